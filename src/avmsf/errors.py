@@ -1,0 +1,25 @@
+"""One family of errors: whatever the user can cause and mend is an `AvmsfError` with a message that says how."""
+
+
+class AvmsfError(Exception):
+    """Something the user gave cannot be used; the message says what was expected, what was found and what to do."""
+
+
+class CaptureError(AvmsfError):
+    """A capture folder, its table, its settings or one of its sound files cannot be used."""
+
+
+class ExtractionError(AvmsfError):
+    """No modes can be drawn from these recordings."""
+
+
+class FitError(AvmsfError):
+    """A field cannot be fitted to these impacts, features and modes."""
+
+
+class FieldFileError(AvmsfError):
+    """A file is not a field that this version can read, or a field cannot be written."""
+
+
+class EvaluationError(AvmsfError):
+    """Sounds or contacts given to a metric, a baseline or a split do not fit together."""

@@ -1,0 +1,19 @@
+"""The modes of an object: what it can sing, wherever it is struck."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float64
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class ModalBank:
+    """Damped sines that all contacts share (paper, eq. 3): mode i sounds as exp(-damping_i t) sin(2 pi frequency_i t)."""
+
+    frequency: Float64[Tensor, " modes"]
+    """Damped frequencies, Hz, ascending."""
+    damping: Float64[Tensor, " modes"]
+    """Amplitude decay rates, 1/s, positive."""
+
+    def __len__(self) -> int:
+        return self.frequency.shape[0]
