@@ -1,7 +1,9 @@
 """What is heard beside the modes: noise of one colour, the same at every contact (paper, section 3.4)."""
 
+import math
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -13,3 +15,63 @@ class Residual:
     magnitude: Float[Tensor, " bins"]
     """Standard deviation of the white noise that each band is cut from (bins evenly spaced from 0 Hz to half the
     sample rate), so that all ones is white noise of unit variance. Not negative."""
+
+
+def shape_noise(
+    magnitude: Float[Tensor, " bins"], *, contacts: int, samples: int, generator: torch.Generator
+) -> Float[Tensor, "contacts samples"]:
+    """Return white Gaussian noise filtered to `magnitude`, a fresh draw for every contact (paper, eq. 6).
+
+    The filters b_i are triangles that sum to one, so the noise's spectrum is a white one times `magnitude`
+    interpolated linearly between its bins. The white noise is drawn as its spectrum, which is white too; it is
+    drawn on the CPU, so that one seed gives one noise on every device. Differentiable in `magnitude`.
+    """
+    length = _even_length(samples)
+    frequencies = length // 2 + 1
+    place = torch.linspace(0, len(magnitude) - 1, frequencies, device=magnitude.device)
+    left = place.floor().long().clamp_max(len(magnitude) - 2)
+    share = place - left
+    envelope = (1 - share) * magnitude[left] + share * magnitude[left + 1]
+    white = torch.randn(contacts, frequencies, 2, generator=generator).to(magnitude.device)
+    spectrum = torch.view_as_complex(white) * (envelope * math.sqrt(length / 2))
+    return torch.fft.irfft(spectrum, n=length)[:, :samples]
+
+
+def noise_power(
+    sounds: Float[Tensor, "contacts samples"], *, bins: int, quietest: float = 0.1
+) -> Float[Tensor, "contacts bins"]:
+    """Return the power of the background noise in each band of each sound: white noise of variance v gives v.
+
+    Paper, section 3.4: the mean over the lowest-energy segments of each bin. A segment is a run of about twenty
+    half-overlapping frames where the sound is long enough: the quietest of single frames would come out far below
+    the mean power of a steady noise, the quietest of such runs within about a decibel.
+    """
+    fft_size = 2 * (bins - 1)
+    padded = torch.nn.functional.pad(sounds, (0, max(0, fft_size - sounds.shape[1])))
+    window = torch.hann_window(fft_size, device=sounds.device)
+    frames = padded.unfold(1, fft_size, fft_size // 2)
+    power = torch.fft.rfft(frames * window).abs().square() / window.square().sum()
+    # The edges 0 Hz and half the rate are real numbers with all their power in one part: same mean, no correction.
+    count = max(1, power.shape[1] // 20)
+    runs = power.shape[1] // count
+    segments = power[:, : runs * count].unflatten(1, (runs, count)).mean(2)
+    kept = max(1, round(quietest * runs))
+    return torch.sort(segments, dim=1).values[:, :kept].mean(1)
+
+
+def estimate_residual(sounds: Float[Tensor, "contacts samples"], *, bins: int) -> Residual:
+    """Return the noise common to all sounds, from the quietest segments of each bin (paper, section 3.4)."""
+    return Residual(noise_power(sounds, bins=bins).mean(0).sqrt())
+
+
+def _even_length(samples: int) -> int:
+    """Return the next even length that factors into small primes, on which an FFT is fast."""
+    length = samples + samples % 2
+    while True:
+        rest = length
+        for prime in (2, 3, 5):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            return length
+        length += 2

@@ -1,0 +1,164 @@
+"""What a field has to beat, and what no field on the same modes can beat.
+
+Each baseline is a `Renderer` made from the training impacts alone; nearest is by distance in a straight line, and of
+equally near contacts the one that comes first. The floors are made from the test sounds themselves: they are what
+perfect gains would score, and no renderers, for nobody has the sound of a contact before it is struck.
+"""
+
+import zlib
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import EvaluationError
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction import Extraction
+from avmsf.modal.leastsquares import fit_gains, fit_sine_gains
+from avmsf.modal.synthesis import synthesise
+from avmsf.scene.points import nearest_points
+
+
+@dataclass(frozen=True, eq=False)
+class WhiteNoise:
+    """Gaussian white noise as loud as the training sounds on average, for each contact its own.
+
+    Loudness is the root mean square over the whole sound. (The paper says the same of its own white noise, but its
+    figures for it are those of noise of peak one: see `avmsf.bench.conventions`.)
+    """
+
+    train: Impacts
+    seed: int = 0
+
+    @property
+    def sample_rate(self) -> float:
+        """Samples per second, Hz."""
+        return self.train.sample_rate
+
+    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+        """Return noise that depends on the seed and on where the contact is, and on nothing else."""
+        loudness = self.train.sounds.square().mean(dim=1).sqrt().mean()
+        sounds = [self._noise(contact) for contact in contacts]
+        return torch.stack(sounds) * loudness if sounds else self.train.sounds[:0]
+
+    def _noise(self, contact: Float[Tensor, "3"]) -> Float[Tensor, " samples"]:
+        # Adding zero makes one of the two zeros, whose bytes differ.
+        place = (contact.detach().double().cpu() + 0.0).numpy().tobytes()
+        # One hash of both, for torch's generator heeds the lower 32 bits of its seed alone.
+        generator = torch.Generator().manual_seed(zlib.crc32(place, self.seed))
+        noise = torch.randn(self.train.sounds.shape[1], generator=generator, dtype=self.train.sounds.dtype)
+        return noise.to(self.train.sounds.device)
+
+
+@dataclass(frozen=True, eq=False)
+class NearestStrike:
+    """The training sound whose contact is nearest."""
+
+    train: Impacts
+
+    @property
+    def sample_rate(self) -> float:
+        """Samples per second, Hz."""
+        return self.train.sample_rate
+
+    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+        """Return the nearest training contact's sound."""
+        return self.train.sounds[nearest_points(self.train.contacts, contacts)[:, 0]]
+
+
+@dataclass(frozen=True, eq=False)
+class MeanWaveform:
+    """The mean of the nearest training sounds, sample by sample: the paper's KNN. Phases cancel in it."""
+
+    train: Impacts
+    count: int = 3
+    """How many sounds are averaged."""
+
+    def __post_init__(self) -> None:
+        _expect_neighbours(self.train, self.count)
+
+    @property
+    def sample_rate(self) -> float:
+        """Samples per second, Hz."""
+        return self.train.sample_rate
+
+    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+        """Return the mean of the nearest training contacts' sounds."""
+        return self.train.sounds[nearest_points(self.train.contacts, contacts, count=self.count)].mean(dim=1)
+
+
+@dataclass(frozen=True, eq=False)
+class MeanGains:
+    """The modes with the mean of the nearest contacts' signed gains, in phase and in quadrature; no residual."""
+
+    train: Impacts
+    extraction: Extraction
+    """Modes of the training impacts, and their gains in each of them, row for row."""
+    count: int = 3
+    """How many contacts' gains are averaged."""
+
+    def __post_init__(self) -> None:
+        _expect_neighbours(self.train, self.count)
+        if len(self.extraction.gains) != len(self.train):
+            raise EvaluationError(
+                f"the extraction has gains of {len(self.extraction.gains)} recordings and there are {len(self.train)} "
+                "training impacts; extract the modes from these impacts"
+            )
+
+    @property
+    def sample_rate(self) -> float:
+        """Samples per second, Hz."""
+        return self.train.sample_rate
+
+    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+        """Return the modes' sound with the mean gains of the nearest training contacts."""
+        rows = nearest_points(self.train.contacts, contacts, count=self.count)
+        bank = self.extraction.bank
+        return synthesise(
+            self.extraction.gains[rows].mean(dim=1),
+            bank.frequency,
+            bank.damping,
+            samples=self.train.sounds.shape[1],
+            sample_rate=self.train.sample_rate,
+            quadrature=self.extraction.quadrature[rows].mean(dim=1),
+        )
+
+
+def floor(test: Impacts, bank: ModalBank) -> Float[Tensor, "contacts samples"]:
+    """Return the test sounds as `bank` expresses them best: their own gains, in phase and in quadrature.
+
+    No gains that are predicted for the same modes come nearer in the squared error of the waveform.
+    """
+    gains, quadrature = fit_gains(test.sounds, bank, sample_rate=test.sample_rate)
+    return _render(test, bank, gains, quadrature)
+
+
+def sine_floor(test: Impacts, bank: ModalBank) -> Float[Tensor, "contacts samples"]:
+    """Return the test sounds as damped sines without cosines express them best: all that the paper's equation 3 has."""
+    gains = fit_sine_gains(test.sounds, bank, sample_rate=test.sample_rate)
+    return _render(test, bank, gains, None)
+
+
+def _render(
+    test: Impacts,
+    bank: ModalBank,
+    gains: Float[Tensor, "contacts modes"],
+    quadrature: Float[Tensor, "contacts modes"] | None,
+) -> Float[Tensor, "contacts samples"]:
+    return synthesise(
+        gains,
+        bank.frequency,
+        bank.damping,
+        samples=test.sounds.shape[1],
+        sample_rate=test.sample_rate,
+        quadrature=quadrature,
+    )
+
+
+def _expect_neighbours(train: Impacts, count: int) -> None:
+    if not 1 <= count <= len(train):
+        raise EvaluationError(
+            f"the mean of {count} nearest impacts was asked of {len(train)} training impacts; ask for 1 to {len(train)}"
+        )

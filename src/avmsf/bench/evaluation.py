@@ -1,0 +1,107 @@
+"""Choosing what to learn from and what to be judged by, and the judgement: one line for whatever renders sounds."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.bench.conventions import PAPER, Convention
+from avmsf.bench.metrics import PerContact, default_fft_sizes, relative_stft_error, validate
+from avmsf.bench.renderer import Renderer
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import EvaluationError
+from avmsf.scene.points import farthest_points, nearest_points
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """How far rendered sounds are from recorded ones, by several metrics; lower is better."""
+
+    convention: str
+    """Name of the convention that the metrics follow, `relative_stft` apart, which is the same in all."""
+    names: tuple[str, ...]
+    """What each scored impact is called."""
+    values: Mapping[str, PerContact]
+    """For each metric, by name, one figure an impact."""
+
+    def mean(self) -> dict[str, float]:
+        """Return each metric's mean over the impacts."""
+        return {metric: float(values.mean()) for metric, values in self.values.items()}
+
+    def standard_error(self) -> dict[str, float]:
+        """Return the standard error of each mean, as if the impacts were independent; NaN for a single impact."""
+        return {
+            metric: float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+            for metric, values in self.values.items()
+        }
+
+
+def split(
+    impacts: Impacts, *, fraction: float = 0.2, count: int | None = None, start: int = 0
+) -> tuple[Impacts, Impacts]:
+    """Return (train, test): farthest-point sampling of contacts for training, all the others for testing.
+
+    `count` training contacts, or else the nearest whole number to `fraction` of all impacts and at least 2. Training
+    impacts are in the order of their choice, from row `start` on; so with more contacts the first ones stay the same.
+    Impacts at one and the same contact stay together, with the training ones if it is chosen, lest a test be at a place
+    already heard. Raises EvaluationError where fewer than 2 contacts would remain to train or none to test.
+    """
+    if count is None and not 0.0 < fraction < 1.0:
+        raise EvaluationError(f"the fraction of impacts to train on must lie between 0 and 1, got {fraction:g}")
+    wanted = max(2, round(fraction * len(impacts))) if count is None else count
+    distinct = len(torch.unique(impacts.contacts, dim=0))
+    if not 2 <= wanted < distinct:
+        raise EvaluationError(
+            f"{wanted} contacts to train on cannot be chosen from {len(impacts)} impacts at {distinct} different "
+            "contacts: at least 2 are needed to train and 1 to test; record more contacts or choose another number"
+        )
+    chosen = farthest_points(impacts.contacts, wanted, start=start)
+    owner = nearest_points(impacts.contacts[chosen], impacts.contacts)[:, 0]
+    repeated = (impacts.contacts == impacts.contacts[chosen][owner]).all(dim=1)
+    repeats = set(torch.nonzero(repeated).flatten().tolist()) - set(chosen.tolist())
+    train = chosen.tolist() + sorted(repeats)
+    test = sorted(set(range(len(impacts))) - set(train))
+    return impacts.take(train), impacts.take(test)
+
+
+def evaluate(
+    renderer: Renderer,
+    impacts: Impacts,
+    *,
+    convention: Convention = PAPER,
+    fft_sizes: Sequence[int] | None = None,
+) -> Scores:
+    """Score what `renderer` makes of the impacts' contacts against what was recorded there.
+
+    Raises as `score`, and for a renderer at another sample rate.
+    """
+    if renderer.sample_rate != impacts.sample_rate:
+        raise EvaluationError(
+            f"the renderer's sounds are at {renderer.sample_rate:g} Hz and the impacts at {impacts.sample_rate:g} Hz; "
+            "resample one of them, or train on a capture of this rate"
+        )
+    with torch.no_grad():
+        sounds = renderer.render(impacts.contacts)
+    return score(sounds, impacts, convention=convention, fft_sizes=fft_sizes)
+
+
+def score(
+    sounds: Float[Tensor, "..."],
+    impacts: Impacts,
+    *,
+    convention: Convention = PAPER,
+    fft_sizes: Sequence[int] | None = None,
+) -> Scores:
+    """Score sounds that were made otherwise than by a renderer, row for row of the impacts.
+
+    `relative_stft` with `fft_sizes` in samples, or else with `default_fft_sizes`, and the convention's metrics. Raises
+    EvaluationError for sounds that do not fit the impacts or are not finite, with the name of the impact.
+    """
+    validate(sounds, impacts.sounds, names=impacts.names)
+    sizes = default_fft_sizes(impacts.sample_rate) if fft_sizes is None else tuple(fft_sizes)
+    values = {"relative_stft": relative_stft_error(sounds, impacts.sounds, fft_sizes=sizes)}
+    values |= convention.scores(sounds, impacts.sounds, sample_rate=impacts.sample_rate)
+    return Scores(convention=convention.name, names=impacts.names, values=values)

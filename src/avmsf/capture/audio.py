@@ -1,0 +1,156 @@
+"""Sound files as they lie on disk: every channel, the file's own rate, nothing resampled or scaled."""
+
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+import soundfile
+import torch
+from jaxtyping import Float, Float64, Shaped
+from torch import Tensor
+
+from avmsf.errors import CaptureError
+
+LOWEST_RATE = 100.0
+HIGHEST_RATE = 192_000.0
+EIGHT_BIT = frozenset({"PCM_U8", "PCM_S8", "ULAW", "ALAW", "DPCM_8"})
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One sound file, read whole."""
+
+    name: str
+    """What messages and tables call it."""
+    channels: Float64[np.ndarray, "channels frames"]
+    """Integer formats as fractions of full scale, float formats as they are."""
+    sample_rate: float
+    """The file's own rate, Hz."""
+    subtype: str
+    """How a sample is coded, in libsndfile's words: PCM_16, PCM_U8, FLOAT and so on."""
+
+    @property
+    def frames(self) -> int:
+        """Samples in each channel."""
+        return self.channels.shape[1]
+
+    @property
+    def duration(self) -> float:
+        """Seconds, as recorded."""
+        return self.frames / self.sample_rate
+
+    def channel(self, number: int) -> Float64[np.ndarray, " frames"]:
+        """Return one channel, counted from 1 as sound editors count them; `CaptureError` where there is none."""
+        if not 1 <= number <= len(self.channels):
+            raise CaptureError(
+                f"{self.name}: there is no channel {number}, the file holds {len(self.channels)} (counted from 1): "
+                "mend response_channel or force_channel in capture.toml"
+            )
+        return self.channels[number - 1]
+
+    def response(
+        self, number: int | None = None, *, force_channel: int | None = None
+    ) -> Float64[np.ndarray, " frames"]:
+        """Return the channel that holds the object's sound: the given one, or the only one it can be.
+
+        Without a number that is a file's one channel, the one that is left beside the force, or the first where all
+        are the same to the bit (a mono sound saved as stereo). `CaptureError` where the choice is open.
+        """
+        if number is not None:
+            return self.channel(number)
+        left = [row for index, row in enumerate(self.channels) if index + 1 != force_channel]
+        if not left:
+            raise CaptureError(f"{self.name}: its one channel is the force channel, so there is no sound beside it")
+        if any(not np.array_equal(row, left[0]) for row in left[1:]):
+            raise CaptureError(
+                f"{self.name}: it holds {len(self.channels)} different channels and nothing says which one is the "
+                "sound: write response_channel = 1 (or another, counted from 1) in capture.toml, or save it as mono"
+            )
+        return left[0]
+
+
+def read_recording(path: Path, name: str | None = None) -> Recording:
+    """Read every channel of a sound file.
+
+    Raises `CaptureError` where the file is missing, corrupt or empty, or holds samples that are not numbers.
+    """
+    name = name or str(path)
+    if not path.is_file():
+        raise CaptureError(f"{name}: there is no such file{_nearest_name(path)}")
+    try:
+        with soundfile.SoundFile(path) as file:
+            samples = file.read(dtype="float64", always_2d=True)
+            rate, subtype = float(file.samplerate), str(file.subtype)
+    except (soundfile.LibsndfileError, OSError) as error:
+        reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
+        size = path.stat().st_size
+        raise CaptureError(
+            f"{name}: not a sound file that can be read ({size} bytes: {reason}): export or copy it again as wav"
+        ) from error
+    if not samples.size:
+        raise CaptureError(f"{name}: the file is empty, it holds no samples: record or export it again")
+    if not np.isfinite(samples).all():
+        count = int((~np.isfinite(samples)).sum())
+        raise CaptureError(f"{name}: {count} samples are not finite numbers: export it again")
+    return Recording(name, np.ascontiguousarray(samples.T), rate, subtype)
+
+
+def read_sound(path: str | Path, *, channel: int | None = None) -> tuple[Float[Tensor, " samples"], float]:
+    """Read one clip for which no contact is known: the whole of it as float32, and its sample rate in Hz.
+
+    `channel` counts from 1 and is needed only where a file holds several different ones. Raises `CaptureError` for
+    what `read_recording` refuses, for a rate outside 100 Hz to 192 kHz, and for silence.
+    """
+    recording = read_recording(Path(path))
+    sound = recording.response(channel)
+    refuse_rate(recording.sample_rate, recording.name)
+    refuse_silence(sound, recording.name)
+    return torch.from_numpy(sound.astype(np.float32)), recording.sample_rate
+
+
+def refuse_rate(rate: float, name: str) -> None:
+    """Raise `CaptureError` unless the rate lies between 100 Hz and 192 kHz."""
+    if not LOWEST_RATE <= rate <= HIGHEST_RATE:
+        raise CaptureError(
+            f"{name}: a sample rate of {rate:g} Hz; expected {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz "
+            "(the file's rate times playback_speed)"
+        )
+
+
+def refuse_silence(sound: Float64[np.ndarray, " frames"], name: str) -> None:
+    """Raise `CaptureError` where every sample is the same."""
+    if np.ptp(sound) == 0:
+        raise CaptureError(
+            f"{name}: the sound is silent, all {len(sound)} samples are {sound[0]:g}: "
+            "record it again, or choose another response_channel"
+        )
+
+
+def clipped_samples(samples: Shaped[np.ndarray, " frames"]) -> int:
+    """Count the samples that a converter or an editor has cut off: those at the very highest or lowest value.
+
+    At full scale three of them suffice, since an unclipped sound touches its extreme once or twice. Below full scale
+    (clipped first, turned down later) it takes three flat tops of three samples or more, because a soft slow wave that
+    was rounded to integers has one such top too.
+    """
+    total = 0
+    for signed in (samples, -samples):
+        extreme = signed.max()
+        if extreme <= 0:
+            continue
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], (signed == extreme).view(np.int8), [0]))))
+        runs = edges[1::2] - edges[::2]
+        if abs(extreme - 1) > 1e-4:
+            runs = runs[runs >= 3] if (runs >= 3).sum() >= 3 else runs[:0]
+        total += int(runs.sum()) if runs.sum() >= 3 else 0
+    return total
+
+
+def _nearest_name(path: Path) -> str:
+    """Guess what was meant by a path that does not exist."""
+    if not path.parent.is_dir():
+        return f", nor the folder {path.parent}"
+    names = {other.name.lower(): other.name for other in path.parent.iterdir()}
+    found = get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)
+    return f" (did you mean {names[found[0]]}?)" if found else ": copy it there, or remove its row from impacts.csv"

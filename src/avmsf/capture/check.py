@@ -1,0 +1,99 @@
+"""Everything that is wrong with a capture folder, found without stopping at the first thing."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from avmsf.capture.folder import read_strike, settings_of
+from avmsf.capture.measure import RecordingReport
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.surface import find_surface
+from avmsf.capture.table import TABLE, Row, Strike, read_rows, refuse_repeated_files, understand
+from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_surface, refuse_few
+from avmsf.errors import CaptureError
+
+
+@dataclass(frozen=True)
+class CaptureReport:
+    """What `check` found: plain values throughout, so that `dataclasses.asdict` gives what JSON holds."""
+
+    readable: bool
+    """Whether `read_capture` would read this folder (perhaps with warnings)."""
+    recordings: tuple[RecordingReport, ...]
+    """One a row of impacts.csv, in its order."""
+    problems: tuple[str, ...]
+    """What is wrong with the folder, its table, its surface, or with the recordings side by side."""
+
+
+def check(folder: str | Path, settings: CaptureSettings | None = None) -> CaptureReport:
+    """Look at a capture folder as `read_capture` would and report on every recording; raises nothing for bad input."""
+    folder = Path(folder)
+    try:
+        settings = settings or settings_of(folder)
+        rows, problems = read_rows(folder)
+    except CaptureError as error:
+        return CaptureReport(False, (), (str(error),))
+    reports, strikes, lengths = [], [], []
+    for row in rows:
+        strike, length, report = _check_row(folder, row, settings=settings)
+        reports.append(report)
+        if strike is not None:
+            strikes.append(strike)
+        if length is not None:
+            lengths.append((report.file, length, report.sample_rate or 0.0))
+    refused = _check_contacts(folder, strikes, rows, settings=settings, problems=problems)
+    try:
+        if lengths:
+            names, samples, rates = zip(*lengths, strict=True)
+            problems += common_length(samples, names, rate=common_rate(rates, names), settings=settings)[1]
+    except CaptureError as error:
+        refused.append(str(error))
+    listed = {report.file for report in reports}
+    present = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.wav"))
+    stray = [name for name in present if name not in listed]
+    if stray:
+        problems.append(
+            f"{len(stray)} wav files have no row in {TABLE}: {', '.join(stray[:5])}{', …' * (len(stray) > 5)}"
+        )
+    readable = not refused and all(report.readable for report in reports)
+    return CaptureReport(readable, tuple(reports), tuple(refused + problems))
+
+
+def _check_row(
+    folder: Path, row: Row, *, settings: CaptureSettings
+) -> tuple[Strike | None, int | None, RecordingReport]:
+    """Return what could be understood of one row, the samples after its onset, and its report."""
+    strike = None
+    try:
+        strike = understand(row, settings)
+        prepared, report = read_strike(folder, strike, settings=settings)
+    except CaptureError as error:
+        file = strike.file if strike is not None else row.cells["file"]
+        return strike, None, RecordingReport(file=file, line=row.line, readable=False, problems=(str(error),))
+    return strike, len(prepared.sound), report
+
+
+def _check_contacts(
+    folder: Path, strikes: list[Strike], rows: list[Row], *, settings: CaptureSettings, problems: list[str]
+) -> list[str]:
+    """Add to `problems` what looks wrong about the contacts, and return what makes the folder unreadable."""
+    if strikes:
+        problems += judge_contacts(strikes, settings)
+
+    def judge_shape() -> None:
+        surface = find_surface(folder, settings)
+        if surface is not None and strikes:
+            problems.extend(judge_surface(strikes, surface, settings=settings))
+
+    refused = []
+    judges: tuple[Callable[[], None], ...] = (
+        lambda: refuse_few(len(rows)),
+        lambda: refuse_repeated_files(strikes),
+        judge_shape,
+    )
+    for judge in judges:
+        try:
+            judge()
+        except CaptureError as error:
+            refused.append(str(error))
+    return refused

@@ -1,0 +1,186 @@
+"""A capture folder: `impacts.csv`, its wav files, perhaps `capture.toml` and a surface; read and written whole."""
+
+import csv
+import os
+import shutil
+import uuid
+import warnings
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import soundfile
+import torch
+
+from avmsf.capture.audio import read_recording
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.measure import RecordingReport, measure
+from avmsf.capture.prepare import Prepared, prepare
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.surface import Surface, find_surface, write_surface
+from avmsf.capture.table import (
+    DIRECTION,
+    FORCE,
+    REQUIRED,
+    TABLE,
+    Strike,
+    read_rows,
+    refuse_repeated_files,
+    understand,
+)
+from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_surface, refuse_few
+from avmsf.capture.warning import CaptureWarning
+from avmsf.errors import CaptureError
+
+SETTINGS = "capture.toml"
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """One object, as it was struck and recorded."""
+
+    name: str
+    impacts: Impacts
+    surface: Surface | None = None
+
+
+def read_capture(folder: str | Path, settings: CaptureSettings | None = None) -> Capture:
+    """Read a capture folder; `settings`, where given, take the place of the folder's `capture.toml`.
+
+    Every sound starts at its blow, is divided by its force where that is known, and has the length and the sample
+    rate of all others (see `CaptureSettings`); nothing is resampled. Rows keep the order of `impacts.csv`. Raises
+    `CaptureError` at the first thing that cannot be used, and warns with `CaptureWarning` of what can be used but
+    looks wrong; `check` lists everything.
+    """
+    folder = Path(folder)
+    settings = settings or settings_of(folder)
+    rows, remarks = read_rows(folder)
+    strikes = [understand(row, settings) for row in rows]
+    refuse_few(len(strikes))
+    refuse_repeated_files(strikes)
+    remarks += judge_contacts(strikes, settings)
+    surface = find_surface(folder, settings)
+    if surface is not None:
+        remarks += judge_surface(strikes, surface, settings=settings)
+    sounds, forces, reports = [], [], []
+    for strike in strikes:
+        prepared, report = read_strike(folder, strike, settings=settings)
+        sounds.append(prepared.sound.astype(np.float32))
+        forces.append(prepared.newtons)
+        reports.append(report)
+    names = [strike.file for strike in strikes]
+    rate = common_rate([report.sample_rate or 0.0 for report in reports], names)
+    length, cut = common_length([len(sound) for sound in sounds], names, rate=rate, settings=settings)
+    for remark in remarks + cut + _summary(reports, folder):
+        warnings.warn(remark, CaptureWarning, stacklevel=2)
+    directions = [strike.direction for strike in strikes]
+    impacts = Impacts(
+        contacts=torch.tensor([strike.contact for strike in strikes], dtype=torch.float32),
+        sounds=torch.from_numpy(np.stack([sound[:length] for sound in sounds])),
+        sample_rate=rate * settings.playback_speed,
+        names=tuple(names),
+        directions=None if None in directions else torch.tensor(directions, dtype=torch.float32),
+        forces=None if None in forces else torch.tensor(forces, dtype=torch.float32),
+    )
+    return Capture(settings.name or folder.resolve().name, impacts, surface)
+
+
+def settings_of(folder: Path) -> CaptureSettings:
+    """Read the folder's `capture.toml`, or return the defaults where there is none."""
+    path = folder / SETTINGS
+    return CaptureSettings.read(path) if path.is_file() else CaptureSettings()
+
+
+def read_strike(folder: Path, strike: Strike, *, settings: CaptureSettings) -> tuple[Prepared, RecordingReport]:
+    """Read, prepare and measure the recording of one row; `CaptureError` where it cannot be used."""
+    recording = read_recording(folder / strike.file, strike.file)
+    prepared = prepare(recording, settings, newtons=strike.newtons)
+    return prepared, measure(recording, prepared, settings=settings, line=strike.line)
+
+
+def write_capture(capture: Capture, folder: str | Path) -> None:
+    """Write a folder that `read_capture` reads back to the same values, bit for bit.
+
+    Sounds become float32 wav files under the recordings' names where these are wav paths inside a folder, else under
+    numbers. Everything is written beside the folder first and then renamed into place, so that a folder of this name
+    is whole or absent. Raises `CaptureError` where the folder exists and is not empty, or cannot be written.
+    """
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise CaptureError(f"{folder}: exists and is not an empty folder; choose another name or remove it")
+    begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
+    try:
+        begun.mkdir(parents=True)
+        _write_files(capture, begun)
+        if folder.exists():
+            folder.rmdir()
+        os.rename(begun, folder)
+    except (OSError, soundfile.LibsndfileError) as error:
+        raise CaptureError(f"{folder}: the capture cannot be written: {error}") from error
+    finally:
+        shutil.rmtree(begun, ignore_errors=True)
+
+
+def _write_files(capture: Capture, folder: Path) -> None:
+    impacts = capture.impacts
+    names = _file_names(impacts.names)
+    rate, speed = _whole_rate(impacts.sample_rate)
+    for name, sound in zip(names, impacts.sounds.numpy(), strict=True):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        soundfile.write(folder / name, sound, rate, subtype="FLOAT", format="WAV")
+    header, columns = list(REQUIRED), [impacts.contacts]
+    if impacts.directions is not None:
+        header, columns = [*header, *DIRECTION], [*columns, impacts.directions]
+    if impacts.forces is not None:
+        header, columns = [*header, FORCE], [*columns, impacts.forces[:, None]]
+    with open(folder / TABLE, "w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(header)
+        # Nine digits hold a float32 exactly.
+        for name, values in zip(names, torch.cat(columns, dim=1).tolist(), strict=True):
+            table.writerow([name, *(f"{value:.9g}" for value in values)])
+    if capture.surface is not None:
+        write_surface(capture.surface, folder / "surface.ply")
+    name = "".join(
+        f"\\u{ord(mark):04x}" if mark in '"\\' or ord(mark) in (*range(32), 127) else mark for mark in capture.name
+    )
+    (folder / SETTINGS).write_text(
+        f'name = "{name}"\n'
+        f"seconds = {impacts.sounds.shape[1] / rate!r}\n"
+        f"playback_speed = {speed!r}\n"
+        f'normalise = "{"none" if impacts.forces is None else "done"}"\n'
+        "align = false\n",
+        encoding="utf-8",
+    )
+
+
+def _file_names(names: tuple[str, ...]) -> list[str]:
+    """Return the names where all can be files inside the folder, else numbers."""
+    paths = [PurePosixPath(name) for name in names]
+    usable = all(
+        path.suffix.lower() == ".wav" and str(path) == name and not path.is_absolute() and ".." not in path.parts
+        and "\\" not in name and ":" not in path.parts[0] and name == name.strip()
+        for path, name in zip(paths, names, strict=True)
+    )  # fmt: skip
+    if usable and len({name.lower() for name in names}) == len(names):
+        return list(names)
+    return [f"{number:03d}.wav" for number in range(1, len(names) + 1)]
+
+
+def _whole_rate(sample_rate: float) -> tuple[int, float]:
+    """Return a whole rate for the files, close to the given one, and the playback speed that brings that back exactly.
+
+    A quotient times its divisor misses by one unit in the last place for one divisor in seven, so others are tried.
+    """
+    nearest = max(1, round(sample_rate))
+    rate = next(rate for rate in range(nearest, 2 * nearest + 64) if rate * (sample_rate / rate) == sample_rate)
+    return rate, sample_rate / rate
+
+
+def _summary(reports: list[RecordingReport], folder: Path) -> list[str]:
+    wrong = [report for report in reports if report.problems]
+    if not wrong:
+        return []
+    shown = "; ".join(f"{report.file}: {', '.join(report.problems)}" for report in wrong[:5])
+    more = f"; and {len(wrong) - 5} more" if len(wrong) > 5 else ""
+    return [f"{len(wrong)} of {len(reports)} recordings look wrong: {shown}{more}. `avmsf check {folder}` shows all"]

@@ -1,0 +1,105 @@
+"""What one recording is worth: its length, level, noise, clipping, onset and second blows."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from avmsf.capture.audio import EIGHT_BIT, Recording, clipped_samples
+from avmsf.capture.onset import SECONDS_BEFORE, find_second_blow, find_second_push
+from avmsf.capture.prepare import Prepared
+from avmsf.capture.settings import CaptureSettings
+
+HIGHEST_NOISE_DB = -20.0
+"""Noise above this, against the peak, leaves too little of the decay to measure."""
+LOWEST_PEAK_DB = -50.0
+"""An integer file below this uses so few of its steps that it was recorded too softly."""
+
+
+@dataclass(frozen=True)
+class RecordingReport:
+    """One row of `avmsf check`: plain values; those that could not be measured are None."""
+
+    file: str
+    line: int
+    """Line of impacts.csv."""
+    readable: bool
+    """Whether the capture can be read with this recording in it."""
+    problems: tuple[str, ...] = ()
+    """What is wrong and what to do about it."""
+    seconds: float | None = None
+    """Length of the whole file, as recorded."""
+    sample_rate: float | None = None
+    """The file's own, Hz."""
+    channels: int | None = None
+    coding: str | None = None
+    """PCM_16, FLOAT and so on."""
+    peak_db: float | None = None
+    """Peak of the response against full scale (against 1.0 in float files), dB."""
+    noise_db: float | None = None
+    """Noise (root mean square) against the peak, dB: before the blow, or else in the quietest tenth of the file."""
+    onset_seconds: float | None = None
+    """When the blow begins in the file, seconds as recorded."""
+    clipped: int | None = None
+    """Samples on flat tops, in the response and the force."""
+    double_hit_seconds: float | None = None
+    """When a second blow begins in the file, within what is kept; None where there is none."""
+
+
+def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettings, line: int) -> RecordingReport:
+    """Measure one recording that could be read and prepared, and say what about it looks wrong."""
+    rate = recording.sample_rate
+    response = recording.response(settings.response_channel, force_channel=settings.force_channel)
+    peak = float(np.abs(response).max())
+    noise = _decibels(_noise(response, prepared.onset, rate) / peak)
+    clipped, second = clipped_samples(response), None
+    if prepared.pulse is not None and settings.force_channel is not None:
+        force = recording.channel(settings.force_channel)
+        clipped += clipped_samples(force)
+        second = find_second_push(force, prepared.pulse, sample_rate=rate, seconds=settings.seconds)
+    else:
+        second = find_second_blow(response, prepared.onset, sample_rate=rate, seconds=settings.seconds)
+    problems = []
+    if clipped:
+        problems.append(f"{clipped} clipped samples: turn the gain down and record it again")
+    if second is not None:
+        problems.append(f"a second blow at {second / rate:.3f} s: record it again, or keep fewer seconds")
+    if noise > HIGHEST_NOISE_DB:
+        problems.append(
+            f"never quieter than {-noise:.0f} dB below the peak: noise, no clear blow, or cut while it still rings"
+        )
+    if recording.subtype in EIGHT_BIT:
+        problems.append(f"only 8 bits a sample ({recording.subtype}): its noise hides the decay; record 16 or more")
+    elif recording.subtype.startswith("PCM") and _decibels(peak) < LOWEST_PEAK_DB:
+        problems.append(f"its peak is {-_decibels(peak):.0f} dB below full scale: turn the gain up")
+    return RecordingReport(
+        file=recording.name,
+        line=line,
+        readable=True,
+        problems=tuple(problems),
+        seconds=recording.duration,
+        sample_rate=rate,
+        channels=len(recording.channels),
+        coding=recording.subtype,
+        peak_db=_decibels(peak),
+        noise_db=noise,
+        onset_seconds=prepared.onset / rate,
+        clipped=clipped,
+        double_hit_seconds=None if second is None else second / rate,
+    )
+
+
+def _noise(response: Float64[np.ndarray, " frames"], onset: int, rate: float) -> float:
+    """Return the noise's root mean square: of what lies before the blow, or of the quietest tenth of 10 ms blocks."""
+    before = response[: max(0, onset - round(SECONDS_BEFORE * rate))]
+    size = max(64, round(0.01 * rate))
+    if len(before) >= size:
+        return float(np.std(before))
+    size = min(size, len(response))
+    blocks = response[: len(response) // size * size].reshape(-1, size)
+    return float(np.quantile(np.std(blocks, axis=1), 0.1))
+
+
+def _decibels(ratio: float) -> float:
+    """Return the level of an amplitude ratio; silence is 200 dB down, so that it stays a number."""
+    return float(20 * np.log10(max(ratio, 1e-10)))

@@ -1,0 +1,134 @@
+"""From a recording to a sound that starts at its blow and no longer depends on how hard the blow was."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.fft import irfft, next_fast_len, rfft
+
+from avmsf.capture.audio import Recording, refuse_rate, refuse_silence
+from avmsf.capture.onset import Pulse, find_onset, find_pulse
+from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import CaptureError
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """One recording from its onset on, to its end."""
+
+    sound: Float64[np.ndarray, " samples"]
+    """Per newton where `newtons` is known, else as recorded."""
+    onset: int
+    """Sample of the file at which the blow begins, whether or not it was moved to zero."""
+    pulse: Pulse | None
+    """The hammer's push, where there is a force channel."""
+    newtons: float | None
+    """Peak force that the sound is divided by."""
+
+
+def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float | None = None) -> Prepared:
+    """Align and normalise one recording as the settings say; `newtons` is the peak force that the table gives.
+
+    The result keeps everything after the onset; how much of it a capture keeps depends on all its recordings.
+    Raises `CaptureError` for rates outside 100 Hz to 192 kHz, silence, and normalisations that lack their force.
+    """
+    refuse_rate(recording.sample_rate * settings.playback_speed, recording.name)
+    sound = recording.response(settings.response_channel, force_channel=settings.force_channel)
+    refuse_silence(sound, recording.name)
+    pulse, onset = None, 0
+    if settings.force_channel is not None:
+        force = recording.channel(settings.force_channel)
+        pulse = _find_pulse(force, recording.name, settings)
+        onset = pulse.start
+        if newtons is None:
+            newtons = abs(pulse.height * settings.force_scale)
+    elif settings.align:
+        onset = find_onset(sound, sample_rate=recording.sample_rate)
+    manner = settings.normalise
+    if manner == "auto":
+        manner = "none" if newtons is None else "peak"
+    if manner == "peak" and newtons is None:
+        raise CaptureError(
+            f'{recording.name}: normalise = "peak" needs a force: give force_newtons in impacts.csv, or a force_channel'
+        )
+    if manner == "deconvolve" and pulse is not None:
+        kept = deconvolve(sound, force, pulse=pulse, regularisation=settings.regularisation)
+    else:
+        kept = sound[onset if settings.align else 0 :]
+    refuse_short(kept, recording)
+    if manner in ("peak", "deconvolve") and newtons is not None:
+        kept = kept / newtons
+    return Prepared(kept, onset, pulse, None if manner == "none" else newtons)
+
+
+def shortest_allowed(rate: float) -> int:
+    """Return the fewest samples in which modes can be told apart at all: 20 ms as recorded, and at least 64."""
+    return max(64, math.ceil(0.02 * rate))
+
+
+def refuse_short(kept: Float64[np.ndarray, " samples"], recording: Recording) -> None:
+    """Raise `CaptureError` where less than `shortest_allowed` follows the onset."""
+    least = shortest_allowed(recording.sample_rate)
+    if len(kept) < least:
+        raise CaptureError(
+            f"{recording.name}: too short, {len(kept)} samples ({len(kept) / recording.sample_rate * 1e3:.3g} ms) "
+            f"after the onset; at least {least} are needed: record it again, or remove its row"
+        )
+
+
+def _find_pulse(force: Float64[np.ndarray, " frames"], name: str, settings: CaptureSettings) -> Pulse:
+    if np.ptp(force) == 0:
+        raise CaptureError(
+            f"{name}: the force channel ({settings.force_channel}) is silent: "
+            "choose another force_channel or remove the recording"
+        )
+    return find_pulse(force)
+
+
+def deconvolve(
+    sound: Float64[np.ndarray, " frames"],
+    force: Float64[np.ndarray, " frames"],
+    *,
+    pulse: Pulse,
+    regularisation: float,
+) -> Float64[np.ndarray, " samples"]:
+    """Return the response to a force of one sample's length and of the recorded pulse's height.
+
+    With F and X the spectra of force and sound from just before the blow on, zero-padded so that nothing wraps
+    round, and e the regularisation, the response has the spectrum
+
+        H = X conj(F) / (|F|^2 + e max |F|^2),
+
+    with F first divided by the pulse's height (and so its sign made positive). Where the blow had energy that is
+    X / F; where it had none H goes to zero instead of to noise. Of the force only the push counts (`isolate`): what its
+    channel holds later is the drift of an amplifier and the object's ringing in the hammer, and dividing by that puts
+    it into the response. Divided by the peak force in newtons, the result is in sound per newton for a push of one
+    sample, 1 / sample rate newton seconds; times the sample rate it is per newton second. It starts with the push, so
+    there is no onset to align.
+    """
+    begin, isolated = isolate(force, pulse)
+    later = sound[begin:]
+    size = next_fast_len(len(later) + len(isolated), real=True)
+    push, heard = rfft(isolated / pulse.height, size), rfft(later, size)
+    power = np.abs(push) ** 2
+    whole = irfft(heard * push.conj() / (power + regularisation * power.max()), size)
+    # What the last samples hold of the response is the part of the push that came before its peak.
+    return whole[: len(sound) - pulse.peak]
+
+
+def isolate(force: Float64[np.ndarray, " frames"], pulse: Pulse) -> tuple[int, Float64[np.ndarray, " window"]]:
+    """Return where the window about a push begins, and the force above rest in it.
+
+    The window leaves room for the filter's ringing before and after a pulse near the recorder's bandwidth, and for the
+    slow end of a soft hammer's: 16 samples and one width before, 24 samples and two widths after, the latter half
+    faded out by a cosine.
+    """
+    width = pulse.stop - pulse.start
+    begin = max(0, pulse.start - 16 - width)
+    fade = 12 + width
+    end = min(len(force), pulse.stop + 2 * fade)
+    window = force[begin:end] - pulse.rest
+    fade = min(fade, len(window))
+    window[len(window) - fade :] *= np.cos(0.5 * np.pi * (np.arange(fade) + 1) / (fade + 1)) ** 2
+    return begin, window

@@ -1,0 +1,116 @@
+"""What a capture's owner knows about its recordings: the contents of `capture.toml`, every key optional."""
+
+import math
+import tomllib
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from pathlib import Path
+from types import NoneType
+from typing import get_args
+
+from avmsf.errors import CaptureError
+
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
+NORMALISATIONS = ("auto", "peak", "deconvolve", "none", "done")
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """How to read a capture folder. Raises `CaptureError` for values that cannot be meant."""
+
+    name: str | None = None
+    """What the object is called; the folder's name where it is not given."""
+    unit: str = "m"
+    """Unit of the coordinates in impacts.csv: m, cm, mm, in or ft."""
+    surface_unit: str | None = None
+    """Unit of the surface's coordinates; the same as `unit` where it is not given."""
+    surface: str | None = None
+    """Surface file in the folder; the first of surface.obj, .ply, .glb, .stl where it is not given."""
+    response_channel: int | None = None
+    """Channel of the wav files that holds the sound, counted from 1 as sound editors count. Mono files need none."""
+    force_channel: int | None = None
+    """Channel that holds the hammer's force, counted from 1, where there is one."""
+    force_scale: float = 1.0
+    """Newtons for each unit of the force channel; 1 for float files that hold newtons. Where impacts.csv gives
+    force_newtons as well, that is the peak, and the channel gives the shape alone."""
+    seconds: float = 3.0
+    """How much to keep from the onset, in seconds as recorded (before any speed-up)."""
+    playback_speed: float = 1.0
+    """The capture's sample rate is the files' rate times this; nothing is resampled. Above 1, slow vibrations sound
+    as a smaller object would."""
+    normalise: str = "auto"
+    """peak: divide by the peak force. deconvolve: divide the spectrum by the force's. none: leave as recorded. done:
+    the files hold sounds per newton already, and force_newtons is only kept. auto: peak where a force is known by
+    channel or column, else none."""
+    regularisation: float = 1e-4
+    """For deconvolve: the power, relative to the greatest of the force's spectrum, below which the force counts as
+    absent. Larger is quieter and duller."""
+    align: bool = True
+    """Move each onset to sample zero. Set it false for impulse responses, whose first sample is the blow already."""
+
+    def __post_init__(self) -> None:
+        for key in ("unit", "surface_unit"):
+            if getattr(self, key) not in (*METRES, *((None,) if key == "surface_unit" else ())):
+                raise CaptureError(f"{key} is {getattr(self, key)!r}; expected one of {', '.join(METRES)}")
+        for key in ("seconds", "playback_speed", "regularisation"):
+            value = getattr(self, key)
+            if not (value > 0 and math.isfinite(value)):
+                raise CaptureError(f"{key} is {value!r}; expected a number above 0")
+        if self.force_scale == 0 or not math.isfinite(self.force_scale):
+            raise CaptureError(f"force_scale is {self.force_scale!r}; expected newtons for each unit of the channel")
+        for key in ("response_channel", "force_channel"):
+            value = getattr(self, key)
+            if value is not None and value < 1:
+                raise CaptureError(f"{key} is {value}; channels count from 1, as in a sound editor")
+        if self.force_channel is not None and self.force_channel == self.response_channel:
+            raise CaptureError(f"force_channel and response_channel are both {self.force_channel}")
+        if self.normalise not in NORMALISATIONS:
+            raise CaptureError(f"normalise is {self.normalise!r}; expected one of {', '.join(NORMALISATIONS)}")
+        if self.normalise == "deconvolve" and self.force_channel is None:
+            raise CaptureError('normalise = "deconvolve" needs the hammer\'s pulse: say which force_channel holds it')
+
+    @property
+    def metres(self) -> float:
+        """Metres in one unit of the contacts' coordinates."""
+        return METRES[self.unit]
+
+    @property
+    def surface_metres(self) -> float:
+        """Metres in one unit of the surface's coordinates."""
+        return METRES[self.surface_unit or self.unit]
+
+    @classmethod
+    def read(cls, path: str | Path) -> "CaptureSettings":
+        """Read a TOML file of these keys; `CaptureError` names the file, the key and what was expected."""
+        path = Path(path)
+        try:
+            table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        except FileNotFoundError as error:
+            raise CaptureError(f"{path}: there is no such file of capture settings") from error
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise CaptureError(f"{path}: not a TOML file that can be read: {error}") from error
+        known = {field.name: get_args(field.type) or (field.type,) for field in fields(cls)}
+        for key, value in table.items():
+            if key not in known:
+                raise CaptureError(f"{path}: unknown key {key!r}{_nearest_key(key, list(known))}")
+            table[key] = _typed(value, known[key], f"{path}: {key}")
+        try:
+            return cls(**table)
+        except CaptureError as error:
+            raise CaptureError(f"{path}: {error}") from error
+
+
+def _typed(value: object, kinds: tuple[object, ...], where: str) -> object:
+    """Return the value as one of the kinds; whole numbers serve as numbers, and `true` as neither."""
+    if float in kinds and type(value) is int:
+        return float(value)
+    if type(value) not in kinds:
+        words = {str: "text", int: "a whole number", float: "a number", bool: "true or false"}
+        expected = " or ".join(word for kind, word in words.items() if kind in kinds and kind is not NoneType)
+        raise CaptureError(f"{where} is {value!r}; expected {expected}")
+    return value
+
+
+def _nearest_key(key: str, known: list[str]) -> str:
+    found = get_close_matches(key, known, n=1, cutoff=0.6)
+    return f" (did you mean {found[0]}?)" if found else f"; expected some of {', '.join(known)}"

@@ -1,0 +1,72 @@
+"""The object's shape, as triangles or as points."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import CaptureError
+
+SURFACE_FILES = ("surface.obj", "surface.ply", "surface.glb", "surface.stl")
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles, or points alone."""
+
+    vertices: Float[Tensor, "points 3"]
+    """Object frame, metres."""
+    faces: Int[Tensor, "faces 3"]
+    """Rows of `vertices` at the corners of each triangle; no rows for a point cloud."""
+
+
+def read_surface(path: str | Path, *, metres: float = 1.0) -> Surface:
+    """Read a mesh or a point cloud whose coordinates count `metres` each; vertices keep the file's order.
+
+    A scene of several parts becomes one surface. `CaptureError` where the file is missing, corrupt or without points.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CaptureError(f"{path}: there is no such surface file")
+    try:
+        loaded = trimesh.load(path, process=False)
+        parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
+    except Exception as error:  # trimesh's readers raise whatever their format's parsing raises
+        raise CaptureError(f"{path}: not a mesh or point cloud that can be read: {error}") from error
+    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
+    for part in parts:
+        points = np.asarray(getattr(part, "vertices", np.zeros((0, 3))), dtype=np.float64)
+        vertices.append(points)
+        faces.append(np.asarray(getattr(part, "faces", np.zeros((0, 3))), dtype=np.int64).reshape(-1, 3) + count)
+        count += len(points)
+    joined = np.concatenate(vertices)
+    if not len(joined) or not np.isfinite(joined).all():
+        found = "no points" if not len(joined) else "coordinates that are not finite numbers"
+        raise CaptureError(f"{path}: holds {found}: export the surface again")
+    return Surface(torch.from_numpy((joined * metres).astype(np.float32)), torch.from_numpy(np.concatenate(faces)))
+
+
+def find_surface(folder: Path, settings: CaptureSettings) -> Surface | None:
+    """Read the surface that the settings name, or the first of the usual names; None where there is none of these."""
+    if settings.surface is not None:
+        named = Path(settings.surface)
+        if named.is_absolute() or ".." in named.parts:
+            raise CaptureError(f"surface = {settings.surface!r} lies outside the capture folder: copy it there")
+        return read_surface(folder / named, metres=settings.surface_metres)
+    for name in SURFACE_FILES:
+        if (folder / name).is_file():
+            return read_surface(folder / name, metres=settings.surface_metres)
+    return None
+
+
+def write_surface(surface: Surface, path: Path) -> None:
+    """Write a binary PLY in metres, which holds float32 coordinates to the last bit."""
+    vertices, faces = surface.vertices.numpy(), surface.faces.numpy()
+    cloud = not len(faces)
+    shape = trimesh.PointCloud(vertices) if cloud else trimesh.Trimesh(vertices, faces, process=False)  # type: ignore[no-untyped-call]
+    shape.export(path, file_type="ply")

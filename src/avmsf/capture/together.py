@@ -1,0 +1,122 @@
+"""What the recordings and contacts of one capture must have in common, and what looks wrong when seen side by side."""
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+
+from avmsf.capture.prepare import shortest_allowed
+from avmsf.capture.settings import METRES, CaptureSettings
+from avmsf.capture.surface import Surface
+from avmsf.capture.table import TABLE, Strike, fitting_units
+from avmsf.errors import CaptureError
+
+WIDEST = 10.0
+"""Metres across beyond which contacts are more likely in another unit."""
+NARROWEST = 1e-3
+"""Metres across below which they are."""
+
+
+def refuse_few(count: int) -> None:
+    """Raise `CaptureError` for fewer than two recordings: nothing can be learned about where one strikes."""
+    if count < 2:
+        raise CaptureError(f"{TABLE} lists {count} recording; a capture needs at least 2, at different contacts")
+
+
+def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:
+    """Return the one sample rate of the files, Hz; `CaptureError` where they differ."""
+    counts = Counter(rates)
+    if len(counts) > 1:
+        found = [
+            f"{rate:g} Hz ({count} files, {names[list(rates).index(rate)]} the first)"
+            for rate, count in counts.most_common()
+        ]
+        raise CaptureError(
+            f"the recordings have different sample rates: {', '.join(found)}; "
+            "a capture has one, and nothing is resampled on reading: convert them to one rate"
+        )
+    return rates[0]
+
+
+def common_length(
+    lengths: Sequence[int], names: Sequence[str], *, rate: float, settings: CaptureSettings
+) -> tuple[int, list[str]]:
+    """Return how many samples from the onset every sound keeps, and a remark where one short recording costs the rest.
+
+    That is `settings.seconds`, or all of the shortest recording. `CaptureError` where the settings ask for too little.
+    """
+    asked = round(settings.seconds * rate)
+    least = shortest_allowed(rate)
+    if asked < least:
+        raise CaptureError(
+            f"seconds = {settings.seconds:g} keeps {asked} samples at {rate:g} Hz; at least {least} are needed"
+        )
+    shortest = min(lengths)
+    usual = min(asked, int(np.median(lengths)))
+    remarks = []
+    if shortest < 0.9 * usual:
+        name = names[list(lengths).index(shortest)]
+        remarks.append(
+            f"all sounds are cut to {shortest / rate:.3g} s, the length of {name} after its onset, where most have "
+            f"{usual / rate:.3g} s: record it again or remove its row"
+        )
+    return min(asked, shortest), remarks
+
+
+def judge_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list[str]:
+    """Say which contacts are repeated, and whether all of them together look like another unit's."""
+    remarks = []
+    places = defaultdict(list)
+    for strike in strikes:
+        places[tuple(round(value, 6) for value in strike.contact)].append(strike.line)
+    repeated = [lines for lines in places.values() if len(lines) > 1]
+    if repeated:
+        shown = "; ".join(", ".join(map(str, lines)) for lines in repeated[:5])
+        remarks.append(
+            f"{TABLE}: lines at one and the same contact: {shown}{' and more' * (len(repeated) > 5)}; "
+            "kept as repeated blows"
+        )
+    across = _diagonal([strike.contact for strike in strikes])
+    if across > WIDEST:
+        remarks.append(
+            f"{TABLE}: the contacts lie {across:.3g} m apart (unit = {settings.unit!r}); if that is not so, "
+            f"{fitting_units(across / settings.metres)}"
+        )
+    elif 0 < across < NARROWEST:
+        remarks.append(
+            f"{TABLE}: all contacts lie within {across * 1e3:.2g} mm (unit = {settings.unit!r}); if that is not so, "
+            f"{fitting_units(across / settings.metres)}"
+        )
+    return remarks
+
+
+def judge_surface(strikes: Sequence[Strike], surface: Surface, *, settings: CaptureSettings) -> list[str]:
+    """Say whether contacts and surface differ in size; `CaptureError` where a contact lies far outside the surface."""
+    low, high = surface.vertices.double().amin(0).numpy(), surface.vertices.double().amax(0).numpy()
+    size = float(np.linalg.norm(high - low))
+    contacts = np.array([strike.contact for strike in strikes])
+    across = _diagonal(contacts.tolist())
+    outside = np.linalg.norm(np.maximum(0, np.maximum(low - contacts, contacts - high)), axis=1)
+    if outside.max() > size:
+        worst = strikes[int(outside.argmax())]
+        raise CaptureError(
+            f"{TABLE} line {worst.line}: the contact lies {outside.max():.3g} m outside the surface, which is only "
+            f"{size:.3g} m across: both must be in one frame{_fitting_surface_unit(size, across, settings)}"
+        )
+    if across and not across / size >= 0.05:
+        return [
+            f"the contacts lie within {across:.3g} m on a surface {size:.3g} m across: both must be in one frame"
+            f"{_fitting_surface_unit(size, across, settings)}"
+        ]
+    return []
+
+
+def _fitting_surface_unit(size: float, across: float, settings: CaptureSettings) -> str:
+    written = size / settings.surface_metres
+    fitting = [unit for unit, metres in METRES.items() if across and 0.7 <= written * metres / across <= 3]
+    return f'; surface_unit = "{fitting[0]}" would fit' if fitting else ""
+
+
+def _diagonal(points: Sequence[Sequence[float]]) -> float:
+    return math.dist(*(tuple(edge(axis) for axis in zip(*points, strict=True)) for edge in (min, max)))

@@ -1,0 +1,116 @@
+"""How strongly a blow at a place excites each mode: the paper's attention network (section 3.5)."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from avmsf.scene.features import FeatureField
+
+
+@dataclass(frozen=True)
+class AttentionShape:
+    """The network's sizes."""
+
+    clusters: int = 128
+    """Regions K that the network attends to."""
+    bands: int = 4
+    """Octaves of sines and cosines in the encoding of offsets."""
+    width: int = 64
+    """Size d of queries, keys and values."""
+    hidden: int = 256
+    """Neurons in each hidden layer of the head."""
+    layers: int = 2
+    """Hidden layers of the head."""
+    spatial_damping: bool = False
+    """Whether damping, too, depends on the contact."""
+
+
+class AttentionGains(nn.Module):
+    """Gains from a contact's own feature and from attention over the object's regions (paper, eqs. 7-11).
+
+    Holds the points it looks contacts up in, so that a saved network needs nothing else.
+    """
+
+    points: Float[Tensor, "points 3"]
+    features: Float[Tensor, "points dim"]
+    centers: Float[Tensor, "clusters 3"]
+    descriptors: Float[Tensor, "clusters dim"]
+    gain_scale: Float[Tensor, " modes"]
+
+    def __init__(
+        self,
+        features: FeatureField,
+        *,
+        gain_scale: Float[Tensor, " modes"],
+        shape: AttentionShape,
+        generator: torch.Generator,
+    ) -> None:
+        """Build an untrained network whose gains are about `gain_scale` in size, mode by mode."""
+        super().__init__()
+        regions = features.clusters(shape.clusters)
+        self.shape, self.encoder = shape, features.encoder
+        self.register_buffer("points", features.points)
+        self.register_buffer("features", features.features)
+        self.register_buffer("centers", regions.centers)
+        self.register_buffer("descriptors", regions.descriptors)
+        self.register_buffer("gain_scale", gain_scale)
+        dim, modes = features.features.shape[1], len(gain_scale)
+        encoded = shape.clusters * 3 * (1 + 2 * shape.bands)
+        self.query = nn.Linear(encoded + dim, shape.width, bias=False)
+        self.key = nn.Linear(dim, shape.width, bias=False)
+        self.value = nn.Linear(dim, shape.width, bias=False)
+        sizes = [shape.width + dim] + [shape.hidden] * shape.layers
+        stack: list[nn.Module] = []
+        for before, after in zip(sizes, sizes[1:], strict=False):
+            stack += [nn.Linear(before, after), nn.SiLU()]
+        self.head = nn.Sequential(*stack)
+        self.to_gains = nn.Linear(sizes[-1], modes)
+        self.to_dampings = nn.Linear(sizes[-1], modes) if shape.spatial_damping else None
+        self._initialise(generator)
+
+    def _initialise(self, generator: torch.Generator) -> None:
+        for layer in self.modules():
+            if isinstance(layer, nn.Linear):
+                bound = 1 / math.sqrt(layer.in_features)
+                with torch.no_grad():
+                    layer.weight.uniform_(-bound, bound, generator=generator)
+                    if layer.bias is not None:
+                        layer.bias.zero_()
+        if self.to_dampings is not None:
+            nn.init.zeros_(self.to_dampings.weight)
+
+    @property
+    def feature_field(self) -> FeatureField:
+        """The points and features that the network reads."""
+        return FeatureField(self.points, self.features, self.encoder)
+
+    def forward(
+        self, contacts: Float[Tensor, "contacts 3"]
+    ) -> tuple[Float[Tensor, "contacts modes"], Float[Tensor, "contacts modes"] | None]:
+        """Return the gains at the contacts, and the factors on the global dampings where these vary with place."""
+        return self.read(self.feature_field.nearest(contacts))
+
+    def read(
+        self, rows: Int[Tensor, " contacts"]
+    ) -> tuple[Float[Tensor, "contacts modes"], Float[Tensor, "contacts modes"] | None]:
+        """Return what `forward` does for the points of the given rows."""
+        feature = self.features[rows]
+        offsets = (self.points[rows][:, None, :] - self.centers) / self.feature_field.half_diagonal
+        query = self.query(torch.cat([encode(offsets, self.shape.bands).flatten(1), feature], dim=1))
+        key, value = self.key(self.descriptors), self.value(self.descriptors)
+        attention = torch.softmax(query @ key.T / math.sqrt(self.shape.width), dim=1)
+        hidden = self.head(torch.cat([attention @ value, feature], dim=1))
+        gains = self.to_gains(hidden) * self.gain_scale
+        if self.to_dampings is None:
+            return gains, None
+        return gains, torch.exp(self.to_dampings(hidden))
+
+
+def encode(offsets: Float[Tensor, "*shape 3"], bands: int) -> Float[Tensor, "*shape encoded"]:
+    """Return the offsets with sines and cosines of pi, 2 pi, 4 pi, ... times them (NeRF's encoding; paper: PE)."""
+    angles = offsets[..., None] * (math.pi * 2.0 ** torch.arange(bands, dtype=offsets.dtype, device=offsets.device))
+    waves = torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1)
+    return torch.cat([offsets, waves.flatten(-2)], dim=-1)

@@ -1,0 +1,150 @@
+"""The training objective: multi-scale short-time spectra, of the whole sound and of its beginning (paper, eq. 14).
+
+Autograd through a short-time transform with a hop of 64 samples keeps every frame of every resolution alive. The loss
+is piecewise linear in the magnitudes, so its gradient is at hand as soon as a chunk of frames is: transform, take the
+sign, transform back, overlap-add, forget. One autograd function does all of it in the forward pass.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_CHUNK = 1 << 19
+"""Samples of windowed frames held at once: they stay near the processor's cache."""
+_SILENT = 1e-12
+"""Power below which a magnitude counts as zero, relative to the window's energy: its slope is taken as finite there."""
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralTarget:
+    """Recordings to compare with, as magnitudes: made once, used at every step."""
+
+    magnitudes: tuple[Float[Tensor, "contacts frames bins"], ...]
+    """One a resolution."""
+    hops: tuple[int, ...]
+    """Samples between frames, one a resolution."""
+    samples: int
+    """Length of the sounds that are compared: those that are longer are cut."""
+
+    def take(self, rows: Sequence[int]) -> "SpectralTarget":
+        """Return the targets of some of the contacts."""
+        return SpectralTarget(tuple(each[list(rows)] for each in self.magnitudes), self.hops, self.samples)
+
+
+def spectral_target(
+    sounds: Float[Tensor, "contacts samples"],
+    *,
+    fft_sizes: Sequence[int],
+    hops: Sequence[int],
+    samples: int | None = None,
+) -> SpectralTarget:
+    """Return the magnitudes of `sounds`, or of their first `samples`, at several resolutions (sizes in samples).
+
+    Hann windows, frames centred, silence beyond the ends, as in `avmsf.modal.spectra`.
+    """
+    cut = sounds[:, :samples]
+    magnitudes = []
+    for fft_size, hop in zip(fft_sizes, hops, strict=True):
+        window = torch.hann_window(fft_size, dtype=cut.dtype, device=cut.device)
+        frames = _padded(cut, fft_size).unfold(1, fft_size, hop)
+        target = torch.empty(*frames.shape[:2], fft_size // 2 + 1, dtype=cut.dtype, device=cut.device)
+        for row, part in _chunks(frames.shape[0], frames.shape[1], fft_size):
+            target[row, part] = _magnitude(torch.fft.rfft(frames[row, part] * window), _floor(window))
+        magnitudes.append(target)
+    return SpectralTarget(tuple(magnitudes), tuple(hops), cut.shape[1])
+
+
+def spectral_loss(sounds: Float[Tensor, "contacts samples"], target: SpectralTarget) -> Float[Tensor, ""]:
+    """Return the L1 distance of magnitudes over the target's L1 norm, summed over resolutions (paper, eq. 14).
+
+    The division makes the resolutions weigh alike and the loss read as a relative error; differentiable in `sounds`.
+    """
+    loss: Float[Tensor, ""] = _SpectralL1.apply(sounds[:, : target.samples], target)
+    return loss
+
+
+class _SpectralL1(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: torch.autograd.function.FunctionCtx, sounds: Float[Tensor, "contacts samples"], target: SpectralTarget
+    ) -> Float[Tensor, ""]:
+        loss = sounds.new_zeros(())
+        gradient = torch.zeros_like(sounds)
+        for magnitude, hop in zip(target.magnitudes, target.hops, strict=True):
+            norm = magnitude.sum().clamp_min(torch.finfo(sounds.dtype).tiny)
+            distance, slope = _distance(sounds, magnitude, hop, with_slope=ctx.needs_input_grad[0])
+            loss += distance / norm
+            if slope is not None:
+                gradient += slope / norm
+        ctx.save_for_backward(gradient)
+        return loss
+
+    @staticmethod
+    def backward(ctx: torch.autograd.function.FunctionCtx, outer: Float[Tensor, ""]) -> tuple[Tensor, None]:
+        (gradient,) = ctx.saved_tensors
+        return outer * gradient, None
+
+
+def _distance(
+    sounds: Float[Tensor, "contacts samples"],
+    target: Float[Tensor, "contacts frames bins"],
+    hop: int,
+    *,
+    with_slope: bool,
+) -> tuple[Float[Tensor, ""], Float[Tensor, "contacts samples"] | None]:
+    """Return the L1 distance to `target` and, on demand, its gradient."""
+    fft_size = 2 * (target.shape[2] - 1)
+    window = torch.hann_window(fft_size, dtype=sounds.dtype, device=sounds.device)
+    padded = _padded(sounds, fft_size)
+    frames = padded.unfold(1, fft_size, hop)
+    # A hop more than the sound, for the last column of hops that `_overlap_add` fills only in part.
+    gradient = padded.new_zeros(padded.shape[0], padded.shape[1] + hop)
+    # The one-sided inverse transform counts every bin but the two ends twice; the gradient counts each once.
+    once = torch.full((fft_size // 2 + 1,), 0.5, dtype=sounds.dtype, device=sounds.device)
+    once[0] = once[-1] = 1.0
+    distance = sounds.new_zeros(())
+    for row, part in _chunks(frames.shape[0], frames.shape[1], fft_size):
+        spectrum = torch.fft.rfft(frames[row, part] * window)
+        magnitude = _magnitude(spectrum, _floor(window))
+        difference = magnitude - target[row, part]
+        distance += difference.abs().sum()
+        if with_slope:
+            spectrum *= difference.sign_().div_(magnitude).mul_(once)
+            slopes = torch.fft.irfft(spectrum, fft_size, norm="forward").mul_(window)
+            _overlap_add(gradient[row], slopes, part.start * hop, hop)
+    if not with_slope:
+        return distance, None
+    return distance, gradient[:, fft_size // 2 : fft_size // 2 + sounds.shape[1]]
+
+
+def _overlap_add(into: Float[Tensor, " samples"], frames: Float[Tensor, "frames size"], start: int, hop: int) -> None:
+    """Add frames that begin at start, start + hop, ... to a signal, in place, one column of hops at a time."""
+    count, size = frames.shape
+    for offset in range(0, size, hop):
+        width = min(hop, size - offset)
+        into[start + offset : start + offset + count * hop].view(count, hop)[:, :width] += frames[
+            :, offset : offset + width
+        ]
+
+
+def _padded(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Float[Tensor, "contacts padded"]:
+    """Return the sounds between half windows of silence, so that a frame is centred on every hop from the first sample."""
+    return torch.nn.functional.pad(sounds, (fft_size // 2, fft_size // 2))
+
+
+def _chunks(contacts: int, frames: int, fft_size: int) -> list[tuple[int, slice]]:
+    step = max(1, _CHUNK // fft_size)
+    return [(row, slice(first, min(frames, first + step))) for row in range(contacts) for first in range(0, frames, step)]
+
+
+def _magnitude(spectrum: Tensor, floor: float) -> Tensor:
+    # Torch's abs() of a complex tensor guards against overflow at three times the cost.
+    parts = torch.view_as_real(spectrum)
+    return torch.addcmul(parts[..., 0].square(), parts[..., 1], parts[..., 1]).clamp_min_(floor).sqrt_()
+
+
+def _floor(window: Float[Tensor, " size"]) -> float:
+    return _SILENT * float(window.square().sum())

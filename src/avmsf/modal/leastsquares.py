@@ -1,0 +1,223 @@
+"""Gains, and better modes, by linear and nonlinear least squares.
+
+All sums over time that least squares needs are inner products of damped sines, and those are geometric series: with
+z = exp((-d + 2 pi i f) / rate), sum_n n^p (z_i z_j)^n has a closed form. So the normal equations of any number of
+modes cost nothing that grows with the length of the sounds; only the products of the sounds with the modes do.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Complex128, Float, Float64, Int64
+from torch import Tensor
+
+from avmsf.modal.bank import ModalBank
+
+_BLOCK = 512
+_RIDGE = 1e-13
+"""Relative to the Gram matrix's diagonal: keeps two modes of one frequency solvable."""
+
+
+def fit_gains(
+    sounds: Float[Tensor, "contacts samples"], bank: ModalBank, *, sample_rate: float
+) -> tuple[Float[Tensor, "contacts modes"], Float[Tensor, "contacts modes"]]:
+    """Return the in-phase (sine) and quadrature (cosine) amplitudes of `bank`'s modes that fit each sound best.
+
+    Least squares over the whole sound; amplitudes in the unit and dtype of `sounds`.
+    """
+    system = NormalEquations.of(sounds, poles_of(bank, sample_rate))
+    coefficients = system.solve()
+    gains, quadrature = coefficients.to(sounds.dtype).chunk(2, dim=1)
+    return gains, quadrature
+
+
+def fit_sine_gains(
+    sounds: Float[Tensor, "contacts samples"], bank: ModalBank, *, sample_rate: float
+) -> Float[Tensor, "contacts modes"]:
+    """Return the sine amplitudes alone that fit each sound best: what the paper's synthesis (eq. 3) can express."""
+    system = NormalEquations.of(sounds, poles_of(bank, sample_rate))
+    modes = len(bank)
+    return _solve(system.gram[:modes, :modes], system.products[:, :modes]).to(sounds.dtype)
+
+
+def refine(
+    sounds: Float[Tensor, "contacts samples"], bank: ModalBank, *, sample_rate: float, iterations: int = 20
+) -> ModalBank:
+    """Move frequencies and dampings to where all sounds together are explained best.
+
+    Gauss-Newton on the sum of squared residuals with the gains of every sound eliminated (variable projection, in
+    Kaufman's approximation), damped after Levenberg and Marquardt; no step moves a mode by more than half its own
+    width. Returns modes sorted by frequency.
+    """
+    frequency, damping = bank.frequency.clone(), bank.damping.clone()
+    resolution = sample_rate / sounds.shape[1]
+    system = NormalEquations.of(sounds, poles_of(ModalBank(frequency, damping), sample_rate), weighted=True)
+    energy, trust = system.explained(), 1e-3
+    for _ in range(iterations):
+        step = system.step(sample_rate, trust)
+        width = torch.clamp(damping / (2 * math.pi), min=0.25 * resolution)
+        moved = frequency + torch.clamp(step[0], -0.5 * width, 0.5 * width)
+        decayed = damping * torch.exp(torch.clamp(step[1] / damping, -0.3, 0.3))
+        inside = (moved > 0) & (moved < sample_rate / 2)
+        moved = torch.where(inside, moved, frequency)
+        trial = NormalEquations.of(sounds, poles_of(ModalBank(moved, decayed), sample_rate), weighted=True)
+        gained = trial.explained() - energy
+        if gained <= 0:
+            trust *= 10
+            if trust > 1e3:
+                break
+            continue
+        frequency, damping, system = moved, decayed, trial
+        energy, trust = energy + gained, max(trust / 5, 1e-6)
+        if gained < 1e-7 * energy:
+            break
+    order = torch.argsort(frequency)
+    return ModalBank(frequency[order], damping[order])
+
+
+def poles_of(bank: ModalBank, sample_rate: float) -> Complex128[Tensor, " modes"]:
+    """Return z = exp((-d + 2 pi i f) / rate), the factor by which each mode turns and shrinks from sample to sample."""
+    return torch.exp(torch.complex(-bank.damping, 2 * math.pi * bank.frequency) / sample_rate)
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """Normal equations of all sounds in the basis (sines, cosines) of the given poles, and what moving a pole needs."""
+
+    gram: Float64[Tensor, "two_modes two_modes"]
+    products: Float64[Tensor, "contacts two_modes"]
+    mixed_gram: Float64[Tensor, "two_modes two_modes"] | None
+    """Of n-weighted basis (rows) with plain basis (columns)."""
+    weighted_gram: Float64[Tensor, "two_modes two_modes"] | None
+    weighted_products: Float64[Tensor, "contacts two_modes"] | None
+
+    @classmethod
+    def of(
+        cls,
+        sounds: Float[Tensor, "contacts samples"],
+        poles: Complex128[Tensor, " modes"],
+        *,
+        weighted: bool = False,
+    ) -> "NormalEquations":
+        samples = sounds.shape[1]
+        products, weighted_products = project(sounds, poles, weighted=weighted)
+        if not weighted:
+            return cls(gram(poles, samples, power=0), products, None, None, None)
+        mixed = gram(poles, samples, power=1)
+        return cls(gram(poles, samples, power=0), products, mixed, gram(poles, samples, power=2), weighted_products)
+
+    def take(self, modes: Int64[Tensor, " kept"]) -> "NormalEquations":
+        """Return the plain equations of some of the modes alone."""
+        both = torch.cat([modes, modes + self.gram.shape[0] // 2])
+        return NormalEquations(self.gram[both][:, both], self.products[:, both], None, None, None)
+
+    def solve(self) -> Float64[Tensor, "contacts two_modes"]:
+        return _solve(self.gram, self.products)
+
+    def explained(self) -> float:
+        """Return the energy of the sounds that their best fit explains."""
+        return float((self.solve() * self.products).sum())
+
+    def lost_without(self) -> Float64[Tensor, "contacts modes"]:
+        """Return the energy of each sound that goes unexplained when one mode is left out and the rest fitted anew."""
+        scale = torch.sqrt(torch.diagonal(self.gram))
+        modes = len(scale) // 2
+        inverse = torch.linalg.inv(_normalise(self.gram, scale)).reshape(2, modes, 2, modes)
+        own = torch.diagonal(inverse, dim1=1, dim2=3).permute(2, 0, 1)
+        pairs = (self.solve() * scale).unflatten(1, (2, modes)).permute(2, 1, 0)
+        return (pairs * torch.linalg.solve(own, pairs)).sum(1).T
+
+    def step(self, sample_rate: float, trust: float) -> Float64[Tensor, "2 modes"]:
+        """Return the Gauss-Newton step of (frequency Hz, damping 1/s)."""
+        assert self.mixed_gram is not None and self.weighted_gram is not None and self.weighted_products is not None
+        coefficients = self.solve()
+        modes = coefficients.shape[1] // 2
+        sine, cosine = coefficients[:, :modes], coefficients[:, modes:]
+        # Slopes of the model in the n-weighted basis: along f they are 2 pi n (g cos - q sin) / rate, along d they
+        # are -n (g sin + q cos) / rate.
+        slopes = torch.stack(
+            [
+                torch.cat([-cosine, sine], dim=1) * (2 * math.pi / sample_rate),
+                torch.cat([-sine, -cosine], dim=1) / sample_rate,
+            ]
+        )
+        residual = self.weighted_products - coefficients @ self.mixed_gram.T
+        projected = self.weighted_gram - self.mixed_gram @ _solve(self.gram, self.mixed_gram).T
+        blocks = projected.reshape(2, modes, 2, modes)
+        by_part = slopes.reshape(2, -1, 2, modes)
+        hessian = torch.einsum("acpi,piqj,bcqj->aibj", by_part, blocks, by_part).reshape(2 * modes, 2 * modes)
+        slope = torch.einsum("acpi,cpi->ai", by_part, residual.reshape(-1, 2, modes)).reshape(-1)
+        scale = torch.diagonal(hessian).clamp_min(torch.finfo(torch.float64).tiny)
+        damped = hessian + torch.diag(trust * scale)
+        root = torch.sqrt(scale)
+        step = torch.linalg.solve(damped / (root[:, None] * root[None, :]), slope / root) / root
+        return step.reshape(2, modes)
+
+
+def _solve(
+    gram: Float64[Tensor, "basis basis"], products: Float64[Tensor, "rows basis"]
+) -> Float64[Tensor, "rows basis"]:
+    scale = torch.sqrt(torch.diagonal(gram))
+    return torch.linalg.solve(_normalise(gram, scale), (products / scale).T).T / scale
+
+
+def _normalise(
+    gram: Float64[Tensor, "basis basis"], scale: Float64[Tensor, " basis"]
+) -> Float64[Tensor, "basis basis"]:
+    ridge = _RIDGE * torch.eye(len(scale), dtype=gram.dtype, device=gram.device)
+    return gram / (scale[:, None] * scale[None, :]) + ridge
+
+
+def gram(
+    poles: Complex128[Tensor, " modes"], samples: int, *, power: int
+) -> Float64[Tensor, "two_modes two_modes"]:
+    """Return inner products over time, weighted by n^power (0, 1 or 2), of all sines and cosines with each other."""
+    straight = _power_sum(poles[:, None] * poles[None, :], samples, power)
+    crossed = _power_sum(poles[:, None] * poles[None, :].conj(), samples, power)
+    sine_sine, sine_cosine = (crossed - straight).real, (straight + crossed).imag
+    cosine_sine, cosine_cosine = (straight - crossed).imag, (straight + crossed).real
+    return 0.5 * torch.cat(
+        [torch.cat([sine_sine, sine_cosine], dim=1), torch.cat([cosine_sine, cosine_cosine], dim=1)]
+    )
+
+
+def _power_sum(ratio: Complex128[Tensor, "*shape"], samples: int, power: int) -> Complex128[Tensor, "*shape"]:
+    """Return the sum over n < samples of n^power ratio^n, in closed form."""
+    rest = 1 - ratio
+    last = ratio**samples
+    plain = (1 - last) / rest
+    if power == 0:
+        return plain
+    first = (ratio * plain - samples * last) / rest
+    if power == 1:
+        return first
+    return (ratio * (2 * first + plain) - samples * samples * last) / rest
+
+
+def project(
+    sounds: Float[Tensor, "contacts samples"], poles: Complex128[Tensor, " modes"], *, weighted: bool = False
+) -> tuple[Float64[Tensor, "contacts two_modes"], Float64[Tensor, "contacts two_modes"] | None]:
+    """Return the sounds' inner products with all sines and cosines, and with n times them if `weighted`.
+
+    By blocks, as in `synthesise`: z^(mK + k) = z^(mK) z^k. All in float64: what two modes of nearly one
+    frequency share cancels in the solution, and float32 products would leave only rounding of the rest.
+    """
+    samples, modes = sounds.shape[1], poles.shape[0]
+    blocks = math.ceil(samples / _BLOCK)
+    padded = torch.nn.functional.pad(sounds, (0, blocks * _BLOCK - samples)).reshape(-1, blocks, _BLOCK)
+    steps = torch.arange(_BLOCK, dtype=torch.float64)
+    within = poles ** steps[:, None]
+    tables = [within.real, within.imag]
+    if weighted:
+        tables += [steps[:, None] * within.real, steps[:, None] * within.imag]
+    summed = padded.to(torch.float64) @ torch.cat(tables, dim=1)
+    parts = summed.unflatten(-1, (-1, modes)).unbind(-2)
+    offsets = torch.arange(blocks, dtype=torch.float64) * _BLOCK
+    starts = poles ** offsets[:, None]
+    inner = (starts * torch.complex(parts[0], parts[1])).sum(1)
+    products = torch.cat([inner.imag, inner.real], dim=1)
+    if not weighted:
+        return products, None
+    outer = (starts * (torch.complex(parts[2], parts[3]) + offsets[:, None] * torch.complex(parts[0], parts[1]))).sum(1)
+    return products, torch.cat([outer.imag, outer.real], dim=1)

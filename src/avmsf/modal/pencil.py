@@ -1,0 +1,89 @@
+"""Candidate modes by matrix pencils in subbands, all recordings at once.
+
+A sum of damped exponentials keeps its poles when it is filtered and decimated, so each narrow band can be searched on
+its own: the Hankel matrices of all recordings share one signal subspace, and the rotation that takes its upper rows to
+its lower rows has the poles as eigenvalues (matrix pencil; ESPRIT). A band holds about the same number of samples
+whatever its width, and the search runs over several lengths of the sounds: the whole, for doublets that beat slowly,
+in narrow bands, and ever shorter beginnings, for modes that die early, in ever wider ones.
+"""
+
+import math
+
+import torch
+from jaxtyping import Complex, Complex128, Float, Float64
+from torch import Tensor
+
+_DEPTH = 512
+"""Decimated samples in a band: enough to tell modes apart, few enough for small eigenproblems."""
+_SHORTEST = 256
+"""Samples of the shortest beginning that is still searched."""
+_SHORTENING = 4
+_EDGE = 0.2
+"""Part of a band on either side over which its filter fades: what lies there belongs to the neighbours."""
+_RINGING = 5
+"""Decimated samples after the onset in which the band filter itself still rings."""
+_ABOVE_NOISE = 10.0
+"""Eigenvalues this far above the noise's belong to the signal. Low, for what is wrongly let in is sifted later."""
+
+
+def candidates(
+    sounds: Float[Tensor, "contacts samples"], *, sample_rate: float, lowest: float
+) -> tuple[Float64[Tensor, " candidates"], Float64[Tensor, " candidates"]]:
+    """Return frequencies (Hz) and dampings (1/s) of everything that may be a mode between `lowest` and half the rate.
+
+    More than the object has: one mode may appear at several lengths, and noise may look like modes.
+    """
+    found: list[Complex128[Tensor, " some"]] = []
+    samples = sounds.shape[1]
+    while samples >= _SHORTEST:
+        found += _search(sounds[:, :samples], sample_rate, lowest)
+        samples //= _SHORTENING
+    exponents = torch.cat(found) if found else torch.zeros(0, dtype=torch.complex128)
+    return exponents.imag / (2 * math.pi), -exponents.real
+
+
+def _search(
+    sounds: Float[Tensor, "contacts samples"], sample_rate: float, lowest: float
+) -> list[Complex128[Tensor, " some"]]:
+    """Return the exponents -d + 2 pi i f found band by band in sounds of one length."""
+    samples = sounds.shape[1]
+    padded = 1 << (2 * samples - 1).bit_length()
+    spectrum = torch.fft.rfft(sounds, padded)[:, :-1]
+    size = min(1 << round(math.log2(_DEPTH * padded / samples)), padded // 2)
+    width = size * sample_rate / padded
+    fade = torch.sin(torch.linspace(0, math.pi / 2, round(_EDGE * size))).square()
+    taper = torch.cat([fade, torch.ones(size - 2 * len(fade)), fade.flip(0)])
+    found = []
+    bottom = lowest - _EDGE * width
+    while bottom + _EDGE * width < sample_rate / 2:
+        first = round(bottom * padded / sample_rate)
+        index = torch.arange(first, first + size)
+        inside = (index >= 0) & (index < padded // 2)
+        band = torch.fft.ifft(spectrum[:, index.clamp(0, padded // 2 - 1)] * (inside * taper))
+        poles = _poles(band[:, _RINGING : size * samples // padded])
+        turns = torch.remainder(torch.angle(poles) / (2 * math.pi), 1.0)
+        frequency = turns * width + first * sample_rate / padded
+        damping = -torch.log(poles.abs()) * width
+        overlap = 0.02 * width
+        kept = (frequency >= bottom + _EDGE * width - overlap) & (frequency < bottom + (1 - _EDGE) * width + overlap)
+        kept &= (frequency >= lowest) & (frequency < sample_rate / 2)
+        # Slower than a tenth of the sound's length cannot be told from steady hum; faster than the band is wide is
+        # an artefact of its filter.
+        kept &= (damping > 0.1 * sample_rate / samples) & (damping < width)
+        found.append(torch.complex(-damping, 2 * math.pi * frequency)[kept])
+        bottom += (1 - 2 * _EDGE) * width
+    return found
+
+
+def _poles(band: Complex[Tensor, "contacts times"]) -> Complex128[Tensor, " poles"]:
+    """Return the poles shared by complex signals, by the rotational invariance of their signal subspace."""
+    span = band.shape[1] // 3
+    rows = band.unfold(1, span, 1).reshape(-1, span)
+    values, vectors = torch.linalg.eigh((rows.T @ rows.conj()).to(torch.complex128))
+    values, vectors = values.flip(0), vectors.flip(1)
+    noise = values[span // 2 :].clamp_min(float(values[0]) * 1e-13).median()
+    order = min(int((values > _ABOVE_NOISE * noise).sum()), span // 2)
+    if order == 0 or values[0] <= 0:
+        return torch.zeros(0, dtype=torch.complex128)
+    subspace = vectors[:, :order]
+    return torch.linalg.eigvals(torch.linalg.lstsq(subspace[:-1], subspace[1:]).solution)

@@ -1,0 +1,156 @@
+"""The paper's extraction: one candidate mode a frequency bin, each recording on its own, then consensus (section 3.4).
+
+The inverse short-time transform of a single bin n is a narrow-band signal whose analytic signal needs no Hilbert
+transform: it is the same overlap-add without the mirror bin of negative frequency. Its envelope is therefore taken
+straight from the bin's frames; it is evaluated once a hop, where nothing of so narrow a band is lost.
+"""
+
+import math
+
+import torch
+from jaxtyping import Bool, Complex, Float, Float64
+from torch import Tensor
+
+from avmsf.modal.bank import ModalBank
+
+_PEAK_DB = 60.0
+"""A bin whose envelope peaks this far below the loudest bin's holds no mode."""
+_REGRESSED_DB = 30.0
+"""The line is fitted to the envelope's first fall by this much, or down to the bin's own noise."""
+_ABOVE_NOISE_DB = 6.0
+_WINDOW_FALL = 5.0
+"""How many times e a Hann window's own flank falls over its length, about."""
+_CONSENSUS = 0.5
+"""A frequency belongs to the object when at least this part of the recordings shows it, one bin off at most."""
+
+
+def narrow_band(
+    sounds: Float[Tensor, "contacts samples"], *, fft_size: int, hop: int
+) -> Complex[Tensor, "contacts bins frames"]:
+    """Return the analytic signal of every bin's own inverse transform, sampled once a hop.
+
+    `fft_size` and `hop` in samples, hop a divisor of fft_size. A steady sine of amplitude a at a bin's centre has
+    modulus 2a/3 there and a/3 in the bins beside it, which together make up the sound (Hann window).
+    """
+    window = torch.hann_window(fft_size, dtype=sounds.dtype)
+    frames = torch.stft(
+        sounds, fft_size, hop, window=window, center=True, pad_mode="constant", return_complex=True
+    )
+    reach = fft_size // hop // 2
+    lags = torch.arange(-reach, reach + 1)
+    weights = torch.nn.functional.pad(window, (0, 1))[fft_size // 2 + lags * hop]
+    # Frame m stands at m hop with its own time zero: brought to a common time zero its phase turns by bin x lag.
+    bins = torch.arange(fft_size // 2 + 1)
+    turns = torch.remainder(bins[:, None] * lags[None, :] * hop, fft_size).to(sounds.dtype) * (2 * math.pi / fft_size)
+    kernel = torch.polar(weights.expand(len(bins), -1).contiguous(), turns)
+    padded = torch.nn.functional.pad(frames, (reach, reach))
+    moved = torch.zeros_like(frames)
+    for position in range(len(lags)):
+        moved += kernel[:, position, None].conj() * padded[..., position : position + frames.shape[-1]].contiguous()
+    overlap = window.square().reshape(-1, hop).sum(0)[0]
+    return moved * (2 / fft_size / overlap)
+
+
+def consensus_modes(
+    sounds: Float[Tensor, "contacts samples"],
+    *,
+    sample_rate: float,
+    fft_size: int,
+    hop: int,
+    latest_peak: float,
+    least_damping: float,
+    count: int,
+) -> ModalBank:
+    """Return up to `count` modes, the strongest of those that the recordings agree on.
+
+    In each recording a bin is a candidate when its envelope is a local maximum over bins, peaks within
+    `latest_peak` seconds of the onset and falls by at least `least_damping` 1/s on a straight line fitted to its
+    logarithm (paper, eq. 5). A mode's damping is the mean over the recordings that show it, its frequency likewise,
+    from the slope of each narrow-band signal's phase. Strength is the mean fitted gain.
+    """
+    lines = [
+        _regress(narrow_band(sound[None], fft_size=fft_size, hop=hop)[0], hop / sample_rate, fft_size // hop)
+        for sound in sounds
+    ]
+    gain, damping, advance, peak = (torch.stack(part) for part in zip(*lines, strict=True))
+    # The line of a bin of noise, extended to the onset from its late peak, may start anywhere: reject before ranking.
+    # An envelope that falls as fast as the window itself is the window's, not a mode's.
+    ringing = (damping >= least_damping) & (damping < _WINDOW_FALL * sample_rate / fft_size)
+    gain = torch.where((peak <= latest_peak) & ringing, gain, 0.0)
+    beside = torch.nn.functional.pad(gain, (1, 1))
+    candidate = (gain >= beside[:, :-2]) & (gain > beside[:, 2:])
+    candidate &= gain > gain.amax(1, keepdim=True) * 10 ** (-_PEAK_DB / 20)
+    # The phase advances by whole turns besides from one hop to the next: those that bring it nearest to the centre.
+    centre = torch.arange(gain.shape[1], dtype=torch.float64) * (sample_rate / fft_size)
+    frequency = centre + torch.remainder(advance - centre + sample_rate / hop / 2, sample_rate / hop) - sample_rate / hop / 2
+    return _agree(candidate, gain, damping, frequency, sample_rate=sample_rate, count=count)
+
+
+def _regress(
+    signals: Complex[Tensor, "bins frames"], step: float, settling: int
+) -> tuple[
+    Float64[Tensor, " bins"], Float64[Tensor, " bins"], Float64[Tensor, " bins"], Float64[Tensor, " bins"]
+]:
+    """Return gain, damping (1/s), frequency (Hz, up to whole turns a frame) and time of the peak (s) of every bin.
+
+    The line log|H| = log g - d t is fitted by least squares from the envelope's peak, or `settling` frames after the
+    onset, to where it has fallen by 30 dB or into its own noise. The gain is the line's value at the onset.
+    """
+    envelope = signals.abs().to(torch.float64).clamp_min(torch.finfo(torch.float32).tiny)
+    frames = envelope.shape[-1]
+    times = torch.arange(frames, dtype=torch.float64) * step
+    peak = envelope.argmax(-1)
+    noise = torch.kthvalue(envelope, max(1, frames // 10), dim=-1).values * 10 ** (_ABOVE_NOISE_DB / 20)
+    # While the windows straddle the onset the envelope has their shape and the phase turns at the bin's own pace: the
+    # line starts when they have passed, unless the mode has died by then.
+    later = torch.clamp(peak, min=min(settling, frames - 1))
+    lasting = envelope.gather(-1, later[:, None])[:, 0] > 2 * noise
+    begin = torch.where(lasting, later, peak)[:, None]
+    floor = torch.maximum(envelope.gather(-1, begin) * 10 ** (-_REGRESSED_DB / 20), noise[:, None])
+    after = torch.arange(frames) >= begin
+    fallen = after & (envelope < floor)
+    end = torch.where(fallen.any(-1), fallen.to(torch.int8).argmax(-1), frames)
+    used = (after & (torch.arange(frames) < end[:, None])).to(torch.float64)
+    count = used.sum(-1)
+    mean_time = (used * times).sum(-1) / count
+    level = torch.log(envelope)
+    mean_level = (used * level).sum(-1) / count
+    spread = (used * (times - mean_time[..., None]).square()).sum(-1)
+    slope = (used * (times - mean_time[..., None]) * level).sum(-1) / spread.clamp_min(step**2)
+    # A line through fewer than three points says nothing: no damping, which the caller rejects.
+    slope = torch.where(count >= 3, slope, 0.0)
+    gain = torch.exp(mean_level - slope * mean_time)
+    turn = (signals[..., 1:] * signals[..., :-1].conj() * used[..., 1:]).sum(-1)
+    return gain, -slope, torch.angle(turn).to(torch.float64) / (2 * math.pi * step), peak * step
+
+
+def _agree(
+    candidate: Bool[Tensor, "contacts bins"],
+    gain: Float64[Tensor, "contacts bins"],
+    damping: Float64[Tensor, "contacts bins"],
+    frequency: Float64[Tensor, "contacts bins"],
+    *,
+    sample_rate: float,
+    count: int,
+) -> ModalBank:
+    near = candidate + _neighbours(candidate.to(torch.float64))
+    shown = near.clamp_max(1.0).sum(0)
+    votes = near.sum(0)
+    best = (votes >= torch.nn.functional.pad(votes, (1, 0))[:-1]) & (votes > torch.nn.functional.pad(votes, (0, 1))[1:])
+    bins = torch.nonzero(best & (shown >= max(1.0, _CONSENSUS * len(candidate)))).flatten()
+
+    def mean(values: Float64[Tensor, "contacts bins"], weight: Float64[Tensor, "contacts bins"]) -> Tensor:
+        total, share = ((part + _neighbours(part)).sum(0)[bins] for part in (weight * values, weight))
+        return total / share
+
+    once = candidate.to(torch.float64)
+    pitch, decay, strength = mean(frequency, once * gain), mean(damping, once), mean(gain, once) * shown[bins]
+    audible = torch.nonzero((pitch > 0) & (pitch < sample_rate / 2)).flatten()
+    strongest = audible[torch.argsort(strength[audible], descending=True)[:count]]
+    order = strongest[torch.argsort(pitch[strongest])]
+    return ModalBank(pitch[order], decay[order])
+
+
+def _neighbours(values: Float64[Tensor, "contacts bins"]) -> Float64[Tensor, "contacts bins"]:
+    padded = torch.nn.functional.pad(values, (1, 1))
+    return padded[:, :-2] + padded[:, 2:]

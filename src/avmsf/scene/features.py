@@ -1,0 +1,97 @@
+"""What is known of every point of an object's surface, for the gain field to read."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from avmsf.capture.surface import Surface
+from avmsf.errors import FitError
+from avmsf.scene.points import cluster, lattice, nearest_points, sample_surface
+
+GEOMETRY = "geometry"
+"""The encoder's name where features are the points' own positions and normals: the paper's row without visual input."""
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Groups of neighbouring points, each with one descriptor (paper, eq. 7)."""
+
+    centers: Float[Tensor, "clusters 3"]
+    """Means of the groups' points, metres."""
+    descriptors: Float[Tensor, "clusters dim"]
+    """Means of the groups' features."""
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureField:
+    """Points of an object, each with a feature vector."""
+
+    points: Float[Tensor, "points 3"]
+    """Object frame, metres."""
+    features: Float[Tensor, "points dim"]
+    """About unit size, so that no dimension drowns the others."""
+    encoder: str
+    """Who made the features; a field keeps it, so that it is never taken for another's."""
+
+    @classmethod
+    def from_mesh(cls, surface: Surface, *, generator: torch.Generator, count: int = 8192) -> "FeatureField":
+        """Return `count` points drawn evenly from a surface's triangles, with positions and normals as features.
+
+        A surface of points alone keeps its points.
+        """
+        if len(surface.faces) == 0:
+            return cls.from_points(surface.vertices)
+        samples = sample_surface(surface.vertices, surface.faces, count, generator=generator)
+        return cls.from_points(samples.points, normals=samples.normals)
+
+    @classmethod
+    def from_points(
+        cls, points: Float[Tensor, "points 3"], *, normals: Float[Tensor, "points 3"] | None = None
+    ) -> "FeatureField":
+        """Return the points with their positions, relative to the object's size, and their normals as features."""
+        _expect_extent(points)
+        middle = (points.amax(0) + points.amin(0)) / 2
+        positions = (points - middle) / _half_diagonal(points)
+        features = positions if normals is None else torch.cat([positions, normals], dim=1)
+        return cls(points.float(), features.float(), GEOMETRY)
+
+    @classmethod
+    def from_contacts(cls, contacts: Float[Tensor, "contacts 3"], *, count: int = 8192) -> "FeatureField":
+        """Return points that fill the contacts' bounding box, for an object of which nothing else is known."""
+        _expect_extent(contacts)
+        return cls.from_points(lattice(contacts, count))
+
+    @property
+    def half_diagonal(self) -> float:
+        """Half the diagonal of the points' bounding box, metres: the object's size in formulas."""
+        return _half_diagonal(self.points)
+
+    def nearest(self, contacts: Float[Tensor, "contacts 3"]) -> Int[Tensor, " contacts"]:
+        """Return the row of the point nearest to each contact (paper: i*, section 3.5)."""
+        return nearest_points(self.points, contacts)[:, 0]
+
+    def at(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts dim"]:
+        """Return the features of the points nearest to the contacts."""
+        return self.features[self.nearest(contacts)]
+
+    def clusters(self, count: int) -> Regions:
+        """Return `count` regions by k-means on the positions, with the mean feature of each (paper, eq. 7)."""
+        groups = cluster(self.points, count)
+        sums = torch.zeros(count, self.features.shape[1]).index_add_(0, groups.labels, self.features)
+        sizes = torch.bincount(groups.labels, minlength=count)
+        return Regions(groups.centers.float(), sums / sizes[:, None])
+
+
+def _half_diagonal(points: Float[Tensor, "points 3"]) -> float:
+    return math.dist(points.amax(0).tolist(), points.amin(0).tolist()) / 2
+
+
+def _expect_extent(points: Float[Tensor, "points 3"]) -> None:
+    if len(points) == 0 or not bool(torch.isfinite(points).all()) or _half_diagonal(points) == 0.0:
+        raise FitError(
+            f"expected points that span an object, found {len(points)} points in one place or not finite: "
+            "a field needs to know where on the object a contact lies"
+        )

@@ -1,0 +1,190 @@
+"""Points on an object: which to strike, which are near, which belong together, and points where none are known.
+
+All distances are Euclidean, in metres, taken in float64 whatever the points come in. Ties go to the point that comes
+first, and contacts on a regular grid are full of ties: read them in float64, for what was a tie as it was written
+in decimals is broken by the rounding of float32, and then another split or another neighbour comes out.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avmsf.errors import CaptureError, EvaluationError, FitError
+
+
+@dataclass(frozen=True, eq=False)
+class Clusters:
+    """Groups of points that lie together, none of them empty."""
+
+    centers: Float[Tensor, "clusters 3"]
+    """Mean of each group's points, metres."""
+    labels: Int[Tensor, " points"]
+    """Which group each point belongs to: that of the nearest center."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSamples:
+    """Points drawn from a surface."""
+
+    points: Float[Tensor, "points 3"]
+    """Metres."""
+    normals: Float[Tensor, "points 3"]
+    """Unit normals of the faces that the points lie on, to the side from which a face runs counter-clockwise."""
+
+
+def farthest_points(points: Float[Tensor, "points 3"], count: int, *, start: int = 0) -> Int[Tensor, " chosen"]:
+    """Return `count` rows, the first of them `start`, each the farthest from all that were chosen before it.
+
+    Never the same row twice, even where points coincide. Raises EvaluationError for a count or start that the points
+    do not have.
+    """
+    _expect_rows(points, count, start)
+    places = points.double()
+    distance = _distances(places, start)
+    chosen = [start]
+    while len(chosen) < count:
+        # Chosen rows are barred rather than at distance zero, where they would tie with points that coincide.
+        distance[chosen[-1]] = -math.inf
+        chosen.append(int(torch.argmax(distance)))
+        distance = torch.minimum(distance, _distances(places, chosen[-1]))
+    return torch.tensor(chosen)
+
+
+def closest_points(points: Float[Tensor, "points 3"], count: int, *, start: int = 0) -> Int[Tensor, " chosen"]:
+    """Return the `count` rows nearest to point `start`, itself first: the paper's closest-point sampling.
+
+    Raises as `farthest_points`.
+    """
+    _expect_rows(points, count, start)
+    distance = _distances(points.double(), start)
+    distance[start] = -1.0
+    return torch.argsort(distance, stable=True)[:count]
+
+
+def nearest_points(
+    points: Float[Tensor, "points 3"], queries: Float[Tensor, "queries 3"], *, count: int = 1
+) -> Int[Tensor, "queries count"]:
+    """Return for each query the rows of the `count` points nearest to it, nearest first.
+
+    Raises EvaluationError for a count that the points do not have.
+    """
+    _expect_rows(points, count, 0)
+    tree = cKDTree(points.detach().double().cpu().numpy())
+    places = queries.detach().double().cpu().numpy()
+    # One neighbour more than asked for shows whether the last place is a tie, which the tree breaks as it likes.
+    sought = min(count + 1, len(points))
+    while True:
+        distances, rows = tree.query(places, k=np.arange(1, sought + 1))
+        undecided = sought < len(points) and bool((distances[:, -1] == distances[:, count - 1]).any())
+        if not undecided:
+            break
+        sought = min(2 * sought, len(points))
+    order = np.lexsort((rows, distances), axis=1)[:, :count]
+    return torch.from_numpy(np.take_along_axis(rows, order, axis=1)).long().to(queries.device)
+
+
+def cluster(points: Float[Tensor, "points 3"], count: int, *, iterations: int = 100) -> Clusters:
+    """Return `count` groups of the points by k-means: Lloyd's iteration from farthest points, until no label changes.
+
+    The seeds leave nothing to chance. A group that loses its last point starts anew from the point that is farthest
+    from its center. Raises FitError where the points have fewer than `count` different places.
+    """
+    places = points.detach().double().cpu()
+    distinct = len(torch.unique(places, dim=0)) if len(places) else 0
+    if not 1 <= count <= distinct:
+        raise FitError(
+            f"{count} clusters were asked of points at {distinct} different places; ask for 1 to {distinct} clusters, "
+            "or give more points"
+        )
+    centers = places[farthest_points(places, count)]
+    labels = nearest_points(centers, places)[:, 0]
+    for _ in range(iterations):
+        centers = _centers(places, labels, centers)
+        moved = nearest_points(centers, places)[:, 0]
+        if torch.equal(moved, labels) and len(torch.unique(labels)) == count:
+            break
+        labels = moved
+    return Clusters(centers.to(points), labels.to(points.device))
+
+
+def sample_surface(
+    vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"], count: int, *, generator: torch.Generator
+) -> SurfaceSamples:
+    """Draw `count` points from the triangles, evenly by area, with their faces' normals.
+
+    Raises CaptureError for a surface without area, from which no point can be drawn.
+    """
+    mesh = trimesh.Trimesh(vertices.double().cpu().numpy(), faces.cpu().numpy(), process=False)
+    if not (math.isfinite(mesh.area) and mesh.area > 0.0):
+        raise CaptureError(
+            f"a surface of {len(vertices)} vertices and {len(faces)} faces has an area of {mesh.area:g} m^2; "
+            "points can only be drawn from triangles that have one"
+        )
+    seed = int(torch.randint(2**31 - 1, (1,), generator=generator))
+    places, rows = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    # Of a triangle without area trimesh knows no normal; it is never drawn from.
+    normals = mesh.face_normals[rows]
+    return SurfaceSamples(torch.from_numpy(np.asarray(places)).to(vertices), torch.from_numpy(normals).to(vertices))
+
+
+def lattice(contacts: Float[Tensor, "contacts 3"], count: int) -> Float[Tensor, "points 3"]:
+    """Return at most `count` points that fill the contacts' bounding box evenly, its corners among them.
+
+    What stands for an object of which only contacts are known. The spacing is the same along all axes as far as whole
+    numbers allow; an axis along which the contacts do not differ holds one layer. Raises EvaluationError for fewer
+    points than the box has corners.
+    """
+    lowest, highest = contacts.double().amin(0), contacts.double().amax(0)
+    extent = (highest - lowest).tolist()
+    longest = max(extent)
+    # What is flatter than a thousandth of the longest side is a plane or a line measured with errors.
+    wide = [side > 1e-3 * longest for side in extent]
+    corners = 2 ** sum(wide)
+    if count < corners:
+        raise EvaluationError(f"{count} points cannot fill a box of {corners} corners; ask for at least {corners}")
+    numbers = [1, 1, 1]
+    for spacing in (longest / steps for steps in range(1, count + 1)):
+        finer = [1 + max(1, round(side / spacing)) if on else 1 for side, on in zip(extent, wide, strict=True)]
+        if math.prod(finer) > count:
+            break
+        numbers = finer
+    axes = [
+        torch.linspace(float(low), float(high), number, dtype=torch.float64)
+        if number > 1
+        else torch.tensor([0.5 * float(low + high)], dtype=torch.float64)
+        for low, high, number in zip(lowest, highest, numbers, strict=True)
+    ]
+    return torch.cartesian_prod(*axes).reshape(-1, 3).to(contacts)
+
+
+def _centers(
+    places: Float[Tensor, "points 3"], labels: Int[Tensor, " points"], centers: Float[Tensor, "clusters 3"]
+) -> Float[Tensor, "clusters 3"]:
+    """Return the mean of each cluster's points; of the clusters that have none, the first gets the farthest point.
+
+    The others stay where they are until their turn comes: two that began on coinciding points would be one again.
+    """
+    sizes = torch.bincount(labels, minlength=len(centers))
+    means = torch.zeros_like(centers).index_add(0, labels, places) / sizes.clamp(min=1)[:, None]
+    means = torch.where(sizes[:, None] > 0, means, centers)
+    empty = torch.nonzero(sizes == 0).flatten()
+    if len(empty):
+        means[empty[0]] = places[torch.argmax((places - means[labels]).norm(dim=1))]
+    return means
+
+
+def _distances(places: Float[Tensor, "points 3"], row: int) -> Float[Tensor, " points"]:
+    return (places - places[row]).square().sum(dim=1).sqrt()
+
+
+def _expect_rows(points: Float[Tensor, "points 3"], count: int, start: int) -> None:
+    if not 1 <= count <= len(points):
+        raise EvaluationError(f"{count} points were asked of {len(points)}; ask for 1 to {len(points)}")
+    if not 0 <= start < len(points):
+        raise EvaluationError(f"there is no point {start} among {len(points)}; they are numbered from 0")

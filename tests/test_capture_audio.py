@@ -1,0 +1,149 @@
+"""Sound files: every way in which one can be wrong is refused or warned of by name."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from avmsf.capture import CaptureSettings, CaptureWarning, read_capture, read_sound
+from avmsf.capture.audio import clipped_samples
+from avmsf.errors import CaptureError
+from capture_folder import RATE, fill, ring
+
+
+def stereo() -> np.ndarray:
+    return np.stack([ring(seed=0), ring(seed=1)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("samples", "message"),
+    [
+        (np.zeros(4000), "b.wav: the sound is silent, all 4000 samples are 0"),
+        (np.full(4000, 0.25), "b.wav: the sound is silent, all 4000 samples are 0.25"),
+        (np.zeros(0), "b.wav: the file is empty"),
+        (np.where(np.arange(4000) == 7, np.nan, ring()), "b.wav: 1 samples are not finite"),
+        (ring(0.015), r"b.wav: too short, 1\d\d samples \(1.*ms\) after the onset; at least 160"),
+        (stereo(), "b.wav: it holds 2 different channels .*response_channel = 1"),
+    ],
+    ids=["silent", "constant", "empty", "nan", "short", "stereo"],
+)
+def test_a_bad_recording_is_named(tmp_path: Path, samples: np.ndarray, message: str) -> None:
+    with pytest.raises(CaptureError, match=message):
+        read_capture(fill(tmp_path, replace={"b.wav": samples}))
+
+
+@pytest.mark.parametrize("content", [b"", b"not a wav at all", b"RIFF\x24\x00\x00\x00WAVEfmt "])
+def test_a_corrupt_file_is_named(tmp_path: Path, content: bytes) -> None:
+    folder = fill(tmp_path)
+    (folder / "b.wav").write_bytes(content)
+    with pytest.raises(CaptureError, match=f"b.wav: not a sound file that can be read .{len(content)} bytes"):
+        read_capture(folder)
+
+
+def test_a_missing_file_is_named_and_guessed(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    (folder / "b.wav").rename(folder / "b1.wav")
+    with pytest.raises(CaptureError, match=r"b\.wav: there is no such file .did you mean .*\.wav"):
+        read_capture(folder)
+    fill(tmp_path, rows=("a.wav,0,0,0", "takes/b.wav,1,0,0"))
+    with pytest.raises(CaptureError, match=r"nor the folder .*takes"):
+        read_capture(folder)
+
+
+def test_mixed_rates_are_refused_with_their_counts(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    soundfile.write(folder / "c.wav", ring(), RATE + 1)
+    with pytest.raises(CaptureError, match=r"8000 Hz \(2 files, a.wav the first\), 8001 Hz \(1 files, c.wav"):
+        read_capture(folder)
+
+
+@pytest.mark.parametrize("rate", [100, 512, 192_000])
+def test_any_rate_from_100_hz_to_192_khz_is_kept(tmp_path: Path, rate: int) -> None:
+    seconds = max(1.0, 200 / rate)
+    sounds = {name: ring(seconds, rate=rate, seed=seed) for seed, name in enumerate(("a.wav", "b.wav", "c.wav"))}
+    folder = fill(tmp_path, replace=sounds, rate=rate)
+    impacts = read_capture(folder, CaptureSettings(align=False)).impacts
+    assert impacts.sample_rate == rate
+    assert torch.equal(impacts.sounds[1], torch.from_numpy(sounds["b.wav"].astype(np.float32)))
+
+
+@pytest.mark.parametrize(("rate", "speed"), [(99, 1.0), (192_001, 1.0), (8000, 30.0), (8000, 0.01)])
+def test_other_rates_are_refused(tmp_path: Path, rate: int, speed: float) -> None:
+    folder = fill(tmp_path, rate=rate)
+    with pytest.raises(CaptureError, match=r"a.wav: a sample rate of .* Hz; expected 100 to 192000 Hz"):
+        read_capture(folder, CaptureSettings(playback_speed=speed))
+
+
+def test_channels_are_counted_from_one(tmp_path: Path) -> None:
+    both = stereo()
+    folder = fill(tmp_path, replace={"a.wav": both, "b.wav": both, "c.wav": both})
+    for channel in (1, 2):
+        sounds = read_capture(folder, CaptureSettings(response_channel=channel, align=False)).impacts.sounds
+        assert torch.equal(sounds[0], torch.from_numpy(both[:, channel - 1].astype(np.float32)))
+    with pytest.raises(CaptureError, match="there is no channel 3, the file holds 2"):
+        read_capture(folder, CaptureSettings(response_channel=3))
+
+
+def test_a_mono_sound_saved_as_stereo_needs_no_role(tmp_path: Path) -> None:
+    sound = ring()
+    folder = fill(tmp_path, replace={"b.wav": np.stack([sound, sound], axis=1)})
+    sounds = read_capture(folder, CaptureSettings(align=False)).impacts.sounds
+    assert torch.equal(sounds[1], torch.from_numpy(sound.astype(np.float32)))
+
+
+def test_eight_bits_are_read_with_a_warning(tmp_path: Path) -> None:
+    with pytest.warns(CaptureWarning, match=r"a\.wav: only 8 bits a sample .PCM_U8.*avmsf check"):
+        impacts = read_capture(fill(tmp_path, subtype="PCM_U8"))
+    assert len(impacts.impacts) == 3
+
+
+def test_a_clipped_recording_is_read_with_a_warning(tmp_path: Path) -> None:
+    with pytest.warns(CaptureWarning, match=r"1 of 3 recordings look wrong: b\.wav: \d+ clipped samples"):
+        read_capture(fill(tmp_path, replace={"b.wav": np.clip(8 * ring(), -1, 1)}))
+
+
+def test_a_recording_of_noise_alone_is_warned_of(tmp_path: Path) -> None:
+    noise = 0.01 * np.random.default_rng(0).standard_normal(4000)
+    with pytest.warns(CaptureWarning, match=r"b\.wav: never quieter than 1\d dB below the peak"):
+        read_capture(fill(tmp_path, replace={"b.wav": noise}), CaptureSettings(seconds=0.1))
+
+
+def test_a_recording_far_too_soft_is_warned_of(tmp_path: Path) -> None:
+    with pytest.warns(CaptureWarning, match=r"b\.wav: its peak is 6\d dB below full scale: turn the gain up"):
+        read_capture(fill(tmp_path, subtype="PCM_16", replace={"b.wav": ring(noise=0) / 500}))
+
+
+def test_flat_tops_count_and_smooth_ones_do_not() -> None:
+    time = np.arange(4000) / RATE
+    wave = np.sin(2 * np.pi * 440 * time) * np.exp(-3 * time)
+    clipped = np.clip(3 * wave, -1, 1)
+    assert clipped_samples(wave) == 0
+    assert clipped_samples(clipped) == np.sum(np.abs(clipped) == 1) > 1000
+    # Turned down after clipping, the tops of one or two samples are not told from chance, all others are.
+    assert 0.8 < clipped_samples(0.3 * clipped) / clipped_samples(clipped) <= 1
+    # A soft 20 Hz wave rounded to 16 bits has one flat top of many samples, and is not clipped.
+    slow = np.round(1000 * np.sin(2 * np.pi * 20 * time) * np.exp(-30 * time)) / 32768
+    assert clipped_samples(slow) == 0
+
+
+def test_read_sound_gives_samples_and_rate(tmp_path: Path) -> None:
+    both = stereo()
+    soundfile.write(tmp_path / "clip.wav", both, 44_100, subtype="FLOAT")
+    sound, rate = read_sound(tmp_path / "clip.wav", channel=2)
+    assert rate == 44_100
+    assert torch.equal(sound, torch.from_numpy(both[:, 1].astype(np.float32)))
+    with pytest.raises(CaptureError, match=r"clip\.wav: it holds 2 different channels"):
+        read_sound(tmp_path / "clip.wav")
+    for channel in (0, 3):
+        with pytest.raises(CaptureError, match=f"there is no channel {channel}"):
+            read_sound(tmp_path / "clip.wav", channel=channel)
+    soundfile.write(tmp_path / "silence.wav", np.zeros(100), 44_100)
+    with pytest.raises(CaptureError, match="silent"):
+        read_sound(tmp_path / "silence.wav")
+
+
+def test_integer_samples_become_fractions_of_full_scale(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "half.wav", np.array([0, 16384, -32768], dtype=np.int16), 48_000)
+    assert read_sound(tmp_path / "half.wav")[0].tolist() == [0, 0.5, -1]

@@ -1,0 +1,130 @@
+"""`check` goes on past every broken thing, measures what it can, and agrees with `read_capture` on what is readable."""
+
+import json
+import warnings
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from avmsf.capture import CaptureSettings, check, read_capture
+from avmsf.errors import CaptureError
+from capture_folder import HEADER, RATE, ROWS, fill, ring
+
+
+def test_a_good_folder_has_no_problem_and_true_figures(tmp_path: Path) -> None:
+    sound = ring(1.0, before=0.25, noise=1e-3)
+    folder = fill(tmp_path, replace={"a.wav": sound}, settings="seconds = 0.4")
+    report = check(folder)
+    assert report.readable
+    assert report.problems == ()
+    first = report.recordings[0]
+    assert (first.file, first.line, first.readable, first.problems) == ("a.wav", 2, True, ())
+    assert (first.seconds, first.sample_rate, first.channels, first.coding) == (1.0, RATE, 1, "FLOAT")
+    assert first.peak_db == pytest.approx(20 * np.log10(np.abs(sound).max()), abs=1e-3)
+    # The level of 1840 samples of noise is known to 20 / ln 10 / sqrt(2 x 1840) = .14 dB.
+    assert first.noise_db == pytest.approx(20 * np.log10(1e-3 / np.abs(sound).max()), abs=0.5)
+    # The fourth of a period of the lowest mode, 20 samples long.
+    assert first.onset_seconds == pytest.approx(0.25, abs=5 / RATE)
+    assert first.clipped == 0
+    assert first.double_hit_seconds is None
+
+
+def test_noise_is_found_in_the_quietest_part_where_nothing_comes_before(tmp_path: Path) -> None:
+    sound = ring(1.0, noise=1e-3)
+    noise = check(fill(tmp_path, replace={"a.wav": sound})).recordings[0].noise_db
+    # The quietest tenth of blocks of 80 samples lies 1.3 x 20 / ln 10 / sqrt(160) = .9 dB under the mean one.
+    assert noise == pytest.approx(20 * np.log10(1e-3 / np.abs(sound).max()) - 0.9, abs=1)
+
+
+def test_it_goes_on_past_everything_that_is_broken(tmp_path: Path) -> None:
+    rows = (*ROWS, "gone.wav,0,0,0.1", "d.wav,0,0,0.1", "e.wav,0,0,0.2", "f.wav,0,left,0.1", "g.wav,0,0,0.15")
+    clipped = np.clip(10 * ring(), -1, 1)
+    double = ring(1.0) + np.concatenate([np.zeros(3200), ring(0.6, seed=9)])
+    folder = fill(
+        tmp_path,
+        rows=rows,
+        replace={"b.wav": clipped, "c.wav": double, "d.wav": np.zeros(4000), "f.wav": ring(), "stray.wav": ring()},
+    )
+    (folder / "e.wav").write_bytes(b"RIFF")
+    soundfile.write(folder / "g.wav", ring(), 2 * RATE)
+    report = check(folder)
+    assert not report.readable
+    assert [row.line for row in report.recordings] == [2, 3, 4, 5, 6, 7, 8, 9]
+    assert [row.readable for row in report.recordings] == [True, True, True, False, False, False, False, True]
+    problems = {row.file: "; ".join(row.problems) for row in report.recordings}
+    for name, part in {
+        "a.wav": "",
+        "b.wav": f"{report.recordings[1].clipped} clipped samples",
+        "c.wav": "a second blow at 0.39",
+        "gone.wav": "no such file",
+        "d.wav": "silent",
+        "e.wav": "not a sound file",
+        "f.wav": "line 8: y is 'left'",
+    }.items():
+        assert part in problems[name], name
+        assert bool(part) == bool(problems[name]), name
+    assert report.recordings[2].double_hit_seconds == pytest.approx(0.4, abs=0.01)
+    everything = "; ".join(report.problems)
+    assert "different sample rates: 8000 Hz (3 files" in everything
+    assert "1 wav files have no row in impacts.csv: stray.wav" in everything
+    # What the command line prints as JSON.
+    assert json.loads(json.dumps(asdict(report), allow_nan=False))["recordings"][1]["clipped"] > 3
+
+
+BROKEN = [
+    {},
+    {"rows": ROWS[:1]},
+    {"rows": (*ROWS, "a.wav,0,0,0")},
+    {"rows": (*ROWS[:2], "c.wav,0,0.2,0")},
+    {"rows": (*ROWS[:2], "c.wav,0,0,300")},
+    {"rows": ROWS[:2], "header": "file,x,y"},
+    {"replace": {"b.wav": np.zeros(0)}},
+    {"replace": {"b.wav": np.stack([ring(), ring(seed=1)], axis=1)}},
+    {"replace": {"b.wav": ring(0.015)}},
+    {"replace": {"b.wav": np.clip(10 * ring(), -1, 1)}},
+    {"subtype": "PCM_U8"},
+    {"rate": 99},
+    {"settings": "second = 1"},
+    {"settings": "seconds = 0.001"},
+    {"settings": 'surface = "no.obj"'},
+    {"settings": 'normalise = "peak"'},
+    {"settings": "force_channel = 2"},
+]
+
+
+@pytest.mark.parametrize("case", BROKEN, ids=[str(number) for number in range(len(BROKEN))])
+def test_readable_means_that_it_can_be_read(tmp_path: Path, case: dict) -> None:
+    folder = fill(tmp_path, **case)
+    report = check(folder)
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            read_capture(folder)
+        readable = True
+    except CaptureError:
+        readable, caught = False, []
+    assert report.readable == readable
+    found = [*report.problems, *(problem for row in report.recordings for problem in row.problems)]
+    assert bool(found) == (not readable or bool(caught))
+
+
+def test_a_folder_of_wavs_alone_is_told_what_to_write(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    (folder / "impacts.csv").unlink()
+    report = check(folder)
+    assert not report.readable
+    assert report.recordings == ()
+    assert HEADER in report.problems[0]
+
+
+def test_measured_strikes_pass(shared: Path) -> None:
+    captures = Path(__file__).resolve().parents[1] / "benchmarks/captures"
+    for name in ("aircraft", "aircraft_response"):
+        report = check(shared / name, CaptureSettings.read(captures / f"{name}.toml"))
+        assert report.readable
+        assert report.problems == ()
+        assert len(report.recordings) == 74
+        assert [row.problems for row in report.recordings] == [()] * 74
