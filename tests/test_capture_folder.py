@@ -28,7 +28,7 @@ def invented(*, names: tuple[str, ...] = ("takes/one.wav", "two.wav"), sample_ra
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(2, 3, generator=generator)
     impacts = Impacts(
-        contacts=torch.randn(2, 3, generator=generator) / 7,
+        contacts=torch.randn(2, 3, dtype=torch.float64, generator=generator) / 7,
         sounds=torch.from_numpy(np.stack([ring(1.0, seed=1), ring(1.0, seed=2)]).astype(np.float32)),
         sample_rate=sample_rate,
         names=names,

@@ -19,9 +19,9 @@ from avmsf.bench.metrics import (
     envelope_distance,
     log_mel_distance,
     objectfolder_distance,
-    scaled_fft_size,
     spectrogram_distance,
 )
+from avmsf.modal.spectra import scaled_fft_size
 
 
 class Convention(ABC):

@@ -23,7 +23,14 @@ from scipy.signal import resample_poly
 from torch import Tensor
 
 from avmsf.errors import EvaluationError
-from avmsf.modal.spectra import envelope, htk_filters, log_mel, magnitude_stft, slaney_filters
+from avmsf.modal.spectra import (
+    envelope,
+    htk_filters,
+    log_mel,
+    magnitude_stft,
+    scaled_fft_size,
+    slaney_filters,
+)
 
 # Shapes that differ are what `validate` explains, so the annotations leave them open.
 Sounds = Float[Tensor, "..."]
@@ -64,19 +71,6 @@ def validate(predicted: Sounds, truth: Sounds, *, names: Sequence[str] | None = 
             raise EvaluationError(
                 f"the {what} sound of {name} is {float(sounds[row, sample])} at sample {sample}; all must be finite"
             )
-
-
-def scaled_fft_size(fft_size: int, *, sample_rate: float) -> int:
-    """Return the FFT size that spans at `sample_rate` Hz nearly the time that `fft_size` samples span at 44.1 kHz.
-
-    A power of two times `fft_size`, never below a quarter of it: a rate below 15.6 kHz marks a large, slow object whose
-    modes need as many samples to tell apart, not a coarse recording of a small one. So 44.1 and 48 kHz have the size as
-    it stands, 96 kHz twice the size, and a structure measured at 400 Hz a quarter.
-    """
-    if not sample_rate > 0.0:
-        raise EvaluationError(f"a sample rate must be positive, got {sample_rate:g} Hz")
-    octaves = max(-2, round(float(np.log2(sample_rate / 44100.0))))
-    return max(2, round(fft_size * 2.0**octaves))
 
 
 def default_fft_sizes(sample_rate: float) -> tuple[int, ...]:

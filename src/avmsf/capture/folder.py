@@ -75,7 +75,7 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
         warnings.warn(remark, CaptureWarning, stacklevel=2)
     directions = [strike.direction for strike in strikes]
     impacts = Impacts(
-        contacts=torch.tensor([strike.contact for strike in strikes], dtype=torch.float32),
+        contacts=torch.tensor([strike.contact for strike in strikes], dtype=torch.float64),
         sounds=torch.from_numpy(np.stack([sound[:length] for sound in sounds])),
         sample_rate=rate * settings.playback_speed,
         names=tuple(names),
@@ -136,9 +136,9 @@ def _write_files(capture: Capture, folder: Path) -> None:
     with open(folder / TABLE, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(header)
-        # Nine digits hold a float32 exactly.
+        # Seventeen digits hold a float64 exactly.
         for name, values in zip(names, torch.cat(columns, dim=1).tolist(), strict=True):
-            table.writerow([name, *(f"{value:.9g}" for value in values)])
+            table.writerow([name, *(f"{value:.17g}" for value in values)])
     if capture.surface is not None:
         write_surface(capture.surface, folder / "surface.ply")
     name = "".join(

@@ -24,6 +24,8 @@ class AttentionShape:
     """Neurons in each hidden layer of the head."""
     layers: int = 2
     """Hidden layers of the head."""
+    feature_scale: float = 4.0
+    """Factor on the features as the network reads them."""
     spatial_damping: bool = False
     """Whether damping, too, depends on the contact."""
 
@@ -97,10 +99,11 @@ class AttentionGains(nn.Module):
         self, rows: Int[Tensor, " contacts"]
     ) -> tuple[Float[Tensor, "contacts modes"], Float[Tensor, "contacts modes"] | None]:
         """Return what `forward` does for the points of the given rows."""
-        feature = self.features[rows]
+        feature = self.features[rows] * self.shape.feature_scale
         offsets = (self.points[rows][:, None, :] - self.centers) / self.feature_field.half_diagonal
         query = self.query(torch.cat([encode(offsets, self.shape.bands).flatten(1), feature], dim=1))
-        key, value = self.key(self.descriptors), self.value(self.descriptors)
+        descriptors = self.descriptors * self.shape.feature_scale
+        key, value = self.key(descriptors), self.value(descriptors)
         attention = torch.softmax(query @ key.T / math.sqrt(self.shape.width), dim=1)
         hidden = self.head(torch.cat([attention @ value, feature], dim=1))
         gains = self.to_gains(hidden) * self.gain_scale

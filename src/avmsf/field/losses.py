@@ -137,7 +137,9 @@ def _padded(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Float[T
 
 def _chunks(contacts: int, frames: int, fft_size: int) -> list[tuple[int, slice]]:
     step = max(1, _CHUNK // fft_size)
-    return [(row, slice(first, min(frames, first + step))) for row in range(contacts) for first in range(0, frames, step)]
+    return [
+        (row, slice(first, min(frames, first + step))) for row in range(contacts) for first in range(0, frames, step)
+    ]
 
 
 def _magnitude(spectrum: Tensor, floor: float) -> Tensor:

@@ -13,10 +13,18 @@ from avmsf.errors import ExtractionError
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction import Extraction
 from avmsf.modal.leastsquares import fit_gains, refine
-from avmsf.modal.pencil import candidates
+from avmsf.modal.pencil import SHORTEST, candidates
 from avmsf.modal.residual import estimate_residual, noise_power
-from avmsf.modal.selection import merge, prune, select
+from avmsf.modal.selection import Candidates, chance_ratio, merge, prune, select
 from avmsf.modal.shorttime import consensus_modes
+
+_EMPTY = ModalBank(torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
+_QUIET = 1e-12
+"""Least power of the noise, of sounds of mean power one: rounding of what is recorded without any."""
+_LEAST_FALL = 0.3
+"""A mode that falls by fewer nepers over the whole sound is not told from hum."""
+_PERIODS = 50
+"""How many periods of the lowest frequency the sounds last: with fewer, a mode is not told from rumble."""
 
 
 class ModeFinder(Protocol):
@@ -37,40 +45,49 @@ class HighResolution:
 
     modes: int = 128
     """Most modes to keep: those whose absence would lose most energy."""
-    significance: float = 6.0
-    """How many times the energy that noise alone would yield a mode has to explain."""
+    significance: float = 1.5
+    """How many times the most that noise alone would yield anywhere a mode has to explain, in energy."""
     range_db: float = 60.0
     """Modes this far below the strongest are left out, decibels of energy."""
     least_quality: float = 1.0
     """Least quality factor, pi f / d: below it a thing is a thud, not a tone."""
     lowest_hertz: float = 0.0
-    """Lowest frequency to look at, Hz; zero for what the length of the sounds allows (five periods)."""
+    """Lowest frequency to look at, Hz; zero for what the length of the sounds allows (about fifty periods)."""
 
     def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:
         """Return the modes of `sounds`, at most `modes` of them."""
-        duration = sounds.shape[1] / sample_rate
-        lowest = max(self.lowest_hertz, 5 / duration)
-        bank = merge(*candidates(sounds, sample_rate=sample_rate, lowest=lowest), duration=duration)
-        noise = noise_power(sounds, bins=_noise_bins(sounds.shape[1], sample_rate))
-
-        def beneath(modes: ModalBank) -> Float64[Tensor, "contacts modes"]:
-            place = modes.frequency * (2 * (noise.shape[1] - 1) / sample_rate)
-            floor = noise[:, place.round().long()].to(torch.float64)
-            return floor.clamp_min(float(sounds.square().mean()) * 1e-12)
-
-        found = self._toned(bank)
-        bank = ModalBank(found.frequency[:0], found.damping[:0])
+        level = _level(sounds)
+        sounds = ((sounds - sounds.mean(1, keepdim=True)) / level[:, None])[level > 0]
+        samples = sounds.shape[1]
+        if samples < SHORTEST or len(sounds) == 0:
+            return _EMPTY
+        lowest = max(self.lowest_hertz, lowest_frequency(samples, sample_rate))
+        chance = chance_ratio(len(sounds), trials=samples)
+        noise = noise_power(sounds, bins=_noise_bins(samples)).clamp_min(_QUIET)
+        pairs = candidates(sounds, noise, sample_rate=sample_rate, lowest=lowest, significance=chance)
+        sounds = sounds.to(torch.float64)
+        merged = self._toned(merge(*pairs, duration=samples / sample_rate), lowest, samples / sample_rate)
+        found = Candidates.of(sounds, merged, _beneath(noise, merged, sample_rate), sample_rate=sample_rate)
+        found = found.significant(chance, samples=samples, sample_rate=sample_rate)
+        bank = _EMPTY
         # The strong modes first, refined until little of them is left over: their remains would pass for weak modes.
         for range_db in (*torch.arange(20.0, self.range_db, 20.0).tolist(), self.range_db, self.range_db):
-            sifting = {"sample_rate": sample_rate, "significance": self.significance, "range_db": range_db}
-            bank = select(sounds, bank, found, beneath(found), **sifting, count=self.modes)
-            bank = prune(sounds, bank, beneath(bank), **sifting, count=self.modes)
-            bank = self._toned(refine(sounds, bank, sample_rate=sample_rate))
-            bank = prune(sounds, bank, beneath(bank), **sifting, count=self.modes)
+            sifting = {
+                "sample_rate": sample_rate,
+                "significance": self.significance * chance,
+                "range_db": range_db,
+                "count": self.modes,
+            }
+            known = Candidates.of(sounds, bank, _beneath(noise, bank, sample_rate), sample_rate=sample_rate)
+            bank = select(known, found, samples=samples, **sifting)
+            bank = prune(sounds, bank, _beneath(noise, bank, sample_rate), **sifting)
+            bank = self._toned(refine(sounds, bank, sample_rate=sample_rate), lowest, samples / sample_rate)
+            bank = prune(sounds, bank, _beneath(noise, bank, sample_rate), **sifting)
         return bank
 
-    def _toned(self, bank: ModalBank) -> ModalBank:
+    def _toned(self, bank: ModalBank, lowest: float, duration: float) -> ModalBank:
         kept = math.pi * bank.frequency > self.least_quality * bank.damping
+        kept &= (bank.frequency >= lowest) & (bank.damping >= _LEAST_FALL / duration)
         return ModalBank(bank.frequency[kept], bank.damping[kept])
 
 
@@ -130,13 +147,33 @@ def extract_sounds(
     if len(bank) == 0:
         raise ExtractionError(_why_no_mode(sounds, sample_rate))
     gains, quadrature = fit_gains(sounds, bank, sample_rate=sample_rate)
-    residual = estimate_residual(sounds, bins=_noise_bins(sounds.shape[1], sample_rate))
+    residual = estimate_residual(sounds, bins=_noise_bins(sounds.shape[1]))
     return Extraction(bank, gains, residual, quadrature)
 
 
-def _noise_bins(samples: int, sample_rate: float) -> int:
-    """Return how many noise bands the length allows: of about 20 Hz at 44.1 kHz, wider in short sounds."""
-    return _power_of_two(min(0.05 * sample_rate, samples / 8), least=16) // 2 + 1
+def lowest_frequency(samples: int, sample_rate: float) -> float:
+    """Return the lowest frequency (Hz) at which sounds of this length let a mode be told from rumble."""
+    return _PERIODS * sample_rate / samples
+
+
+def _level(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, " contacts"]:
+    """Return each sound's root mean square about its mean."""
+    return (sounds - sounds.mean(1, keepdim=True)).square().mean(1).sqrt()
+
+
+def _beneath(
+    noise: Float[Tensor, "contacts bins"], bank: ModalBank, sample_rate: float
+) -> Float64[Tensor, "contacts modes"]:
+    """Return the noise's power at each mode: the most of the three bins there, for its spectrum may be steep."""
+    padded = torch.nn.functional.pad(noise, (1, 1))
+    highest = torch.maximum(torch.maximum(padded[:, :-2], padded[:, 2:]), noise)
+    place = torch.round(bank.frequency * (2 * (noise.shape[1] - 1) / sample_rate)).long()
+    return highest[:, place].to(torch.float64)
+
+
+def _noise_bins(samples: int) -> int:
+    """Return how many noise bands the length allows: of 23 Hz in 3 s at 48 kHz, wider in shorter sounds."""
+    return max(16, 1 << round(math.log2(samples / 64))) // 2 + 1
 
 
 def _power_of_two(value: float, *, least: int) -> int:

@@ -17,6 +17,8 @@ from avmsf.modal.bank import ModalBank
 _BLOCK = 512
 _RIDGE = 1e-13
 """Relative to the Gram matrix's diagonal: keeps two modes of one frequency solvable."""
+_DEAD = 1e-12
+"""Part of its beginning below which a mode is no longer followed."""
 
 
 def fit_gains(
@@ -48,22 +50,28 @@ def refine(
 
     Gauss-Newton on the sum of squared residuals with the gains of every sound eliminated (variable projection, in
     Kaufman's approximation), damped after Levenberg and Marquardt; no step moves a mode by more than half its own
-    width. Returns modes sorted by frequency.
+    width, and none leaves a mode that falls by less than a hundredth over the whole sound. Returns modes sorted by
+    frequency, which explain at least as much as `bank` does.
     """
+    if len(bank) == 0:
+        return bank
     frequency, damping = bank.frequency.clone(), bank.damping.clone()
     resolution = sample_rate / sounds.shape[1]
-    system = NormalEquations.of(sounds, poles_of(ModalBank(frequency, damping), sample_rate), weighted=True)
+    wide = sounds.to(torch.float64)
+    system = NormalEquations.of(wide, poles_of(bank, sample_rate), weighted=True)
     energy, trust = system.explained(), 1e-3
     for _ in range(iterations):
         step = system.step(sample_rate, trust)
         width = torch.clamp(damping / (2 * math.pi), min=0.25 * resolution)
         moved = frequency + torch.clamp(step[0], -0.5 * width, 0.5 * width)
         decayed = damping * torch.exp(torch.clamp(step[1] / damping, -0.3, 0.3))
+        decayed = torch.maximum(decayed, torch.clamp(damping, max=0.01 * resolution))
         inside = (moved > 0) & (moved < sample_rate / 2)
         moved = torch.where(inside, moved, frequency)
-        trial = NormalEquations.of(sounds, poles_of(ModalBank(moved, decayed), sample_rate), weighted=True)
+        trial = NormalEquations.of(wide, poles_of(ModalBank(moved, decayed), sample_rate), weighted=True)
         gained = trial.explained() - energy
-        if gained <= 0:
+        # Not "gained <= 0": a step into a singular basis gives NaN, and is refused too.
+        if not gained > 0:
             trust *= 10
             if trust > 1e3:
                 break
@@ -119,14 +127,20 @@ class NormalEquations:
         """Return the energy of the sounds that their best fit explains."""
         return float((self.solve() * self.products).sum())
 
-    def lost_without(self) -> Float64[Tensor, "contacts modes"]:
-        """Return the energy of each sound that goes unexplained when one mode is left out and the rest fitted anew."""
+    def lost_without(self) -> tuple[Float64[Tensor, "contacts modes"], Float64[Tensor, " modes"]]:
+        """Return what each mode is needed for, and how far the others could stand in for it.
+
+        First the energy of each sound that goes unexplained when one mode is left out and the rest fitted anew. Then
+        the part of each mode (of the phase that is worst off) that the others do not span, in energy: one for a mode
+        on its own, near zero where modes cancel each other.
+        """
         scale = torch.sqrt(torch.diagonal(self.gram))
         modes = len(scale) // 2
         inverse = torch.linalg.inv(_normalise(self.gram, scale)).reshape(2, modes, 2, modes)
         own = torch.diagonal(inverse, dim1=1, dim2=3).permute(2, 0, 1)
         pairs = (self.solve() * scale).unflatten(1, (2, modes)).permute(2, 1, 0)
-        return (pairs * torch.linalg.solve(own, pairs)).sum(1).T
+        lost = (pairs * torch.linalg.solve(own, pairs)).sum(1).T
+        return lost, 1 / torch.linalg.eigvalsh(own)[:, 1]
 
     def step(self, sample_rate: float, trust: float) -> Float64[Tensor, "2 modes"]:
         """Return the Gauss-Newton step of (frequency Hz, damping 1/s)."""
@@ -173,8 +187,10 @@ def gram(
     poles: Complex128[Tensor, " modes"], samples: int, *, power: int
 ) -> Float64[Tensor, "two_modes two_modes"]:
     """Return inner products over time, weighted by n^power (0, 1 or 2), of all sines and cosines with each other."""
-    straight = _power_sum(poles[:, None] * poles[None, :], samples, power)
-    crossed = _power_sum(poles[:, None] * poles[None, :].conj(), samples, power)
+    last = poles**samples
+    straight = _power_sum(poles[:, None] * poles[None, :], last[:, None] * last[None, :], samples, power)
+    mirror, last_mirror = poles.conj(), last.conj()
+    crossed = _power_sum(poles[:, None] * mirror[None, :], last[:, None] * last_mirror[None, :], samples, power)
     sine_sine, sine_cosine = (crossed - straight).real, (straight + crossed).imag
     cosine_sine, cosine_cosine = (straight - crossed).imag, (straight + crossed).real
     return 0.5 * torch.cat(
@@ -182,17 +198,43 @@ def gram(
     )
 
 
-def _power_sum(ratio: Complex128[Tensor, "*shape"], samples: int, power: int) -> Complex128[Tensor, "*shape"]:
-    """Return the sum over n < samples of n^power ratio^n, in closed form."""
+def own_gram(poles: Complex128[Tensor, " modes"], samples: int) -> Float64[Tensor, "modes 2 2"]:
+    """Return the inner products over time of each mode's own sine and cosine: the two by two blocks of `gram`."""
+    straight = _power_sum(poles.square(), (poles**samples).square(), samples, 0)
+    crossed = _power_sum(poles * poles.conj(), (poles * poles.conj()) ** samples, samples, 0)
+    mixed = straight.imag
+    rows = torch.stack([crossed.real - straight.real, mixed, mixed, crossed.real + straight.real], dim=-1)
+    return 0.5 * rows.unflatten(-1, (2, 2))
+
+
+def _power_sum(
+    ratio: Complex128[Tensor, "*shape"], last: Complex128[Tensor, "*shape"], samples: int, power: int
+) -> Complex128[Tensor, "*shape"]:
+    """Return the sum over n < samples of n^power ratio^n, in closed form; `last` is ratio^samples."""
     rest = 1 - ratio
-    last = ratio**samples
     plain = (1 - last) / rest
-    if power == 0:
-        return plain
     first = (ratio * plain - samples * last) / rest
-    if power == 1:
-        return first
-    return (ratio * (2 * first + plain) - samples * samples * last) / rest
+    sums = (plain, first, (ratio * (2 * first + plain) - samples * samples * last) / rest)[power]
+    # The fractions lose their digits where hardly anything decays or turns over the whole sound.
+    steady = rest.abs() * samples < 1
+    return sums.masked_scatter(steady, _steady_sum(ratio[steady], samples, power))
+
+
+def _steady_sum(ratio: Complex128[Tensor, " sums"], samples: int, power: int) -> Complex128[Tensor, " sums"]:
+    """Return the sum over n < samples of n^power ratio^n for ratios near one, doubling its length again and again."""
+    plain, first, second = torch.zeros_like(ratio), torch.zeros_like(ratio), torch.zeros_like(ratio)
+    length = 0
+    for bit in f"{samples:b}":
+        turned = ratio**length
+        second = second + turned * (second + 2 * length * first + length * length * plain)
+        first = first + turned * (first + length * plain)
+        plain = plain + turned * plain
+        length *= 2
+        if bit == "1":
+            turned = ratio**length
+            plain, first, second = plain + turned, first + length * turned, second + length * length * turned
+            length += 1
+    return (plain, first, second)[power]
 
 
 def project(
@@ -200,24 +242,54 @@ def project(
 ) -> tuple[Float64[Tensor, "contacts two_modes"], Float64[Tensor, "contacts two_modes"] | None]:
     """Return the sounds' inner products with all sines and cosines, and with n times them if `weighted`.
 
-    By blocks, as in `synthesise`: z^(mK + k) = z^(mK) z^k. All in float64: what two modes of nearly one
-    frequency share cancels in the solution, and float32 products would leave only rounding of the rest.
+    All in float64: what two modes of nearly one frequency share cancels in the solution, and float32 products would
+    leave only rounding of the rest. A mode is followed until it has fallen below 1e-12 of its beginning: most die
+    long before the sound ends.
     """
-    samples, modes = sounds.shape[1], poles.shape[0]
-    blocks = math.ceil(samples / _BLOCK)
-    padded = torch.nn.functional.pad(sounds, (0, blocks * _BLOCK - samples)).reshape(-1, blocks, _BLOCK)
-    steps = torch.arange(_BLOCK, dtype=torch.float64)
-    within = poles ** steps[:, None]
+    samples = sounds.shape[1]
+    wide = sounds.to(torch.float64)
+    needed = math.log(_DEAD) / torch.log(poles.abs()).clamp_max(-1e-300)
+    inner = torch.zeros(len(sounds), len(poles), dtype=torch.complex128)
+    outer = torch.zeros_like(inner)
+    upper, length = math.inf, samples
+    while upper > 0:
+        lower = length / 2 if length > 2 * _BLOCK else 0
+        group = torch.nonzero((needed > lower) & (needed <= upper)).flatten()
+        if len(group):
+            inner[:, group], outer[:, group] = _project(wide[:, : math.ceil(length)], poles[group], weighted)
+        upper, length = lower, lower
+    products = torch.cat([inner.imag, inner.real], dim=1)
+    return products, torch.cat([outer.imag, outer.real], dim=1) if weighted else None
+
+
+def _project(
+    sounds: Float64[Tensor, "contacts samples"], poles: Complex128[Tensor, " modes"], weighted: bool
+) -> tuple[Complex128[Tensor, "contacts modes"], Complex128[Tensor, "contacts modes"]]:
+    """Return the sums over n of sound z^n and, if `weighted`, of n sound z^n (zero if not).
+
+    By blocks, as in `synthesise`: z^(mK + k) = z^(mK) z^k.
+    """
+    blocks = math.ceil(sounds.shape[1] / _BLOCK)
+    padded = torch.nn.functional.pad(sounds, (0, blocks * _BLOCK - sounds.shape[1])).reshape(-1, blocks, _BLOCK)
+    within = _powers(poles, _BLOCK)
     tables = [within.real, within.imag]
     if weighted:
-        tables += [steps[:, None] * within.real, steps[:, None] * within.imag]
-    summed = padded.to(torch.float64) @ torch.cat(tables, dim=1)
-    parts = summed.unflatten(-1, (-1, modes)).unbind(-2)
-    offsets = torch.arange(blocks, dtype=torch.float64) * _BLOCK
-    starts = poles ** offsets[:, None]
-    inner = (starts * torch.complex(parts[0], parts[1])).sum(1)
-    products = torch.cat([inner.imag, inner.real], dim=1)
+        steps = torch.arange(_BLOCK, dtype=torch.float64)[:, None]
+        tables += [steps * within.real, steps * within.imag]
+    summed = padded @ torch.cat(tables, dim=1)
+    parts = summed.unflatten(-1, (len(tables), len(poles))).unbind(-2)
+    starts = _powers(poles**_BLOCK, blocks)
+    inner = torch.complex(parts[0], parts[1])
+    plain = (starts * inner).sum(1)
     if not weighted:
-        return products, None
-    outer = (starts * (torch.complex(parts[2], parts[3]) + offsets[:, None] * torch.complex(parts[0], parts[1]))).sum(1)
-    return products, torch.cat([outer.imag, outer.real], dim=1)
+        return plain, torch.zeros_like(plain)
+    offsets = torch.arange(blocks, dtype=torch.float64)[:, None] * _BLOCK
+    return plain, (starts * (torch.complex(parts[2], parts[3]) + offsets * inner)).sum(1)
+
+
+def _powers(poles: Complex128[Tensor, " modes"], count: int) -> Complex128[Tensor, "count modes"]:
+    """Return z^0 to z^(count - 1), by doubling: a product costs a twentieth of a power, and rounds no worse."""
+    table = torch.ones(1, len(poles), dtype=poles.dtype)
+    while len(table) < count:
+        table = torch.cat([table, table * poles ** len(table)])
+    return table[:count]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 _DEPTH = 512
 """Decimated samples in a band: enough to tell modes apart, few enough for small eigenproblems."""
-_SHORTEST = 256
+SHORTEST = 256
 """Samples of the shortest beginning that is still searched."""
 _SHORTENING = 4
 _EDGE = 0.2
@@ -27,28 +27,42 @@ _ABOVE_NOISE = 10.0
 
 
 def candidates(
-    sounds: Float[Tensor, "contacts samples"], *, sample_rate: float, lowest: float
+    sounds: Float[Tensor, "contacts samples"],
+    noise: Float[Tensor, "contacts bins"],
+    *,
+    sample_rate: float,
+    lowest: float,
+    significance: float,
 ) -> tuple[Float64[Tensor, " candidates"], Float64[Tensor, " candidates"]]:
     """Return frequencies (Hz) and dampings (1/s) of everything that may be a mode between `lowest` and half the rate.
 
-    More than the object has: one mode may appear at several lengths, and noise may look like modes.
+    More than the object has: one mode may appear at several lengths, and noise may look like modes. `noise` is its
+    power in evenly spaced bands up to half the rate; bands whose spectrum nowhere reaches `significance` times it,
+    mean over the sounds, are passed over.
     """
     found: list[Complex128[Tensor, " some"]] = []
     samples = sounds.shape[1]
-    while samples >= _SHORTEST:
-        found += _search(sounds[:, :samples], sample_rate, lowest)
+    while samples >= SHORTEST:
+        found += _search(sounds[:, :samples], noise, sample_rate, lowest, significance)
         samples //= _SHORTENING
     exponents = torch.cat(found) if found else torch.zeros(0, dtype=torch.complex128)
     return exponents.imag / (2 * math.pi), -exponents.real
 
 
 def _search(
-    sounds: Float[Tensor, "contacts samples"], sample_rate: float, lowest: float
+    sounds: Float[Tensor, "contacts samples"],
+    noise: Float[Tensor, "contacts bins"],
+    sample_rate: float,
+    lowest: float,
+    significance: float,
 ) -> list[Complex128[Tensor, " some"]]:
     """Return the exponents -d + 2 pi i f found band by band in sounds of one length."""
     samples = sounds.shape[1]
     padded = 1 << (2 * samples - 1).bit_length()
     spectrum = torch.fft.rfft(sounds, padded)[:, :-1]
+    # Band and bin of the noise's own spectrum that each bin of this one lies in.
+    place = torch.arange(padded // 2) * (noise.shape[1] - 1) // (padded // 2)
+    above = (spectrum.abs().square() / (samples * noise[:, place])).mean(0)
     size = min(1 << round(math.log2(_DEPTH * padded / samples)), padded // 2)
     width = size * sample_rate / padded
     fade = torch.sin(torch.linspace(0, math.pi / 2, round(_EDGE * size))).square()
@@ -59,18 +73,20 @@ def _search(
         first = round(bottom * padded / sample_rate)
         index = torch.arange(first, first + size)
         inside = (index >= 0) & (index < padded // 2)
-        band = torch.fft.ifft(spectrum[:, index.clamp(0, padded // 2 - 1)] * (inside * taper))
-        poles = _poles(band[:, _RINGING : size * samples // padded])
-        turns = torch.remainder(torch.angle(poles) / (2 * math.pi), 1.0)
-        frequency = turns * width + first * sample_rate / padded
-        damping = -torch.log(poles.abs()) * width
-        overlap = 0.02 * width
-        kept = (frequency >= bottom + _EDGE * width - overlap) & (frequency < bottom + (1 - _EDGE) * width + overlap)
-        kept &= (frequency >= lowest) & (frequency < sample_rate / 2)
-        # Slower than a tenth of the sound's length cannot be told from steady hum; faster than the band is wide is
-        # an artefact of its filter.
-        kept &= (damping > 0.1 * sample_rate / samples) & (damping < width)
-        found.append(torch.complex(-damping, 2 * math.pi * frequency)[kept])
+        index = index.clamp(0, padded // 2 - 1)
+        if float(above[index].max()) > significance:
+            band = torch.fft.ifft(spectrum[:, index] * (inside * taper))
+            poles = _poles(band[:, _RINGING : size * samples // padded])
+            turns = torch.remainder(torch.angle(poles) / (2 * math.pi), 1.0)
+            frequency = turns * width + first * sample_rate / padded
+            damping = -torch.log(poles.abs()) * width
+            overlap = 0.02 * width
+            kept = (frequency >= bottom + _EDGE * width - overlap) & (frequency < bottom + (1 - _EDGE) * width + overlap)
+            kept &= (frequency >= lowest) & (frequency < sample_rate / 2)
+            # Slower than a tenth of the sound's length cannot be told from steady hum; faster than the band is wide
+            # is an artefact of its filter.
+            kept &= (damping > 0.1 * sample_rate / samples) & (damping < width)
+            found.append(torch.complex(-damping, 2 * math.pi * frequency)[kept])
         bottom += (1 - 2 * _EDGE) * width
     return found
 

@@ -7,6 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+_REFERENCE = 1 << 17
+"""Least number of samples of the white noise that the search for the quietest segments is calibrated on."""
+
 
 @dataclass(frozen=True, eq=False)
 class Residual:
@@ -42,21 +45,35 @@ def noise_power(
 ) -> Float[Tensor, "contacts bins"]:
     """Return the power of the background noise in each band of each sound: white noise of variance v gives v.
 
-    Paper, section 3.4: the mean over the lowest-energy segments of each bin. A segment is a run of about twenty
-    half-overlapping frames where the sound is long enough: the quietest of single frames would come out far below
-    the mean power of a steady noise, the quietest of such runs within about a decibel.
+    Paper, section 3.4: the mean over the lowest-energy segments of each bin, here the part `quietest` of them, each
+    a run of half-overlapping frames, twenty runs where the sound is long enough. The quietest of anything that
+    scatters lie below its mean; the result is divided by what the same search finds in white noise, of the same
+    length, of variance one.
     """
+    rows = max(1, _REFERENCE // sounds.shape[1])
+    white = torch.randn(rows, sounds.shape[1], generator=torch.Generator().manual_seed(0)).to(sounds)
+    found = _quietest_power(sounds, bins=bins, quietest=quietest)
+    return found / _quietest_power(white, bins=bins, quietest=quietest).mean()
+
+
+def _quietest_power(
+    sounds: Float[Tensor, "contacts samples"], *, bins: int, quietest: float
+) -> Float[Tensor, "contacts bins"]:
     fft_size = 2 * (bins - 1)
     padded = torch.nn.functional.pad(sounds, (0, max(0, fft_size - sounds.shape[1])))
-    window = torch.hann_window(fft_size, device=sounds.device)
+    window = torch.hann_window(fft_size, dtype=sounds.dtype, device=sounds.device)
     frames = padded.unfold(1, fft_size, fft_size // 2)
     power = torch.fft.rfft(frames * window).abs().square() / window.square().sum()
-    # The edges 0 Hz and half the rate are real numbers with all their power in one part: same mean, no correction.
     count = max(1, power.shape[1] // 20)
     runs = power.shape[1] // count
-    segments = power[:, : runs * count].unflatten(1, (runs, count)).mean(2)
+    # Whole runs up to the end: the end is where a sound that dies away is quietest.
+    segments = power[:, power.shape[1] - runs * count :].unflatten(1, (runs, count)).mean(2)
     kept = max(1, round(quietest * runs))
-    return torch.sort(segments, dim=1).values[:, :kept].mean(1)
+    quiet = torch.sort(segments, dim=1).values[:, :kept].mean(1)
+    # At 0 Hz and half the rate the spectrum is real and scatters twice as widely: its quietest lie too low.
+    quiet[:, 0] = torch.maximum(quiet[:, 0], quiet[:, 1])
+    quiet[:, -1] = torch.maximum(quiet[:, -1], quiet[:, -2])
+    return quiet
 
 
 def estimate_residual(sounds: Float[Tensor, "contacts samples"], *, bins: int) -> Residual:

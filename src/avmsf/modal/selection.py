@@ -1,18 +1,22 @@
 """Which candidates are modes: forward selection by explained energy, then removal of what the rest explains as well."""
 
 import math
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
+from scipy.special import gammainccinv
 from torch import Tensor
 
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.leastsquares import NormalEquations, gram, poles_of, project
+from avmsf.modal.leastsquares import NormalEquations, gram, own_gram, poles_of, project
 
 _CHUNK, _SHARED = 120, 30
 """Candidates judged together, in order of frequency, and how many of them the next chunk judges again."""
 _DISTINCT = 1e-6
 """Part of a candidate's (sine, cosine) area that the chosen ones must leave for it to count as another mode."""
+_APART = 0.03
+"""Least part of a mode that the others must not span: with less, gains of large and opposite modes would cancel."""
 _SAME = 0.03
 """Candidates closer than this part of their width, with dampings as close, are one."""
 _NEIGHBOURS = 30
@@ -41,12 +45,65 @@ def merge(
     return ModalBank(frequency[index], damping[index])
 
 
+def chance_ratio(contacts: int, *, trials: int) -> float:
+    """Return how many times its mean the energy that a mode explains of white noise is at most, of `trials` modes.
+
+    A mode has two amplitudes in each of the recordings, so the energy is chi-squared with twice as many degrees of
+    freedom; exceeded once in ten searches by chance.
+    """
+    return float(gammainccinv(contacts, 0.1 / trials)) / contacts
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """What may be modes, with what judging them needs; by frequency."""
+
+    bank: ModalBank
+    products: Float64[Tensor, "contacts two candidates"]
+    """Inner products of the sounds with the sines and the cosines."""
+    noise: Float64[Tensor, "contacts candidates"]
+    """Power of the noise where each of them lies."""
+
+    @classmethod
+    def of(
+        cls,
+        sounds: Float[Tensor, "contacts samples"],
+        bank: ModalBank,
+        noise: Float64[Tensor, "contacts candidates"],
+        *,
+        sample_rate: float,
+    ) -> "Candidates":
+        products, _ = project(sounds, poles_of(bank, sample_rate))
+        return cls(bank, products.unflatten(1, (2, len(bank))), noise)
+
+    def take(self, rows: Int64[Tensor, " kept"]) -> "Candidates":
+        """Return the given candidates alone."""
+        bank = ModalBank(self.bank.frequency[rows], self.bank.damping[rows])
+        return Candidates(bank, self.products[:, :, rows], self.noise[:, rows])
+
+    def join(self, other: "Candidates") -> "Candidates":
+        """Return these and then the others."""
+        return Candidates(
+            ModalBank(
+                torch.cat([self.bank.frequency, other.bank.frequency]),
+                torch.cat([self.bank.damping, other.bank.damping]),
+            ),
+            torch.cat([self.products, other.products], dim=2),
+            torch.cat([self.noise, other.noise], dim=1),
+        )
+
+    def significant(self, significance: float, *, samples: int, sample_rate: float) -> "Candidates":
+        """Return those that explain at least `significance` times what they would of noise, each on its own."""
+        poles = poles_of(self.bank, sample_rate)
+        energy = _explained(own_gram(poles, samples), self.products.permute(2, 1, 0))
+        return self.take(torch.nonzero((energy / self.noise.T).mean(1) / 2 > significance).flatten())
+
+
 def select(
-    sounds: Float[Tensor, "contacts samples"],
-    known: ModalBank,
-    found: ModalBank,
-    noise: Float64[Tensor, "contacts candidates"],
+    known: Candidates,
+    found: Candidates,
     *,
+    samples: int,
     sample_rate: float,
     significance: float,
     range_db: float,
@@ -54,33 +111,24 @@ def select(
 ) -> ModalBank:
     """Return `known` and up to `count` of `found`: those that explain most of what is left beside each other.
 
-    `noise` is the noise's power where each of `found` lies: a candidate counts only when it explains `significance`
-    times what it would explain of noise, and within `range_db` of the strongest of its neighbourhood.
+    A candidate counts only when it explains `significance` times the energy that it would explain of noise, mean over
+    the sounds, and within `range_db` of the strongest of its neighbourhood. `samples` is the sounds' length.
     """
-    both = join(known, found)
-    order = torch.argsort(torch.cat([known.frequency, found.frequency]))
-    given = order < len(known)
-    floor = torch.cat([torch.ones(len(sounds), len(known), dtype=torch.float64), noise], dim=1)[:, order]
-    energy = torch.zeros(len(both), dtype=torch.float64)
+    both = known.join(found)
+    order = torch.argsort(both.bank.frequency)
+    both, given = both.take(order), order < len(known.bank)
+    energy = torch.zeros(len(both.bank), dtype=torch.float64)
     first = 0
     while True:
-        rows = torch.arange(first, min(len(both), first + _CHUNK))
-        part = ModalBank(both.frequency[rows], both.damping[rows])
-        gained = _forward(sounds, part, given[rows], floor[:, rows], sample_rate, significance, range_db)
+        rows = torch.arange(first, min(len(both.bank), first + _CHUNK))
+        gained = _forward(both.take(rows), given[rows], samples, sample_rate, significance, range_db)
         energy[rows] = torch.maximum(energy[rows], gained)
-        if first + _CHUNK >= len(both):
+        if first + _CHUNK >= len(both.bank):
             break
         first += _CHUNK - _SHARED
     energy[given] = torch.inf
-    kept = torch.argsort(energy, descending=True)[: min(count + len(known), int((energy > 0).sum()))].sort().values
-    return ModalBank(both.frequency[kept], both.damping[kept])
-
-
-def join(one: ModalBank, other: ModalBank) -> ModalBank:
-    """Return the modes of both banks, by frequency."""
-    frequency = torch.cat([one.frequency, other.frequency])
-    order = torch.argsort(frequency)
-    return ModalBank(frequency[order], torch.cat([one.damping, other.damping])[order])
+    kept = torch.argsort(energy, descending=True)[: min(count + len(known.bank), int((energy > 0).sum()))].sort().values
+    return both.take(kept).bank
 
 
 def prune(
@@ -103,10 +151,10 @@ def prune(
         return bank
     system = NormalEquations.of(sounds, poles_of(bank, sample_rate))
     while True:
-        lost = system.lost_without()
-        ratio = (lost / noise).sum(0) / (2 * len(sounds))
+        lost, apart = system.lost_without()
+        ratio = (lost / noise).mean(0) / 2
         total = lost.sum(0)
-        weak = (ratio < significance) | (total < total.max() * 10 ** (-range_db / 10))
+        weak = (ratio < significance) | (total < total.max() * 10 ** (-range_db / 10)) | (apart < _APART)
         if not weak.any():
             break
         width = torch.maximum(bank.damping[:, None], bank.damping[None, :]) * (3 / (2 * math.pi))
@@ -120,42 +168,67 @@ def prune(
 
 
 def _forward(
-    sounds: Float[Tensor, "contacts samples"],
-    bank: ModalBank,
+    candidates: Candidates,
     given: Bool[Tensor, " candidates"],
-    noise: Float64[Tensor, "contacts candidates"],
+    samples: int,
     sample_rate: float,
     significance: float,
     range_db: float,
 ) -> Float64[Tensor, " candidates"]:
     """Return the energy that each candidate explained when it was chosen, zero if never: orthogonal least squares.
 
-    The `given` ones are chosen first, whatever they explain.
+    The `given` ones have been chosen before.
     """
-    modes = len(bank)
-    poles = poles_of(bank, sample_rate)
-    products = project(sounds, poles)[0].unflatten(1, (2, modes)).permute(2, 1, 0).contiguous()
-    inner = gram(poles, sounds.shape[1], power=0).reshape(2, modes, 2, modes).permute(1, 0, 3, 2).contiguous()
-    whole = torch.diagonal(inner, dim1=0, dim2=2).permute(2, 0, 1).clone()
+    modes = len(given)
+    products = candidates.products.permute(2, 1, 0).contiguous()
+    inner = gram(poles_of(candidates.bank, sample_rate), samples, power=0)
+    inner = inner.reshape(2, modes, 2, modes).permute(1, 0, 3, 2).contiguous()
+    whole = _determinants(_own(inner))
+    for mode in torch.nonzero(given).flatten().tolist():
+        if _determinants(_own(inner)[mode : mode + 1]) > _DISTINCT * whole[mode]:
+            _eliminate(mode, products, inner)
     chosen = torch.zeros(modes, dtype=torch.float64)
-    free = torch.ones(modes, dtype=torch.bool)
+    free = ~given
+    noise = candidates.noise.T
     for _ in range(modes):
-        left = torch.diagonal(inner, dim1=0, dim2=2).permute(2, 0, 1)
+        own = _own(inner)
         # What the chosen ones span already cannot be judged: only rounding is left of it.
-        distinct = free & (torch.linalg.det(left) > _DISTINCT * torch.linalg.det(whole))
-        safe = torch.where(distinct[:, None, None], left, torch.eye(2, dtype=torch.float64))
-        explained = (products * torch.linalg.solve(safe, products)).sum(1)
-        ratio = (explained / noise.T).sum(1) / (2 * len(sounds))
-        first = distinct & given
-        wanted = first if first.any() else distinct & (ratio > significance)
-        score = torch.where(wanted, explained.sum(1), 0.0)
+        distinct = free & (_determinants(own) > _DISTINCT * whole)
+        explained = _explained(torch.where(distinct[:, None, None], own, torch.eye(2, dtype=torch.float64)), products)
+        ratio = (explained / noise).mean(1) / 2
+        score = torch.where(distinct & (ratio > significance), explained.sum(1), 0.0)
         best = int(score.argmax())
-        if not wanted[best] or (not first[best] and score[best] <= chosen.max() * 10 ** (-range_db / 10)):
+        if score[best] <= chosen.max() * 10 ** (-range_db / 10):
             break
         chosen[best] = score[best]
         free[best] = False
-        column = inner[:, :, best, :].clone()
-        weights = torch.linalg.solve(inner[best, :, best, :], column.flatten(0, 1).T)
-        products -= (weights.T @ products[best]).reshape(products.shape)
-        inner -= (column.flatten(0, 1) @ weights).reshape(inner.shape)
+        _eliminate(best, products, inner)
     return chosen
+
+
+def _own(inner: Float64[Tensor, "modes 2 modes 2"]) -> Float64[Tensor, "modes 2 2"]:
+    return torch.diagonal(inner, dim1=0, dim2=2).permute(2, 0, 1)
+
+
+def _determinants(own: Float64[Tensor, "modes 2 2"]) -> Float64[Tensor, " modes"]:
+    return own[:, 0, 0] * own[:, 1, 1] - own[:, 0, 1] * own[:, 1, 0]
+
+
+def _explained(
+    own: Float64[Tensor, "modes 2 2"], products: Float64[Tensor, "modes 2 contacts"]
+) -> Float64[Tensor, "modes contacts"]:
+    """Return the energy of each sound that each mode alone explains: p' G^-1 p, of two by two matrices G."""
+    sine, cosine = products.unbind(1)
+    crossed = (own[:, 0, 1] + own[:, 1, 0])[:, None] * sine * cosine
+    energy = own[:, 1, 1, None] * sine.square() - crossed + own[:, 0, 0, None] * cosine.square()
+    return energy / _determinants(own)[:, None]
+
+
+def _eliminate(
+    mode: int, products: Float64[Tensor, "modes 2 contacts"], inner: Float64[Tensor, "modes 2 modes 2"]
+) -> None:
+    """Make all modes orthogonal to one of them, in place."""
+    column = inner[:, :, mode, :].flatten(0, 1)
+    weights = torch.linalg.solve(inner[mode, :, mode, :], column.T)
+    products -= (weights.T @ products[mode]).reshape(products.shape)
+    inner -= (column @ weights).reshape(inner.shape)

@@ -63,9 +63,13 @@ class PlateModes:
     """Half waves (m, n) along x and along y."""
 
 
-def plate_modes(plate: Plate, contacts: Float[Tensor, "contacts 3"], *, highest: float = 8000.0) -> PlateModes:
+def plate_modes(
+    plate: Plate, contacts: Float[Tensor, "contacts 3"], *, highest: float = 8000.0, contact_time: float = 0.0
+) -> PlateModes:
     """Return all modes of undamped frequency up to `highest` Hz, with the gains of blows at `contacts`.
 
+    A hammer's tip stays on the plate for `contact_time` seconds and pushes with half a sine, which excites a mode of
+    frequency f by cos(pi f tau) / (1 - (2 f tau)^2) of what an impulse in its middle does; zero is an impulse.
     Raises ValueError for contacts off the plate and for a band that holds no mode.
     """
     places = contacts.double()
@@ -93,7 +97,9 @@ def plate_modes(plate: Plate, contacts: Float[Tensor, "contacts 3"], *, highest:
     heard = heard[torch.argsort(frequency[heard])]
     pickup = torch.tensor([[plate.pickup[0] * plate.length, plate.pickup[1] * plate.width]], dtype=torch.float64)
     gains = _shapes(plate, places[:, :2], per_metre[heard]) * _shapes(plate, pickup, per_metre[heard])
-    return PlateModes(frequency[heard], damping[heard], gains, numbers[heard])
+    return PlateModes(
+        frequency[heard], damping[heard], gains * _half_sine(frequency[heard] * contact_time), numbers[heard]
+    )
 
 
 def ring(modes: PlateModes, *, sample_rate: float, samples: int) -> Float64[Tensor, "contacts samples"]:
@@ -115,8 +121,9 @@ def strike(
     generator: torch.Generator,
     noise_db: float | None = None,
     highest: float = 8000.0,
+    contact_time: float = 0.0,
 ) -> Impacts:
-    """Record a blow of one newton-second, straight down, at each contact.
+    """Record a blow of one newton-second, straight down, at each contact, as `plate_modes` has it.
 
     `noise_db` is the level of the white Gaussian noise that is added to all sounds: its root mean square over that of
     the noiseless sounds, both taken over all sounds and their whole length, so that -40.0 is noise 40 dB down and one
@@ -127,7 +134,7 @@ def strike(
         raise ValueError(
             f"modes up to {highest:g} Hz alias at {sample_rate:g} Hz; ask for less than half the sample rate"
         )
-    modes = plate_modes(plate, contacts, highest=highest)
+    modes = plate_modes(plate, contacts, highest=highest, contact_time=contact_time)
     sounds = ring(modes, sample_rate=sample_rate, samples=round(seconds * sample_rate))
     if noise_db is not None:
         level = sounds.square().mean().sqrt() * 10.0 ** (noise_db / 20.0)
@@ -153,6 +160,14 @@ def plate_surface_points(plate: Plate, count: int) -> Float64[Tensor, "points 3"
     across = max(1, count // along)
     sides = [(torch.arange(number, dtype=torch.float64) + 0.5) / number for number in (along, across)]
     return _on_plate(plate, torch.cartesian_prod(*sides).reshape(-1, 2))
+
+
+def _half_sine(cycles: Float64[Tensor, " modes"]) -> Float64[Tensor, " modes"]:
+    """Return the Fourier transform of a half-sine pulse of unit area about its middle, `cycles` = f times its length."""
+    # Zero over zero at half a cycle, where the limit is pi / 4.
+    resonant = (cycles - 0.5).abs() < 1e-9
+    safe = torch.where(resonant, 0.0, cycles)
+    return torch.where(resonant, math.pi / 4, torch.cos(math.pi * safe) / (1.0 - (2.0 * safe).square()))
 
 
 def _shapes(

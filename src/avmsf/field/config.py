@@ -1,0 +1,85 @@
+"""How a field is fitted: one flat record, which is the command line's options too."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from avmsf.field.gains import AttentionShape
+from avmsf.modal.spectra import scaled_fft_size
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Settings of a fit. The defaults are the quick recipe; `PAPER` holds the paper's."""
+
+    clusters: int = 16
+    """Regions of the object that the network attends to (paper: 128, 256 or 512)."""
+    bands: int = 0
+    """Octaves in the encoding of offsets; 0 leaves the plain offsets."""
+    width: int = 64
+    """Size of queries, keys and values."""
+    hidden: int = 256
+    """Neurons in each hidden layer."""
+    layers: int = 2
+    """Hidden layers."""
+    feature_scale: float = 4.0
+    """Factor on the features as the network reads them: larger lets gains change over shorter distances."""
+    warmup_rate: float = 3e-3
+    """Adam's step at the start of the warm-up; it falls on a cosine to a tenth."""
+    learning_rate: float = 1e-3
+    """Adam's step at the start of the end-to-end stage, likewise (paper: 1e-2, 5e-3 or 1e-3)."""
+    correction_rate: float = 0.1
+    """Part of that step for frequencies, dampings and noise, which start close to where they end."""
+    weight_decay: float = 0.3
+    """Decoupled weight decay on the network's matrices."""
+    warmup_steps: int = 500
+    """Steps on the extracted gains alone (paper, eq. 13)."""
+    steps: int = 150
+    """Steps end to end on spectra (paper, eq. 14)."""
+    patience: int = 0
+    """Stop when the validation contacts have not improved for this many steps; 0 runs all steps."""
+    fft_sizes: tuple[int, ...] = (2048, 1024, 512, 256)
+    """Resolutions of the spectral loss, samples at 44.1 and 48 kHz; other rates scale them in octaves."""
+    hop: int = 0
+    """Samples between frames at 44.1 and 48 kHz; 0 takes a quarter of each FFT size (paper: 64)."""
+    early: int = 8192
+    """Length of the beginning that is compared once more, samples at 44.1 and 48 kHz."""
+    early_weight: float = 1.0
+    """Weight of that beginning (paper: .5, 1 or 2)."""
+    damping: Literal["shared", "per-contact", "validated"] = "validated"
+    """Whether dampings vary with the contact; `validated` tries both and keeps what validation contacts prefer."""
+    validation: float = 0.25
+    """Part of the training contacts that choices are validated on; with fewer than 6 contacts none are."""
+    residual: bool = True
+    """Whether noise is modelled beside the modes."""
+    seed: int = 0
+    """Start of all chance in the fit: initial weights and noise."""
+
+    @property
+    def shape(self) -> AttentionShape:
+        """Sizes of the network, with shared damping."""
+        return AttentionShape(self.clusters, self.bands, self.width, self.hidden, self.layers, self.feature_scale)
+
+    def resolutions(self, sample_rate: float) -> tuple[tuple[int, ...], tuple[int, ...], int]:
+        """Return FFT sizes, hops and the early length in samples at a sample rate, Hz."""
+        sizes = tuple(scaled_fft_size(size, sample_rate=sample_rate) for size in self.fft_sizes)
+        if self.hop:
+            hops = (scaled_fft_size(self.hop, sample_rate=sample_rate),) * len(sizes)
+        else:
+            hops = tuple(max(1, size // 4) for size in sizes)
+        return sizes, hops, scaled_fft_size(self.early, sample_rate=sample_rate)
+
+
+PAPER = FitConfig(
+    clusters=128,
+    bands=4,
+    width=128,
+    feature_scale=1.0,
+    warmup_rate=5e-3,
+    learning_rate=5e-3,
+    correction_rate=1.0,
+    weight_decay=0.0,
+    warmup_steps=1000,
+    steps=10000,
+    hop=64,
+)
+"""The paper's settings where it states them (supplement, training setup), the middle of each of its lists."""

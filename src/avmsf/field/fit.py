@@ -1,0 +1,259 @@
+"""From recordings, features and modes to a sound field."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import FitError
+from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
+from avmsf.field.config import FitConfig
+from avmsf.field.gains import AttentionGains
+from avmsf.field.losses import spectral_loss
+from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.training import Targets, TrainingRun, gain_scale
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction import Extraction
+from avmsf.modal.leastsquares import fit_sine_gains
+from avmsf.modal.residual import Residual
+from avmsf.modal.spectra import envelope
+from avmsf.scene.features import FeatureField
+from avmsf.scene.points import farthest_points
+
+_FEWEST_TO_VALIDATE = 6
+_CHECKPOINT_SECONDS = 30.0
+_LOOK_EVERY = 10
+"""Steps between looks at the validation contacts."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a fit stands."""
+
+    stage: str
+    """What is being done, in words."""
+    step: int
+    """Steps done of this run."""
+    steps: int
+    """Steps of this run."""
+    loss: float
+    """Loss of the last step: relative squared gain error in warm-up, spectral loss after."""
+
+
+def fit(
+    train: Impacts,
+    features: FeatureField,
+    modes: Extraction,
+    config: FitConfig | None = None,
+    *,
+    capture: str = "",
+    checkpoint: Path | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> SoundField:
+    """Fit a sound field to recordings (paper, section 3.5).
+
+    `modes` as extracted from `train`. Choices that the config leaves open are made on a part of the training contacts
+    held out for the purpose, then the field is fitted to all. With `checkpoint`, the state is kept there while the fit
+    runs and on interruption, and a fit of the same arguments goes on from it to the same result; the file goes when
+    the fit is done. Raises `FitError` for arguments that do not fit together.
+    """
+    config = FitConfig() if config is None else config
+    _expect_fitting(train, features, modes, config)
+    job = _Job(train, features, modes, config, checkpoint, progress)
+    chosen, report = job.choose()
+    run = job.run("fit", list(range(len(train))), chosen)
+    if checkpoint is not None:
+        checkpoint.unlink(missing_ok=True)
+    return SoundField(
+        ModalBank(*(each.detach().clone() for each in (run.bank.frequency, run.bank.damping))),
+        run.network.eval().requires_grad_(False),
+        Residual(run.residual.magnitude.detach().clone()),
+        train.sample_rate,
+        train.sounds.shape[1],
+        Origin(capture, train.names, train.forces is not None, config, report),
+    )
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """A run's free choices."""
+
+    spatial_damping: bool
+    steps: int
+
+
+class _Job:
+    """The runs of one fit, in order, with a memory of those that are done."""
+
+    def __init__(
+        self,
+        train: Impacts,
+        features: FeatureField,
+        modes: Extraction,
+        config: FitConfig,
+        checkpoint: Path | None,
+        progress: Callable[[Progress], None] | None,
+    ) -> None:
+        self.train, self.features, self.modes, self.config = train, features, modes, config
+        self.checkpoint, self.progress = checkpoint, progress
+        self.gains = fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate)
+        self.rows = features.nearest(train.contacts)
+        self.fingerprint = _fingerprint(train, features, modes, config)
+        saved = read_checkpoint(checkpoint, fingerprint=self.fingerprint) if checkpoint is not None else None
+        self.trials: dict[str, Any] = {} if saved is None else saved["trials"]
+        self.running: dict[str, Any] | None = None if saved is None else saved["running"]
+        self.saved_at = time.monotonic()
+
+    def choose(self) -> tuple[_Plan, dict[str, Any]]:
+        """Return what the config leaves open, decided on validation contacts, and how it was decided."""
+        default = _Plan(self.config.damping == "per-contact", self.config.steps)
+        count = round(self.config.validation * len(self.train))
+        undecided = self.config.damping == "validated"
+        if len(self.train) < _FEWEST_TO_VALIDATE or count < 1 or not (undecided or self.config.patience):
+            return default, {"damping": _named(default.spatial_damping), "validated": False}
+        held = farthest_points(self.train.contacts, len(self.train)).tolist()[-count:]
+        learnt = [row for row in range(len(self.train)) if row not in held]
+        variants = [False, True] if undecided else [default.spatial_damping]
+        for spatial in variants:
+            name = f"trial with {_named(spatial)} damping"
+            if name not in self.trials:
+                self.run(name, learnt, _Plan(spatial, self.config.steps), held=held)
+        outcomes = {spatial: self.trials[f"trial with {_named(spatial)} damping"] for spatial in variants}
+        best = min(outcomes, key=lambda spatial: outcomes[spatial]["envelope"])
+        steps = outcomes[best]["steps"] if self.config.patience else self.config.steps
+        report = {
+            "damping": _named(best),
+            "validated": True,
+            "validation_contacts": [self.train.names[row] for row in held],
+            "validation_envelope": {_named(spatial): each["envelope"] for spatial, each in outcomes.items()},
+            "validation_spectral": {_named(spatial): each["spectral"] for spatial, each in outcomes.items()},
+            "steps": steps,
+        }
+        return _Plan(best, steps), report
+
+    def run(self, name: str, learnt: list[int], plan: _Plan, *, held: list[int] | None = None) -> TrainingRun:
+        """Train on the rows `learnt`; with `held`, note how well the best step does there."""
+        run = self._start(learnt, plan)
+        targets = self._targets(learnt)
+        look = None if held is None else _Look(self._targets(held), self.train.sounds[held])
+        if self.running is not None and self.running["name"] == name:
+            run.resume(self.running["run"])
+            if look is not None:
+                look.best = self.running["look"]
+        end = self.config.warmup_steps + plan.steps
+        loss = float("nan")
+        try:
+            while run.step < end:
+                loss = run.advance(targets)
+                if look is not None and self._due(run.step, end):
+                    look.at(run)
+                    if self.config.patience and run.step - look.best["at"] >= self.config.patience:
+                        break
+                self._tell(name, run, end, loss)
+                if time.monotonic() - self.saved_at > _CHECKPOINT_SECONDS:
+                    self._save(name, run, look)
+        except KeyboardInterrupt:
+            self._save(name, run, look)
+            raise
+        if look is not None:
+            self.trials[name] = {
+                "envelope": look.best["envelope"],
+                "spectral": look.best["spectral"],
+                "steps": max(0, look.best["at"] - self.config.warmup_steps),
+            }
+        return run
+
+    def _start(self, learnt: list[int], plan: _Plan) -> TrainingRun:
+        gains = self.gains[learnt]
+        network = AttentionGains(
+            self.features,
+            gain_scale=gain_scale(gains),
+            shape=replace(self.config.shape, spatial_damping=plan.spatial_damping),
+            generator=torch.Generator().manual_seed(self.config.seed),
+        )
+        # The cosine runs out where the plan ends, for a run that is meant to end early as well.
+        config = replace(self.config, steps=max(1, plan.steps))
+        return TrainingRun(
+            network,
+            self.modes,
+            gains=gains,
+            sample_rate=self.train.sample_rate,
+            samples=self.train.sounds.shape[1],
+            config=config,
+        )
+
+    def _targets(self, rows: list[int]) -> Targets:
+        return Targets.of(self.train.take(rows), self.gains[rows], self.rows[rows], self.config)
+
+    def _due(self, step: int, end: int) -> bool:
+        if step < self.config.warmup_steps:
+            return False
+        return (step - self.config.warmup_steps) % _LOOK_EVERY == 0 or step == end
+
+    def _tell(self, name: str, run: TrainingRun, end: int, loss: float) -> None:
+        if self.progress is not None:
+            self.progress(Progress(name, run.step, end, loss))
+
+    def _save(self, name: str, run: TrainingRun, look: "_Look | None") -> None:
+        if self.checkpoint is None:
+            return
+        running = {"name": name, "run": run.state(), "look": None if look is None else look.best}
+        write_checkpoint(self.checkpoint, {"fingerprint": self.fingerprint, "trials": self.trials, "running": running})
+        self.saved_at = time.monotonic()
+
+
+class _Look:
+    """Held-out contacts, and the best that a run has done on them."""
+
+    def __init__(self, targets: Targets, sounds: Float[Tensor, "contacts samples"]) -> None:
+        self.targets, self.envelope = targets, envelope(sounds)
+        self.best: dict[str, Any] = {"spectral": float("inf"), "envelope": float("inf"), "at": 0}
+
+    def at(self, run: TrainingRun) -> None:
+        """Note the held-out errors if the spectral one is the lowest so far: relative, and ENV (paper, 4.2)."""
+        # Validation must not disturb the run: its noise comes from the same place in the stream every time.
+        state = run.generator.get_state()
+        with torch.no_grad():
+            sounds = run.sounds(self.targets.rows)
+            spectral = float(spectral_loss(sounds, self.targets.whole)) / len(self.targets.whole.hops)
+            distance = float((envelope(sounds) - self.envelope).square().mean(1).sqrt().mean())
+        run.generator.set_state(state)
+        if spectral < self.best["spectral"]:
+            self.best = {"spectral": spectral, "envelope": distance, "at": run.step}
+
+
+def _named(spatial_damping: bool) -> str:
+    return "per-contact" if spatial_damping else "shared"
+
+
+def _fingerprint(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> str:
+    digest = hashlib.sha256(json.dumps([asdict(config), train.names], sort_keys=True).encode())
+    for tensor in (train.contacts, train.sounds, features.points, features.features, modes.bank.frequency):
+        digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _expect_fitting(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> None:
+    if len(train) < 2:
+        raise FitError(f"expected at least 2 recordings to fit a field to, found {len(train)}")
+    if len(modes.gains) != len(train):
+        raise FitError(
+            f"the modes were extracted from {len(modes.gains)} recordings, the field is to be fitted to {len(train)}: "
+            "extract them from the recordings that the field is fitted to"
+        )
+    if config.clusters > len(features.points):
+        raise FitError(
+            f"{config.clusters} clusters were asked of {len(features.points)} points: ask for fewer (clusters) or give "
+            "more points"
+        )
+    loudest = float(train.sounds.abs().max())
+    if loudest == 0.0:
+        raise FitError("all recordings are silent: there is nothing to fit")

@@ -1,0 +1,186 @@
+"""One training run: warm-up on extracted gains, then all parameters end to end (paper, section 3.5)."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float, Float64, Int
+from torch import Tensor, nn
+
+from avmsf.capture.impacts import Impacts
+from avmsf.field.config import FitConfig
+from avmsf.field.gains import AttentionGains
+from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction import Extraction
+from avmsf.modal.residual import Residual, shape_noise
+from avmsf.modal.synthesis import synthesise
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """Recordings as the losses compare them: their gains, and their spectra, whole and at the beginning."""
+
+    rows: Int[Tensor, " contacts"]
+    """Points of the gain field that are nearest to the contacts."""
+    gains: Float[Tensor, "contacts modes"]
+    """Extracted gains, the warm-up's aim."""
+    whole: SpectralTarget
+    early: SpectralTarget
+
+    @classmethod
+    def of(
+        cls,
+        impacts: Impacts,
+        gains: Float[Tensor, "contacts modes"],
+        rows: Int[Tensor, " contacts"],
+        config: FitConfig,
+    ) -> "Targets":
+        """Prepare recordings with the config's resolutions."""
+        sizes, hops, early = config.resolutions(impacts.sample_rate)
+        return cls(
+            rows,
+            gains,
+            spectral_target(impacts.sounds, fft_sizes=sizes, hops=hops),
+            spectral_target(impacts.sounds, fft_sizes=sizes, hops=hops, samples=early),
+        )
+
+
+class TrainingRun:
+    """Parameters on their way: a gain network, small corrections to the bank and residual, and their optimisers.
+
+    The corrections are measured in what the recordings resolve: frequencies in their modes' widths, dampings and noise
+    magnitudes as logarithms. So one learning rate serves all, and dampings and magnitudes stay positive.
+    """
+
+    def __init__(
+        self,
+        network: AttentionGains,
+        modes: Extraction,
+        *,
+        gains: Float[Tensor, "contacts modes"],
+        sample_rate: float,
+        samples: int,
+        config: FitConfig,
+    ) -> None:
+        self.network, self.config = network, config
+        self.sample_rate, self.samples = sample_rate, samples
+        self.start = modes
+        self.weight = _mode_weight(modes.bank, gains)
+        self.width = torch.clamp(modes.bank.damping / (2 * math.pi), min=sample_rate / samples)
+        count, bins = len(modes.bank), len(modes.residual.magnitude)
+        self.shift = nn.Parameter(torch.zeros(count, dtype=torch.float64))
+        self.decay = nn.Parameter(torch.zeros(count, dtype=torch.float64))
+        self.noise = nn.Parameter(torch.zeros(bins))
+        self.generator = torch.Generator().manual_seed(config.seed)
+        matrices = [parameter for parameter in network.parameters() if parameter.ndim > 1]
+        vectors = [parameter for parameter in network.parameters() if parameter.ndim == 1]
+        groups = [
+            {"params": matrices, "weight_decay": config.weight_decay},
+            {"params": vectors, "weight_decay": 0.0},
+        ]
+        corrections = [self.shift, self.decay] + ([self.noise] if config.residual else [])
+        self.warmup = torch.optim.AdamW(groups, lr=config.learning_rate)
+        self.joint = torch.optim.AdamW(
+            [*groups, {"params": corrections, "weight_decay": 0.0, "share": config.correction_rate}],
+            lr=config.learning_rate,
+        )
+        self.step = 0
+
+    @property
+    def bank(self) -> ModalBank:
+        """The modes as they stand."""
+        bank = self.start.bank
+        # A correction beyond half the mode's own frequency would mean that another mode is sought.
+        moved = torch.clamp(bank.frequency + self.width * self.shift, bank.frequency / 2, bank.frequency * 1.5)
+        return ModalBank(torch.clamp(moved, max=0.499 * self.sample_rate), bank.damping * torch.exp(self.decay))
+
+    @property
+    def residual(self) -> Residual:
+        """The noise as it stands."""
+        if not self.config.residual:
+            return Residual(torch.zeros_like(self.start.residual.magnitude))
+        return Residual(self.start.residual.magnitude * torch.exp(self.noise))
+
+    @property
+    def steps(self) -> int:
+        """Steps of both stages together."""
+        return self.config.warmup_steps + self.config.steps
+
+    def sounds(self, rows: Int[Tensor, " contacts"]) -> Float[Tensor, "contacts samples"]:
+        """Return the sounds at points of the gain field, with a fresh draw of noise (paper, eq. 12)."""
+        gains, factors = self.network.read(rows)
+        bank = self.bank
+        damping = bank.damping if factors is None else bank.damping * factors
+        sounds = synthesise(gains, bank.frequency, damping, samples=self.samples, sample_rate=self.sample_rate)
+        if not self.config.residual:
+            return sounds
+        return sounds + shape_noise(
+            self.residual.magnitude, contacts=len(rows), samples=self.samples, generator=self.generator
+        )
+
+    def advance(self, targets: Targets) -> float:
+        """Take one step on all contacts and return the loss before it."""
+        if self.step < self.config.warmup_steps:
+            loss = self._warmup_loss(targets)
+            optimiser, done, rate = self.warmup, self.step / self.config.warmup_steps, self.config.warmup_rate
+        else:
+            loss = self.spectral_loss(targets)
+            optimiser, done = self.joint, (self.step - self.config.warmup_steps) / self.config.steps
+            rate = self.config.learning_rate
+        for group in optimiser.param_groups:
+            group["lr"] = rate * group.get("share", 1.0) * (0.55 + 0.45 * math.cos(math.pi * done))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        self.step += 1
+        return float(loss.detach())
+
+    def spectral_loss(self, targets: Targets) -> Float[Tensor, ""]:
+        """Return the loss on whole sounds and on their beginnings (paper, eq. 14)."""
+        sounds = self.sounds(targets.rows)
+        early = spectral_loss(sounds, targets.early)
+        return spectral_loss(sounds, targets.whole) + self.config.early_weight * early
+
+    def _warmup_loss(self, targets: Targets) -> Float[Tensor, ""]:
+        """Return the squared error of the gains (paper, eq. 13), over their mean square.
+
+        Each mode weighs as its energy over time does, gain^2 / (4 d): a gain counts by the sound that it makes.
+        """
+        gains, _ = self.network.read(targets.rows)
+        return ((gains - targets.gains).square() * self.weight).sum(1).mean()
+
+    def state(self) -> dict[str, Any]:
+        """Return all that decides how the run goes on, as tensors, numbers and containers of these."""
+        return {
+            "network": self.network.state_dict(),
+            "corrections": [each.detach().clone() for each in (self.shift, self.decay, self.noise)],
+            "warmup": self.warmup.state_dict(),
+            "joint": self.joint.state_dict(),
+            "generator": self.generator.get_state(),
+            "step": self.step,
+        }
+
+    def resume(self, state: dict[str, Any]) -> None:
+        """Go back to what `state` returned."""
+        self.network.load_state_dict(state["network"])
+        with torch.no_grad():
+            for parameter, value in zip((self.shift, self.decay, self.noise), state["corrections"], strict=True):
+                parameter.copy_(value)
+        self.warmup.load_state_dict(state["warmup"])
+        self.joint.load_state_dict(state["joint"])
+        self.generator.set_state(state["generator"])
+        self.step = state["step"]
+
+
+def _mode_weight(bank: ModalBank, gains: Float[Tensor, "contacts modes"]) -> Float[Tensor, " modes"]:
+    energy = (1 / (4 * bank.damping)).to(gains.dtype)
+    total = (gains.square().mean(0) * energy).sum()
+    return energy / total.clamp_min(torch.finfo(gains.dtype).tiny)
+
+
+def gain_scale(gains: Float[Tensor, "contacts modes"]) -> Float64[Tensor, " modes"] | Float[Tensor, " modes"]:
+    """Return each mode's root mean square gain, never zero: the size that the network's output is measured in."""
+    scale = gains.square().mean(0).sqrt()
+    return scale.clamp_min(float(scale.max()) * 1e-6 + torch.finfo(gains.dtype).tiny)
