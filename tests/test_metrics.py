@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from avmsf.bench.conventions import OBJECTFOLDER, PAPER
-from avmsf.modal.spectra import scaled_fft_size
 from avmsf.bench.metrics import (
     default_fft_sizes,
     envelope_distance,
@@ -17,7 +16,7 @@ from avmsf.bench.metrics import (
     validate,
 )
 from avmsf.errors import EvaluationError
-from avmsf.modal.spectra import magnitude_stft
+from avmsf.modal.spectra import magnitude_stft, scaled_fft_size
 
 RATE = 24000.0
 METRICS = {

@@ -8,7 +8,7 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class ModalBank:
-    """Damped sines that all contacts share (paper, eq. 3): mode i sounds as exp(-damping_i t) sin(2 pi frequency_i t)."""
+    """Damped sines that all contacts share (paper, eq. 3): mode i sounds as exp(-d_i t) sin(2 pi f_i t)."""
 
     frequency: Float64[Tensor, " modes"]
     """Damped frequencies, Hz, ascending."""

@@ -2,10 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
@@ -17,6 +17,7 @@ from avmsf.modal.pencil import SHORTEST, candidates
 from avmsf.modal.residual import estimate_residual, noise_power
 from avmsf.modal.selection import Candidates, chance_ratio, merge, prune, select
 from avmsf.modal.shorttime import consensus_modes
+from avmsf.modal.synthesis import synthesise
 
 _EMPTY = ModalBank(torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
 _QUIET = 1e-12
@@ -27,6 +28,7 @@ _PERIODS = 50
 """How many periods of the lowest frequency the sounds last: with fewer, a mode is not told from rumble."""
 
 
+@runtime_checkable
 class ModeFinder(Protocol):
     """Finds the modes that all recordings share."""
 
@@ -65,30 +67,57 @@ class HighResolution:
         chance = chance_ratio(len(sounds), trials=samples)
         noise = noise_power(sounds, bins=_noise_bins(samples)).clamp_min(_QUIET)
         pairs = candidates(sounds, noise, sample_rate=sample_rate, lowest=lowest, significance=chance)
-        sounds = sounds.to(torch.float64)
-        merged = self._toned(merge(*pairs, duration=samples / sample_rate), lowest, samples / sample_rate)
-        found = Candidates.of(sounds, merged, _beneath(noise, merged, sample_rate), sample_rate=sample_rate)
-        found = found.significant(chance, samples=samples, sample_rate=sample_rate)
-        bank = _EMPTY
-        # The strong modes first, refined until little of them is left over: their remains would pass for weak modes.
-        for range_db in (*torch.arange(20.0, self.range_db, 20.0).tolist(), self.range_db, self.range_db):
-            sifting = {
-                "sample_rate": sample_rate,
-                "significance": self.significance * chance,
-                "range_db": range_db,
-                "count": self.modes,
-            }
-            known = Candidates.of(sounds, bank, _beneath(noise, bank, sample_rate), sample_rate=sample_rate)
-            bank = select(known, found, samples=samples, **sifting)
-            bank = prune(sounds, bank, _beneath(noise, bank, sample_rate), **sifting)
-            bank = self._toned(refine(sounds, bank, sample_rate=sample_rate), lowest, samples / sample_rate)
-            bank = prune(sounds, bank, _beneath(noise, bank, sample_rate), **sifting)
-        return bank
+        found = merge(*pairs, duration=samples / sample_rate)
+        bank = self._sift(sounds.to(torch.float64), found, noise, sample_rate, lowest)
+        # Hum and thuds are fitted beside the modes, or modes that are not there would stand in for them.
+        toned = math.pi * bank.frequency > self.least_quality * bank.damping
+        return _take(bank, toned & (bank.damping >= _LEAST_FALL * sample_rate / samples))
 
-    def _toned(self, bank: ModalBank, lowest: float, duration: float) -> ModalBank:
-        kept = math.pi * bank.frequency > self.least_quality * bank.damping
-        kept &= (bank.frequency >= lowest) & (bank.damping >= _LEAST_FALL / duration)
-        return ModalBank(bank.frequency[kept], bank.damping[kept])
+    def _sift(
+        self,
+        sounds: Float64[Tensor, "contacts samples"],
+        found: ModalBank,
+        noise: Float[Tensor, "contacts bins"],
+        sample_rate: float,
+        lowest: float,
+    ) -> ModalBank:
+        """Return those of `found` that the sounds need, refined.
+
+        The strong ones first, refined until little of them is left over: their remains would pass for weak modes.
+        """
+        samples = sounds.shape[1]
+        significance = self.significance * chance_ratio(len(sounds), trials=samples)
+
+        def weigh(bank: ModalBank) -> Candidates:
+            return Candidates.of(sounds, bank, _beneath(noise, bank, sample_rate), sample_rate=sample_rate)
+
+        def need(bank: ModalBank, range_db: float) -> ModalBank:
+            return prune(
+                sounds,
+                bank,
+                _beneath(noise, bank, sample_rate),
+                sample_rate=sample_rate,
+                significance=significance,
+                range_db=range_db,
+                count=self.modes,
+            )
+
+        weighed, bank = weigh(found), _EMPTY
+        rounds = [*torch.arange(20.0, self.range_db, 20.0).tolist(), self.range_db, self.range_db]
+        for turn, range_db in enumerate(rounds, 1):
+            bank = select(
+                weigh(bank),
+                weighed,
+                samples=samples,
+                sample_rate=sample_rate,
+                significance=significance,
+                range_db=range_db,
+                count=self.modes,
+            )
+            iterations = 20 if turn == len(rounds) else 6
+            bank = refine(sounds, need(bank, range_db), sample_rate=sample_rate, iterations=iterations)
+            bank = need(_take(bank, bank.frequency >= lowest), range_db)
+        return bank
 
 
 @dataclass(frozen=True)
@@ -142,18 +171,29 @@ def extract_sounds(
     sounds: Float[Tensor, "contacts samples"], *, sample_rate: float, method: ModeFinder | None = None
 ) -> Extraction:
     """Return what `extract` does, from bare sounds that start at their onset; a single one is enough here."""
+    if not bool(torch.isfinite(sounds).all()):
+        row = int(torch.nonzero(~torch.isfinite(sounds))[0, 0])
+        raise ExtractionError(f"sound {row} holds samples that are not finite numbers; record or export it again")
     finder = HighResolution() if method is None else method
     bank = finder.find(sounds, sample_rate)
     if len(bank) == 0:
         raise ExtractionError(_why_no_mode(sounds, sample_rate))
     gains, quadrature = fit_gains(sounds, bank, sample_rate=sample_rate)
-    residual = estimate_residual(sounds, bins=_noise_bins(sounds.shape[1]))
+    modes = synthesise(
+        gains, bank.frequency, bank.damping, samples=sounds.shape[1], sample_rate=sample_rate, quadrature=quadrature
+    )
+    # Without the modes, for the slow ones still ring where everything else is quietest.
+    residual = estimate_residual(sounds - modes, bins=_noise_bins(sounds.shape[1]))
     return Extraction(bank, gains, residual, quadrature)
 
 
 def lowest_frequency(samples: int, sample_rate: float) -> float:
     """Return the lowest frequency (Hz) at which sounds of this length let a mode be told from rumble."""
     return _PERIODS * sample_rate / samples
+
+
+def _take(bank: ModalBank, kept: Bool[Tensor, " modes"]) -> ModalBank:
+    return ModalBank(bank.frequency[kept], bank.damping[kept])
 
 
 def _level(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, " contacts"]:
@@ -181,16 +221,33 @@ def _power_of_two(value: float, *, least: int) -> int:
 
 
 def _why_no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> str:
-    duration = sounds.shape[1] / sample_rate
-    head = sounds[:, : max(1, sounds.shape[1] // 10)].square().mean()
-    tail = sounds[:, -max(1, sounds.shape[1] // 10) :].square().mean()
-    fall = 10 * math.log10(float(head / tail.clamp_min(1e-30)) + 1e-30)
+    samples = sounds.shape[1]
+    duration = samples / sample_rate
+    if samples < SHORTEST:
+        return (
+            f"no mode found in {len(sounds)} recordings of only {samples} samples ({duration:.3g} s): at least "
+            f"{SHORTEST} samples are needed. Keep more seconds after the onset"
+        )
+    lowest = lowest_frequency(samples, sample_rate)
+    moving = sounds.to(torch.float64) - sounds.mean(1, keepdim=True)
+    tenth = samples // 10
+    head, tail = (float(part.square().mean()) for part in (moving[:, :tenth], moving[:, -tenth:]))
+    if head + tail == 0:
+        return f"no mode found in {len(sounds)} recordings: they are silent. Check which channel holds the sound"
+    fall = 10 * math.log10(max(head, 1e-30) / max(tail, 1e-30))
     found = (
-        f"no mode found between {5 / duration:.0f} and {sample_rate / 2:.0f} Hz in {len(sounds)} recordings of "
+        f"no mode found between {lowest:.0f} and {sample_rate / 2:.0f} Hz in {len(sounds)} recordings of "
         f"{duration:.3g} s, whose last tenth is {fall:.0f} dB below the first"
     )
+    power = torch.fft.rfft(moving).abs().square().sum(0)
+    below = float(power[: math.ceil(lowest * duration)].sum() / power.sum())
     if fall < 6:
-        return f"{found}: they do not decay. Check the onset and the noise (avmsf check), or strike harder"
-    if duration < 0.1:
-        return f"{found}: too short for tones to stand out. Keep more seconds after the onset"
+        return (
+            f"{found}: noise or hum, they do not decay. Check the onset and the noise (avmsf check), or strike harder"
+        )
+    if below > 0.5:
+        return (
+            f"{found}: {100 * below:.0f} % of their energy lies below that band. Keep more seconds after the onset, "
+            "which lowers its lower end"
+        )
     return f"{found}: nothing rings above the noise there. Record at a higher rate, closer, or a less damped object"

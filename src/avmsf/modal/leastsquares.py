@@ -108,6 +108,7 @@ class NormalEquations:
         *,
         weighted: bool = False,
     ) -> "NormalEquations":
+        """Return the equations of the given sounds and poles, with what `step` needs besides if `weighted`."""
         samples = sounds.shape[1]
         products, weighted_products = project(sounds, poles, weighted=weighted)
         if not weighted:
@@ -121,6 +122,7 @@ class NormalEquations:
         return NormalEquations(self.gram[both][:, both], self.products[:, both], None, None, None)
 
     def solve(self) -> Float64[Tensor, "contacts two_modes"]:
+        """Return the amplitudes of sines and cosines that fit each sound best."""
         return _solve(self.gram, self.products)
 
     def explained(self) -> float:
@@ -138,13 +140,15 @@ class NormalEquations:
         modes = len(scale) // 2
         inverse = torch.linalg.inv(_normalise(self.gram, scale)).reshape(2, modes, 2, modes)
         own = torch.diagonal(inverse, dim1=1, dim2=3).permute(2, 0, 1)
-        pairs = (self.solve() * scale).unflatten(1, (2, modes)).permute(2, 1, 0)
+        pairs = (self.solve() * scale).reshape(-1, 2, modes).permute(2, 1, 0)
         lost = (pairs * torch.linalg.solve(own, pairs)).sum(1).T
         return lost, 1 / torch.linalg.eigvalsh(own)[:, 1]
 
     def step(self, sample_rate: float, trust: float) -> Float64[Tensor, "2 modes"]:
-        """Return the Gauss-Newton step of (frequency Hz, damping 1/s)."""
-        assert self.mixed_gram is not None and self.weighted_gram is not None and self.weighted_products is not None
+        """Return the Gauss-Newton step of (frequency Hz, damping 1/s), of `weighted` equations only."""
+        assert self.mixed_gram is not None
+        assert self.weighted_gram is not None
+        assert self.weighted_products is not None
         coefficients = self.solve()
         modes = coefficients.shape[1] // 2
         sine, cosine = coefficients[:, :modes], coefficients[:, modes:]
@@ -183,9 +187,7 @@ def _normalise(
     return gram / (scale[:, None] * scale[None, :]) + ridge
 
 
-def gram(
-    poles: Complex128[Tensor, " modes"], samples: int, *, power: int
-) -> Float64[Tensor, "two_modes two_modes"]:
+def gram(poles: Complex128[Tensor, " modes"], samples: int, *, power: int) -> Float64[Tensor, "two_modes two_modes"]:
     """Return inner products over time, weighted by n^power (0, 1 or 2), of all sines and cosines with each other."""
     last = poles**samples
     straight = _power_sum(poles[:, None] * poles[None, :], last[:, None] * last[None, :], samples, power)
@@ -193,9 +195,7 @@ def gram(
     crossed = _power_sum(poles[:, None] * mirror[None, :], last[:, None] * last_mirror[None, :], samples, power)
     sine_sine, sine_cosine = (crossed - straight).real, (straight + crossed).imag
     cosine_sine, cosine_cosine = (straight - crossed).imag, (straight + crossed).real
-    return 0.5 * torch.cat(
-        [torch.cat([sine_sine, sine_cosine], dim=1), torch.cat([cosine_sine, cosine_cosine], dim=1)]
-    )
+    return 0.5 * torch.cat([torch.cat([sine_sine, sine_cosine], dim=1), torch.cat([cosine_sine, cosine_cosine], dim=1)])
 
 
 def own_gram(poles: Complex128[Tensor, " modes"], samples: int) -> Float64[Tensor, "modes 2 2"]:
@@ -204,7 +204,7 @@ def own_gram(poles: Complex128[Tensor, " modes"], samples: int) -> Float64[Tenso
     crossed = _power_sum(poles * poles.conj(), (poles * poles.conj()) ** samples, samples, 0)
     mixed = straight.imag
     rows = torch.stack([crossed.real - straight.real, mixed, mixed, crossed.real + straight.real], dim=-1)
-    return 0.5 * rows.unflatten(-1, (2, 2))
+    return 0.5 * rows.reshape(-1, 2, 2)
 
 
 def _power_sum(
@@ -253,10 +253,10 @@ def project(
     outer = torch.zeros_like(inner)
     upper, length = math.inf, samples
     while upper > 0:
-        lower = length / 2 if length > 2 * _BLOCK else 0
+        lower = length // 2 if length > 2 * _BLOCK else 0
         group = torch.nonzero((needed > lower) & (needed <= upper)).flatten()
         if len(group):
-            inner[:, group], outer[:, group] = _project(wide[:, : math.ceil(length)], poles[group], weighted)
+            inner[:, group], outer[:, group] = _project(wide[:, :length], poles[group], weighted)
         upper, length = lower, lower
     products = torch.cat([inner.imag, inner.real], dim=1)
     return products, torch.cat([outer.imag, outer.real], dim=1) if weighted else None
@@ -277,7 +277,7 @@ def _project(
         steps = torch.arange(_BLOCK, dtype=torch.float64)[:, None]
         tables += [steps * within.real, steps * within.imag]
     summed = padded @ torch.cat(tables, dim=1)
-    parts = summed.unflatten(-1, (len(tables), len(poles))).unbind(-2)
+    parts = summed.reshape(*summed.shape[:2], len(tables), len(poles)).unbind(-2)
     starts = _powers(poles**_BLOCK, blocks)
     inner = torch.complex(parts[0], parts[1])
     plain = (starts * inner).sum(1)

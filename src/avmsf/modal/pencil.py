@@ -22,6 +22,8 @@ _EDGE = 0.2
 """Part of a band on either side over which its filter fades: what lies there belongs to the neighbours."""
 _RINGING = 5
 """Decimated samples after the onset in which the band filter itself still rings."""
+_LEAST_FALL = 0.1
+"""Nepers over its length by which a sound must fall for its damping to be measured at all."""
 _ABOVE_NOISE = 10.0
 """Eigenvalues this far above the noise's belong to the signal. Low, for what is wrongly let in is sifted later."""
 
@@ -36,16 +38,21 @@ def candidates(
 ) -> tuple[Float64[Tensor, " candidates"], Float64[Tensor, " candidates"]]:
     """Return frequencies (Hz) and dampings (1/s) of everything that may be a mode between `lowest` and half the rate.
 
-    More than the object has: one mode may appear at several lengths, and noise may look like modes. `noise` is its
+    More than the object has: one mode may appear at several lengths, noise may look like modes, and steady hum
+    appears as a mode that falls by a tenth of a neper over the whole sound. `noise` is its
     power in evenly spaced bands up to half the rate; bands whose spectrum nowhere reaches `significance` times it,
     mean over the sounds, are passed over.
     """
-    found: list[Complex128[Tensor, " some"]] = []
+    found = [torch.zeros(0, dtype=torch.complex128)]
     samples = sounds.shape[1]
     while samples >= SHORTEST:
-        found += _search(sounds[:, :samples], noise, sample_rate, lowest, significance)
+        exponents = _search(sounds[:, :samples], noise, sample_rate, lowest, significance)
+        slowest = _LEAST_FALL * sample_rate / samples
+        if samples == sounds.shape[1]:
+            exponents = torch.complex(exponents.real.clamp_max(-slowest), exponents.imag)
+        found.append(exponents[exponents.real <= -slowest])
         samples //= _SHORTENING
-    exponents = torch.cat(found) if found else torch.zeros(0, dtype=torch.complex128)
+    exponents = torch.cat(found)
     return exponents.imag / (2 * math.pi), -exponents.real
 
 
@@ -55,19 +62,23 @@ def _search(
     sample_rate: float,
     lowest: float,
     significance: float,
-) -> list[Complex128[Tensor, " some"]]:
+) -> Complex128[Tensor, " found"]:
     """Return the exponents -d + 2 pi i f found band by band in sounds of one length."""
     samples = sounds.shape[1]
     padded = 1 << (2 * samples - 1).bit_length()
     spectrum = torch.fft.rfft(sounds, padded)[:, :-1]
     # Band and bin of the noise's own spectrum that each bin of this one lies in.
     place = torch.arange(padded // 2) * (noise.shape[1] - 1) // (padded // 2)
-    above = (spectrum.abs().square() / (samples * noise[:, place])).mean(0)
+    # Seen through a smooth window, or the onset's own edge would stand above the noise in every band. What has died
+    # before the window opens stands out in shorter beginnings.
+    window = torch.hann_window(samples, dtype=sounds.dtype)
+    power = torch.fft.rfft(sounds * window, padded)[:, :-1].abs().square() / window.square().sum()
+    above = (power / noise[:, place]).mean(0)
     size = min(1 << round(math.log2(_DEPTH * padded / samples)), padded // 2)
     width = size * sample_rate / padded
     fade = torch.sin(torch.linspace(0, math.pi / 2, round(_EDGE * size))).square()
     taper = torch.cat([fade, torch.ones(size - 2 * len(fade)), fade.flip(0)])
-    found = []
+    found = [torch.zeros(0, dtype=torch.complex128)]
     bottom = lowest - _EDGE * width
     while bottom + _EDGE * width < sample_rate / 2:
         first = round(bottom * padded / sample_rate)
@@ -81,25 +92,44 @@ def _search(
             frequency = turns * width + first * sample_rate / padded
             damping = -torch.log(poles.abs()) * width
             overlap = 0.02 * width
-            kept = (frequency >= bottom + _EDGE * width - overlap) & (frequency < bottom + (1 - _EDGE) * width + overlap)
+            kept = (frequency >= bottom + _EDGE * width - overlap) & (
+                frequency < bottom + (1 - _EDGE) * width + overlap
+            )
             kept &= (frequency >= lowest) & (frequency < sample_rate / 2)
-            # Slower than a tenth of the sound's length cannot be told from steady hum; faster than the band is wide
-            # is an artefact of its filter.
-            kept &= (damping > 0.1 * sample_rate / samples) & (damping < width)
+            # What grows is noise; what dies faster than the band is wide is an artefact of its filter.
+            kept &= (damping > -sample_rate / samples) & (damping < width)
             found.append(torch.complex(-damping, 2 * math.pi * frequency)[kept])
         bottom += (1 - 2 * _EDGE) * width
-    return found
+    return torch.cat(found)
 
 
 def _poles(band: Complex[Tensor, "contacts times"]) -> Complex128[Tensor, " poles"]:
     """Return the poles shared by complex signals, by the rotational invariance of their signal subspace."""
     span = band.shape[1] // 3
-    rows = band.unfold(1, span, 1).reshape(-1, span)
-    values, vectors = torch.linalg.eigh((rows.T @ rows.conj()).to(torch.complex128))
+    values, vectors = torch.linalg.eigh(_correlation(band.to(torch.complex128), span))
     values, vectors = values.flip(0), vectors.flip(1)
     noise = values[span // 2 :].clamp_min(float(values[0]) * 1e-13).median()
     order = min(int((values > _ABOVE_NOISE * noise).sum()), span // 2)
     if order == 0 or values[0] <= 0:
         return torch.zeros(0, dtype=torch.complex128)
     subspace = vectors[:, :order]
-    return torch.linalg.eigvals(torch.linalg.lstsq(subspace[:-1], subspace[1:]).solution)
+    poles = torch.linalg.eigvals(torch.linalg.lstsq(subspace[:-1], subspace[1:]).solution)
+    return poles[torch.isfinite(poles.abs()) & (poles != 0)]
+
+
+def _correlation(band: Complex128[Tensor, "contacts times"], span: int) -> Complex128[Tensor, "span span"]:
+    """Return the sum of x x^H over all runs x of `span` samples: H^T H* of the signals' Hankel matrices H.
+
+    From one entry to the next along a diagonal one product leaves the sum and one enters it, so that only the first
+    row is summed in full.
+    """
+    runs = band.shape[1] - span + 1
+    ahead = band.unfold(1, runs, 1)
+    first = torch.einsum("ct,cjt->j", ahead[:, 0], ahead.conj())
+    enters, leaves = band[:, runs : runs + span - 1], band[:, : span - 1]
+    changes = enters.T @ enters.conj() - leaves.T @ leaves.conj()
+    whole = torch.empty(span, span, dtype=band.dtype)
+    whole[0], whole[:, 0] = first, first.conj()
+    for row in range(span - 1):
+        whole[row + 1, 1:] = whole[row, :-1] + changes[row]
+    return whole

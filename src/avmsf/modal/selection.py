@@ -15,7 +15,7 @@ _CHUNK, _SHARED = 120, 30
 """Candidates judged together, in order of frequency, and how many of them the next chunk judges again."""
 _DISTINCT = 1e-6
 """Part of a candidate's (sine, cosine) area that the chosen ones must leave for it to count as another mode."""
-_APART = 0.03
+_APART = 0.01
 """Least part of a mode that the others must not span: with less, gains of large and opposite modes would cancel."""
 _SAME = 0.03
 """Candidates closer than this part of their width, with dampings as close, are one."""
@@ -73,8 +73,9 @@ class Candidates:
         *,
         sample_rate: float,
     ) -> "Candidates":
+        """Return the modes of `bank` as candidates in `sounds`."""
         products, _ = project(sounds, poles_of(bank, sample_rate))
-        return cls(bank, products.unflatten(1, (2, len(bank))), noise)
+        return cls(bank, products.reshape(len(sounds), 2, len(bank)), noise)
 
     def take(self, rows: Int64[Tensor, " kept"]) -> "Candidates":
         """Return the given candidates alone."""
@@ -92,11 +93,11 @@ class Candidates:
             torch.cat([self.noise, other.noise], dim=1),
         )
 
-    def significant(self, significance: float, *, samples: int, sample_rate: float) -> "Candidates":
-        """Return those that explain at least `significance` times what they would of noise, each on its own."""
-        poles = poles_of(self.bank, sample_rate)
-        energy = _explained(own_gram(poles, samples), self.products.permute(2, 1, 0))
-        return self.take(torch.nonzero((energy / self.noise.T).mean(1) / 2 > significance).flatten())
+    def judge(self, *, samples: int, sample_rate: float) -> tuple[Float64[Tensor, " candidates"], ...]:
+        """Return the energy of all sounds that each explains on its own, and how many times what it would of noise."""
+        own = own_gram(poles_of(self.bank, sample_rate), samples)
+        energy = _explained(own, self.products.permute(2, 1, 0))
+        return energy.sum(1), (energy / self.noise.T).mean(1) / 2
 
 
 def select(
@@ -114,7 +115,12 @@ def select(
     A candidate counts only when it explains `significance` times the energy that it would explain of noise, mean over
     the sounds, and within `range_db` of the strongest of its neighbourhood. `samples` is the sounds' length.
     """
-    both = known.join(found)
+    if len(found.bank) == 0:
+        return known.bank
+    energy, ratio = found.judge(samples=samples, sample_rate=sample_rate)
+    # Few lie high enough for the first, coarse rounds; with all of them each would take as long as the last.
+    able = (ratio > significance) & (energy >= energy.amax() * 10 ** (-range_db / 10))
+    both = known.join(found.take(torch.nonzero(able).flatten()))
     order = torch.argsort(both.bank.frequency)
     both, given = both.take(order), order < len(known.bank)
     energy = torch.zeros(len(both.bank), dtype=torch.float64)
@@ -143,14 +149,13 @@ def prune(
 ) -> ModalBank:
     """Return `bank` without the modes whose absence the others make up for, the `count` most needed at most.
 
-    A mode goes when leaving it out loses less than `significance` times what it would explain of noise, or lies
-    `range_db` below the mode that is missed most; of neighbours that could stand in for each other the least
-    needed goes first.
+    A mode goes when leaving it out loses less than `significance` times what it would explain of noise, when that loss
+    lies `range_db` below the greatest, or when the others nearly span it, so that its gain would be large only to be
+    cancelled by theirs; of neighbours that could stand in for each other the least needed goes first.
     """
-    if len(bank) == 0:
-        return bank
     system = NormalEquations.of(sounds, poles_of(bank, sample_rate))
-    while True:
+    total = torch.zeros(0, dtype=torch.float64)
+    while len(bank) > 0:
         lost, apart = system.lost_without()
         ratio = (lost / noise).mean(0) / 2
         total = lost.sum(0)
@@ -159,10 +164,11 @@ def prune(
             break
         width = torch.maximum(bank.damping[:, None], bank.damping[None, :]) * (3 / (2 * math.pi))
         near = (bank.frequency[:, None] - bank.frequency[None, :]).abs() <= width
-        least = torch.where(near & weak[None, :], total[None, :], torch.inf).amin(1)
-        kept = torch.nonzero(~(weak & (total <= least))).flatten()
+        # By index, not by value: of two that are equal only one may go.
+        least = torch.where(near & weak[None, :], total[None, :], torch.inf).argmin(1)
+        kept = torch.nonzero(~weak | (least != torch.arange(len(bank)))).flatten()
         bank, noise = ModalBank(bank.frequency[kept], bank.damping[kept]), noise[:, kept]
-        system = system.take(kept)
+        system, total = system.take(kept), total[kept]
     strongest = torch.argsort(total, descending=True)[:count].sort().values
     return ModalBank(bank.frequency[strongest], bank.damping[strongest])
 

@@ -30,18 +30,17 @@ def narrow_band(
     """Return the analytic signal of every bin's own inverse transform, sampled once a hop.
 
     `fft_size` and `hop` in samples, hop a divisor of fft_size. A steady sine of amplitude a at a bin's centre has
-    modulus 2a/3 there and a/3 in the bins beside it, which together make up the sound (Hann window).
+    modulus 2a/3 there and a/6 in each of the two bins beside it: together they make up the sound (Hann window).
     """
     window = torch.hann_window(fft_size, dtype=sounds.dtype)
-    frames = torch.stft(
-        sounds, fft_size, hop, window=window, center=True, pad_mode="constant", return_complex=True
-    )
+    frames = torch.stft(sounds, fft_size, hop, window=window, center=True, pad_mode="constant", return_complex=True)
     reach = fft_size // hop // 2
     lags = torch.arange(-reach, reach + 1)
     weights = torch.nn.functional.pad(window, (0, 1))[fft_size // 2 + lags * hop]
-    # Frame m stands at m hop with its own time zero: brought to a common time zero its phase turns by bin x lag.
+    # A frame's time zero is its own beginning: at its centre half the transform has passed, `lag` frames on bin x lag.
     bins = torch.arange(fft_size // 2 + 1)
-    turns = torch.remainder(bins[:, None] * lags[None, :] * hop, fft_size).to(sounds.dtype) * (2 * math.pi / fft_size)
+    passed = torch.remainder(bins[:, None] * (lags[None, :] * hop - fft_size // 2), fft_size)
+    turns = passed.to(sounds.dtype) * (2 * math.pi / fft_size)
     kernel = torch.polar(weights.expand(len(bins), -1).contiguous(), turns)
     padded = torch.nn.functional.pad(frames, (reach, reach))
     moved = torch.zeros_like(frames)
@@ -80,17 +79,19 @@ def consensus_modes(
     beside = torch.nn.functional.pad(gain, (1, 1))
     candidate = (gain >= beside[:, :-2]) & (gain > beside[:, 2:])
     candidate &= gain > gain.amax(1, keepdim=True) * 10 ** (-_PEAK_DB / 20)
+    # The lowest bin holds the recorder's offset and the room's rumble.
+    candidate[:, 0] = False
     # The phase advances by whole turns besides from one hop to the next: those that bring it nearest to the centre.
     centre = torch.arange(gain.shape[1], dtype=torch.float64) * (sample_rate / fft_size)
-    frequency = centre + torch.remainder(advance - centre + sample_rate / hop / 2, sample_rate / hop) - sample_rate / hop / 2
+    frequency = (
+        centre + torch.remainder(advance - centre + sample_rate / hop / 2, sample_rate / hop) - sample_rate / hop / 2
+    )
     return _agree(candidate, gain, damping, frequency, sample_rate=sample_rate, count=count)
 
 
 def _regress(
     signals: Complex[Tensor, "bins frames"], step: float, settling: int
-) -> tuple[
-    Float64[Tensor, " bins"], Float64[Tensor, " bins"], Float64[Tensor, " bins"], Float64[Tensor, " bins"]
-]:
+) -> tuple[Float64[Tensor, " bins"], Float64[Tensor, " bins"], Float64[Tensor, " bins"], Float64[Tensor, " bins"]]:
     """Return gain, damping (1/s), frequency (Hz, up to whole turns a frame) and time of the peak (s) of every bin.
 
     The line log|H| = log g - d t is fitted by least squares from the envelope's peak, or `settling` frames after the
@@ -111,7 +112,7 @@ def _regress(
     fallen = after & (envelope < floor)
     end = torch.where(fallen.any(-1), fallen.to(torch.int8).argmax(-1), frames)
     used = (after & (torch.arange(frames) < end[:, None])).to(torch.float64)
-    count = used.sum(-1)
+    count = used.sum(-1).clamp_min(1.0)
     mean_time = (used * times).sum(-1) / count
     level = torch.log(envelope)
     mean_level = (used * level).sum(-1) / count
@@ -121,7 +122,7 @@ def _regress(
     slope = torch.where(count >= 3, slope, 0.0)
     gain = torch.exp(mean_level - slope * mean_time)
     turn = (signals[..., 1:] * signals[..., :-1].conj() * used[..., 1:]).sum(-1)
-    return gain, -slope, torch.angle(turn).to(torch.float64) / (2 * math.pi * step), peak * step
+    return gain, -slope, torch.angle(turn).to(torch.float64) / (2 * math.pi * step), peak.to(torch.float64) * step
 
 
 def _agree(

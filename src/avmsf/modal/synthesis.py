@@ -42,10 +42,7 @@ def synthesise(
         sine, cosine = sine + quadrature[:, None, :] * start_cosine, cosine - quadrature[:, None, :] * start_sine
     left = torch.cat([sine, cosine], dim=-1)
     right = torch.cat([step_cosine, step_sine], dim=-1)
-    if damping.ndim == 1:
-        sounds = left.flatten(0, 1) @ right.mT
-    else:
-        sounds = left @ right.mT
+    sounds = left.flatten(0, 1) @ right.mT if damping.ndim == 1 else left @ right.mT
     return sounds.reshape(gains.shape[0], blocks * _BLOCK)[:, :samples]
 
 

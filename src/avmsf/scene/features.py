@@ -37,25 +37,35 @@ class FeatureField:
     """Who made the features; a field keeps it, so that it is never taken for another's."""
 
     @classmethod
-    def from_mesh(cls, surface: Surface, *, generator: torch.Generator, count: int = 8192) -> "FeatureField":
+    def from_mesh(
+        cls, surface: Surface, *, generator: torch.Generator, count: int = 8192, normal_scale: float = 0.0
+    ) -> "FeatureField":
         """Return `count` points drawn evenly from a surface's triangles, with positions and normals as features.
 
-        A surface of points alone keeps its points.
+        `normal_scale` is the length of the normals beside positions of about unit size. Thin walls have two sides
+        that sound alike and opposite normals, between which a contact's nearest point flips, so that normals mislead
+        there: they are left out unless asked for. A surface of points alone keeps its points, which have no normals.
         """
         if len(surface.faces) == 0:
             return cls.from_points(surface.vertices)
         samples = sample_surface(surface.vertices, surface.faces, count, generator=generator)
-        return cls.from_points(samples.points, normals=samples.normals)
+        return cls.from_points(
+            samples.points, normals=samples.normals if normal_scale else None, normal_scale=normal_scale
+        )
 
     @classmethod
     def from_points(
-        cls, points: Float[Tensor, "points 3"], *, normals: Float[Tensor, "points 3"] | None = None
+        cls,
+        points: Float[Tensor, "points 3"],
+        *,
+        normals: Float[Tensor, "points 3"] | None = None,
+        normal_scale: float = 1.0,
     ) -> "FeatureField":
         """Return the points with their positions, relative to the object's size, and their normals as features."""
         _expect_extent(points)
         middle = (points.amax(0) + points.amin(0)) / 2
         positions = (points - middle) / _half_diagonal(points)
-        features = positions if normals is None else torch.cat([positions, normals], dim=1)
+        features = positions if normals is None else torch.cat([positions, normal_scale * normals], dim=1)
         return cls(points.float(), features.float(), GEOMETRY)
 
     @classmethod
@@ -80,7 +90,7 @@ class FeatureField:
     def clusters(self, count: int) -> Regions:
         """Return `count` regions by k-means on the positions, with the mean feature of each (paper, eq. 7)."""
         groups = cluster(self.points, count)
-        sums = torch.zeros(count, self.features.shape[1]).index_add_(0, groups.labels, self.features)
+        sums = self.features.new_zeros(count, self.features.shape[1]).index_add_(0, groups.labels, self.features)
         sizes = torch.bincount(groups.labels, minlength=count)
         return Regions(groups.centers.float(), sums / sizes[:, None])
 

@@ -163,7 +163,7 @@ def plate_surface_points(plate: Plate, count: int) -> Float64[Tensor, "points 3"
 
 
 def _half_sine(cycles: Float64[Tensor, " modes"]) -> Float64[Tensor, " modes"]:
-    """Return the Fourier transform of a half-sine pulse of unit area about its middle, `cycles` = f times its length."""
+    """Return the Fourier transform of a half-sine pulse of unit area about its middle; `cycles` is f tau."""
     # Zero over zero at half a cycle, where the limit is pi / 4.
     resonant = (cycles - 0.5).abs() < 1e-9
     safe = torch.where(resonant, 0.0, cycles)

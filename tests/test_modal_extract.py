@@ -1,0 +1,282 @@
+"""Extraction against the closed-form plate, doublets, changes that must not matter, and bad input."""
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.signal import resample_poly
+from torch import Tensor
+
+from avmsf.capture.audio import read_sound
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.onset import find_onset
+from avmsf.errors import ExtractionError
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extract import HighResolution, ShortTime, extract, extract_sounds, lowest_frequency
+from avmsf.modal.synthesis import synthesise
+from avmsf.simulate.plate import Plate, PlateModes, plate_modes, sample_contacts, strike
+
+RATE = 16000.0
+PLATE = Plate(alpha=20.0)
+HIGHEST = 4000.0
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def recorded(noise_db: float, *, contacts: int = 6, seconds: float = 0.5) -> tuple[Impacts, PlateModes]:
+    generator = seeded(1)
+    places = sample_contacts(PLATE, contacts, generator=generator)
+    impacts = strike(
+        PLATE, places, sample_rate=RATE, seconds=seconds, generator=generator, noise_db=noise_db, highest=HIGHEST
+    )
+    return impacts, plate_modes(PLATE, places, highest=HIGHEST)
+
+
+def matched(bank: ModalBank, truth: PlateModes) -> tuple[Tensor, Tensor, Tensor]:
+    """Return for each true mode the nearest found one's relative errors of frequency and damping, and its energy."""
+    nearest = (bank.frequency[:, None] - truth.frequency).abs().argmin(0)
+    energy = (truth.gains.square() / (4 * truth.damping)).sum(0)
+    return (
+        (bank.frequency[nearest] / truth.frequency - 1).abs(),
+        (bank.damping[nearest] / truth.damping - 1).abs(),
+        energy,
+    )
+
+
+def impacts_of(sounds: Tensor, rate: float = RATE) -> Impacts:
+    names = tuple(f"{row}.wav" for row in range(len(sounds)))
+    return Impacts(contacts=torch.zeros(len(sounds), 3), sounds=sounds, sample_rate=rate, names=names)
+
+
+def make(bank: ModalBank, gains: Tensor, *, rate: float, samples: int, noise: float, seed: int = 0) -> Tensor:
+    sounds = synthesise(gains, bank.frequency, bank.damping, samples=samples, sample_rate=rate)
+    return sounds + noise * torch.randn(sounds.shape, generator=seeded(seed))
+
+
+@pytest.mark.parametrize("noise_db", [-20.0, -40.0])
+def test_the_plates_modes_are_found(noise_db: float):
+    impacts, truth = recorded(noise_db)
+    found = extract(impacts)
+    frequency, damping, energy = matched(found.bank, truth)
+    strong = energy > energy.max() * 1e-4
+    assert int(strong.sum()) >= 20
+    assert float(frequency[strong].max()) < 5e-4
+    assert float(damping[strong].max()) < (0.05 if noise_db == -40.0 else 0.3)
+    distance = (found.bank.frequency[:, None] / truth.frequency - 1).abs().amin(1)
+    assert float((distance > 5e-4).double().mean()) <= 0.05
+    assert len(found.bank) <= len(truth.frequency)
+
+
+def test_errors_fall_with_the_noise():
+    errors = []
+    for noise_db in (-20.0, -40.0, -60.0):
+        impacts, truth = recorded(noise_db)
+        bank = HighResolution().find(impacts.sounds, RATE)
+        frequency, damping, energy = matched(bank, truth)
+        strong = energy > energy.max() * 1e-2
+        errors.append((float(frequency[strong].median()), float(damping[strong].median())))
+    # An unbiased estimate's error is in proportion to the noise: a tenth each time, a fifth where luck is bad.
+    for louder, softer in pairwise(errors):
+        assert softer[0] < 0.2 * louder[0]
+        assert softer[1] < 0.2 * louder[1]
+
+
+def test_gains_are_the_plates():
+    impacts, truth = recorded(-60.0)
+    found = extract(impacts)
+    nearest = (found.bank.frequency[:, None] - truth.frequency).abs().argmin(0)
+    scale = float(truth.gains.abs().max())
+    assert float((found.gains[:, nearest] - truth.gains).abs().max()) < 0.01 * scale
+    assert float(found.quadrature.abs().max()) < 0.01 * scale
+    level = impacts.sounds.square().mean().sqrt() * 1e-3
+    assert abs(float(20 * torch.log10(found.residual.magnitude.square().mean().sqrt() / level))) < 1.0
+
+
+@pytest.mark.parametrize("seconds", [0.5, 0.8])
+def test_a_doublet_three_hertz_apart_is_resolved(seconds: float):
+    pair = ModalBank(
+        torch.tensor([1250.0, 1681.2, 1684.24], dtype=torch.float64),
+        torch.tensor([8.0, 3.1, 3.1], dtype=torch.float64),
+    )
+    gains = torch.randn(7, 3, generator=seeded(2))
+    sounds = make(pair, gains, rate=RATE, samples=round(seconds * RATE), noise=0.02)
+    found = HighResolution().find(sounds, RATE)
+    assert len(found) == 3
+    torch.testing.assert_close(found.frequency, pair.frequency, rtol=0, atol=0.03)
+    torch.testing.assert_close(found.damping, pair.damping, rtol=0.07, atol=0)
+
+
+def test_louder_recordings_have_louder_gains_and_the_same_modes():
+    impacts, _ = recorded(-40.0, seconds=0.25)
+    one, two = (extract_sounds(impacts.sounds * scale, sample_rate=RATE) for scale in (1.0, 300.0))
+    torch.testing.assert_close(two.bank.frequency, one.bank.frequency, rtol=1e-6, atol=0)
+    torch.testing.assert_close(two.bank.damping, one.bank.damping, rtol=1e-3, atol=0)
+    torch.testing.assert_close(two.gains, 300 * one.gains, rtol=0, atol=0.3 * float(one.gains.abs().max()) * 1e-2)
+    torch.testing.assert_close(two.residual.magnitude, 300 * one.residual.magnitude, rtol=1e-4, atol=0)
+
+
+def test_one_loud_recording_does_not_drown_the_others():
+    impacts, _ = recorded(-40.0, seconds=0.25)
+    uneven = impacts.sounds.clone()
+    uneven[2] *= 1000
+    even, found = (HighResolution().find(sounds, RATE) for sounds in (impacts.sounds, uneven))
+    torch.testing.assert_close(found.frequency, even.frequency, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("stretch", [93.75, 1 / 40])
+def test_played_faster_all_rates_rise_alike(stretch: float):
+    impacts, _ = recorded(-40.0, seconds=0.25)
+    slow, fast = (extract_sounds(impacts.sounds, sample_rate=rate) for rate in (RATE, RATE * stretch))
+    torch.testing.assert_close(fast.bank.frequency, slow.bank.frequency * stretch, rtol=1e-6, atol=0)
+    torch.testing.assert_close(fast.bank.damping, slow.bank.damping * stretch, rtol=1e-3, atol=0)
+    torch.testing.assert_close(fast.residual.magnitude, slow.residual.magnitude, rtol=1e-3, atol=0)
+
+
+def test_the_order_of_recordings_does_not_matter():
+    impacts, _ = recorded(-40.0, seconds=0.25)
+    order = [3, 5, 0, 2, 1, 4]
+    one, two = extract(impacts), extract(impacts.take(order))
+    torch.testing.assert_close(two.bank.frequency, one.bank.frequency, rtol=1e-6, atol=0)
+    torch.testing.assert_close(two.bank.damping, one.bank.damping, rtol=1e-3, atol=0)
+    torch.testing.assert_close(two.gains, one.gains[order], rtol=0, atol=1e-2 * float(one.gains.abs().max()))
+
+
+def test_an_offset_is_no_mode():
+    impacts, _ = recorded(-40.0, seconds=0.25)
+    offset = 10 * impacts.sounds.abs().max()
+    plain, raised = (HighResolution().find(sounds, RATE) for sounds in (impacts.sounds, impacts.sounds + offset))
+    # The mean of a sound is not only its offset, so that the two differ a little.
+    torch.testing.assert_close(raised.frequency, plain.frequency, rtol=1e-4, atol=0)
+
+
+def test_a_silent_recording_changes_nothing():
+    impacts, _ = recorded(-40.0, seconds=0.25)
+    more = torch.cat([impacts.sounds, torch.zeros(1, impacts.sounds.shape[1])])
+    found = extract_sounds(more, sample_rate=RATE)
+    expected = HighResolution().find(impacts.sounds, RATE).frequency
+    torch.testing.assert_close(found.bank.frequency, expected, rtol=1e-6, atol=0)
+    assert float(found.gains[-1].abs().max()) == 0.0
+
+
+def test_hum_is_no_mode():
+    impacts, _ = recorded(-40.0, seconds=0.5)
+    times = torch.arange(8000) / RATE
+    level = float(impacts.sounds.square().mean().sqrt())
+    turns = 2 * math.pi * torch.rand(6, 1, generator=seeded(5))
+    hum = level * torch.sin(2 * math.pi * 1250.0 * times + turns)
+    found = HighResolution().find(impacts.sounds + hum, RATE)
+    plain = HighResolution().find(impacts.sounds, RATE)
+    assert float((found.frequency - 1250.0).abs().min()) > 20.0
+    assert abs(len(found) - len(plain)) <= 1
+
+
+def test_at_most_as_many_as_asked_for_are_kept():
+    impacts, truth = recorded(-40.0, seconds=0.25)
+    few = HighResolution(modes=5).find(impacts.sounds, RATE)
+    # Every recording counts alike, however loud.
+    level = impacts.sounds.square().mean(1, keepdim=True).sqrt()
+    energy = ((truth.gains / level).square() / truth.damping).sum(0)
+    strongest = truth.frequency[energy.argsort(descending=True)[:3]]
+    assert len(few) == 5
+    assert float((few.frequency[:, None] - strongest).abs().amin(0).max()) < 1.0
+
+
+@pytest.mark.parametrize(("rate", "samples"), [(100.0, 1000), (400.0, 1600), (192000.0, 9600)])
+def test_rates_from_a_hundred_hertz_to_192_kilohertz(rate: float, samples: int):
+    bank = ModalBank(
+        torch.tensor([0.09, 0.21, 0.43], dtype=torch.float64) * rate,
+        torch.tensor([6.0, 10.0, 30.0], dtype=torch.float64) * rate / samples,
+    )
+    sounds = make(bank, torch.randn(4, 3, generator=seeded(3)), rate=rate, samples=samples, noise=0.01)
+    found = extract_sounds(sounds, sample_rate=rate)
+    torch.testing.assert_close(found.bank.frequency, bank.frequency, rtol=5e-4, atol=0)
+    torch.testing.assert_close(found.bank.damping, bank.damping, rtol=0.05, atol=0)
+
+
+def test_a_single_sound_is_enough_without_its_contact():
+    impacts, truth = recorded(-40.0, seconds=0.25)
+    found = extract_sounds(impacts.sounds[:1], sample_rate=RATE)
+    assert len(found.bank) > 10
+    assert float((found.bank.frequency[:, None] / truth.frequency - 1).abs().amin(1).median()) < 1e-4
+
+
+def test_the_papers_method_finds_the_plates_strong_modes():
+    impacts, truth = recorded(-40.0)
+    found = extract(impacts, ShortTime())
+    energy = matched(found.bank, truth)[2]
+    strongest = truth.frequency[energy.argsort(descending=True)[:6]]
+    # A bin is 8 Hz wide.
+    assert float((found.bank.frequency[:, None] - strongest).abs().amin(0).max()) < 4.0
+
+
+def test_one_recording_has_nothing_in_common():
+    impacts, _ = recorded(-40.0, contacts=1, seconds=0.25)
+    with pytest.raises(ExtractionError, match="at least 2 recordings, found 1"):
+        extract(impacts)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("contacts", [2, 8])
+def test_noise_is_blamed(seed: int, contacts: int):
+    noise = 0.01 * torch.randn(contacts, 8000, generator=seeded(seed))
+    with pytest.raises(ExtractionError, match=r"in \d recordings of 0\.5 s.* noise or hum"):
+        extract(impacts_of(noise))
+
+
+def test_length_is_blamed():
+    impacts, _ = recorded(-40.0, seconds=0.25)
+    with pytest.raises(ExtractionError, match=r"only 200 samples .* Keep more seconds"):
+        extract(impacts_of(impacts.sounds[:, :200]))
+
+
+def test_band_is_blamed():
+    # A tone of 12 periods, below the 50 that tell a mode from rumble.
+    bank = ModalBank(torch.tensor([24.0], dtype=torch.float64), torch.tensor([12.0], dtype=torch.float64))
+    sounds = make(bank, torch.ones(3, 1), rate=RATE, samples=8000, noise=1e-3)
+    assert lowest_frequency(8000, RATE) == 100.0
+    with pytest.raises(ExtractionError, match=r"between 100 and 8000 Hz.* lies below that band\. Keep more seconds"):
+        extract(impacts_of(sounds))
+
+
+def test_a_thud_is_blamed():
+    times = torch.arange(8000) / RATE
+    thud = torch.exp(-2000 * times) * torch.sin(2 * math.pi * 600 * times) * torch.tensor([[1.0], [0.5], [-2.0]])
+    noise = 1e-3 * torch.randn(3, 8000, generator=seeded(1))
+    with pytest.raises(ExtractionError, match="nothing rings above the noise"):
+        extract(impacts_of(thud + noise))
+
+
+def test_silence_is_blamed():
+    with pytest.raises(ExtractionError, match="they are silent"):
+        extract(impacts_of(torch.zeros(2, 4000)))
+
+
+def test_samples_that_are_no_numbers_are_refused():
+    impacts, _ = recorded(-40.0, seconds=0.25)
+    broken = impacts.sounds.clone()
+    broken[3, 17] = math.nan
+    with pytest.raises(ExtractionError, match=r"sound 3 .* not finite"):
+        extract(impacts_of(broken))
+
+
+def test_the_bowls_doublet_is_resolved(shared: Path):
+    clips = []
+    for row in range(8):
+        sound, rate = read_sound(shared / "bowl_clips" / f"mic{row}.wav")
+        begin = find_onset(sound.double().numpy(), sample_rate=rate)
+        # To a sixth of the rate, below the doublet's octave, to be quick.
+        slower = resample_poly(sound[begin : begin + round(1.5 * rate)].numpy(), 1, 6)
+        clips.append(torch.from_numpy(slower.astype(np.float32)))
+    found = extract_sounds(torch.stack(clips), sample_rate=rate / 6)
+    for pitch in (1681.2, 1684.24):
+        nearest = int((found.bank.frequency - pitch).abs().argmin())
+        # As measured on all of 3 s at the full rate, whichever seven of the eight clips are taken.
+        assert float(found.bank.frequency[nearest]) == pytest.approx(pitch, abs=0.05)
+        assert float(found.bank.damping[nearest]) == pytest.approx(3.1, abs=0.3)
+    loudest = torch.hypot(found.gains, found.quadrature).amax(1) / torch.stack(clips).abs().amax(1)
+    assert float(loudest.max()) < 5.0

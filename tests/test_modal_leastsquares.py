@@ -1,0 +1,183 @@
+"""Closed forms against explicit sums; fits and refinement against sounds whose modes are known."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.leastsquares import (
+    NormalEquations,
+    fit_gains,
+    fit_sine_gains,
+    gram,
+    own_gram,
+    poles_of,
+    project,
+    refine,
+)
+from avmsf.modal.synthesis import synthesise
+
+RATE = 8000.0
+
+
+def bank_of(frequency: list[float], damping: list[float]) -> ModalBank:
+    return ModalBank(torch.tensor(frequency, dtype=torch.float64), torch.tensor(damping, dtype=torch.float64))
+
+
+# The first two lie closer than the sound resolves; the third is gone after a twentieth of it; the last hardly decays.
+BANK = bank_of([440.0, 441.5, 1000.0, 2500.0, 3999.0], [3.0, 4.0, 600.0, 20.0, 1e-6])
+
+
+def basis(bank: ModalBank, samples: int) -> Tensor:
+    """Return all sines and then all cosines, [two_modes, samples]."""
+    times = torch.arange(samples, dtype=torch.float64) / RATE
+    decay = torch.exp(-bank.damping[:, None] * times)
+    phase = 2 * math.pi * bank.frequency[:, None] * times
+    return torch.cat([decay * torch.sin(phase), decay * torch.cos(phase)])
+
+
+def draw(bank: ModalBank, *, contacts: int = 3, samples: int = 6000, dtype: torch.dtype = torch.float64):
+    """Return gains, quadratures and the sounds they make."""
+    generator = torch.Generator().manual_seed(3)
+    gains, quadrature = torch.randn(2, contacts, len(bank), generator=generator, dtype=torch.float64)
+    sounds = torch.cat([gains, quadrature], dim=1) @ basis(bank, samples)
+    return gains, quadrature, sounds.to(dtype)
+
+
+@pytest.mark.parametrize("power", [0, 1, 2])
+@pytest.mark.parametrize("samples", [1, 37, 6000])
+def test_gram_is_the_sum_over_time(power: int, samples: int):
+    atoms = basis(BANK, samples)
+    weights = torch.arange(samples, dtype=torch.float64) ** power
+    expected = (atoms * weights) @ atoms.T
+    found = gram(poles_of(BANK, RATE), samples, power=power)
+    # Digits are lost in proportion to samples x 1e-16 where two modes are close, and the sums grow as samples^power.
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10 * max(1.0, float(expected.abs().max())))
+
+
+def test_gram_of_what_does_not_decay_is_finite():
+    bank = bank_of([500.0, 500.0], [0.0, 1e-12])
+    expected = basis(bank, 8000) @ basis(bank, 8000).T
+    torch.testing.assert_close(gram(poles_of(bank, RATE), 8000, power=0), expected, rtol=1e-9, atol=1e-7)
+
+
+def test_own_gram_is_the_gram_of_one_mode():
+    poles = poles_of(BANK, RATE)
+    for row, own in enumerate(own_gram(poles, 900)):
+        torch.testing.assert_close(own, gram(poles[row : row + 1], 900, power=0), rtol=1e-11, atol=1e-9)
+
+
+@pytest.mark.parametrize("samples", [100, 512, 6000])
+def test_projections_are_the_sums_over_time(samples: int):
+    sounds = torch.randn(2, samples, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    atoms, steps = basis(BANK, samples), torch.arange(samples, dtype=torch.float64)
+    plain, weighted = project(sounds, poles_of(BANK, RATE), weighted=True)
+    assert weighted is not None
+    # An atom is dropped below 1e-12 of its start.
+    torch.testing.assert_close(plain, sounds @ atoms.T, rtol=1e-9, atol=1e-8)
+    torch.testing.assert_close(weighted, sounds @ (steps * atoms).T, rtol=1e-9, atol=1e-8 * samples)
+
+
+def test_gains_of_exact_sounds_come_back():
+    gains, quadrature, sounds = draw(BANK)
+    found, beside = fit_gains(sounds, BANK, sample_rate=RATE)
+    # The close pair is conditioned about 1e3; the ridge of 1e-13 and rounding remain.
+    torch.testing.assert_close(found, gains, rtol=0, atol=1e-7)
+    torch.testing.assert_close(beside, quadrature, rtol=0, atol=1e-7)
+
+
+def test_sine_gains_of_sines_come_back():
+    gains, _, _ = draw(BANK)
+    sounds = gains @ basis(BANK, 6000)[: len(BANK)]
+    torch.testing.assert_close(fit_sine_gains(sounds, BANK, sample_rate=RATE), gains, rtol=0, atol=1e-7)
+
+
+def test_sine_gains_leave_the_least_residual():
+    _, _, sounds = draw(BANK)
+    atoms = basis(BANK, 6000)[: len(BANK)]
+    best = torch.linalg.lstsq(atoms.T, sounds.T).solution.T
+    torch.testing.assert_close(fit_sine_gains(sounds, BANK, sample_rate=RATE), best, rtol=0, atol=1e-7)
+
+
+def test_gains_have_the_dtype_of_the_sounds_and_render_them():
+    _, _, sounds = draw(BANK, dtype=torch.float32)
+    gains, quadrature = fit_gains(sounds, BANK, sample_rate=RATE)
+    assert gains.dtype == quadrature.dtype == torch.float32
+    rendered = synthesise(gains, BANK.frequency, BANK.damping, samples=6000, sample_rate=RATE, quadrature=quadrature)
+    assert float((rendered - sounds).abs().max()) < 3e-6 * float(sounds.abs().max())
+
+
+def test_an_empty_bank_has_no_gains():
+    empty = bank_of([], [])
+    gains, quadrature = fit_gains(torch.ones(3, 600), empty, sample_rate=RATE)
+    assert (
+        gains.shape == quadrature.shape == fit_sine_gains(torch.ones(3, 600), empty, sample_rate=RATE).shape == (3, 0)
+    )
+    assert len(refine(torch.ones(3, 600), empty, sample_rate=RATE)) == 0
+
+
+def test_two_modes_of_one_frequency_share_the_gain():
+    twice = bank_of([700.0, 700.0], [5.0, 5.0])
+    gains, quadrature = fit_gains(basis(bank_of([700.0], [5.0]), 4000)[:1], twice, sample_rate=RATE)
+    assert torch.isfinite(gains).all()
+    assert float(gains.sum()) == pytest.approx(1.0, abs=1e-6)
+    assert float(quadrature.sum()) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_refinement_finds_the_modes_from_nearby():
+    truth = bank_of([440.0, 443.0, 1000.0, 2500.0], [3.0, 4.0, 60.0, 20.0])
+    _, _, sounds = draw(truth)
+    start = ModalBank(
+        truth.frequency + torch.tensor([0.3, -0.3, 4.0, 1.0], dtype=torch.float64),
+        truth.damping * torch.tensor([1.5, 0.7, 1.4, 0.6], dtype=torch.float64),
+    )
+    found = refine(sounds, start, sample_rate=RATE, iterations=60)
+    # The search ends when a step gains less than 1e-7 of the energy: the error is the root of that, shrunk once more.
+    torch.testing.assert_close(found.frequency, truth.frequency, rtol=0, atol=1e-3)
+    torch.testing.assert_close(found.damping, truth.damping, rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_refinement_never_explains_less(seed: int):
+    generator = torch.Generator().manual_seed(seed)
+    sounds = torch.randn(2, 1500, generator=generator) * torch.exp(-torch.arange(1500) / 400.0)
+    bank = ModalBank(
+        torch.sort(4000 * torch.rand(8, generator=generator, dtype=torch.float64)).values,
+        torch.exp(8 * torch.rand(8, generator=generator, dtype=torch.float64) - 2),
+    )
+    found = refine(sounds, bank, sample_rate=RATE)
+    before, after = (NormalEquations.of(sounds, poles_of(modes, RATE)).explained() for modes in (bank, found))
+    assert after > before
+    assert torch.isfinite(found.frequency).all()
+    assert (found.damping > 0).all()
+    assert (found.frequency.diff() >= 0).all()
+    assert 0 < found.frequency[0] < found.frequency[-1] < RATE / 2
+
+
+def test_refinement_of_a_steady_tone_ends_above_no_damping():
+    sounds = torch.sin(2 * math.pi * 500.0 / RATE * torch.arange(4000, dtype=torch.float64))[None]
+    found = refine(sounds, bank_of([500.2], [2.0]), sample_rate=RATE, iterations=200)
+    assert float(found.damping) >= 0.01 * RATE / 4000 * (1 - 1e-12)
+    assert float(found.frequency) == pytest.approx(500.0, abs=0.01)
+
+
+def test_lost_energy_is_the_difference_of_two_fits():
+    bank = bank_of([440.0, 446.0, 1000.0], [3.0, 4.0, 60.0])
+    _, _, sounds = draw(bank)
+    system = NormalEquations.of(sounds, poles_of(bank, RATE))
+    lost, apart = system.lost_without()
+    for mode in range(3):
+        rest = torch.tensor([row for row in range(3) if row != mode])
+        fewer = system.take(rest)
+        difference = (system.solve() * system.products).sum(1) - (fewer.solve() * fewer.products).sum(1)
+        torch.testing.assert_close(lost[:, mode], difference, rtol=1e-6, atol=1e-6)
+    assert (apart > 0.5).all()
+
+
+def test_a_mode_that_others_span_is_not_apart():
+    bank = bank_of([440.0, 440.05, 1000.0], [30.0, 30.0, 60.0])
+    _, apart = NormalEquations.of(torch.ones(1, 6000), poles_of(bank, RATE)).lost_without()
+    assert (apart[:2] < 1e-3).all()
+    assert apart[2] > 0.9

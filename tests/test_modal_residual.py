@@ -1,0 +1,91 @@
+"""Noise against white noise, its own spectrum and sounds whose noise is known."""
+
+import math
+
+import pytest
+import torch
+
+from avmsf.modal.residual import Residual, estimate_residual, noise_power, shape_noise
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize("samples", [4096, 30011])
+def test_ones_are_white_noise_of_unit_variance(samples: int):
+    noise = shape_noise(torch.ones(33), contacts=20, samples=samples, generator=seeded())
+    assert noise.shape == (20, samples)
+    # Of n samples the variance scatters by sqrt(2 / n), .5 % here at most; four of these.
+    assert float(noise.var()) == pytest.approx(1.0, abs=0.02)
+    power = torch.fft.rfft(noise).abs().square().mean(0) / samples
+    bands = power[1:-1][: 16 * (len(power) // 17)].reshape(16, -1).mean(1)
+    assert float((10 * torch.log10(bands)).abs().max()) < 0.6  # dB; twenty contacts x 120 bins scatter by .09
+    following = (noise[:, 1:] * noise[:, :-1]).mean()
+    assert abs(float(following)) < 0.02
+
+
+def test_spectrum_follows_the_magnitude():
+    magnitude = torch.tensor([0.0, 2.0, 1.0, 0.1, 4.0])
+    samples = 32768
+    noise = shape_noise(magnitude, contacts=64, samples=samples, generator=seeded())
+    power = torch.fft.rfft(noise).abs().square().mean(0) / samples
+    place = torch.linspace(0, 4, samples // 2 + 1)
+    left = place.floor().long().clamp_max(3)
+    expected = magnitude[left] + (place - left) * (magnitude[left + 1] - magnitude[left])
+    narrow = power[:16384].reshape(64, 256).mean(1).sqrt()
+    wanted = expected[:16384].square().reshape(64, 256).mean(1).sqrt()
+    # 64 contacts x 256 bins: the root of the power scatters by .4 %.
+    torch.testing.assert_close(narrow, wanted, rtol=0.02, atol=0)
+
+
+def test_same_seed_same_noise_and_every_contact_its_own():
+    one, two = (shape_noise(torch.ones(9), contacts=2, samples=500, generator=seeded(4)) for _ in range(2))
+    assert torch.equal(one, two)
+    assert not torch.equal(one, shape_noise(torch.ones(9), contacts=2, samples=500, generator=seeded(5)))
+    assert abs(float(torch.corrcoef(one)[0, 1])) < 0.2
+
+
+def test_gradient_reaches_the_magnitude():
+    magnitude = torch.rand(7, generator=seeded(), dtype=torch.float64).requires_grad_()
+
+    def level(magnitude: torch.Tensor) -> torch.Tensor:
+        return shape_noise(magnitude, contacts=2, samples=100, generator=seeded(1)).square().mean(1)
+
+    # The white noise is float32, its level is linear in it: gradcheck's differences are exact to float32's rounding.
+    assert torch.autograd.gradcheck(level, [magnitude], atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("samples", "bins"), [(600, 9), (4800, 33), (24000, 257), (48000, 513)])
+def test_white_noise_has_its_variance_in_every_band(samples: int, bins: int):
+    sounds = 3.0 * torch.randn(12, samples, generator=seeded(2))
+    power = noise_power(sounds, bins=bins)
+    assert power.shape == (12, bins)
+    assert abs(10 * math.log10(float(power.mean()) / 9.0)) < 0.5  # dB
+
+
+def test_noise_beside_decaying_modes_is_told_from_them():
+    # A second at 16 kHz of modes 40 dB above the noise, the slowest of which falls by 104 dB.
+    times = torch.arange(16000) / 16000.0
+    modes = sum(
+        torch.exp(-rate * times) * torch.sin(2 * math.pi * pitch * times) for pitch, rate in ((900, 12), (5000, 40))
+    )
+    level = 0.003
+    sounds = torch.stack([modes + level * torch.randn(16000, generator=seeded(seed)) for seed in range(10)])
+    decibels = 20 * torch.log10(estimate_residual(sounds, bins=129).magnitude / level)
+    assert abs(float(decibels.mean())) < 0.5
+    # Ten sounds' quietest segments of one bin scatter by about .6 dB; where a mode rings the rise is its own.
+    assert float(decibels.abs().median()) < 1.0
+    assert float(decibels.max()) < 3.0
+
+
+def test_residual_renders_with_the_spectrum_it_was_estimated_from():
+    magnitude = torch.linspace(2.0, 0.5, 33)
+    recorded = shape_noise(magnitude, contacts=16, samples=32000, generator=seeded(3))
+    found = estimate_residual(recorded, bins=33)
+    assert isinstance(found, Residual)
+    assert float((20 * torch.log10(found.magnitude / magnitude)).abs().max()) < 1.0  # dB
+
+
+def test_noise_power_of_sounds_shorter_than_the_transform_is_finite():
+    assert torch.isfinite(noise_power(torch.randn(2, 20, generator=seeded()), bins=33)).all()

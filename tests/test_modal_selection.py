@@ -1,0 +1,214 @@
+"""What counts as a mode: chance, candidates, doubles, selection and pruning."""
+
+import math
+
+import pytest
+import scipy.stats
+import torch
+from torch import Tensor
+
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.leastsquares import NormalEquations, poles_of
+from avmsf.modal.pencil import candidates
+from avmsf.modal.selection import Candidates, chance_ratio, merge, prune, select
+from avmsf.modal.synthesis import synthesise
+
+RATE = 8000.0
+SAMPLES = 6000
+SIFTING = {"sample_rate": RATE, "significance": 6.0, "range_db": 60.0}
+
+
+def bank_of(frequency: list[float], damping: list[float]) -> ModalBank:
+    return ModalBank(torch.tensor(frequency, dtype=torch.float64), torch.tensor(damping, dtype=torch.float64))
+
+
+TRUTH = bank_of([300.0, 700.0, 703.0, 1500.0, 2900.0], [5.0, 6.0, 7.0, 30.0, 80.0])
+
+
+def record(bank: ModalBank, *, noise: float = 0.0, contacts: int = 4, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    gains = torch.randn(contacts, len(bank), generator=generator, dtype=torch.float64)
+    sounds = synthesise(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
+    return sounds + noise * torch.randn(contacts, SAMPLES, generator=generator, dtype=torch.float64)
+
+
+def flat(level: float, bank: ModalBank, contacts: int = 4) -> Tensor:
+    return torch.full((contacts, len(bank)), level**2, dtype=torch.float64)
+
+
+def sift(sounds: Tensor, found: ModalBank, *, known: ModalBank | None = None, noise: float = 1e-3, count: int = 50):
+    given = bank_of([], []) if known is None else known
+    both = [Candidates.of(sounds, bank, flat(noise, bank), sample_rate=RATE) for bank in (given, found)]
+    return select(*both, samples=SAMPLES, count=count, **SIFTING)
+
+
+def contains(bank: ModalBank, frequency: float, *, within: float = 1e-9) -> bool:
+    return bool(((bank.frequency - frequency).abs() <= within).any())
+
+
+@pytest.mark.parametrize("contacts", [1, 2, 8, 100])
+def test_chance_is_the_tail_of_chi_squared(contacts: int):
+    threshold = chance_ratio(contacts, trials=10_000)
+    assert scipy.stats.chi2.sf(threshold * 2 * contacts, 2 * contacts) == pytest.approx(1e-5, rel=1e-6)
+
+
+def test_noise_explains_what_chance_says():
+    sounds = torch.randn(3, SAMPLES, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    everywhere = bank_of(torch.linspace(50, 3950, 800).tolist(), [5.0] * 800)
+    energy, ratio = Candidates.of(sounds, everywhere, flat(1.0, everywhere, 3), sample_rate=RATE).judge(
+        samples=SAMPLES, sample_rate=RATE
+    )
+    # The mean of 800 chi-squared variables with 6 degrees of freedom scatters by 2 %.
+    assert float(ratio.mean()) == pytest.approx(1.0, abs=0.08)
+    assert float(ratio.max()) < chance_ratio(3, trials=800)
+    assert float(ratio.max()) > 0.5 * chance_ratio(3, trials=800)
+    torch.testing.assert_close(energy, ratio * 6, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("noise", [1e-5, 1e-2])
+def test_every_mode_is_among_the_candidates(noise: float):
+    sounds = record(TRUTH, noise=noise).float()
+    frequency, damping = candidates(
+        sounds, torch.full((4, 33), noise**2), sample_rate=RATE, lowest=20.0, significance=3.0
+    )
+    for pitch, decay in zip(TRUTH.frequency.tolist(), TRUTH.damping.tolist(), strict=True):
+        near = (frequency - pitch).abs() < 0.05 * decay
+        assert near.any()
+        assert ((damping[near] / decay - 1).abs() < 0.3).any()
+    assert (frequency >= 20.0).all()
+    assert (frequency < RATE / 2).all()
+    assert (damping > 0).all()
+
+
+def test_bands_of_noise_yield_hardly_a_candidate():
+    noise = torch.randn(4, SAMPLES, generator=torch.Generator().manual_seed(2))
+    frequency, _ = candidates(
+        noise, torch.ones(4, 33), sample_rate=RATE, lowest=20.0, significance=chance_ratio(4, trials=SAMPLES)
+    )
+    assert len(frequency) == 0
+
+
+def test_silence_yields_no_candidate():
+    frequency, damping = candidates(
+        torch.zeros(2, SAMPLES), torch.full((2, 33), 1e-12), sample_rate=RATE, lowest=20.0, significance=3.0
+    )
+    assert len(frequency) == len(damping) == 0
+
+
+def test_doubles_are_merged_and_neighbours_kept():
+    bank = merge(
+        torch.tensor([700.0, 300.0, 700.0001, 703.0, 700.0], dtype=torch.float64),
+        torch.tensor([6.0, 5.0, 6.001, 7.0, 60.0], dtype=torch.float64),
+        duration=1.0,
+    )
+    assert bank.frequency.tolist() == [300.0, 700.0, 700.0, 703.0]
+    assert sorted(bank.damping.tolist()) == [5.0, 6.0, 7.0, 60.0]
+
+
+def test_selection_takes_the_modes_from_among_the_rest():
+    sounds = record(TRUTH, noise=1e-3)
+    decoys = bank_of([120.0, 500.0, 1100.0, 2000.0, 3500.0], [5.0, 8.0, 30.0, 9.0, 50.0])
+    mixed = merge(
+        torch.cat([TRUTH.frequency, decoys.frequency]), torch.cat([TRUTH.damping, decoys.damping]), duration=0.75
+    )
+    chosen = sift(sounds, mixed)
+    assert chosen.frequency.tolist() == TRUTH.frequency.tolist()
+    assert chosen.damping.tolist() == TRUTH.damping.tolist()
+
+
+def test_selection_keeps_what_is_known_and_no_more_than_asked():
+    sounds = record(TRUTH, noise=1e-3)
+    known = bank_of([1234.0], [10.0])
+    chosen = sift(sounds, TRUTH, known=known, count=2)
+    assert len(chosen) == 3
+    assert contains(chosen, 1234.0)
+    assert (chosen.frequency.diff() > 0).all()
+
+
+def test_selection_does_not_judge_twice_what_is_known():
+    sounds = record(TRUTH, noise=1e-3)
+    assert sift(sounds, TRUTH, known=TRUTH).frequency.tolist() == TRUTH.frequency.tolist()
+
+
+def test_selection_among_hundreds_spans_its_chunks():
+    sounds = record(TRUTH, noise=1e-3)
+    decoys = torch.linspace(100, 3900, 400, dtype=torch.float64) + 0.5
+    mixed = merge(
+        torch.cat([TRUTH.frequency, decoys]),
+        torch.cat([TRUTH.damping, torch.full((400,), 4.0, dtype=torch.float64)]),
+        duration=0.75,
+    )
+    chosen = sift(sounds, mixed)
+    for pitch in TRUTH.frequency.tolist():
+        assert contains(chosen, pitch)
+
+
+def test_selection_from_nothing_is_what_is_known():
+    sounds = record(TRUTH)
+    assert sift(sounds, bank_of([], []), known=TRUTH).frequency.tolist() == TRUTH.frequency.tolist()
+    assert len(sift(sounds, bank_of([], []))) == 0
+
+
+def test_pruning_leaves_true_modes_and_takes_decoys():
+    sounds = record(TRUTH, noise=1e-3)
+    bank = merge(
+        torch.cat([TRUTH.frequency, torch.tensor([500.0, 2000.0], dtype=torch.float64)]),
+        torch.cat([TRUTH.damping, torch.tensor([8.0, 9.0], dtype=torch.float64)]),
+        duration=0.75,
+    )
+    kept = prune(sounds, bank, flat(1e-3, bank), count=50, **SIFTING)
+    assert kept.frequency.tolist() == TRUTH.frequency.tolist()
+
+
+def test_pruning_takes_one_of_two_that_are_equal():
+    sounds = record(TRUTH, noise=1e-3)
+    twice = merge(
+        torch.cat([TRUTH.frequency, torch.tensor([300.0, 1500.0], dtype=torch.float64)]),
+        torch.cat([TRUTH.damping, torch.tensor([5.4, 33.0], dtype=torch.float64)]),
+        duration=0.75,
+    )
+    kept = prune(sounds, twice, flat(1e-3, twice), count=50, **SIFTING)
+    assert len(kept) == len(TRUTH)
+    torch.testing.assert_close(kept.frequency, TRUTH.frequency)
+    same = bank_of([300.0, 300.0], [5.0, 5.0])
+    assert len(prune(sounds, same, flat(1e-3, same), count=50, **SIFTING)) == 1
+
+
+def test_pruning_leaves_no_cancelling_modes():
+    sounds = record(bank_of([700.0], [30.0]), noise=1e-4)
+    crowd = bank_of([699.0, 700.0, 701.0, 702.0], [28.0, 30.0, 35.0, 31.0])
+    kept = prune(sounds, crowd, flat(1e-6, crowd), count=50, **SIFTING)
+    _, apart = NormalEquations.of(sounds, poles_of(kept, RATE)).lost_without()
+    assert float(apart.min()) >= 0.01
+    assert contains(kept, 700.0)
+
+
+def test_pruning_keeps_the_most_needed():
+    gains = torch.tensor([[1.0, 0.1, 0.5]], dtype=torch.float64)
+    bank = bank_of([300.0, 900.0, 2000.0], [10.0, 10.0, 10.0])
+    sounds = synthesise(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
+    assert prune(sounds, bank, flat(1e-5, bank, 1), count=2, **SIFTING).frequency.tolist() == [300.0, 2000.0]
+
+
+def test_range_leaves_faint_modes_out():
+    gains = torch.tensor([[1.0, 10 ** (-50 / 20), 10 ** (-70 / 20)]], dtype=torch.float64)
+    bank = bank_of([300.0, 900.0, 2000.0], [10.0, 10.0, 10.0])
+    sounds = synthesise(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
+    for keep in (
+        lambda: prune(sounds, bank, flat(1e-9, bank, 1), count=9, **SIFTING),
+        lambda: select_one(sounds, bank),
+    ):
+        assert keep().frequency.tolist() == [300.0, 900.0]
+
+
+def select_one(sounds: Tensor, bank: ModalBank) -> ModalBank:
+    none = bank_of([], [])
+    known, found = (Candidates.of(sounds, part, flat(1e-9, part, 1), sample_rate=RATE) for part in (none, bank))
+    return select(known, found, samples=SAMPLES, count=9, **SIFTING)
+
+
+def test_pruning_nothing_but_noise_leaves_nothing():
+    sounds = torch.randn(4, SAMPLES, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    assert len(prune(sounds, TRUTH, flat(1.0, TRUTH), count=9, **SIFTING)) == 0
+    assert len(prune(sounds, bank_of([], []), flat(1.0, bank_of([], [])), count=9, **SIFTING)) == 0
+    assert math.isfinite(chance_ratio(1, trials=1))
