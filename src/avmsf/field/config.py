@@ -1,10 +1,29 @@
 """How a field is fitted: one flat record, which is the command line's options too."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
+from avmsf.errors import FitError
 from avmsf.field.gains import AttentionShape
 from avmsf.modal.spectra import scaled_fft_size
+
+_LEAST = {
+    "clusters": 1,
+    "bands": 0,
+    "width": 1,
+    "hidden": 1,
+    "layers": 0,
+    "correction_rate": 0,
+    "weight_decay": 0,
+    "warmup_steps": 0,
+    "steps": 0,
+    "patience": 0,
+    "hop": 0,
+    "early": 1,
+    "early_weight": 0,
+    "seed": 0,
+}
 
 
 @dataclass(frozen=True)
@@ -17,9 +36,9 @@ class FitConfig:
     """Octaves in the encoding of offsets; 0 leaves the plain offsets."""
     width: int = 64
     """Size of queries, keys and values."""
-    hidden: int = 256
+    hidden: int = 512
     """Neurons in each hidden layer."""
-    layers: int = 2
+    layers: int = 3
     """Hidden layers."""
     feature_scale: float = 4.0
     """Factor on the features as the network reads them: larger lets gains change over shorter distances."""
@@ -29,9 +48,9 @@ class FitConfig:
     """Adam's step at the start of the end-to-end stage, likewise (paper: 1e-2, 5e-3 or 1e-3)."""
     correction_rate: float = 0.1
     """Part of that step for frequencies, dampings and noise, which start close to where they end."""
-    weight_decay: float = 0.3
+    weight_decay: float = 1.0
     """Decoupled weight decay on the network's matrices."""
-    warmup_steps: int = 500
+    warmup_steps: int = 1000
     """Steps on the extracted gains alone (paper, eq. 13)."""
     steps: int = 150
     """Steps end to end on spectra (paper, eq. 14)."""
@@ -54,10 +73,35 @@ class FitConfig:
     seed: int = 0
     """Start of all chance in the fit: initial weights and noise."""
 
+    def __post_init__(self) -> None:
+        for name, least in _LEAST.items():
+            value = getattr(self, name)
+            if not least <= value < math.inf:
+                raise FitError(f"{name} = {value}: expected {least} or more")
+        for name in ("feature_scale", "warmup_rate", "learning_rate"):
+            value = getattr(self, name)
+            if not 0 < value < math.inf:
+                raise FitError(f"{name} = {value}: expected more than 0")
+        if not 0 <= self.validation <= 0.5:
+            raise FitError(f"validation = {self.validation}: expected 0 to 0.5, the part of the contacts held out")
+        if self.warmup_steps + self.steps == 0:
+            raise FitError("warmup_steps = 0 and steps = 0: expected at least one step of either, or nothing is learnt")
+        # A rate as low as a structure's takes a quarter of each size, which has to be even.
+        odd = [size for size in self.fft_sizes if size < 16 or size % 8]
+        if odd or not self.fft_sizes:
+            raise FitError(f"fft_sizes = {self.fft_sizes}: expected one or more multiples of 8, none below 16")
+
     @property
     def shape(self) -> AttentionShape:
         """Sizes of the network, with shared damping."""
-        return AttentionShape(self.clusters, self.bands, self.width, self.hidden, self.layers, self.feature_scale)
+        return AttentionShape(
+            clusters=self.clusters,
+            bands=self.bands,
+            width=self.width,
+            hidden=self.hidden,
+            layers=self.layers,
+            feature_scale=self.feature_scale,
+        )
 
     def resolutions(self, sample_rate: float) -> tuple[tuple[int, ...], tuple[int, ...], int]:
         """Return FFT sizes, hops and the early length in samples at a sample rate, Hz."""

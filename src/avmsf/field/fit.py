@@ -1,10 +1,9 @@
 """From recordings, features and modes to a sound field."""
 
-import hashlib
-import json
+import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,12 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError
+from avmsf.field.arguments import expect_fitting, fingerprint
 from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
 from avmsf.field.config import FitConfig
 from avmsf.field.gains import AttentionGains
 from avmsf.field.losses import spectral_loss
+from avmsf.field.orientation import orientation_signs
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.training import Targets, TrainingRun, gain_scale
 from avmsf.modal.bank import ModalBank
@@ -55,7 +56,7 @@ def fit(
     config: FitConfig | None = None,
     *,
     capture: str = "",
-    checkpoint: Path | None = None,
+    checkpoint: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> SoundField:
     """Fit a sound field to recordings (paper, section 3.5).
@@ -63,17 +64,25 @@ def fit(
     `modes` as extracted from `train`. Choices that the config leaves open are made on a part of the training contacts
     held out for the purpose, then the field is fitted to all. With `checkpoint`, the state is kept there while the fit
     runs and on interruption, and a fit of the same arguments goes on from it to the same result; the file goes when
-    the fit is done. Raises `FitError` for arguments that do not fit together.
+    the fit is done. Raises `FitError` for arguments that do not fit together and for a fit that diverges, and
+    `FieldFileError` for a checkpoint that is none of this fit's.
     """
     config = FitConfig() if config is None else config
-    _expect_fitting(train, features, modes, config)
-    job = _Job(train, features, modes, config, checkpoint, progress)
+    expect_fitting(train, modes)
+    # Amplitudes are float32 from here on, so that a field is the same whichever its recordings came in.
+    train = replace(train, sounds=train.sounds.float())
+    modes = replace(modes, residual=Residual(modes.residual.magnitude.float()))
+    place = None if checkpoint is None else Path(checkpoint)
+    job = _Job(train, features, modes, config, place, progress)
     chosen, report = job.choose()
     run = job.run("fit", list(range(len(train))), chosen)
-    if checkpoint is not None:
-        checkpoint.unlink(missing_ok=True)
+    if place is not None:
+        place.unlink(missing_ok=True)
+    # Close modes may have passed one another on the way.
+    order = torch.argsort(run.bank.frequency.detach())
+    run.network.reorder(order)
     return SoundField(
-        ModalBank(*(each.detach().clone() for each in (run.bank.frequency, run.bank.damping))),
+        ModalBank(*(each.detach()[order] for each in (run.bank.frequency, run.bank.damping))),
         run.network.eval().requires_grad_(False),
         Residual(run.residual.magnitude.detach().clone()),
         train.sample_rate,
@@ -104,9 +113,12 @@ class _Job:
     ) -> None:
         self.train, self.features, self.modes, self.config = train, features, modes, config
         self.checkpoint, self.progress = checkpoint, progress
-        self.gains = fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate)
+        signs = orientation_signs(train.contacts, train.directions)
+        gains = fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate)
+        self.gains = gains * signs[:, None]
         self.rows = features.nearest(train.contacts)
-        self.fingerprint = _fingerprint(train, features, modes, config)
+        self.regions = features.clusters(config.clusters)
+        self.fingerprint = fingerprint(train, features, modes, config)
         saved = read_checkpoint(checkpoint, fingerprint=self.fingerprint) if checkpoint is not None else None
         self.trials: dict[str, Any] = {} if saved is None else saved["trials"]
         self.running: dict[str, Any] | None = None if saved is None else saved["running"]
@@ -149,19 +161,25 @@ class _Job:
             if look is not None:
                 look.best = self.running["look"]
         end = self.config.warmup_steps + plan.steps
-        loss = float("nan")
         try:
-            while run.step < end:
-                loss = run.advance(targets)
+            while True:
+                # First in the loop, so that a run which goes on takes the look that an interruption may have cut off;
+                # a second look at the same step changes nothing.
                 if look is not None and self._due(run.step, end):
                     look.at(run)
                     if self.config.patience and run.step - look.best["at"] >= self.config.patience:
                         break
+                if run.step >= end:
+                    break
+                loss = run.advance(targets)
+                _expect_finite_loss(loss, name, run.step)
                 self._tell(name, run, end, loss)
                 if time.monotonic() - self.saved_at > _CHECKPOINT_SECONDS:
                     self._save(name, run, look)
         except KeyboardInterrupt:
-            self._save(name, run, look)
+            # Amid a step's changes there is nothing to keep but what was saved before.
+            if run.whole:
+                self._save(name, run, look)
             raise
         if look is not None:
             self.trials[name] = {
@@ -178,6 +196,7 @@ class _Job:
             gain_scale=gain_scale(gains),
             shape=replace(self.config.shape, spatial_damping=plan.spatial_damping),
             generator=torch.Generator().manual_seed(self.config.seed),
+            regions=self.regions,
         )
         # The cosine runs out where the plan ends, for a run that is meant to end early as well.
         config = replace(self.config, steps=max(1, plan.steps))
@@ -234,26 +253,9 @@ def _named(spatial_damping: bool) -> str:
     return "per-contact" if spatial_damping else "shared"
 
 
-def _fingerprint(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> str:
-    digest = hashlib.sha256(json.dumps([asdict(config), train.names], sort_keys=True).encode())
-    for tensor in (train.contacts, train.sounds, features.points, features.features, modes.bank.frequency):
-        digest.update(tensor.contiguous().numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _expect_fitting(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> None:
-    if len(train) < 2:
-        raise FitError(f"expected at least 2 recordings to fit a field to, found {len(train)}")
-    if len(modes.gains) != len(train):
+def _expect_finite_loss(loss: float, name: str, step: int) -> None:
+    if not math.isfinite(loss):
         raise FitError(
-            f"the modes were extracted from {len(modes.gains)} recordings, the field is to be fitted to {len(train)}: "
-            "extract them from the recordings that the field is fitted to"
+            f"the {name} diverged, its loss at step {step} is {loss}: lower learning_rate or warmup_rate, or the "
+            "correction_rate"
         )
-    if config.clusters > len(features.points):
-        raise FitError(
-            f"{config.clusters} clusters were asked of {len(features.points)} points: ask for fewer (clusters) or give "
-            "more points"
-        )
-    loudest = float(train.sounds.abs().max())
-    if loudest == 0.0:
-        raise FitError("all recordings are silent: there is nothing to fit")

@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from avmsf.scene.features import FeatureField
+from avmsf.scene.features import FeatureField, Regions
 
 
 @dataclass(frozen=True)
@@ -49,29 +50,38 @@ class AttentionGains(nn.Module):
         gain_scale: Float[Tensor, " modes"],
         shape: AttentionShape,
         generator: torch.Generator,
+        regions: Regions | None = None,
     ) -> None:
-        """Build an untrained network whose gains are about `gain_scale` in size, mode by mode."""
+        """Build an untrained network whose gains are about `gain_scale` in size, mode by mode, in float32.
+
+        `regions` are the features' clusters where they have been found before.
+        """
         super().__init__()
-        regions = features.clusters(shape.clusters)
+        regions = features.clusters(shape.clusters) if regions is None else regions
         self.shape, self.encoder = shape, features.encoder
-        self.register_buffer("points", features.points)
-        self.register_buffer("features", features.features)
-        self.register_buffer("centers", regions.centers)
-        self.register_buffer("descriptors", regions.descriptors)
-        self.register_buffer("gain_scale", gain_scale)
-        dim, modes = features.features.shape[1], len(gain_scale)
+        self.register_buffer("points", features.points.float())
+        self.register_buffer("features", features.features.float())
+        self.register_buffer("centers", regions.centers.float())
+        self.register_buffer("descriptors", regions.descriptors.float())
+        self.register_buffer("gain_scale", gain_scale.float())
+        # Layers draw from torch's global generator as they are made, which is not ours to advance.
+        with torch.random.fork_rng(devices=[]):
+            self._build(features.features.shape[1], len(gain_scale))
+        self._initialise(generator)
+
+    def _build(self, dim: int, modes: int) -> None:
+        shape = self.shape
         encoded = shape.clusters * 3 * (1 + 2 * shape.bands)
         self.query = nn.Linear(encoded + dim, shape.width, bias=False)
         self.key = nn.Linear(dim, shape.width, bias=False)
         self.value = nn.Linear(dim, shape.width, bias=False)
         sizes = [shape.width + dim] + [shape.hidden] * shape.layers
         stack: list[nn.Module] = []
-        for before, after in zip(sizes, sizes[1:], strict=False):
+        for before, after in pairwise(sizes):
             stack += [nn.Linear(before, after), nn.SiLU()]
         self.head = nn.Sequential(*stack)
         self.to_gains = nn.Linear(sizes[-1], modes)
         self.to_dampings = nn.Linear(sizes[-1], modes) if shape.spatial_damping else None
-        self._initialise(generator)
 
     def _initialise(self, generator: torch.Generator) -> None:
         for layer in self.modules():
@@ -88,6 +98,15 @@ class AttentionGains(nn.Module):
     def feature_field(self) -> FeatureField:
         """The points and features that the network reads."""
         return FeatureField(self.points, self.features, self.encoder)
+
+    def reorder(self, modes: Int[Tensor, " modes"]) -> None:
+        """Put the outputs for the modes in the given order, in place."""
+        with torch.no_grad():
+            self.gain_scale.copy_(self.gain_scale[modes])
+            for layer in (self.to_gains, self.to_dampings):
+                if layer is not None:
+                    layer.weight.copy_(layer.weight[modes])
+                    layer.bias.copy_(layer.bias[modes])
 
     def forward(
         self, contacts: Float[Tensor, "contacts 3"]

@@ -7,6 +7,7 @@ sign, transform back, overlap-add, forget. One autograd function does all of it 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -22,16 +23,12 @@ _SILENT = 1e-12
 class SpectralTarget:
     """Recordings to compare with, as magnitudes: made once, used at every step."""
 
-    magnitudes: tuple[Float[Tensor, "contacts frames bins"], ...]
-    """One a resolution."""
+    magnitudes: tuple[Float[Tensor, "contacts _frames _bins"], ...]
+    """One a resolution, each with its own numbers of frames and bins."""
     hops: tuple[int, ...]
     """Samples between frames, one a resolution."""
     samples: int
     """Length of the sounds that are compared: those that are longer are cut."""
-
-    def take(self, rows: Sequence[int]) -> "SpectralTarget":
-        """Return the targets of some of the contacts."""
-        return SpectralTarget(tuple(each[list(rows)] for each in self.magnitudes), self.hops, self.samples)
 
 
 def spectral_target(
@@ -43,8 +40,12 @@ def spectral_target(
 ) -> SpectralTarget:
     """Return the magnitudes of `sounds`, or of their first `samples`, at several resolutions (sizes in samples).
 
-    Hann windows, frames centred, silence beyond the ends, as in `avmsf.modal.spectra`.
+    Hann windows, frames centred, silence beyond the ends, as in `avmsf.modal.spectra`. Raises ValueError for an odd
+    FFT size.
     """
+    odd = [size for size in fft_sizes if size % 2]
+    if odd:
+        raise ValueError(f"expected even FFT sizes, found {odd[0]}: half a window lies before a frame's centre")
     cut = sounds[:, :samples]
     magnitudes = []
     for fft_size, hop in zip(fft_sizes, hops, strict=True):
@@ -61,16 +62,21 @@ def spectral_loss(sounds: Float[Tensor, "contacts samples"], target: SpectralTar
     """Return the L1 distance of magnitudes over the target's L1 norm, summed over resolutions (paper, eq. 14).
 
     The division makes the resolutions weigh alike and the loss read as a relative error; differentiable in `sounds`.
+    Raises ValueError for other sounds than the target's, in number, or shorter ones.
     """
-    loss: Float[Tensor, ""] = _SpectralL1.apply(sounds[:, : target.samples], target)
+    contacts = len(target.magnitudes[0])
+    if len(sounds) != contacts or sounds.shape[1] < target.samples:
+        raise ValueError(
+            f"expected {contacts} sounds of {target.samples} samples or more, as the target's, found {len(sounds)} of "
+            f"{sounds.shape[1]}"
+        )
+    loss: Float[Tensor, ""] = _SpectralL1.apply(sounds[:, : target.samples], target)  # type: ignore[no-untyped-call]
     return loss
 
 
 class _SpectralL1(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: torch.autograd.function.FunctionCtx, sounds: Float[Tensor, "contacts samples"], target: SpectralTarget
-    ) -> Float[Tensor, ""]:
+    def forward(ctx: Any, sounds: Float[Tensor, "contacts samples"], target: SpectralTarget) -> Float[Tensor, ""]:
         loss = sounds.new_zeros(())
         gradient = torch.zeros_like(sounds)
         for magnitude, hop in zip(target.magnitudes, target.hops, strict=True):
@@ -83,7 +89,7 @@ class _SpectralL1(torch.autograd.Function):
         return loss
 
     @staticmethod
-    def backward(ctx: torch.autograd.function.FunctionCtx, outer: Float[Tensor, ""]) -> tuple[Tensor, None]:
+    def backward(ctx: Any, outer: Float[Tensor, ""]) -> tuple[Tensor, None]:
         (gradient,) = ctx.saved_tensors
         return outer * gradient, None
 
@@ -131,7 +137,7 @@ def _overlap_add(into: Float[Tensor, " samples"], frames: Float[Tensor, "frames 
 
 
 def _padded(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Float[Tensor, "contacts padded"]:
-    """Return the sounds between half windows of silence, so that a frame is centred on every hop from the first sample."""
+    """Return the sounds between half windows of silence: frames are centred on the samples 0, hop, 2 hop, ..."""
     return torch.nn.functional.pad(sounds, (fft_size // 2, fft_size // 2))
 
 

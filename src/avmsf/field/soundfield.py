@@ -74,7 +74,7 @@ class SoundField:
         with torch.no_grad():
             generator = torch.Generator().manual_seed(self.origin.config.seed)
             noise = shape_noise(self.residual.magnitude, contacts=1, samples=length, generator=generator)
-            parts = [self._modes(part, length) for part in contacts.split(_BATCH)]
+            parts = [self._modes(part, length) for part in torch.split(contacts, _BATCH)]
             return force * (torch.cat(parts) + noise)
 
     def _modes(self, contacts: Float[Tensor, "contacts 3"], samples: int) -> Float[Tensor, "contacts samples"]:

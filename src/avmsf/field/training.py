@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from avmsf.capture.impacts import Impacts
@@ -76,17 +76,23 @@ class TrainingRun:
         self.generator = torch.Generator().manual_seed(config.seed)
         matrices = [parameter for parameter in network.parameters() if parameter.ndim > 1]
         vectors = [parameter for parameter in network.parameters() if parameter.ndim == 1]
-        groups = [
-            {"params": matrices, "weight_decay": config.weight_decay},
-            {"params": vectors, "weight_decay": 0.0},
-        ]
         corrections = [self.shift, self.decay] + ([self.noise] if config.residual else [])
-        self.warmup = torch.optim.AdamW(groups, lr=config.learning_rate)
+
+        def groups() -> list[dict[str, Any]]:
+            return [
+                {"params": matrices, "weight_decay": config.weight_decay},
+                {"params": vectors, "weight_decay": 0.0},
+            ]
+
+        self.warmup = torch.optim.AdamW(groups(), lr=config.warmup_rate)
         self.joint = torch.optim.AdamW(
-            [*groups, {"params": corrections, "weight_decay": 0.0, "share": config.correction_rate}],
+            [*groups(), {"params": corrections, "weight_decay": 0.0, "share": config.correction_rate}],
             lr=config.learning_rate,
         )
         self.step = 0
+        self.whole = True
+        """False while parameters are being moved: an interruption then leaves a state that nothing can go on from."""
+        self._chance = self.generator.get_state()
 
     @property
     def bank(self) -> ModalBank:
@@ -132,9 +138,12 @@ class TrainingRun:
         for group in optimiser.param_groups:
             group["lr"] = rate * group.get("share", 1.0) * (0.55 + 0.45 * math.cos(math.pi * done))
         optimiser.zero_grad()
-        loss.backward()
+        torch.autograd.backward(loss)
+        self.whole = False
         optimiser.step()
         self.step += 1
+        self._chance = self.generator.get_state()
+        self.whole = True
         return float(loss.detach())
 
     def spectral_loss(self, targets: Targets) -> Float[Tensor, ""]:
@@ -152,13 +161,16 @@ class TrainingRun:
         return ((gains - targets.gains).square() * self.weight).sum(1).mean()
 
     def state(self) -> dict[str, Any]:
-        """Return all that decides how the run goes on, as tensors, numbers and containers of these."""
+        """Return all that decides how the run goes on after its last whole step: tensors, numbers, containers of these.
+
+        An interruption in the middle of a step may call for it too, while `whole`: only the noise has moved on by then.
+        """
         return {
             "network": self.network.state_dict(),
             "corrections": [each.detach().clone() for each in (self.shift, self.decay, self.noise)],
             "warmup": self.warmup.state_dict(),
             "joint": self.joint.state_dict(),
-            "generator": self.generator.get_state(),
+            "generator": self._chance,
             "step": self.step,
         }
 
@@ -170,7 +182,8 @@ class TrainingRun:
                 parameter.copy_(value)
         self.warmup.load_state_dict(state["warmup"])
         self.joint.load_state_dict(state["joint"])
-        self.generator.set_state(state["generator"])
+        self._chance = state["generator"]
+        self.generator.set_state(self._chance)
         self.step = state["step"]
 
 
@@ -180,7 +193,7 @@ def _mode_weight(bank: ModalBank, gains: Float[Tensor, "contacts modes"]) -> Flo
     return energy / total.clamp_min(torch.finfo(gains.dtype).tiny)
 
 
-def gain_scale(gains: Float[Tensor, "contacts modes"]) -> Float64[Tensor, " modes"] | Float[Tensor, " modes"]:
+def gain_scale(gains: Float[Tensor, "contacts modes"]) -> Float[Tensor, " modes"]:
     """Return each mode's root mean square gain, never zero: the size that the network's output is measured in."""
     scale = gains.square().mean(0).sqrt()
     return scale.clamp_min(float(scale.max()) * 1e-6 + torch.finfo(gains.dtype).tiny)

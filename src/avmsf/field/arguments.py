@@ -1,0 +1,55 @@
+"""What a fit is asked with: whether it fits together, and by what it is known again."""
+
+import hashlib
+import json
+from dataclasses import asdict
+from importlib.metadata import version
+
+import torch
+
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import FitError
+from avmsf.field.config import FitConfig
+from avmsf.modal.extraction import Extraction
+from avmsf.scene.features import FeatureField
+
+
+def expect_fitting(train: Impacts, modes: Extraction) -> None:
+    """Raise `FitError` for recordings and modes that no field can be fitted to."""
+    if len(train) < 2:
+        raise FitError(
+            f"expected at least 2 recordings to fit a field to, found {len(train)}: strike the object in more places"
+        )
+    for name, sound, contact in zip(train.names, train.sounds, train.contacts, strict=True):
+        if not bool(torch.isfinite(sound).all() and torch.isfinite(contact).all()):
+            raise FitError(
+                f"{name}: expected finite samples and coordinates, found NaN or infinity: leave the recording out or "
+                "read it again"
+            )
+    if float(train.sounds.abs().max()) == 0.0:
+        raise FitError("all recordings are silent: there is nothing to fit; check the channel that was read")
+    if len(modes.gains) != len(train):
+        raise FitError(
+            f"the modes were extracted from {len(modes.gains)} recordings, the field is to be fitted to {len(train)}: "
+            "extract them from the recordings that the field is fitted to"
+        )
+    if len(modes.bank) == 0:
+        raise FitError("expected modes, found none: a field of noise alone is the same everywhere")
+    highest = float(modes.bank.frequency.max())
+    if highest >= train.sample_rate / 2:
+        raise FitError(
+            f"the highest mode is at {highest:g} Hz, the recordings reach {train.sample_rate / 2:g} Hz: extract the "
+            "modes from the recordings that the field is fitted to"
+        )
+
+
+def fingerprint(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> str:
+    """Return a digest of all that decides a fit's result, this package's version among it."""
+    words = [version("avmsf"), asdict(config), train.names, train.sample_rate, features.encoder]
+    digest = hashlib.sha256(json.dumps(words, sort_keys=True).encode())
+    tensors = [train.contacts, train.sounds, features.points, features.features]
+    tensors += [modes.bank.frequency, modes.bank.damping, modes.residual.magnitude]
+    for tensor in tensors if train.directions is None else [*tensors, train.directions]:
+        digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,160 @@
+"""A sound field as one file: safetensors, and one JSON in its header for all that is no tensor.
+
+Tensors are named by the path of their field: `bank.frequency`, `residual.magnitude`, `gain_field.query.weight`. The
+header's metadata holds under the key `avmsf` the record that `avmsf.field.header` describes.
+"""
+
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as to_bytes
+from torch import Tensor
+
+from avmsf.errors import FieldFileError
+from avmsf.field.files import write_whole
+from avmsf.field.gains import AttentionGains
+from avmsf.field.header import FORMAT, Header, read_header
+from avmsf.field.soundfield import SoundField
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.residual import Residual
+from avmsf.scene.features import FeatureField, Regions
+
+_KEY = "avmsf"
+_GAIN_FIELD = "gain_field."
+_POSITIVE = ("bank.frequency", "bank.damping")
+
+
+def save(field: SoundField, path: str | Path) -> None:
+    """Write a field to one file, which `load` reads back to the last bit.
+
+    A file that is there is replaced in one step and stays whole until then; folders that are missing are made. Raises
+    `FieldFileError` where the file cannot be written, and for a field that could not be read back.
+    """
+    path = Path(path)
+    header, tensors = Header.of(field), _tensors(field)
+    _expect_tensors(tensors, header, path)
+    content = to_bytes(tensors, {_KEY: header.to_json(path)})
+    write_whole(path, lambda place: place.write_bytes(content))
+
+
+def load(path: str | Path) -> SoundField:
+    """Read a field that `save` wrote; it renders what the saved one does, to the last bit.
+
+    Raises `FieldFileError` for a file that is missing, cut short, of another kind or of a newer format, and where a
+    tensor is missing, unexpected, of another shape or dtype, or not finite.
+    """
+    path = Path(path)
+    words, tensors = _read(path)
+    header = read_header(words, path)
+    _expect_tensors(tensors, header, path)
+    return SoundField(
+        ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
+        _network(header, tensors),
+        Residual(tensors["residual.magnitude"]),
+        header.sample_rate,
+        header.samples,
+        header.origin,
+    )
+
+
+def _tensors(field: SoundField) -> dict[str, Tensor]:
+    named = {
+        "bank.frequency": field.bank.frequency,
+        "bank.damping": field.bank.damping,
+        "residual.magnitude": field.residual.magnitude,
+    }
+    named |= {_GAIN_FIELD + name: tensor for name, tensor in field.gain_field.state_dict().items()}
+    # Safetensors refuses tensors that share memory, as a field's points may with its features.
+    return {name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in named.items()}
+
+
+def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
+    """Return the header's record and the tensors of a file that is ours."""
+    if not path.exists():
+        raise FieldFileError(f"{path}: expected a sound field, found no such file: check the name, or fit and save one")
+    try:
+        with safe_open(path, framework="pt") as file:
+            words = (file.metadata() or {}).get(_KEY)
+            if words is None:
+                raise FieldFileError(
+                    f"{path}: expected a sound field, found a safetensors file of something else (its metadata has no "
+                    f"entry {_KEY!r}): name a file that avmsf saved"
+                )
+            # Clones, for what the file maps into memory would change with it.
+            return words, {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise FieldFileError(f"{path}: expected a sound field, found {_guess(path)}") from error
+
+
+def _guess(path: Path) -> str:
+    """Return what a file is that safetensors cannot read, and what to do."""
+    if path.is_dir():
+        return "a folder: name the file in it"
+    try:
+        with open(path, "rb") as file:
+            start = file.read(9)
+    except OSError as error:
+        return f"a file that cannot be read ({error.strerror}): check its permissions"
+    # Eight bytes of length, then the header's opening brace.
+    if start[8:] == b"{":
+        return "one that is cut short or damaged: copy it again, or fit and save it again"
+    return f"a file of another kind, which starts with {start[:8]!r}: name a file that avmsf saved"
+
+
+def _expect_tensors(tensors: dict[str, Tensor], header: Header, path: Path) -> None:
+    """Compare names, shapes and dtypes with what the header's sizes ask for, and the values with what they mean."""
+    expected = _skeleton(header)
+    missing, unexpected = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
+    if missing or unexpected:
+        raise FieldFileError(
+            f"{path}: the tensors are not those of format {FORMAT}: missing {', '.join(missing) or 'none'}; unexpected "
+            f"{', '.join(unexpected) or 'none'}: the file was changed after it was saved, fit and save it again"
+        )
+    for name, tensor in tensors.items():
+        like = expected[name]
+        if tensor.shape != like.shape or tensor.dtype != like.dtype:
+            raise FieldFileError(
+                f"{path}: expected {name} as {_named(like)}, found {_named(tensor)}: the header and the tensors do not "
+                "belong together, fit and save the field again"
+            )
+        least = float(tensor.min()) if tensor.numel() else 0.0
+        negative = least < 0 and name == "residual.magnitude"
+        if not bool(torch.isfinite(tensor).all()) or (name in _POSITIVE and least <= 0) or negative:
+            wanted = "positive" if name in _POSITIVE else "not negative" if negative else "finite"
+            raise FieldFileError(f"{path}: expected {name} to be {wanted} throughout, found otherwise: fit it again")
+
+
+def _skeleton(header: Header) -> dict[str, Tensor]:
+    """Return tensors of the names, shapes and dtypes of a field with these sizes, which take no memory."""
+    with torch.device("meta"):
+        features = FeatureField(torch.empty(header.points, 3), torch.empty(header.points, header.dim), header.encoder)
+        regions = Regions(torch.empty(header.shape.clusters, 3), torch.empty(header.shape.clusters, header.dim))
+        network = AttentionGains(
+            features,
+            gain_scale=torch.empty(header.modes),
+            shape=header.shape,
+            generator=torch.Generator(device="cpu"),
+            regions=regions,
+        )
+        bank = torch.empty(header.modes, dtype=torch.float64)
+        residual = torch.empty(header.bins)
+    named = {"bank.frequency": bank, "bank.damping": bank, "residual.magnitude": residual}
+    return named | {_GAIN_FIELD + name: tensor for name, tensor in network.state_dict().items()}
+
+
+def _network(header: Header, tensors: dict[str, Tensor]) -> AttentionGains:
+    state = {name.removeprefix(_GAIN_FIELD): each for name, each in tensors.items() if name.startswith(_GAIN_FIELD)}
+    network = AttentionGains(
+        FeatureField(state["points"], state["features"], header.encoder),
+        gain_scale=state["gain_scale"],
+        shape=header.shape,
+        generator=torch.Generator(),
+        regions=Regions(state["centers"], state["descriptors"]),
+    )
+    network.load_state_dict(state)
+    return network.eval().requires_grad_(False)
+
+
+def _named(tensor: Tensor) -> str:
+    return f"{str(tensor.dtype).removeprefix('torch.')}{list(tensor.shape)}"

@@ -1,0 +1,274 @@
+"""A field fitted to a plate whose modes are known in closed form."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+
+from avmsf.bench.metrics import relative_stft_error
+from avmsf.errors import FitError
+from avmsf.field.config import FitConfig
+from avmsf.field.fit import Progress, fit
+from avmsf.field.soundfield import SoundField
+from avmsf.field.training import Targets, TrainingRun
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction import Extraction
+from avmsf.modal.leastsquares import fit_sine_gains
+from avmsf.scene.features import FeatureField
+from avmsf.simulate.plate import plate_modes
+from plate_field import PLATE, QUICK, plate_extraction, plate_features, plate_impacts
+
+LONG = replace(QUICK, width=32, hidden=128, warmup_steps=300, steps=60, correction_rate=3.0)
+SHORT = replace(QUICK, warmup_steps=4, steps=4)
+VALIDATED = replace(SHORT, damping="validated")
+
+
+def fitted(config: FitConfig, **changes) -> SoundField:
+    """Fit to the plate, with other arguments where `changes` names them."""
+    impacts = changes.pop("train", plate_impacts())
+    modes = changes.pop("modes", None) or plate_extraction(plate_impacts(len(impacts)))
+    return fit(impacts, changes.pop("features", plate_features()), modes, config, **changes)
+
+
+@cache
+def short_fit() -> SoundField:
+    return fitted(SHORT)
+
+
+@cache
+def long_fit() -> tuple[SoundField, list[Progress]]:
+    told: list[Progress] = []
+    return fitted(LONG, progress=told.append), told
+
+
+def bits(field: SoundField) -> dict[str, torch.Tensor]:
+    return {
+        "frequency": field.bank.frequency,
+        "damping": field.bank.damping,
+        "magnitude": field.residual.magnitude,
+        **field.gain_field.state_dict(),
+    }
+
+
+def same(one: SoundField, other: SoundField) -> bool:
+    mine, others = bits(one), bits(other)
+    return mine.keys() == others.keys() and all(torch.equal(mine[name], others[name]) for name in mine)
+
+
+def test_a_fit_reproduces_the_contacts_that_it_was_trained_on():
+    field, impacts = long_fit()[0], plate_impacts()
+    error = float(relative_stft_error(field.render(impacts.contacts), impacts.sounds, fft_sizes=(1024, 256)).mean())
+    # Noise 40 dB down alone costs some two hundredths of the spectrum; silence costs 1, and .055 was measured.
+    assert error < 0.08
+
+
+def test_both_stages_lower_their_loss():
+    told = long_fit()[1]
+    assert [(each.stage, each.step, each.steps) for each in told] == [("fit", step + 1, 360) for step in range(360)]
+    losses = [each.loss for each in told]
+    # Relative squared error: an untrained network is wrong by about all there is.
+    assert 0.5 < losses[0] < 2
+    assert losses[299] < 0.02
+    assert sum(losses[-5:]) / 5 < 0.9 * losses[300]
+
+
+def test_training_mends_what_the_extraction_left_wrong():
+    """Frequencies .2 Hz and dampings 5 % off, with the network's gains, come closer to the plate's."""
+    truth, bank = plate_modes(PLATE, plate_impacts().contacts, highest=2500.0), long_fit()[0].bank
+    # At most .08 Hz and 3 % were measured.
+    assert float((bank.frequency - truth.frequency).abs().max()) < 0.1
+    assert float((bank.damping / truth.damping - 1).abs().max()) < 0.04
+
+
+def test_the_same_seed_gives_the_same_field_to_the_last_bit_and_another_another():
+    torch.manual_seed(1)
+    first = fitted(VALIDATED)
+    torch.manual_seed(2)
+    before = torch.get_rng_state()
+    again = fitted(VALIDATED)
+    assert same(first, again)
+    assert first.origin == again.origin
+    assert torch.equal(torch.get_rng_state(), before)
+    assert not torch.equal(fitted(replace(VALIDATED, seed=1)).bank.frequency, first.bank.frequency)
+
+
+def test_recordings_in_float64_give_the_same_field():
+    impacts = plate_impacts()
+    wide = replace(impacts, sounds=impacts.sounds.double())
+    modes = plate_extraction(impacts)
+    wide_modes = replace(modes, residual=replace(modes.residual, magnitude=modes.residual.magnitude.double()))
+    field = fitted(SHORT, train=wide, modes=wide_modes)
+    # Least squares on the same numbers in another dtype: only the last bits of products differ, and training spreads
+    # these.
+    torch.testing.assert_close(field.render(impacts.contacts), short_fit().render(impacts.contacts), rtol=0, atol=1e-3)
+    assert {each.dtype for each in field.gain_field.state_dict().values()} == {torch.float32}
+    assert field.residual.magnitude.dtype == torch.float32
+
+
+def test_contacts_in_float32_and_float64_meet_the_same_points():
+    impacts = plate_impacts()
+    assert same(fitted(SHORT, train=replace(impacts, contacts=impacts.contacts.float())), short_fit())
+
+
+def test_modes_come_out_by_frequency():
+    """Modes in the wrong order come out ascending, and each with its own gains."""
+    impacts = plate_impacts()
+    modes = plate_extraction(impacts)
+    order = torch.arange(len(modes.bank)).flip(0)
+    flipped = Extraction(
+        ModalBank(modes.bank.frequency[order], modes.bank.damping[order]),
+        modes.gains[:, order],
+        modes.residual,
+        modes.quadrature[:, order],
+    )
+    field = fitted(replace(LONG, steps=0), modes=flipped)
+    assert bool((field.bank.frequency.diff() > 0).all())
+    gains = fit_sine_gains(impacts.sounds, modes.bank, sample_rate=impacts.sample_rate)
+    assert float((field.gains(impacts.contacts) - gains).square().sum() / gains.square().sum()) < 0.02
+
+
+def test_validation_holds_out_training_contacts_and_says_which():
+    field = fitted(VALIDATED)
+    report = field.origin.report
+    assert report["validated"] is True
+    assert report["damping"] in ("shared", "per-contact")
+    # A quarter of twelve, and of the twelve: the fit sees no others.
+    assert len(report["validation_contacts"]) == 3
+    assert set(report["validation_contacts"]) < set(plate_impacts().names)
+    assert field.origin.trained_on == plate_impacts().names
+    envelopes = report["validation_envelope"]
+    assert envelopes.keys() == {"shared", "per-contact"}
+    assert envelopes[report["damping"]] == min(envelopes.values())
+    assert (field.gain_field.to_dampings is not None) == (report["damping"] == "per-contact")
+
+
+def test_a_trial_does_not_learn_from_the_recordings_held_out(monkeypatch):
+    ends: list[dict[str, torch.Tensor]] = []
+    looks: list[float] = []
+    advance = TrainingRun.advance
+
+    def watched(run: TrainingRun, targets: Targets) -> float:
+        loss = advance(run, targets)
+        if run.step == run.steps:
+            ends.append({name: each.clone() for name, each in run.network.state_dict().items()})
+        return loss
+
+    monkeypatch.setattr(TrainingRun, "advance", watched)
+    impacts = plate_impacts()
+    modes = plate_extraction(impacts)
+    report = fitted(VALIDATED, modes=modes).origin.report
+    looks.append(report["validation_spectral"]["shared"])
+    sounds = impacts.sounds.clone()
+    for name in report["validation_contacts"]:
+        sounds[impacts.names.index(name)] *= -0.3
+    changed = fitted(VALIDATED, train=replace(impacts, sounds=sounds), modes=modes).origin.report
+    looks.append(changed["validation_spectral"]["shared"])
+    assert changed["validation_contacts"] == report["validation_contacts"]
+    shared, per_contact, final, *others = ends
+    for before, after in zip((shared, per_contact), others[:2], strict=True):
+        assert all(torch.equal(before[name], after[name]) for name in before)
+    # The last fit learns from all, and the validation heard the difference.
+    assert not torch.equal(final["to_gains.weight"], others[2]["to_gains.weight"])
+    assert looks[0] != looks[1]
+
+
+def test_patience_ends_a_trial_early_and_shortens_the_fit():
+    told: list[Progress] = []
+    # Steps far too long for the network to go on improving.
+    config = replace(QUICK, warmup_steps=20, warmup_rate=3e-2, learning_rate=0.3, steps=200, patience=10)
+    report = fitted(config, progress=told.append).origin.report
+    trial = [each.step for each in told if each.stage == "trial with shared damping"]
+    final = [each.step for each in told if each.stage == "fit"]
+    assert max(trial) < 220
+    assert report["steps"] < 200
+    assert max(final) == 20 + report["steps"]
+
+
+def test_few_contacts_are_not_divided():
+    report = fitted(VALIDATED, train=plate_impacts(5)).origin.report
+    assert report == {"damping": "shared", "validated": False}
+
+
+@pytest.mark.parametrize("damping", ["shared", "per-contact"])
+def test_damping_follows_the_config(damping):
+    field, impacts = fitted(replace(SHORT, damping=damping)), plate_impacts()
+    dampings = field.dampings(impacts.contacts)
+    assert float(dampings.min()) > 0
+    assert (float(dampings.std(0).max()) > 0) == (damping == "per-contact")
+    if damping == "shared":
+        assert torch.equal(dampings[3], field.bank.damping)
+
+
+def test_a_field_without_residual_has_no_noise():
+    field = fitted(replace(SHORT, residual=False))
+    assert float(field.residual.magnitude.abs().max()) == 0
+    assert short_fit().residual.magnitude.min() > 0
+
+
+def test_warm_up_aims_at_the_gains_that_sines_can_express():
+    impacts, modes = plate_impacts(), plate_extraction(plate_impacts())
+    field = fitted(replace(LONG, steps=0))
+    gains = fit_sine_gains(impacts.sounds, modes.bank, sample_rate=impacts.sample_rate)
+    error = (field.gains(impacts.contacts) - gains).square().sum() / gains.square().sum()
+    assert float(error) < 0.02
+    # Nothing but the network moves in warm-up.
+    assert torch.equal(field.bank.frequency, modes.bank.frequency)
+    assert torch.equal(field.residual.magnitude, modes.residual.magnitude)
+
+
+def test_forces_make_a_field_per_newton():
+    assert fitted(SHORT, train=plate_impacts(forces=True)).origin.per_newton is True
+    assert short_fit().origin.per_newton is False
+
+
+def test_a_silent_recording_and_a_mode_that_is_never_excited_do_no_harm():
+    impacts = plate_impacts()
+    sounds = impacts.sounds.clone()
+    sounds[4] = 0
+    modes = plate_extraction(impacts)
+    # 3.9 kHz: above all modes of the plate that were struck.
+    frequency = torch.cat([modes.bank.frequency, torch.tensor([3900.0], dtype=torch.float64)])
+    damping = torch.cat([modes.bank.damping, torch.tensor([20.0], dtype=torch.float64)])
+    zeros = torch.zeros(12, 1)
+    more = Extraction(
+        ModalBank(frequency, damping), torch.cat([modes.gains, zeros], 1), modes.residual, torch.zeros(12, 13)
+    )
+    field = fitted(VALIDATED, train=replace(impacts, sounds=sounds), modes=more)
+    assert all(bool(torch.isfinite(each).all()) for each in bits(field).values())
+    gains = field.gains(impacts.contacts).abs().mean(0)
+    assert float(gains[-1]) < 0.1 * float(gains[:-1].mean())
+
+
+def test_recordings_that_cannot_be_fitted_are_refused():
+    impacts, modes = plate_impacts(), plate_extraction(plate_impacts())
+    with pytest.raises(FitError, match="at least 2 recordings to fit a field to, found 1"):
+        fitted(SHORT, train=impacts.take([0]), modes=modes)
+    with pytest.raises(FitError, match="extracted from 12 recordings, the field is to be fitted to 7"):
+        fitted(SHORT, train=impacts.take(range(7)), modes=modes)
+    with pytest.raises(FitError, match="all recordings are silent"):
+        fitted(SHORT, train=replace(impacts, sounds=torch.zeros_like(impacts.sounds)))
+    broken = impacts.sounds.clone()
+    broken[3, 17] = math.inf
+    with pytest.raises(FitError, match="plate/004: expected finite samples"):
+        fitted(SHORT, train=replace(impacts, sounds=broken))
+    with pytest.raises(FitError, match=r"highest mode is at 2302\.\d* Hz, the recordings reach 2000 Hz"):
+        fitted(SHORT, train=replace(impacts, sample_rate=4000.0))
+    none = torch.zeros(0, dtype=torch.float64)
+    empty = Extraction(ModalBank(none, none), torch.zeros(12, 0), modes.residual, torch.zeros(12, 0))
+    with pytest.raises(FitError, match="expected modes, found none"):
+        fitted(SHORT, modes=empty)
+
+
+def test_too_many_clusters_are_refused_with_how_many_there_can_be():
+    few = FeatureField.from_points(plate_impacts().contacts)
+    with pytest.raises(FitError, match="16 clusters were asked of points at 12 different places; ask for 1 to 12"):
+        fitted(FitConfig(), features=few)
+    assert fitted(replace(SHORT, clusters=12), features=few).gain_field.shape.clusters == 12
+
+
+def test_a_fit_that_diverges_says_so():
+    config = replace(QUICK, learning_rate=1e30, warmup_steps=0)
+    with pytest.raises(FitError, match=r"the fit diverged, its loss at step \d+ is (nan|inf): lower learning_rate"):
+        fitted(config)

@@ -1,0 +1,121 @@
+"""The spectral loss against torch's own transform and its automatic gradient."""
+
+import math
+
+import pytest
+import torch
+
+from avmsf.field.losses import spectral_loss, spectral_target
+from avmsf.modal.spectra import magnitude_stft
+
+SIZES, HOPS = (256, 64, 30), (64, 16, 7)
+
+
+def sounds(contacts: int = 3, samples: int = 1000, *, seed: int = 0) -> torch.Tensor:
+    return torch.randn(contacts, samples, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def plain_loss(made: torch.Tensor, recorded: torch.Tensor, sizes=SIZES, hops=HOPS) -> torch.Tensor:
+    loss = torch.zeros((), dtype=torch.float64)
+    for fft_size, hop in zip(sizes, hops, strict=True):
+        truth = magnitude_stft(recorded, fft_size=fft_size, hop=hop)
+        loss = loss + (magnitude_stft(made, fft_size=fft_size, hop=hop) - truth).abs().sum() / truth.sum()
+    return loss
+
+
+# A hop that divides the FFT, hops that do not, one longer than the FFT, sounds shorter than the FFT.
+@pytest.mark.parametrize(
+    ("sizes", "hops", "samples"),
+    [(SIZES, HOPS, 1000), ((64,), (64,), 640), ((64,), (100,), 999), ((512,), (128,), 50), ((16, 8), (1, 3), 33)],
+)
+def test_loss_and_gradient_are_those_of_autograd_through_the_transform(sizes, hops, samples):
+    recorded = sounds(samples=samples, seed=1)
+    made, plain = (sounds(samples=samples).requires_grad_() for _ in range(2))
+    # Scaled, so that the outer gradient is seen to be applied.
+    loss = 3 * spectral_loss(made, spectral_target(recorded, fft_sizes=sizes, hops=hops))
+    expected = 3 * plain_loss(plain, recorded, sizes, hops)
+    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-12)
+    loss.backward()
+    expected.backward()
+    # Float64 sums over some hundred frames.
+    torch.testing.assert_close(made.grad, plain.grad, rtol=0, atol=1e-12 * float(plain.grad.abs().max()))
+
+
+def test_frames_that_do_not_fit_one_chunk_are_none_the_worse(monkeypatch):
+    recorded, made = sounds(seed=1), sounds().requires_grad_()
+    target = spectral_target(recorded, fft_sizes=SIZES, hops=HOPS)
+    whole = spectral_loss(made, target)
+    (gradient,) = torch.autograd.grad(whole, made)
+    monkeypatch.setattr("avmsf.field.losses._CHUNK", 3 * 256)
+    assert all(
+        torch.equal(*pair)
+        for pair in zip(
+            target.magnitudes, spectral_target(recorded, fft_sizes=SIZES, hops=HOPS).magnitudes, strict=True
+        )
+    )
+    parts = spectral_loss(made, target)
+    assert float(parts.detach()) == pytest.approx(float(whole.detach()), rel=1e-12)
+    torch.testing.assert_close(torch.autograd.grad(parts, made)[0], gradient, rtol=0, atol=1e-15)
+
+
+def test_a_match_costs_nothing_and_silence_costs_one_a_resolution():
+    recorded = sounds()
+    target = spectral_target(recorded, fft_sizes=SIZES, hops=HOPS)
+    assert float(spectral_loss(recorded, target)) == 0
+    # A magnitude of zero counts as 1e-6 of the window's norm.
+    assert float(spectral_loss(torch.zeros_like(recorded), target)) == pytest.approx(len(SIZES), abs=1e-5)
+
+
+def test_the_loss_is_relative():
+    recorded, made = sounds(seed=1), sounds()
+    loss = spectral_loss(made, spectral_target(recorded, fft_sizes=SIZES, hops=HOPS))
+    louder = spectral_loss(1e3 * made, spectral_target(1e3 * recorded, fft_sizes=SIZES, hops=HOPS))
+    assert float(louder) == pytest.approx(float(loss), rel=1e-9)
+    # Twice as loud is wrong by as much as there is.
+    double = spectral_loss(2 * recorded, spectral_target(recorded, fft_sizes=SIZES, hops=HOPS))
+    assert float(double) == pytest.approx(len(SIZES), rel=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("silent_target", [False, True])
+@pytest.mark.parametrize("silent_sound", [False, True])
+def test_silence_gives_finite_losses_and_gradients(dtype, silent_target, silent_sound):
+    recorded = sounds(seed=1).to(dtype) * (not silent_target)
+    made = (sounds().to(dtype) * (not silent_sound)).requires_grad_()
+    loss = spectral_loss(made, spectral_target(recorded, fft_sizes=SIZES, hops=HOPS))
+    loss.backward()
+    assert math.isfinite(float(loss.detach()))
+    assert bool(torch.isfinite(made.grad).all())
+    if silent_sound and silent_target:
+        assert float(loss.detach()) == 0
+
+
+def test_only_the_beginning_counts_where_only_that_is_asked_for():
+    recorded = sounds(seed=1)
+    target = spectral_target(recorded, fft_sizes=SIZES, hops=HOPS, samples=300)
+    assert target.samples == 300
+    made = sounds().requires_grad_()
+    loss = spectral_loss(made, target)
+    assert float(loss.detach()) == pytest.approx(
+        float(plain_loss(made.detach()[:, :300], recorded[:, :300])), rel=1e-12
+    )
+    loss.backward()
+    assert torch.equal(made.grad[:, 300:], torch.zeros(3, 700, dtype=torch.float64))
+    assert bool((made.grad[:, :300] != 0).all())
+
+
+def test_a_beginning_longer_than_the_sound_is_the_sound():
+    assert spectral_target(sounds(), fft_sizes=SIZES, hops=HOPS, samples=5000).samples == 1000
+
+
+def test_sounds_that_are_not_the_targets_are_refused():
+    target = spectral_target(sounds(), fft_sizes=SIZES, hops=HOPS)
+    with pytest.raises(ValueError, match="expected 3 sounds of 1000 samples or more, as the target's, found 2 of 1000"):
+        spectral_loss(sounds(2), target)
+    with pytest.raises(ValueError, match="found 3 of 900"):
+        spectral_loss(sounds(samples=900), target)
+
+
+def test_an_odd_transform_is_refused():
+    with pytest.raises(ValueError, match="expected even FFT sizes, found 63"):
+        spectral_target(sounds(), fft_sizes=(64, 63), hops=(16, 16))

@@ -1,0 +1,109 @@
+"""What a field renders: each contact's own sound, in whatever company, at whatever force."""
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+
+from avmsf.bench.renderer import Renderer
+from avmsf.field.fit import fit
+from avmsf.field.soundfield import SoundField
+from avmsf.simulate.plate import sample_contacts
+from plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
+
+CONTACTS = sample_contacts(PLATE, 40, generator=torch.Generator().manual_seed(5))
+
+
+@cache
+def field(damping: str = "per-contact") -> SoundField:
+    impacts = plate_impacts(forces=True)
+    config = replace(QUICK, damping=damping, warmup_steps=20, steps=4, learning_rate=0.05)
+    return fit(impacts, plate_features(), plate_extraction(impacts), config)
+
+
+def by_hand(sound_field: SoundField, row: int) -> torch.Tensor:
+    """Return the modal part of one contact's sound as the sum that it is (paper, eq. 3), in float64."""
+    contact = CONTACTS[row : row + 1]
+    gains, damping = sound_field.gains(contact)[0], sound_field.dampings(contact)[0]
+    times = torch.arange(2400, dtype=torch.float64) / RATE
+    sound = torch.zeros(2400, dtype=torch.float64)
+    for gain, decay, frequency in zip(gains.double(), damping, sound_field.bank.frequency, strict=True):
+        sound += gain * torch.exp(-decay * times) * torch.sin(2 * torch.pi * frequency * times)
+    return sound
+
+
+@pytest.mark.parametrize("damping", ["shared", "per-contact"])
+def test_a_sound_is_its_modes_and_the_noise(damping):
+    sound_field = field(damping)
+    if damping == "per-contact":
+        assert float(sound_field.dampings(CONTACTS).std(0).min()) > 1e-3
+    sounds, loudest = sound_field.render(CONTACTS), float(sound_field.render(CONTACTS).abs().max())
+    noise = sounds[:2].double() - torch.stack([by_hand(sound_field, row) for row in (0, 1)])
+    # Float32 sounds: the same noise is left at both contacts, to a millionth of the loudest sample.
+    torch.testing.assert_close(noise[0], noise[1], rtol=0, atol=1e-6 * loudest)
+    # Noise of flat magnitude has that as its standard deviation; 2400 samples tell it to 2 %.
+    level = float(sound_field.residual.magnitude.mean())
+    assert float(noise.std()) == pytest.approx(level, rel=0.06)
+
+
+def test_the_noise_is_the_same_at_every_contact_and_in_every_call():
+    sound_field = field()
+    silent = replace(sound_field, residual=replace(sound_field.residual, magnitude=torch.zeros(33)))
+    noise = sound_field.render(CONTACTS) - silent.render(CONTACTS)
+    level = float(noise.std())
+    assert level > 0
+    # What float32 leaves of it beside the modes.
+    torch.testing.assert_close(noise, noise[:1].expand(40, -1), rtol=0, atol=1e-3 * level)
+    assert torch.equal(sound_field.render(CONTACTS), sound_field.render(CONTACTS))
+
+
+@pytest.mark.parametrize("rows", [[0], [7], [3, 39], list(range(39, -1, -1)), list(range(33))])
+def test_a_contacts_sound_does_not_depend_on_its_company(rows):
+    """More contacts than one batch, one alone, the last one of a batch: to the rounding of other orders of sums."""
+    sounds = field().render(CONTACTS)
+    loudest = float(sounds.abs().max())
+    torch.testing.assert_close(field().render(CONTACTS[rows]), sounds[rows], rtol=0, atol=1e-6 * loudest)
+
+
+def test_no_contacts_make_no_sounds():
+    assert field().render(CONTACTS[:0]).shape == (0, 2400)
+
+
+def test_force_scales_all_of_the_sound():
+    sounds = field().render(CONTACTS)
+    assert torch.equal(field().render(CONTACTS, force=4.0), 4.0 * sounds)
+    assert torch.equal(field().render(CONTACTS, force=0.0), torch.zeros(40, 2400))
+    # Noise and modes alike, to float32.
+    torch.testing.assert_close(field().render(CONTACTS, force=0.3), 0.3 * sounds, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("samples", [1, 511, 2400, 5000])
+def test_modes_of_a_longer_sound_begin_as_those_of_a_shorter_one(samples):
+    silent = replace(field(), residual=replace(field().residual, magnitude=torch.zeros(33)))
+    shorter, longer = silent.render(CONTACTS, samples=samples), silent.render(CONTACTS, samples=6000)
+    assert shorter.shape == (40, samples)
+    loudest = float(longer.abs().max())
+    torch.testing.assert_close(shorter, longer[:, :samples], rtol=0, atol=1e-6 * loudest)
+    assert field().render(CONTACTS, samples=samples).shape == (40, samples)
+
+
+def test_contacts_in_float32_and_float64_sound_alike():
+    sounds = field().render(CONTACTS)
+    assert sounds.dtype == torch.float32
+    assert torch.equal(field().render(CONTACTS.float()), sounds)
+
+
+def test_rendering_keeps_no_gradients_and_changes_no_chance():
+    before = torch.get_rng_state()
+    assert not field().render(CONTACTS).requires_grad
+    assert not field().gains(CONTACTS).requires_grad
+    assert not any(parameter.requires_grad for parameter in field().gain_field.parameters())
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_field_is_a_renderer():
+    assert isinstance(field(), Renderer)
+    assert field().samples == 2400
+    assert field().sample_rate == RATE
+    assert field().origin.per_newton is True

@@ -1,0 +1,363 @@
+"""A field is one file: it comes back to the last bit, or is refused with a reason."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+from safetensors import safe_open
+from safetensors.torch import load as from_bytes
+from safetensors.torch import save as to_bytes
+
+from avmsf.errors import FieldFileError
+from avmsf.field.fit import fit
+from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.store import load, save
+from avmsf.simulate.plate import sample_contacts
+from plate_field import PLATE, QUICK, plate_extraction, plate_features, plate_impacts
+
+CONTACTS = sample_contacts(PLATE, 10, generator=torch.Generator().manual_seed(5))
+CONFIG = replace(QUICK, warmup_steps=4, steps=2)
+
+
+@cache
+def field(damping: str = "shared") -> SoundField:
+    impacts = plate_impacts(forces=True)
+    config = replace(CONFIG, damping=damping, learning_rate=0.05)
+    return fit(impacts, plate_features(), plate_extraction(impacts), config, capture="a plate")
+
+
+def other_field() -> SoundField:
+    return replace(field(), bank=replace(field().bank, damping=field().bank.damping * 2))
+
+
+@pytest.mark.parametrize("damping", ["shared", "per-contact", "validated"])
+def test_a_field_comes_back_to_the_last_bit(tmp_path, damping):
+    saved, path = field(damping), tmp_path / "plate.safetensors"
+    save(saved, path)
+    loaded = load(str(path))
+    assert torch.equal(loaded.render(CONTACTS), saved.render(CONTACTS))
+    assert torch.equal(loaded.gains(CONTACTS), saved.gains(CONTACTS))
+    assert torch.equal(loaded.dampings(CONTACTS), saved.dampings(CONTACTS))
+    assert loaded.origin == saved.origin
+    assert loaded.origin.config.fft_sizes == (1024, 256)
+    assert loaded.origin.trained_on == plate_impacts().names
+    assert (loaded.sample_rate, loaded.samples) == (saved.sample_rate, saved.samples)
+    assert (loaded.gain_field.shape, loaded.gain_field.encoder) == (saved.gain_field.shape, "geometry")
+    assert not loaded.gain_field.training
+    assert not any(parameter.requires_grad for parameter in loaded.gain_field.parameters())
+
+
+def test_a_file_names_its_tensors_and_itself(tmp_path):
+    save(field(), tmp_path / "plate.safetensors")
+    with safe_open(tmp_path / "plate.safetensors", framework="pt") as file:
+        names, record = set(file.keys()), json.loads(file.metadata()["avmsf"])
+    assert {"bank.frequency", "bank.damping", "residual.magnitude"} < names
+    assert {name.removeprefix("gain_field.") for name in names if name.startswith("gain_field.")} == set(
+        field().gain_field.state_dict()
+    )
+    assert record["format"] == 1
+    assert record["version"] == "0.1.0"
+    assert record["sample_rate"] == 8000.0
+    assert record["origin"]["capture"] == "a plate"
+    assert record["origin"]["per_newton"] is True
+
+
+def test_saving_twice_gives_the_same_bytes(tmp_path):
+    save(field(), tmp_path / "one")
+    save(load(tmp_path / "one"), tmp_path / "two")
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+
+
+def test_loading_and_saving_leave_chance_alone(tmp_path):
+    before = torch.get_rng_state()
+    save(field(), tmp_path / "plate")
+    load(tmp_path / "plate")
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_loaded_field_needs_its_file_no_more(tmp_path):
+    path = tmp_path / "plate.safetensors"
+    save(field(), path)
+    loaded = load(path)
+    with open(path, "r+b") as file:
+        file.write(bytes(path.stat().st_size))
+    path.unlink()
+    assert torch.equal(loaded.render(CONTACTS), field().render(CONTACTS))
+
+
+def test_missing_folders_are_made_and_what_is_there_is_replaced(tmp_path):
+    path = tmp_path / "fields" / "of" / "plates" / "plate.safetensors"
+    save(field(), path)
+    save(other_field(), path)
+    assert torch.equal(load(path).bank.damping, other_field().bank.damping)
+    assert [each.name for each in path.parent.iterdir()] == ["plate.safetensors"]
+
+
+def test_a_saved_file_may_be_read_by_whom_the_umask_lets(tmp_path):
+    mask = os.umask(0o022)
+    try:
+        save(field(), tmp_path / "plate")
+    finally:
+        os.umask(mask)
+    assert (tmp_path / "plate").stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize("place", ["file/plate", "."])
+def test_a_place_where_no_file_can_be_is_refused(tmp_path, place):
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(FieldFileError, match=r"cannot be written .*choose another place"):
+        save(field(), tmp_path / place)
+    assert [each.name for each in tmp_path.iterdir()] == ["file"]
+    assert (tmp_path / "file").read_text() == "not a folder"
+
+
+def in_another_process(script: str, *arguments: object) -> subprocess.Popen[str]:
+    """Start Python on a script that finds `field` and `path`, the second a place where a field may be written."""
+    head = (
+        "import resource, signal, sys\n"
+        "from avmsf.errors import FieldFileError\n"
+        "from avmsf.field.store import load, save\n"
+        "field, path = load(sys.argv[1]), sys.argv[2]\n"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", head + script, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+
+
+def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path):
+    source, path = tmp_path / "source", tmp_path / "there" / "plate.safetensors"
+    save(field(), source)
+    save(other_field(), path)
+    before = path.read_bytes()
+    script = (
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
+        "try:\n    save(field, path)\n"
+        "except FieldFileError as error:\n    print(error)\n"
+    )
+    process = in_another_process(script, source, path)
+    said, _ = process.communicate(timeout=60)
+    assert "plate.safetensors: cannot be written (File too large); what was there is untouched" in said
+    assert process.returncode == 0
+    assert path.read_bytes() == before
+    assert [each.name for each in path.parent.iterdir()] == ["plate.safetensors"]
+
+
+def test_a_kill_while_saving_leaves_one_whole_field_or_the_other(tmp_path):
+    source, folder = tmp_path / "source", tmp_path / "there"
+    path = folder / "plate.safetensors"
+    save(field(), source)
+    save(other_field(), path)
+    # Saving again and again, so that the kill falls at any moment of it.
+    process = in_another_process("print('now', flush=True)\nwhile True: save(field, path)", source, path)
+    assert process.stdout is not None
+    with process:
+        assert process.stdout.readline() == "now\n"
+        time.sleep(random.Random(0).uniform(0.02, 0.05))
+        process.send_signal(signal.SIGKILL)
+    assert torch.equal(load(path).bank.frequency, field().bank.frequency)
+    left = {each.name for each in folder.iterdir()} - {path.name}
+    assert all(name.startswith(".plate.safetensors.") and name.endswith(".part") for name in left)
+    save(other_field(), path)
+    assert torch.equal(load(path).bank.damping, other_field().bank.damping)
+
+
+def test_a_kill_before_the_last_moment_leaves_the_old_field(tmp_path):
+    source, path = tmp_path / "source", tmp_path / "there" / "plate.safetensors"
+    save(field(), source)
+    save(other_field(), path)
+    before = path.read_bytes()
+    script = (
+        "import os\ndef die(*given):\n    os.kill(os.getpid(), signal.SIGKILL)\nos.replace = die\nsave(field, path)\n"
+    )
+    process = in_another_process(script, source, path)
+    process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGKILL
+    assert path.read_bytes() == before
+    # The half-done file lies hidden beside it, is none of the user's names, and stands in no later saving's way.
+    (left,) = [each for each in path.parent.iterdir() if each != path]
+    assert left.name.startswith(".plate.safetensors.")
+    save(field(), path)
+    assert torch.equal(load(path).render(CONTACTS), field().render(CONTACTS))
+
+
+Change = Callable[[dict[str, torch.Tensor], dict], None]
+
+
+def changed(tmp_path: Path, change: Change) -> Path:
+    """Save a field, and write it once more with its tensors and record changed."""
+    path = tmp_path / "plate.safetensors"
+    save(field(), path)
+    with safe_open(path, framework="pt") as file:
+        record = json.loads(file.metadata()["avmsf"])
+    tensors = from_bytes(path.read_bytes())
+    change(tensors, record)
+    path.write_bytes(to_bytes(tensors, {"avmsf": json.dumps(record)}))
+    return path
+
+
+def test_a_file_written_again_unchanged_is_read(tmp_path):
+    assert torch.equal(load(changed(tmp_path, lambda *_: None)).render(CONTACTS), field().render(CONTACTS))
+
+
+@pytest.mark.parametrize("kept", [0, 5, 9, 100, 3000, -1])
+def test_a_file_cut_short_is_refused(tmp_path, kept):
+    path = tmp_path / "plate.safetensors"
+    save(field(), path)
+    path.write_bytes(path.read_bytes()[:kept])
+    reason = "a file of another kind" if kept in (0, 5) else "one that is cut short or damaged: copy it again"
+    with pytest.raises(FieldFileError, match=rf"plate\.safetensors: expected a sound field, found {reason}"):
+        load(path)
+
+
+@pytest.mark.parametrize("kind", ["wav", "text", "pickle", "zeros"])
+def test_a_file_of_another_kind_is_refused(tmp_path, kind):
+    path = tmp_path / "something"
+    if kind == "wav":
+        soundfile.write(path, np.zeros(1000), 44100, format="WAV")
+    elif kind == "pickle":
+        torch.save({"bank.frequency": torch.ones(3)}, path)
+    else:
+        path.write_bytes({"text": b"a long text about bowls\n" * 9, "zeros": bytes(200)}[kind])
+    with pytest.raises(FieldFileError, match="something: expected a sound field, found a file of another kind"):
+        load(path)
+
+
+def test_someone_elses_safetensors_are_refused(tmp_path):
+    for number, metadata in enumerate([None, {"format": "pt"}]):
+        (tmp_path / f"{number}").write_bytes(to_bytes({"bank.frequency": torch.ones(3)}, metadata))
+        with pytest.raises(FieldFileError, match=r"found a safetensors file of something else .*no entry 'avmsf'"):
+            load(tmp_path / f"{number}")
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path):
+    with pytest.raises(FieldFileError, match="nowhere: expected a sound field, found no such file"):
+        load(tmp_path / "nowhere")
+    with pytest.raises(FieldFileError, match="found a folder: name the file in it"):
+        load(tmp_path)
+
+
+def test_a_newer_format_is_refused_by_name(tmp_path):
+    def change(_: dict, record: dict) -> None:
+        record.update(format=2, version="3.1.4", something="new")
+
+    with pytest.raises(FieldFileError, match=r"of format 1, found format 2, written by avmsf 3\.1\.4") as caught:
+        load(changed(tmp_path, change))
+    assert "pip install 'avmsf>=3.1.4'" in str(caught.value)
+
+
+def test_missing_and_unexpected_tensors_are_named(tmp_path):
+    def change(tensors: dict[str, torch.Tensor], _: dict) -> None:
+        tensors["gain_field.to_dampings.bias"] = tensors.pop("gain_field.to_gains.bias")
+
+    with pytest.raises(
+        FieldFileError, match=r"missing gain_field\.to_gains\.bias; unexpected gain_field\.to_dampings\.bias"
+    ):
+        load(changed(tmp_path, change))
+
+
+@pytest.mark.parametrize(
+    ("name", "made", "message"),
+    [
+        ("gain_field.centers", lambda each: each[:-1].clone(), r"as float32\[8, 3\], found float32\[7, 3\]"),
+        ("bank.damping", lambda each: each.float(), r"as float64\[12\], found float32\[12\]"),
+        ("residual.magnitude", lambda each: each[None], r"as float32\[33\], found float32\[1, 33\]"),
+        ("gain_field.to_gains.weight", lambda each: each * torch.nan, "to be finite"),
+        ("bank.damping", lambda each: -each, "to be positive"),
+        ("bank.frequency", lambda each: each * 0, "to be positive"),
+        ("bank.frequency", lambda each: each * torch.inf, "to be positive"),
+        ("residual.magnitude", lambda each: -each, "to be not negative"),
+    ],
+)
+def test_tensors_of_another_form_or_of_impossible_values_are_refused(tmp_path, name, made, message):
+    def change(tensors: dict[str, torch.Tensor], _: dict) -> None:
+        tensors[name] = made(tensors[name])
+
+    with pytest.raises(FieldFileError, match=rf"expected {name} {message}"):
+        load(changed(tmp_path, change))
+
+
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (("sizes", "modes"), 13),
+        (("gain_field", "shape", "clusters"), 9),
+        (("gain_field", "shape", "width"), 10**7),
+        (("gain_field", "shape", "spatial_damping"), True),
+    ],
+)
+def test_a_record_that_is_not_of_these_tensors_is_refused(tmp_path, keys, value):
+    with pytest.raises(FieldFileError, match=r"missing gain_field\.to_dampings|do not belong together"):
+        load(changed(tmp_path, lambda _, record: put(record, keys, value)))
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "reason"),
+    [
+        (("format",), "1", "format"),
+        (("sample_rate",), "44100", "sample_rate"),
+        (("sample_rate",), -1.0, "sample_rate"),
+        (("samples",), 0, "samples"),
+        (("sizes",), {}, "points"),
+        (("sizes", "dim"), True, "dim"),
+        (("gain_field", "kind"), "splines", "splines"),
+        (("gain_field", "shape", "width"), 1.5, "width"),
+        (("gain_field", "shape", "heads"), 4, "heads"),
+        (("config", "clusters"), 0, "clusters"),
+        (("config", "fft_sizes"), "1024", "fft_sizes"),
+        (("config", "unheard_of"), 1, "unheard_of"),
+        (("origin", "trained_on"), [1], "trained_on"),
+        (("origin",), None, "NoneType"),
+    ],
+)
+def test_a_damaged_record_is_refused_with_what_is_wrong(tmp_path, keys, value, reason):
+    path = changed(tmp_path, lambda _, record: put(record, keys, value))
+    with pytest.raises(FieldFileError, match=rf"plate\.safetensors: expected .*{reason}"):
+        load(path)
+
+
+@pytest.mark.parametrize("words", ["", "[]", "{", '"avmsf"', '{"format": 1}'])
+def test_a_record_that_is_none_is_refused(tmp_path, words):
+    path = tmp_path / "plate.safetensors"
+    save(field(), path)
+    path.write_bytes(to_bytes(from_bytes(path.read_bytes()), {"avmsf": words}))
+    with pytest.raises(FieldFileError, match="expected the header of a sound field of format 1, found another"):
+        load(path)
+
+
+def put(record: dict, keys: tuple[str, ...], value: object) -> None:
+    for key in keys[:-1]:
+        record = record[key]
+    record[keys[-1]] = value
+
+
+def test_what_could_not_be_read_back_is_not_written(tmp_path):
+    path = tmp_path / "plate.safetensors"
+    bank = replace(field().bank, damping=-field().bank.damping)
+    with pytest.raises(FieldFileError, match=r"expected bank\.damping to be positive"):
+        save(replace(field(), bank=bank), path)
+    for broken in (float("nan"), torch.ones(1)):
+        origin = replace(field().origin, report={"loss": broken})
+        with pytest.raises(FieldFileError, match=r"expected origin\.report to hold finite numbers"):
+            save(replace(field(), origin=origin), path)
+    assert not path.exists()
+
+
+def test_an_origin_that_says_nothing_is_kept(tmp_path):
+    save(replace(field(), origin=Origin()), tmp_path / "plate")
+    assert load(tmp_path / "plate").origin == Origin()
