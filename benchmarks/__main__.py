@@ -1,0 +1,59 @@
+"""`python -m benchmarks field`, `extract` or `speed`."""
+
+import argparse
+import sys
+import warnings
+from collections.abc import Sequence
+from types import ModuleType
+
+from avmsf.capture import CaptureWarning
+from avmsf.errors import AvmsfError
+from benchmarks import extract, field, speed
+from benchmarks.material import MissingDataError
+from benchmarks.report import Options, show
+
+BENCHMARKS: dict[str, ModuleType] = {"field": field, "extract": extract, "speed": speed}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one benchmark and return the exit code: 0, or 2 for arguments or data that cannot be used."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("name", choices=tuple(BENCHMARKS), help="which benchmark to run")
+    parser.add_argument(
+        "--parts", nargs="+", metavar="PART", help="run only these: " + "; ".join(map(_parts_of, BENCHMARKS))
+    )
+    parser.add_argument(
+        "--quick-look", action="store_true", help="small settings, to see that everything runs; the output says so"
+    )
+    parser.add_argument(
+        "--paper-minutes",
+        type=float,
+        default=6.0,
+        help="speed: minutes for a real run of the paper's recipe (default 6)",
+    )
+    chosen = parser.parse_args(arguments)
+    benchmark = BENCHMARKS[chosen.name]
+    parts = tuple(chosen.parts or benchmark.PARTS)
+    unknown = [part for part in parts if part not in benchmark.PARTS]
+    if unknown:
+        parser.error(f"{chosen.name} has no part {', '.join(unknown)}; it has {', '.join(benchmark.PARTS)}")
+    if not chosen.paper_minutes > 0:
+        parser.error(f"--paper-minutes is {chosen.paper_minutes:g}; expected a number above 0")
+    options = Options(parts, chosen.quick_look, chosen.paper_minutes)
+    # Remarks on a capture are `avmsf check`'s business.
+    warnings.simplefilter("ignore", CaptureWarning)
+    try:
+        report = benchmark.measure(options)
+    except (AvmsfError, MissingDataError) as error:
+        print(f"benchmarks {chosen.name}: {error}", file=sys.stderr)
+        return 2
+    show(report, options, name=chosen.name)
+    return 0
+
+
+def _parts_of(name: str) -> str:
+    return f"{name}: {', '.join(BENCHMARKS[name].PARTS)}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
