@@ -1,0 +1,91 @@
+"""The command `avmsf`: one module a verb, and what happens around all of them."""
+
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import TextIO
+
+import tyro
+
+import avmsf
+from avmsf.errors import AvmsfError
+
+VERBS = {
+    "check": "Say what each recording of a capture is worth, and what is wrong.",
+    "modes": "List the modes that a capture's recordings have in common.",
+    "fit": "Fit a sound field to a capture and write it to one file.",
+    "render": "Write the sounds of blows anywhere on the object as wav files.",
+    "show": "Say what a field file holds, and draw it.",
+    "demo": "Go all the way on a built-in example: capture, modes, field, sounds, pictures, figures.",
+}
+"""Each verb's module in this package, and the first sentence of its help."""
+INTERRUPTED = 130
+"""The exit code that shells give a command ended by Ctrl-C."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one verb and return its exit code: 0, 2 for input that cannot be used, 130 after Ctrl-C.
+
+    Raises SystemExit, as command lines do, for help (0) and for arguments that cannot be understood (2).
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words[:1] == ["--version"]:
+        print(avmsf.__version__)
+        return 0
+    if not words or words[0] not in VERBS:
+        _explain(words)
+        return 2
+    # Only the verb that is asked for is imported: torch takes seconds, and help on the whole needs none of it.
+    verb = import_module(f"avmsf.cli.{words[0]}")
+    with warnings.catch_warnings():
+        _show_plainly()
+        try:
+            return verb.run(verb.parse(words[1:]))
+        except AvmsfError as error:
+            print(f"avmsf {words[0]}: {' '.join(str(error).split())}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            print(f"avmsf {words[0]}: interrupted", file=sys.stderr)
+            return INTERRUPTED
+
+
+def _explain(words: list[str]) -> None:
+    """Print the list of verbs, or say that there is no such verb; leaves by SystemExit."""
+    listed: dict[str, Callable[[], None]] = {}
+    for verb, summary in VERBS.items():
+
+        def stand_in() -> None:
+            pass
+
+        stand_in.__doc__ = summary
+        listed[verb] = stand_in
+    tyro.extras.subcommand_cli_from_dict(
+        listed,
+        prog="avmsf",
+        description="The sound of an object wherever it is struck, from a few taps. `avmsf VERB --help` explains each.",
+        args=words or ["--help"],
+    )
+
+
+def _show_plainly() -> None:
+    """Let what a capture's owner should know appear as a sentence, without Python's file, line and category."""
+    from avmsf.capture.warning import CaptureWarning  # its package imports torch, which help does without
+
+    others = warnings.showwarning
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if issubclass(category, CaptureWarning):
+            print(f"note: {message}", file=sys.stderr)
+        else:
+            others(message, category, filename, lineno, file, line)
+
+    warnings.simplefilter("always", CaptureWarning)
+    warnings.showwarning = show

@@ -1,0 +1,84 @@
+"""`avmsf check`: what each recording of a capture is worth, and what is wrong."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import tyro
+
+from avmsf.capture import CaptureReport, CaptureSettings, RecordingReport, check
+from avmsf.cli.printing import console, decimals, print_json, say, table
+
+UNREADABLE = 2
+
+
+@dataclass(frozen=True)
+class Options:
+    """Say what each recording of a capture is worth, and what is wrong.
+
+    One row a recording, problems below. The exit code is 0 where the capture can be read, with or without warnings,
+    and 2 where it cannot.
+    """
+
+    capture: tyro.conf.Positional[Path]
+    """Folder with impacts.csv and the wav files it names."""
+    settings: Path | None = None
+    """A capture.toml to use in place of the folder's own."""
+    json: bool = False
+    """Print one JSON object on the standard output, all else on the standard error."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return tyro.cli(Options, prog="avmsf check", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def run(options: Options) -> int:
+    """Print the report; return 2 where the capture cannot be read."""
+    settings = None if options.settings is None else CaptureSettings.read(options.settings)
+    report = check(options.capture, settings)
+    screen = console(errors=options.json)
+    if report.recordings:
+        screen.print(_table(report, str(options.capture)))
+    for problem in problems_of(report):
+        screen.print(problem, soft_wrap=True)
+    if options.json:
+        print_json(asdict(report))
+    if not report.readable:
+        say(f"avmsf check: {options.capture} cannot be read as it is: mend what is listed and check again")
+        return UNREADABLE
+    wrong = sum(bool(row.problems) for row in report.recordings) + len(report.problems)
+    screen.print("no problem found" if not wrong else f"readable, with {wrong} warnings", soft_wrap=True)
+    return 0
+
+
+def problems_of(report: CaptureReport) -> list[str]:
+    """Return every problem as one sentence: the folder's first, then the recordings' in their order."""
+    return [
+        *report.problems,
+        *(_placed(row, problem) for row in report.recordings for problem in row.problems),
+    ]
+
+
+def _placed(row: RecordingReport, problem: str) -> str:
+    # Errors of the capture's reader name the file or the line by themselves.
+    return problem if problem.startswith((row.file, "impacts.csv")) else f"{row.file}: {problem}"
+
+
+def _table(report: CaptureReport, title: str) -> object:
+    columns = ("recording", "state", "length s", "rate Hz", "peak dB", "noise dB", "clipped", "onset s", "2nd blow s")
+    rows = [
+        (
+            row.file,
+            "unreadable" if not row.readable else "look" if row.problems else "good",
+            decimals(row.seconds, 2),
+            decimals(row.sample_rate, 0),
+            decimals(row.peak_db, 1),
+            decimals(row.noise_db, 1),
+            decimals(row.clipped, 0),
+            decimals(row.onset_seconds, 4),
+            decimals(row.double_hit_seconds, 3),
+        )
+        for row in report.recordings
+    ]
+    return table(title, columns, rows, words=2)

@@ -1,0 +1,101 @@
+"""Contacts to render, from the command line or from a table, each with the name of its sound."""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from avmsf.cli.writing import OutputError
+from avmsf.errors import CaptureError
+from avmsf.field.soundfield import SoundField
+
+_COLUMNS = ("x", "y", "z")
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Where to strike, and what to call each sound."""
+
+    places: Float64[Tensor, "contacts 3"]
+    """Object frame, metres."""
+    names: tuple[str, ...]
+    """Paths of wav files in the output folder."""
+
+
+def contacts_at(places: Sequence[tuple[float, float, float]], *, metres: float) -> Contacts:
+    """Number the contacts that the command line gives, whose coordinates count `metres` each."""
+    return Contacts(
+        torch.tensor(places, dtype=torch.float64).reshape(-1, 3) * metres,
+        tuple(f"{number:03d}.wav" for number in range(1, len(places) + 1)),
+    )
+
+
+def read_contacts(path: Path, *, metres: float) -> Contacts:
+    """Read a table with the columns x, y, z and perhaps file, such as a capture's impacts.csv; others are ignored.
+
+    Sounds are called as the column `file` says, else by number. Raises `CaptureError` with the line at fault.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CaptureError(f"{path}: not a table that can be read: {error}") from error
+    first = text.lstrip().split("\n", 1)[0]
+    separator = max(",;\t", key=first.count)
+    reader = csv.reader(io.StringIO(text), delimiter=separator)
+    lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+    lines = [(line, cells) for line, cells in lines if any(cells)]
+    header = [name.lower() for name in lines[0][1]] if lines else []
+    missing = [name for name in _COLUMNS if name not in header]
+    if missing or len(lines) < 2:
+        lacking = f"the column {missing[0]} is missing" if missing else "there is no row"
+        raise CaptureError(
+            f"{path}: {lacking}; expected a header line with x,y,z (and perhaps file) and one row a blow"
+        )
+    places, names = [], []
+    for line, cells in lines[1:]:
+        row = dict(zip(header, cells, strict=False))
+        places.append([_number(row.get(name, ""), f"{path} line {line}: {name}", separator) for name in _COLUMNS])
+        names.append(_wav_name(row["file"], f"{path} line {line}") if "file" in row else f"{len(places):03d}.wav")
+    repeated = next((name for name in names if names.count(name) > 1), None)
+    if repeated is not None:
+        raise CaptureError(f"{path}: more than one row is to become {repeated}; each needs a name of its own")
+    return Contacts(torch.tensor(places, dtype=torch.float64) * metres, tuple(names))
+
+
+def refuse_far(contacts: Contacts, field: SoundField) -> None:
+    """Raise `OutputError` for a contact farther outside the object's box than the object is large: a wrong unit."""
+    points = field.gain_field.points.double()
+    low, high = points.amin(0), points.amax(0)
+    size = float((high - low).norm())
+    outside = torch.clamp(torch.maximum(low - contacts.places, contacts.places - high), min=0).norm(dim=1)
+    worst = int(outside.argmax())
+    if float(outside[worst]) > size:
+        place = ", ".join(f"{value:.4g}" for value in contacts.places[worst].tolist())
+        raise OutputError(
+            f"{contacts.names[worst]}: the contact ({place}) m lies {float(outside[worst]):.3g} m outside an object "
+            f"{size:.3g} m across; if its numbers count another unit, say so with --unit"
+        )
+
+
+def _number(text: str, where: str, separator: str) -> float:
+    try:
+        # Tables that are not separated by commas may write 0,75.
+        value = float(text if separator == "," else text.replace(",", "."))
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise CaptureError(f"{where} is {text!r}; expected a number")
+    return value
+
+
+def _wav_name(text: str, where: str) -> str:
+    path = PurePosixPath(text.replace("\\", "/"))
+    if not path.name or path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
+        raise CaptureError(f"{where}: file is {text!r}; expected the name of a wav file inside the output folder")
+    return str(path if path.suffix.lower() == ".wav" else path.with_name(f"{path.name}.wav"))

@@ -1,0 +1,163 @@
+"""`avmsf fit`: a capture folder in, a field file out."""
+
+from collections.abc import Sequence
+from dataclasses import MISSING, asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+import tyro
+
+from avmsf.bench.evaluation import split
+from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
+from avmsf.cli import INTERRUPTED
+from avmsf.cli.modes import Method, finder
+from avmsf.cli.printing import console, print_json, say
+from avmsf.cli.progress import FitBar
+from avmsf.cli.scores import compare, score_table, score_values
+from avmsf.cli.writing import expect_writable
+from avmsf.field.config import PAPER, FitConfig
+from avmsf.field.fit import fit
+from avmsf.field.soundfield import SoundField
+from avmsf.field.store import save
+from avmsf.modal.extract import extract
+from avmsf.scene.features import FeatureField
+
+RECIPES = {"quick": FitConfig(), "paper": PAPER}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Fit a sound field to a capture and write it to one file.
+
+    An interrupted fit leaves a checkpoint beside the output; the same command goes on from it to the same result.
+    """
+
+    capture: tyro.conf.Positional[Path]
+    """Folder with impacts.csv and the wav files it names."""
+    output: Annotated[Path, tyro.conf.arg(metavar="FIELD.safetensors")]
+    """File to write the field to."""
+    settings: Path | None = None
+    """A capture.toml to use in place of the folder's own."""
+    train_fraction: float | None = None
+    """Fit to this part of the contacts, spread as far apart as they go, and score the field on the others."""
+    train_count: int | None = None
+    """Likewise with so many contacts."""
+    start: int = 0
+    """Row of impacts.csv, counted from 0, that this choice of contacts starts from."""
+    method: Method = "high-resolution"
+    """How modes are found; see `avmsf modes --help`."""
+    modes: int = 128
+    """Most modes to keep."""
+    json: bool = False
+    """Print one JSON object on the standard output, all else on the standard error."""
+    recipe: Literal["quick", "paper"] = "quick"
+    """Where the settings below start from: quick takes seconds to minutes, paper has the paper's settings and takes
+    hours without an accelerator. `--recipe paper --help` shows its values."""
+    config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)
+    """Settings of the fit."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell, with the recipe's settings where they say nothing."""
+    chosen, _ = tyro.cli(_Recipe, args=words, add_help=False, return_unknown_args=True)
+    # Fields without a default are still to be given.
+    start: dict[str, Any] = {
+        each.name: tyro.MISSING
+        for each in fields(Options)
+        if each.default is MISSING and each.default_factory is MISSING
+    }
+    default = Options(**start, recipe=chosen.recipe, config=RECIPES[chosen.recipe])
+    return tyro.cli(Options, prog="avmsf fit", args=words, default=default, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    recipe: Literal["quick", "paper"] = "quick"
+
+
+def run(options: Options) -> int:
+    """Fit, write, and say what came of it; return 130 where Ctrl-C stopped it."""
+    expect_writable(options.output)
+    settings = None if options.settings is None else CaptureSettings.read(options.settings)
+    capture = read_capture(options.capture, settings)
+    train, test = _parts(capture, options)
+    say(f"finding the modes of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
+    modes = extract(train, finder(options.method, options.modes))
+    say(f"fitting a field of {len(modes.bank)} modes")
+    checkpoint = checkpoint_of(options.output)
+    try:
+        with FitBar() as bar:
+            fitted = fit(
+                train,
+                features_of(capture, options.config),
+                modes,
+                options.config,
+                capture=capture.name,
+                checkpoint=checkpoint,
+                progress=bar.show,
+            )
+    except KeyboardInterrupt:
+        say(_how_to_go_on(checkpoint))
+        return INTERRUPTED
+    save(fitted, options.output)
+    scores = {} if test is None else compare(fitted, train, test, modes)
+    screen = console(errors=options.json)
+    if test is not None:
+        title = f"{len(test)} contacts not trained on, {len(train)} trained on; lower is better"
+        screen.print(score_table(title, scores))
+    screen.print(_summary(fitted, len(train)), soft_wrap=True)
+    screen.print(f"wrote {options.output}", soft_wrap=True)
+    if options.json:
+        print_json(
+            {
+                "field": str(options.output),
+                "capture": capture.name,
+                "recipe": options.recipe,
+                "config": asdict(options.config),
+                "modes": len(fitted.bank),
+                "sample_rate": fitted.sample_rate,
+                "trained_on": list(train.names),
+                "tested_on": [] if test is None else list(test.names),
+                "report": fitted.origin.report,
+                "scores": score_values(scores),
+            }
+        )
+    return 0
+
+
+def checkpoint_of(output: Path) -> Path:
+    """Return where the state of an unfinished fit is kept: beside the field that it will become."""
+    return output.with_name(f"{output.name}.checkpoint")
+
+
+def features_of(capture: Capture, config: FitConfig) -> FeatureField:
+    """Return the object's points: of its surface where there is one, else those that fill the contacts' box."""
+    if capture.surface is None:
+        say("the capture has no surface: points that fill the box of its contacts stand for the object")
+        return FeatureField.from_contacts(capture.impacts.contacts)
+    return FeatureField.from_mesh(capture.surface, generator=torch.Generator().manual_seed(config.seed))
+
+
+def _parts(capture: Capture, options: Options) -> tuple[Impacts, Impacts | None]:
+    if options.train_count is not None:
+        return split(capture.impacts, count=options.train_count, start=options.start)
+    if options.train_fraction is not None:
+        return split(capture.impacts, fraction=options.train_fraction, start=options.start)
+    return capture.impacts, None
+
+
+def _summary(fitted: SoundField, contacts: int) -> str:
+    report = fitted.origin.report
+    how = "chosen on validation contacts" if report.get("validated") else "as set"
+    return (
+        f"field of {fitted.origin.capture}: {len(fitted.bank)} modes from {contacts} recordings, "
+        f"{report.get('damping', 'shared')} damping ({how}), {report.get('steps', fitted.origin.config.steps)} steps "
+        "end to end"
+    )
+
+
+def _how_to_go_on(checkpoint: Path) -> str:
+    if not checkpoint.exists():
+        return "avmsf fit: interrupted before there was anything to keep"
+    return f"avmsf fit: interrupted; give the same command again to go on from {checkpoint}, or delete it"

@@ -1,0 +1,72 @@
+"""What the verbs print: tables and words for people, JSON for programs, each on its own stream."""
+
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+_WIDTH = 120
+"""Columns of tables that go to a file or a pipe, which have no width of their own."""
+
+
+def console(*, errors: bool) -> Console:
+    """Return where tables go: the standard output, or with `errors` the standard error, left free by JSON."""
+    stream = sys.stderr if errors else sys.stdout
+    # File names and messages hold square brackets, which would be taken for markup.
+    width = None if stream.isatty() else _WIDTH
+    return Console(file=stream, width=width, markup=False, highlight=False, emoji=False)
+
+
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, words: int = 1) -> Table:
+    """Return a table whose first `words` columns are words, set left, and the others figures, set right."""
+    drawn = Table(title=title, title_justify="left")
+    for place, column in enumerate(columns):
+        left = place < words
+        drawn.add_column(column, justify="left" if left else "right", overflow="fold" if left else "ellipsis")
+    for row in rows:
+        drawn.add_row(*row)
+    return drawn
+
+
+def figure(value: float | None, digits: int = 3) -> str:
+    """Return a number with so many significant digits and no exponent where none is needed; a dash for None."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value == 0 or not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.{digits}g}"
+    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    return f"{value:.{decimals}f}"
+
+
+def decimals(value: float | None, places: int) -> str:
+    """Return a number with so many decimals; a dash for None."""
+    return "–" if value is None else f"{value:.{places}f}"
+
+
+def say(text: str) -> None:
+    """Print one line of progress or remark to the standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def print_json(value: Mapping[str, Any]) -> None:
+    """Print one JSON object to the standard output."""
+    print(json_text(value))
+
+
+def json_text(value: Mapping[str, Any]) -> str:
+    """Return valid JSON: what is not a finite number becomes null, which NaN is not."""
+    return json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,49 @@
+"""A fit's progress, on the standard error."""
+
+import sys
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from avmsf.cli.printing import figure, say
+from avmsf.field.fit import Progress as FitProgress
+
+
+class FitBar:
+    """One bar a stage, with its loss and the time it has left; in a file or a pipe, one line a stage."""
+
+    def __init__(self) -> None:
+        self.live = sys.stderr.isatty()
+        self.stage = ""
+        self.bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("loss {task.fields[loss]}"),
+            TimeRemainingColumn(),
+            console=Console(file=sys.stderr, markup=False, highlight=False),
+            disable=not self.live,
+        )
+        self.task = self.bar.add_task("", total=None, loss="–", visible=False)
+
+    def __enter__(self) -> "FitBar":
+        self.bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.bar.stop()
+
+    def show(self, progress: FitProgress) -> None:
+        """Take note of one step."""
+        new = progress.stage != self.stage
+        if new and self.live:
+            self.bar.remove_task(self.task)
+            self.task = self.bar.add_task(progress.stage, total=progress.steps, loss="–")
+        self.stage = progress.stage
+        if self.live:
+            self.bar.update(self.task, completed=progress.step, loss=figure(progress.loss))
+        elif progress.step == progress.steps:
+            say(f"{progress.stage}: {progress.steps} steps, loss {figure(progress.loss)}")

@@ -1,0 +1,116 @@
+"""`avmsf render`: the sounds of blows anywhere on the object."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import tyro
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.cli.contacts import Contacts, contacts_at, read_contacts, refuse_far
+from avmsf.cli.printing import say
+from avmsf.cli.writing import Coding, Level, OutputError, expect_writable, write_sound
+from avmsf.field.soundfield import SoundField
+from avmsf.field.store import load
+
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Write the sounds of blows anywhere on the object as wav files.
+
+    Contacts come from `--at`, once a contact, or from a table with the columns x,y,z and perhaps file, such as a
+    capture's own impacts.csv. Each is heard at the object's point nearest to it.
+    """
+
+    field: tyro.conf.Positional[Path]
+    """Field file, as `avmsf fit` writes it."""
+    output: Annotated[Path, tyro.conf.arg(metavar="FOLDER|FILE.wav")]
+    """Folder for the sounds; or for one contact alone, a file that ends in .wav."""
+    at: Annotated[
+        tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]], tyro.conf.arg(metavar="X Y Z")
+    ] = ()
+    """A contact in the object frame."""
+    contacts: Path | None = None
+    """Table of contacts."""
+    unit: Literal["m", "cm", "mm", "in", "ft"] = "m"
+    """What the contacts' coordinates count. A field itself is in metres, whatever its capture's unit was."""
+    force: float = 1.0
+    """Peak force of the blow, newtons, where the field knows forces; else relative to an average recorded blow."""
+    seconds: float | None = None
+    """Length of the sounds; that of the training sounds where it is not given."""
+    normalise: Literal["none", "peak"] = "none"
+    """none: the recordings' own scale. peak: all sounds by one factor, so that the loudest reaches full scale."""
+    level_db: float = 0.0
+    """Gain on top of that, dB."""
+    coding: Coding = "float32"
+    """How a sample is written. float32 holds any level; int16 refuses sounds that would clip."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return tyro.cli(Options, prog="avmsf render", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def run(options: Options) -> int:
+    """Render and write."""
+    metres = METRES[options.unit]
+    if bool(options.at) == (options.contacts is not None):
+        raise OutputError("expected contacts either by --at X Y Z, once or more, or by --contacts TABLE.csv")
+    contacts = contacts_at(options.at, metres=metres)
+    if options.contacts is not None:
+        contacts = read_contacts(options.contacts, metres=metres)
+    paths = _paths(options.output, contacts)
+    for name in ("force", "level_db"):
+        if not math.isfinite(getattr(options, name)):
+            raise OutputError(f"--{name.replace('_', '-')} is {getattr(options, name)}; expected a finite number")
+    if not bool(torch.isfinite(contacts.places).all()):
+        raise OutputError("--at: expected finite numbers as coordinates")
+    field = load(options.field)
+    refuse_far(contacts, field)
+    if options.force != 1 and not field.origin.per_newton:
+        say(f"note: the recordings' forces are not known, so {options.force:g} counts in average recorded blows")
+    if round(field.sample_rate) != field.sample_rate:
+        say(f"note: wav files hold whole sample rates: {round(field.sample_rate)} for {field.sample_rate:g} Hz")
+    sounds = render_sounds(field, contacts.places, force=options.force, seconds=options.seconds)
+    sounds = sounds * Level(options.normalise, options.level_db).factor(sounds)
+    peak = float(sounds.abs().max())
+    if options.coding == "float32" and peak > 1:
+        say(
+            f"note: the loudest sound peaks at {20 * math.log10(peak):+.1f} dB over full scale, where players clip; "
+            "add --normalise peak, or lower --level-db"
+        )
+    for path, sound in zip(paths, sounds, strict=True):
+        write_sound(path, sound, sample_rate=field.sample_rate, coding=options.coding)
+    wrote = paths[0] if len(paths) == 1 else f"{len(paths)} sounds to {options.output}"
+    print(f"wrote {wrote}: {sounds.shape[1] / field.sample_rate:.3g} s at {field.sample_rate:g} Hz, {options.coding}")
+    return 0
+
+
+def render_sounds(
+    field: SoundField, places: Float[Tensor, "contacts 3"], *, force: float, seconds: float | None
+) -> Float[Tensor, "contacts samples"]:
+    """Render blows of `force` for `seconds`; raises `OutputError` for a time that holds no sample."""
+    if seconds is None:
+        return field.render(places, force=force)
+    samples = round(seconds * field.sample_rate) if math.isfinite(seconds) else 0
+    if samples < 1:
+        raise OutputError(f"--seconds is {seconds:g}; expected a time above 0")
+    return field.render(places, force=force, samples=samples)
+
+
+def _paths(output: Path, contacts: Contacts) -> list[Path]:
+    if output.suffix.lower() == ".wav" and not output.is_dir():
+        if len(contacts.names) > 1:
+            raise OutputError(f"{output}: is one file and there are {len(contacts.names)} contacts; name a folder")
+        expect_writable(output)
+        return [output]
+    paths = [output / name for name in contacts.names]
+    for path in paths:
+        expect_writable(path)
+    return paths

@@ -1,0 +1,59 @@
+"""A field beside what it has to beat, on contacts that none of them has heard."""
+
+from collections.abc import Mapping
+
+from rich.table import Table
+
+from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, WhiteNoise, floor
+from avmsf.bench.evaluation import Scores, evaluate, score
+from avmsf.capture import Impacts
+from avmsf.cli.printing import figure, table
+from avmsf.field.soundfield import SoundField
+from avmsf.modal.extraction import Extraction
+
+HEADINGS = {
+    "relative_stft": "relative STFT error",
+    "l1": "L1",
+    "l1_log": "L1-log",
+    "envelope": "ENV",
+}
+"""Metrics in the order of the table, as its columns call them."""
+
+
+def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction) -> dict[str, Scores]:
+    """Score the field, the baselines made of the same training impacts, and the floor that the modes set."""
+    count = min(3, len(train))
+    return {
+        "field": evaluate(field, test),
+        "nearest strike": evaluate(NearestStrike(train), test),
+        f"mean waveform of {count} nearest": evaluate(MeanWaveform(train, count), test),
+        f"mean gains of {count} nearest": evaluate(MeanGains(train, modes, count), test),
+        "white noise": evaluate(WhiteNoise(train), test),
+        "floor: the test strikes' own gains": score(floor(test, modes.bank), test),
+    }
+
+
+def score_table(title: str, scores: Mapping[str, Scores]) -> Table:
+    """Return the means for printing, with the standard error of the first metric."""
+    rows = []
+    for method, each in scores.items():
+        mean, error = each.mean(), each.standard_error()
+        first, *others = HEADINGS
+        rows.append(
+            [method, f"{figure(mean[first])} ± {figure(error[first], 1)}", *(figure(mean[metric]) for metric in others)]
+        )
+    return table(title, ["", *HEADINGS.values()], rows)
+
+
+def score_markdown(scores: Mapping[str, Scores]) -> str:
+    """Return the means as a markdown table."""
+    lines = [f"| | {' | '.join(HEADINGS.values())} |", f"|---|{'---:|' * len(HEADINGS)}"]
+    for method, each in scores.items():
+        mean = each.mean()
+        lines.append(f"| {method} | {' | '.join(figure(mean[metric]) for metric in HEADINGS)} |")
+    return "\n".join(lines) + "\n"
+
+
+def score_values(scores: Mapping[str, Scores]) -> dict[str, dict[str, float]]:
+    """Return the means as plain values for JSON."""
+    return {method: each.mean() for method, each in scores.items()}

@@ -1,0 +1,177 @@
+"""`avmsf show`: what a field file holds, in words and pictures."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.bench.evaluation import evaluate
+from avmsf.bench.pictures import draw_gains, draw_modes, draw_spectrograms, save_picture
+from avmsf.capture import CaptureSettings, Impacts, read_capture
+from avmsf.cli.modes import mode_table
+from avmsf.cli.modetable import levels, mode_rows
+from avmsf.cli.printing import console, print_json, say
+from avmsf.cli.scores import score_table, score_values
+from avmsf.field.soundfield import SoundField
+from avmsf.field.store import load
+from avmsf.scene.points import farthest_points
+
+_DRAWN_POINTS = 4000
+_DRAWN_CONTACTS = 4
+_BATCH = 1024
+"""Points whose gains are taken at once: the encoding of their offsets to many clusters is large."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Say what a field file holds, and draw it: its modes, their gains on the object, and with a capture its sounds."""
+
+    field: tyro.conf.Positional[Path]
+    """Field file, as `avmsf fit` writes it."""
+    capture: tyro.conf.Positional[Path | None] = None
+    """Capture to set beside the field: its recordings that the field was not fitted to, or all where there are none."""
+    output: Path | None = None
+    """Folder for the pictures modes.png, gains.png and, with a capture, spectrograms.png; none without it."""
+    settings: Path | None = None
+    """A capture.toml to use in place of the capture's own."""
+    json: bool = False
+    """Print one JSON object on the standard output, all else on the standard error."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return tyro.cli(Options, prog="avmsf show", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def run(options: Options) -> int:
+    """Print and draw."""
+    field = load(options.field)
+    points = _some(field.gain_field.points)
+    gains = gains_at(field, points)
+    level = levels(gains)
+    rows = mode_rows(field.bank, level)
+    values = describe(field)
+    screen = console(errors=options.json)
+    screen.print(_words(values), soft_wrap=True)
+    screen.print(mode_table(f"{len(rows)} modes, levels on average over the object", rows))
+    heard = None
+    if options.capture is not None:
+        settings = None if options.settings is None else CaptureSettings.read(options.settings)
+        heard, what = _unheard(read_capture(options.capture, settings).impacts, field)
+        scores = {"field": evaluate(Fitted(field, heard.sounds.shape[1]), heard)}
+        screen.print(score_table(f"{len(heard)} contacts, {what}; lower is better", scores))
+        values |= {"compared_with": {"recordings": list(heard.names), "which": what, "scores": score_values(scores)}}
+    if options.output is not None:
+        draw_field(field, options.output, points=points, gains=gains, level=level, heard=heard)
+    if options.json:
+        print_json(values | {"modes": [asdict(row) for row in rows]})
+    return 0
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A field whose sounds have the length of the recordings that it is compared with."""
+
+    field: SoundField
+    samples: int
+
+    @property
+    def sample_rate(self) -> float:
+        """Samples per second, Hz."""
+        return self.field.sample_rate
+
+    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+        """Return the field's sounds."""
+        return self.field.render(contacts, samples=self.samples)
+
+
+def describe(field: SoundField) -> dict[str, Any]:
+    """Return what the field is, as plain values."""
+    points = field.gain_field.points
+    noise = float(field.residual.magnitude.square().mean().sqrt())
+    return {
+        "capture": field.origin.capture,
+        "sample_rate": field.sample_rate,
+        "seconds": field.samples / field.sample_rate,
+        "mode_count": len(field.bank),
+        "points": len(points),
+        "extent_metres": (points.amax(0) - points.amin(0)).tolist(),
+        "encoder": field.gain_field.encoder,
+        "residual_rms": noise,
+        "per_newton": field.origin.per_newton,
+        "trained_on": list(field.origin.trained_on),
+        "config": asdict(field.origin.config),
+        "report": field.origin.report,
+    }
+
+
+def gains_at(field: SoundField, points: Float[Tensor, "points 3"]) -> Float[Tensor, "points modes"]:
+    """Return the gains at many points."""
+    return torch.cat([field.gains(part) for part in torch.split(points, _BATCH)])
+
+
+def draw_field(
+    field: SoundField,
+    folder: Path,
+    *,
+    points: Float[Tensor, "points 3"],
+    gains: Float[Tensor, "points modes"],
+    level: Float[Tensor, " modes"],
+    heard: Impacts | None,
+) -> None:
+    """Write the pictures of a field, with some of the recordings `heard` beside its own sounds."""
+    name = field.origin.capture or "field"
+    pictures = {
+        "modes": draw_modes(field.bank, level, title=f"{len(field.bank)} modes of {name}"),
+        "gains": draw_gains(points, gains, field.bank.frequency, title=f"gains of the strongest modes of {name}"),
+    }
+    if heard is not None:
+        chosen = heard.take(farthest_points(heard.contacts, min(_DRAWN_CONTACTS, len(heard))).tolist())
+        pictures["spectrograms"] = draw_spectrograms(
+            chosen.sounds,
+            field.render(chosen.contacts, samples=chosen.sounds.shape[1]),
+            sample_rate=field.sample_rate,
+            names=chosen.names,
+            title=f"{name}: recorded and rendered",
+        )
+    for stem, picture in pictures.items():
+        path = folder / f"{stem}.png"
+        save_picture(picture, path)
+        say(f"wrote {path}")
+
+
+def _some(points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
+    step = max(1, len(points) // _DRAWN_POINTS)
+    return points[::step]
+
+
+def _unheard(impacts: Impacts, field: SoundField) -> tuple[Impacts, str]:
+    known = set(field.origin.trained_on)
+    rows = [row for row, name in enumerate(impacts.names) if name not in known]
+    if not rows:
+        return impacts, "all of them trained on"
+    return impacts.take(rows), "not trained on" if len(rows) < len(impacts) else "none of them trained on"
+
+
+def _words(values: dict[str, Any]) -> str:
+    extent = " x ".join(f"{side:.3g}" for side in values["extent_metres"])
+    report = values["report"]
+    lines = [
+        f"field of {values['capture'] or 'an unnamed capture'}",
+        f"  sounds     {values['seconds']:.3g} s at {values['sample_rate']:g} Hz, "
+        f"{'per newton' if values['per_newton'] else 'on the scale of the recordings'}",
+        f"  modes      {values['mode_count']}, {report.get('damping', 'shared')} damping",
+        f"  noise      {values['residual_rms']:.2g} (root mean square of the residual)",
+        f"  object     {values['points']} points, {extent} m, features: {values['encoder']}",
+        f"  fitted to  {len(values['trained_on'])} recordings",
+    ]
+    if report.get("validated"):
+        held = report.get("validation_spectral", {})
+        errors = ", ".join(f"{name} {float(error):.3g}" for name, error in held.items())
+        lines.append(f"  chosen on  {len(report['validation_contacts'])} validation contacts, spectral error {errors}")
+    return "\n".join(lines)
