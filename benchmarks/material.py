@@ -1,7 +1,7 @@
 """What the benchmarks measure on: plates struck here, and recordings read where they lie."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -104,9 +104,12 @@ def surface_features(capture: Capture) -> FeatureField:
     return FeatureField.from_points(drawn.points)
 
 
-def clips_in_place(name: str) -> list[Clip]:
-    """Read a folder of clips without contacts: of each the first blow, up to the next one or `seconds` long."""
-    settings = _settings(name)
+def clips_in_place(name: str, *, highpass: float = 0.0) -> list[Clip]:
+    """Read a folder of clips without contacts: of each the first blow, up to the next one or `seconds` long.
+
+    Without what lies below `highpass` Hz.
+    """
+    settings = replace(_settings(name), highpass=highpass)
     clips = []
     for path in sorted((shared_data() / name).glob("*.wav")):
         recording = read_recording(path)

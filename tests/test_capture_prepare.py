@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 import torch
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
 from avmsf.capture import CaptureSettings, read_capture
-from avmsf.capture.audio import Recording
+from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.prepare import prepare
 from avmsf.errors import CaptureError
 from capture_folder import RATE, ROWS, fill, ring
@@ -202,3 +203,21 @@ def test_the_aircraft_s_blows_deconvolved_are_its_measured_impulse_responses(sha
     # Divided by the peak alone the pulse stays in the sound, and with it the delay of its flank.
     peak = read_capture(shared / "aircraft", replace(struck_settings, normalise="peak")).impacts
     assert agreement(spectra(peak.sounds, 512, decay=0.13), truth)[0] > 0.4
+
+
+def test_a_highpass_removes_rumble_and_moves_no_phase(tmp_path: Path) -> None:
+    rate = 8000
+    times = np.arange(2 * rate) / rate
+    tone = np.sin(2 * np.pi * 400 * times) * np.exp(-3 * times)
+    rumble = 0.5 * np.sin(2 * np.pi * 5 * times)
+    soundfile.write(tmp_path / "hit.wav", 0.5 * (tone + rumble), rate, subtype="DOUBLE")
+    recording = read_recording(tmp_path / "hit.wav")
+    kept = prepare(recording, CaptureSettings(highpass=50.0, align=False)).sound
+    # 5 Hz lies a decade below a filter that falls 48 dB an octave; the tone's own spectrum reaches below 50 Hz by a
+    # few thousandths. The first tenth and the last hold the filter's edges.
+    middle = slice(rate // 5, -rate // 5)
+    assert np.abs(kept - 0.5 * tone)[middle].max() < 2e-3
+    with pytest.raises(CaptureError, match=r"hit\.wav: highpass is 4000 Hz, and at 8000 Hz nothing lies above 4000"):
+        prepare(recording, CaptureSettings(highpass=4000.0))
+    with pytest.raises(CaptureError, match="highpass is -1"):
+        CaptureSettings(highpass=-1.0)

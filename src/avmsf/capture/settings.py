@@ -45,6 +45,9 @@ class CaptureSettings:
     regularisation: float = 1e-4
     """For deconvolve: the power, relative to the greatest of the force's spectrum, below which the force counts as
     absent. Larger is quieter and duller."""
+    highpass: float = 0.0
+    """Remove rumble below this frequency from the sound, Hz as recorded: 20 leaves all that is heard. 0 leaves it
+    as it is, for a large structure may ring as low as that. The hammer's force is never filtered."""
     align: bool = True
     """Move each onset to sample zero. Set it false for impulse responses, whose first sample is the blow already."""
 
@@ -56,6 +59,8 @@ class CaptureSettings:
             value = getattr(self, key)
             if not (value > 0 and math.isfinite(value)):
                 raise CaptureError(f"{key} is {value!r}; expected a number above 0")
+        if not 0 <= self.highpass < math.inf:
+            raise CaptureError(f"highpass is {self.highpass!r}; expected a frequency in Hz, or 0 for none")
         if self.force_scale == 0 or not math.isfinite(self.force_scale):
             raise CaptureError(f"force_scale is {self.force_scale!r}; expected newtons for each unit of the channel")
         for key in ("response_channel", "force_channel"):
