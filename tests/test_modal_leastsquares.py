@@ -57,10 +57,12 @@ def test_gram_is_the_sum_over_time(power: int, samples: int):
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10 * max(1.0, float(expected.abs().max())))
 
 
-def test_gram_of_what_does_not_decay_is_finite():
-    bank = bank_of([500.0, 500.0], [0.0, 1e-12])
-    expected = basis(bank, 8000) @ basis(bank, 8000).T
-    torch.testing.assert_close(gram(poles_of(bank, RATE), 8000, power=0), expected, rtol=1e-9, atol=1e-7)
+def test_what_does_not_decay_is_summed_too():
+    bank = bank_of([500.0, 500.0, 1e-9], [0.0, 1e-12, 0.0])
+    atoms = basis(bank, 8000)
+    torch.testing.assert_close(gram(poles_of(bank, RATE), 8000, power=0), atoms @ atoms.T, rtol=1e-9, atol=1e-7)
+    sounds = torch.randn(2, 8000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    torch.testing.assert_close(project(sounds, poles_of(bank, RATE))[0], sounds @ atoms.T, rtol=1e-9, atol=1e-7)
 
 
 def test_own_gram_is_the_gram_of_one_mode():
@@ -139,7 +141,7 @@ def test_refinement_finds_the_modes_from_nearby():
     torch.testing.assert_close(found.damping, truth.damping, rtol=1e-3, atol=0)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_refinement_never_explains_less(seed: int):
     generator = torch.Generator().manual_seed(seed)
     sounds = torch.randn(2, 1500, generator=generator) * torch.exp(-torch.arange(1500) / 400.0)
@@ -147,9 +149,11 @@ def test_refinement_never_explains_less(seed: int):
         torch.sort(4000 * torch.rand(8, generator=generator, dtype=torch.float64)).values,
         torch.exp(8 * torch.rand(8, generator=generator, dtype=torch.float64) - 2),
     )
-    found = refine(sounds, bank, sample_rate=RATE)
-    before, after = (NormalEquations.of(sounds, poles_of(modes, RATE)).explained() for modes in (bank, found))
-    assert after > before
+    banks = [bank] + [refine(sounds, bank, sample_rate=RATE, iterations=count) for count in range(1, 15)]
+    explained = [NormalEquations.of(sounds, poles_of(modes, RATE)).explained() for modes in banks]
+    assert explained == sorted(explained)
+    assert explained[-1] > explained[0]
+    found = banks[-1]
     assert torch.isfinite(found.frequency).all()
     assert (found.damping > 0).all()
     assert (found.frequency.diff() >= 0).all()

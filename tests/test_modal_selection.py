@@ -88,9 +88,15 @@ def test_bands_of_noise_yield_hardly_a_candidate():
     assert len(frequency) == 0
 
 
-def test_silence_yields_no_candidate():
+@pytest.mark.parametrize("significance", [3.0, -1.0])
+def test_silence_yields_no_candidate(significance: float):
+    # With a negative limit no band is passed over.
     frequency, damping = candidates(
-        torch.zeros(2, SAMPLES), torch.full((2, 33), 1e-12), sample_rate=RATE, lowest=20.0, significance=3.0
+        torch.zeros(2, SAMPLES),
+        torch.full((2, 33), 1e-12),
+        sample_rate=RATE,
+        lowest=20.0,
+        significance=significance,
     )
     assert len(frequency) == len(damping) == 0
 
@@ -114,6 +120,23 @@ def test_selection_takes_the_modes_from_among_the_rest():
     chosen = sift(sounds, mixed)
     assert chosen.frequency.tolist() == TRUTH.frequency.tolist()
     assert chosen.damping.tolist() == TRUTH.damping.tolist()
+
+
+def test_selection_refuses_what_only_leaks_from_a_neighbour():
+    sounds = record(TRUTH, noise=0.03)
+    leaked = merge(
+        torch.cat([TRUTH.frequency, torch.tensor([302.0, 1510.0], dtype=torch.float64)]),
+        torch.cat([TRUTH.damping, torch.tensor([8.0, 50.0], dtype=torch.float64)]),
+        duration=0.75,
+    )
+    assert sift(sounds, leaked, noise=0.03).frequency.tolist() == TRUTH.frequency.tolist()
+
+
+def test_selection_refuses_what_is_faint_beside_a_neighbour():
+    bank = bank_of([300.0, 303.0], [10.0, 10.0])
+    gains = torch.tensor([[1.0, 10 ** (-75 / 20)]], dtype=torch.float64)
+    sounds = synthesise(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
+    assert select_one(sounds, bank).frequency.tolist() == [300.0]
 
 
 def test_selection_keeps_what_is_known_and_no_more_than_asked():

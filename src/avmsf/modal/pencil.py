@@ -110,8 +110,6 @@ def _poles(band: Complex[Tensor, "contacts times"]) -> Complex128[Tensor, " pole
     values, vectors = values.flip(0), vectors.flip(1)
     noise = values[span // 2 :].clamp_min(float(values[0]) * 1e-13).median()
     order = min(int((values > _ABOVE_NOISE * noise).sum()), span // 2)
-    if order == 0 or values[0] <= 0:
-        return torch.zeros(0, dtype=torch.complex128)
     subspace = vectors[:, :order]
     poles = torch.linalg.eigvals(torch.linalg.lstsq(subspace[:-1], subspace[1:]).solution)
     return poles[torch.isfinite(poles.abs()) & (poles != 0)]

@@ -112,15 +112,15 @@ def _regress(
     fallen = after & (envelope < floor)
     end = torch.where(fallen.any(-1), fallen.to(torch.int8).argmax(-1), frames)
     used = (after & (torch.arange(frames) < end[:, None])).to(torch.float64)
-    count = used.sum(-1).clamp_min(1.0)
+    count = used.sum(-1)
     mean_time = (used * times).sum(-1) / count
     level = torch.log(envelope)
     mean_level = (used * level).sum(-1) / count
     spread = (used * (times - mean_time[..., None]).square()).sum(-1)
     slope = (used * (times - mean_time[..., None]) * level).sum(-1) / spread.clamp_min(step**2)
-    # A line through fewer than three points says nothing: no damping, which the caller rejects.
+    # A line through fewer than three points says nothing.
     slope = torch.where(count >= 3, slope, 0.0)
-    gain = torch.exp(mean_level - slope * mean_time)
+    gain = torch.where(count >= 3, torch.exp(mean_level - slope * mean_time), 0.0)
     turn = (signals[..., 1:] * signals[..., :-1].conj() * used[..., 1:]).sum(-1)
     return gain, -slope, torch.angle(turn).to(torch.float64) / (2 * math.pi * step), peak.to(torch.float64) * step
 
