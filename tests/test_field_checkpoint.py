@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -91,45 +92,56 @@ def test_a_fit_may_be_interrupted_again_and_again(tmp_path):
     expect_same(fitted(checkpoint, keys), uninterrupted())
 
 
-@pytest.mark.parametrize("place", ["sounds", "spectral_loss", "Adam", "look"])
-def test_an_interruption_in_the_middle_of_a_step_loses_no_more_than_it(tmp_path, monkeypatch, place):
-    """Ctrl-C falls inside the arithmetic nearly always: noise drawn, gradients made, parameters half moved."""
-    checkpoint, calls = tmp_path / "fit.checkpoint", [0]
-    owner, name = {
-        "sounds": (TrainingRun, "sounds"),
-        "spectral_loss": (TrainingRun, "spectral_loss"),
-        "Adam": (torch.optim.AdamW, "step"),
-        "look": (TrainingRun, "sounds"),
-    }[place]
-    original = getattr(owner, name)
-    # The second look's sounds come after the first look's and those of ten steps.
-    last = 12 if place == "look" else 6
+def interrupt(patch: pytest.MonkeyPatch, owner: type, name: str, *, call: int) -> None:
+    """Press the keys at the end of the given call of a method."""
+    original, calls = getattr(owner, name), count(1)
 
     def interrupted(self, *given, **named):
         result = original(self, *given, **named)
-        calls[0] += 1
-        if calls[0] == last:
+        if next(calls) == call:
             raise KeyboardInterrupt
         return result
 
+    patch.setattr(owner, name, interrupted)
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"), [(TrainingRun, "sounds"), (TrainingRun, "spectral_loss"), (torch.optim.AdamW, "step")]
+)
+def test_an_interruption_in_the_middle_of_a_step_loses_no_more_than_it(tmp_path, monkeypatch, owner, name):
+    """Ctrl-C falls inside the arithmetic nearly always: noise drawn, gradients made, parameters half moved."""
+    checkpoint = tmp_path / "fit.checkpoint"
     with monkeypatch.context() as patch:
-        patch.setattr(owner, name, interrupted)
+        interrupt(patch, owner, name, call=6)
         with pytest.raises(KeyboardInterrupt):
             fitted(checkpoint)
     # Half-moved parameters are no state to go on from: such a fit starts from what was saved before, here nothing.
-    assert checkpoint.exists() == (place != "Adam")
+    assert checkpoint.exists() == (name != "step")
     expect_same(fitted(checkpoint), uninterrupted())
 
 
+PATIENT = replace(CONFIG, damping="shared", patience=10, learning_rate=0.3, steps=90)
+"""Steps so large that a look in the middle is the best."""
+
+
 def test_patience_survives_an_interruption(tmp_path):
-    config = replace(CONFIG, damping="shared", patience=10, learning_rate=0.3, steps=90)
-    stopped = uninterrupted(config).origin.report["steps"]
+    stopped = uninterrupted(PATIENT).origin.report["steps"]
     # Or nothing would have stopped it, and the interruption would never come.
     assert stopped + 10 < 90
     keys = Interruption((STAGES[0], 3 + stopped + 10))
     with pytest.raises(KeyboardInterrupt):
-        fitted(tmp_path / "state", keys, config=config)
-    expect_same(fitted(tmp_path / "state", keys, config=config), uninterrupted(config))
+        fitted(tmp_path / "state", keys, config=PATIENT)
+    expect_same(fitted(tmp_path / "state", keys, config=PATIENT), uninterrupted(PATIENT))
+
+
+def test_a_look_that_was_cut_off_is_taken_again(tmp_path, monkeypatch):
+    stopped = uninterrupted(PATIENT).origin.report["steps"]
+    # Sounds are made once a step after the warm-up and once a look, of which the first comes before those steps.
+    with monkeypatch.context() as patch:
+        interrupt(patch, TrainingRun, "sounds", call=stopped + stopped // 10 + 1)
+        with pytest.raises(KeyboardInterrupt):
+            fitted(tmp_path / "state", config=PATIENT)
+    expect_same(fitted(tmp_path / "state", config=PATIENT), uninterrupted(PATIENT))
 
 
 def test_the_state_is_kept_while_the_fit_runs(tmp_path, monkeypatch):

@@ -38,6 +38,11 @@ def short_fit() -> SoundField:
 
 
 @cache
+def validated_fit() -> SoundField:
+    return fitted(VALIDATED)
+
+
+@cache
 def long_fit() -> tuple[SoundField, list[Progress]]:
     told: list[Progress] = []
     return fitted(LONG, progress=told.append), told
@@ -84,7 +89,7 @@ def test_training_mends_what_the_extraction_left_wrong():
 
 def test_the_same_seed_gives_the_same_field_to_the_last_bit_and_another_another():
     torch.manual_seed(1)
-    first = fitted(VALIDATED)
+    first = validated_fit()
     torch.manual_seed(2)
     before = torch.get_rng_state()
     again = fitted(VALIDATED)
@@ -100,9 +105,7 @@ def test_recordings_in_float64_give_the_same_field():
     modes = plate_extraction(impacts)
     wide_modes = replace(modes, residual=replace(modes.residual, magnitude=modes.residual.magnitude.double()))
     field = fitted(SHORT, train=wide, modes=wide_modes)
-    # Least squares on the same numbers in another dtype: only the last bits of products differ, and training spreads
-    # these.
-    torch.testing.assert_close(field.render(impacts.contacts), short_fit().render(impacts.contacts), rtol=0, atol=1e-3)
+    assert same(field, short_fit())
     assert {each.dtype for each in field.gain_field.state_dict().values()} == {torch.float32}
     assert field.residual.magnitude.dtype == torch.float32
 
@@ -130,7 +133,7 @@ def test_modes_come_out_by_frequency():
 
 
 def test_validation_holds_out_training_contacts_and_says_which():
-    field = fitted(VALIDATED)
+    field = validated_fit()
     report = field.origin.report
     assert report["validated"] is True
     assert report["damping"] in ("shared", "per-contact")
@@ -172,6 +175,15 @@ def test_a_trial_does_not_learn_from_the_recordings_held_out(monkeypatch):
     # The last fit learns from all, and the validation heard the difference.
     assert not torch.equal(final["to_gains.weight"], others[2]["to_gains.weight"])
     assert looks[0] != looks[1]
+
+
+def test_looking_more_often_changes_no_step(monkeypatch):
+    """The looks draw noise too, which must not be missing in the training's stream."""
+    losses: dict[int, list[float]] = {1: [], 100: []}
+    for every, seen in losses.items():
+        monkeypatch.setattr("avmsf.field.fit._LOOK_EVERY", every)
+        fitted(VALIDATED, progress=lambda told, seen=seen: seen.append(told.loss))
+    assert losses[1] == losses[100]
 
 
 def test_patience_ends_a_trial_early_and_shortens_the_fit():

@@ -1,5 +1,6 @@
 """What a field renders: each contact's own sound, in whatever company, at whatever force."""
 
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
@@ -96,8 +97,10 @@ def test_contacts_in_float32_and_float64_sound_alike():
 
 def test_rendering_keeps_no_gradients_and_changes_no_chance():
     before = torch.get_rng_state()
-    assert not field().render(CONTACTS).requires_grad
-    assert not field().gains(CONTACTS).requires_grad
+    in_training = replace(field(), gain_field=deepcopy(field().gain_field).requires_grad_(True))
+    assert not in_training.render(CONTACTS).requires_grad
+    assert not in_training.gains(CONTACTS).requires_grad
+    assert not in_training.dampings(CONTACTS).requires_grad
     assert not any(parameter.requires_grad for parameter in field().gain_field.parameters())
     assert torch.equal(torch.get_rng_state(), before)
 
