@@ -95,13 +95,9 @@ def capture_in_place(name: str) -> Capture:
 
 
 def surface_features(capture: Capture) -> FeatureField:
-    """Return points drawn with seed 0 from a capture's surface, with positions alone as features.
-
-    The normals of thin closed boxes flip between their two sides, which move as one.
-    """
+    """Return points drawn with seed 0 from a capture's surface, with positions alone as features."""
     assert capture.surface is not None
-    drawn = FeatureField.from_mesh(capture.surface, generator=torch.Generator().manual_seed(0), count=POINTS)
-    return FeatureField.from_points(drawn.points)
+    return FeatureField.from_mesh(capture.surface, generator=torch.Generator().manual_seed(0), count=POINTS)
 
 
 def clips_in_place(name: str, *, highpass: float = 0.0) -> list[Clip]:

@@ -50,7 +50,7 @@ def draw_modes(bank: ModalBank, level_db: Float[Tensor, " modes"], *, title: str
     figure = Figure(figsize=(9, 5.4), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     frequency, level = bank.frequency.numpy(), level_db.numpy()
-    bottom = 10 * math.floor(float(level.min()) / 10) - 5
+    bottom = 10.0 * math.floor(float(level.min()) / 10) - 5.0
     _stems(upper, frequency, level, bottom=bottom, colour=_INK)
     upper.set_ylim(bottom, float(level.max()) + 0.12 * (float(level.max()) - bottom))
     upper.set_ylabel("level (dB re strongest)")
@@ -118,7 +118,7 @@ def draw_spectrograms(
 ) -> Figure:
     """Draw recorded and rendered sounds side by side, one row a contact, both on the recorded one's scale.
 
-    Shows the band and the time that hold what the recordings have within 60 dB of their loudest.
+    Shows the band and the time in which the recordings have energy.
     """
     fft_size = scaled_fft_size(1024, sample_rate=sample_rate)
     hop = max(1, fft_size // 8)
@@ -232,7 +232,7 @@ def _scatter_in_space(
     drawn = axes.scatter(points[:, 0], points[:, 1], points[:, 2], s=4, linewidths=0, rasterized=True, **colours)
     if marks is not None:
         axes.scatter(marks[:, 0], marks[:, 1], marks[:, 2], c="black", marker="x", s=20, depthshade=False)
-    axes.set_box_aspect(np.maximum(np.ptp(points, axis=0), 0.15 * np.ptp(points, axis=0).max()), zoom=1.15)
+    axes.set_box_aspect(np.maximum(np.ptp(points, axis=0), 0.15 * np.ptp(points, axis=0).max()), zoom=1.3)
     axes.view_init(elev=38, azim=-60)
     for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y"), (axes.zaxis, "z")):
         axis.set_label_text(f"{name} (m)")
@@ -242,11 +242,15 @@ def _scatter_in_space(
 
 
 def _heard_extent(magnitude: Float[Tensor, "contacts bins frames"]) -> tuple[float, float]:
-    """Return which parts of the band and of the time hold all within 60 dB of the loudest, with a margin, up to 1."""
-    heard = magnitude > 1e-3 * magnitude.max()
-    bins = torch.nonzero(heard.any(2).any(0)).flatten()
-    frames = torch.nonzero(heard.any(1).any(0)).flatten()
-    if not len(bins):
+    """Return up to which part of the band and of the time there is energy within 50 and 60 dB of the greatest, up to 1.
+
+    Energy by frequency is summed over time and the reverse, lest the click of the onset, which has all frequencies for
+    a moment, count as much as what rings.
+    """
+    power = magnitude.square().sum(0)
+    if not bool(power.any()):
         return 1.0, 1.0
-    parts = (int(bins[-1]) / magnitude.shape[1], int(frames[-1]) / magnitude.shape[2])
+    bins = torch.nonzero(power.sum(1) > 1e-5 * power.sum(1).max()).flatten()
+    frames = torch.nonzero(power.sum(0) > 1e-6 * power.sum(0).max()).flatten()
+    parts = (int(bins[-1]) / len(power), int(frames[-1]) / power.shape[1])
     return min(1.0, 1.15 * parts[0] + 0.01), min(1.0, 1.1 * parts[1] + 0.01)

@@ -1,9 +1,9 @@
 """`avmsf fit`: a capture folder in, a field file out."""
 
 from collections.abc import Sequence
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 import tyro
@@ -11,26 +11,25 @@ import tyro
 from avmsf.bench.evaluation import split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.cli import INTERRUPTED
+from avmsf.cli.kept import extract_once
 from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scores import compare, score_table, score_values
 from avmsf.cli.writing import expect_writable
+from avmsf.errors import FitError
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
-from avmsf.modal.extract import extract
 from avmsf.scene.features import FeatureField
-
-RECIPES = {"quick": FitConfig(), "paper": PAPER}
 
 
 @dataclass(frozen=True)
 class Options:
     """Fit a sound field to a capture and write it to one file.
 
-    An interrupted fit leaves a checkpoint beside the output; the same command goes on from it to the same result.
+    An interrupted fit leaves its state beside the output; the same command goes on from it to the same result.
     """
 
     capture: tyro.conf.Positional[Path]
@@ -58,22 +57,27 @@ class Options:
     """Settings of the fit."""
 
 
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell, with the recipe's settings where they say nothing."""
-    chosen, _ = tyro.cli(_Recipe, args=words, add_help=False, return_unknown_args=True)
-    # Fields without a default are still to be given.
-    start: dict[str, Any] = {
-        each.name: tyro.MISSING
-        for each in fields(Options)
-        if each.default is MISSING and each.default_factory is MISSING
-    }
-    default = Options(**start, recipe=chosen.recipe, config=RECIPES[chosen.recipe])
-    return tyro.cli(Options, prog="avmsf fit", args=words, default=default, config=(tyro.conf.FlagCreatePairsOff,))
+@dataclass(frozen=True)
+class PaperOptions(Options):
+    """The same, starting from the paper's settings."""
+
+    recipe: Literal["quick", "paper"] = "paper"
+    config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=lambda: PAPER)
 
 
 @dataclass(frozen=True)
 class _Recipe:
     recipe: Literal["quick", "paper"] = "quick"
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell, with the recipe's settings where they say nothing."""
+    # The recipe is read first, for it decides what all others start from.
+    chosen, _ = tyro.cli(_Recipe, args=words, add_help=False, return_unknown_args=True)
+    kind = {"quick": Options, "paper": PaperOptions}[chosen.recipe]
+    return tyro.cli(
+        kind, prog="avmsf fit", args=words, description=Options.__doc__, config=(tyro.conf.FlagCreatePairsOff,)
+    )
 
 
 def run(options: Options) -> int:
@@ -83,9 +87,9 @@ def run(options: Options) -> int:
     capture = read_capture(options.capture, settings)
     train, test = _parts(capture, options)
     say(f"finding the modes of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
-    modes = extract(train, finder(options.method, options.modes))
+    modes = extract_once(train, finder(options.method, options.modes), _beside(options.output, "modes"))
     say(f"fitting a field of {len(modes.bank)} modes")
-    checkpoint = checkpoint_of(options.output)
+    checkpoint = _beside(options.output, "checkpoint")
     try:
         with FitBar() as bar:
             fitted = fit(
@@ -98,9 +102,12 @@ def run(options: Options) -> int:
                 progress=bar.show,
             )
     except KeyboardInterrupt:
-        say(_how_to_go_on(checkpoint))
+        where = f"from {checkpoint}, or delete it" if checkpoint.exists() else "from the start of training"
+        say(f"avmsf fit: interrupted; give the same command again to go on {where}")
         return INTERRUPTED
     save(fitted, options.output)
+    for ending in ("modes", "checkpoint"):
+        _beside(options.output, ending).unlink(missing_ok=True)
     scores = {} if test is None else compare(fitted, train, test, modes)
     screen = console(errors=options.json)
     if test is not None:
@@ -126,9 +133,9 @@ def run(options: Options) -> int:
     return 0
 
 
-def checkpoint_of(output: Path) -> Path:
-    """Return where the state of an unfinished fit is kept: beside the field that it will become."""
-    return output.with_name(f"{output.name}.checkpoint")
+def _beside(output: Path, ending: str) -> Path:
+    """Return where a part of an unfinished fit is kept: beside the field that it will become."""
+    return output.with_name(f"{output.name}.{ending}")
 
 
 def features_of(capture: Capture, config: FitConfig) -> FeatureField:
@@ -140,10 +147,12 @@ def features_of(capture: Capture, config: FitConfig) -> FeatureField:
 
 
 def _parts(capture: Capture, options: Options) -> tuple[Impacts, Impacts | None]:
-    if options.train_count is not None:
-        return split(capture.impacts, count=options.train_count, start=options.start)
+    if options.train_count is not None and options.train_fraction is not None:
+        raise FitError("expected --train-count or --train-fraction, found both: leave one of them out")
     if options.train_fraction is not None:
         return split(capture.impacts, fraction=options.train_fraction, start=options.start)
+    if options.train_count is not None:
+        return split(capture.impacts, count=options.train_count, start=options.start)
     return capture.impacts, None
 
 
@@ -155,9 +164,3 @@ def _summary(fitted: SoundField, contacts: int) -> str:
         f"{report.get('damping', 'shared')} damping ({how}), {report.get('steps', fitted.origin.config.steps)} steps "
         "end to end"
     )
-
-
-def _how_to_go_on(checkpoint: Path) -> str:
-    if not checkpoint.exists():
-        return "avmsf fit: interrupted before there was anything to keep"
-    return f"avmsf fit: interrupted; give the same command again to go on from {checkpoint}, or delete it"

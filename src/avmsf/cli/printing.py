@@ -42,7 +42,7 @@ def figure(value: float | None, digits: int = 3) -> str:
     return f"{value:.{decimals}f}"
 
 
-def decimals(value: float | None, places: int) -> str:
+def decimals(value: float | int | None, places: int) -> str:
     """Return a number with so many decimals; a dash for None."""
     return "–" if value is None else f"{value:.{places}f}"
 

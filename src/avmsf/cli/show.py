@@ -145,7 +145,7 @@ def draw_field(
         say(f"wrote {path}")
 
 
-def _some(points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
+def _some(points: Float[Tensor, "points 3"]) -> Float[Tensor, "chosen 3"]:
     step = max(1, len(points) // _DRAWN_POINTS)
     return points[::step]
 

@@ -82,6 +82,8 @@ class FitConfig:
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise FitError(f"{name} = {value}: expected more than 0")
+        if self.seed >= 2**63:
+            raise FitError(f"seed = {self.seed}: expected less than 2^63")
         if not 0 <= self.validation <= 0.5:
             raise FitError(f"validation = {self.validation}: expected 0 to 0.5, the part of the contacts held out")
         if self.warmup_steps + self.steps == 0:
@@ -114,9 +116,11 @@ class FitConfig:
 
 
 PAPER = FitConfig(
-    clusters=128,
+    clusters=256,
     bands=4,
     width=128,
+    hidden=256,
+    layers=2,
     feature_scale=1.0,
     warmup_rate=5e-3,
     learning_rate=5e-3,
@@ -124,6 +128,10 @@ PAPER = FitConfig(
     weight_decay=0.0,
     warmup_steps=1000,
     steps=10000,
+    fft_sizes=(2048, 1024, 512, 256),
     hop=64,
+    early_weight=1.0,
 )
-"""The paper's settings where it states them (supplement, training setup), the middle of each of its lists."""
+"""The paper's settings where it states them (supplement, training setup), the middle of each of its lists: clusters,
+learning rate, steps, resolutions, hop and the beginning's weight. It leaves the network's other sizes, the warm-up and
+the beginning's length open."""

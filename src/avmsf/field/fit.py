@@ -2,6 +2,7 @@
 
 import math
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import FitError
+from avmsf.errors import FieldFileError, FitError
 from avmsf.field.arguments import expect_fitting, fingerprint
 from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
 from avmsf.field.config import FitConfig
@@ -63,8 +64,8 @@ def fit(
 
     `modes` as extracted from `train`. Choices that the config leaves open are made on a part of the training contacts
     held out for the purpose, then the field is fitted to all. With `checkpoint`, the state is kept there while the fit
-    runs and on interruption, and a fit of the same arguments goes on from it to the same result; the file goes when
-    the fit is done. Raises `FitError` for arguments that do not fit together and for a fit that diverges, and
+    runs, on interruption and at the end, and a fit of the same arguments goes on from it to the same result; delete the
+    file once the field is saved. Raises `FitError` for arguments that do not fit together and for a fit that diverges, and
     `FieldFileError` for a checkpoint that is none of this fit's.
     """
     config = FitConfig() if config is None else config
@@ -76,8 +77,6 @@ def fit(
     job = _Job(train, features, modes, config, place, progress)
     chosen, report = job.choose()
     run = job.run("fit", list(range(len(train))), chosen)
-    if place is not None:
-        place.unlink(missing_ok=True)
     # Close modes may have passed one another on the way.
     order = torch.argsort(run.bank.frequency.detach())
     run.network.reorder(order)
@@ -155,7 +154,11 @@ class _Job:
         """Train on the rows `learnt`; with `held`, note how well the best step does there."""
         run = self._start(learnt, plan)
         targets = self._targets(learnt)
-        look = None if held is None else _Look(self._targets(held), self.train.sounds[held])
+        look = (
+            None
+            if held is None
+            else _Look(self._targets(held), self.train.sounds[held], keep_best=self.config.patience > 0)
+        )
         if self.running is not None and self.running["name"] == name:
             run.resume(self.running["run"])
             if look is not None:
@@ -187,6 +190,9 @@ class _Job:
                 "spectral": look.best["spectral"],
                 "steps": max(0, look.best["at"] - self.config.warmup_steps),
             }
+        else:
+            # The work is done but the field is not saved yet: should that fail, it need not be done again.
+            self._save(name, run, None)
         return run
 
     def _start(self, learnt: list[int], plan: _Plan) -> TrainingRun:
@@ -225,19 +231,24 @@ class _Job:
         if self.checkpoint is None:
             return
         running = {"name": name, "run": run.state(), "look": None if look is None else look.best}
-        write_checkpoint(self.checkpoint, {"fingerprint": self.fingerprint, "trials": self.trials, "running": running})
+        state = {"fingerprint": self.fingerprint, "trials": self.trials, "running": running}
+        try:
+            write_checkpoint(self.checkpoint, state)
+        except FieldFileError as error:
+            # A full disk costs the checkpoint, not the fit.
+            warnings.warn(f"the fit goes on without a new checkpoint: {error}", stacklevel=2)
         self.saved_at = time.monotonic()
 
 
 class _Look:
-    """Held-out contacts, and the best that a run has done on them."""
+    """Held-out contacts, and how well a run does on them: at its best step, or at its last."""
 
-    def __init__(self, targets: Targets, sounds: Float[Tensor, "contacts samples"]) -> None:
-        self.targets, self.envelope = targets, envelope(sounds)
+    def __init__(self, targets: Targets, sounds: Float[Tensor, "contacts samples"], *, keep_best: bool) -> None:
+        self.targets, self.envelope, self.keep_best = targets, envelope(sounds), keep_best
         self.best: dict[str, Any] = {"spectral": float("inf"), "envelope": float("inf"), "at": 0}
 
     def at(self, run: TrainingRun) -> None:
-        """Note the held-out errors if the spectral one is the lowest so far: relative, and ENV (paper, 4.2)."""
+        """Note the held-out errors, of the best step only where that is kept: relative, and ENV (paper, 4.2)."""
         # Validation must not disturb the run: its noise comes from the same place in the stream every time.
         state = run.generator.get_state()
         with torch.no_grad():
@@ -245,7 +256,7 @@ class _Look:
             spectral = float(spectral_loss(sounds, self.targets.whole)) / len(self.targets.whole.hops)
             distance = float((envelope(sounds) - self.envelope).square().mean(1).sqrt().mean())
         run.generator.set_state(state)
-        if spectral < self.best["spectral"]:
+        if not self.keep_best or spectral < self.best["spectral"]:
             self.best = {"spectral": spectral, "envelope": distance, "at": run.step}
 
 

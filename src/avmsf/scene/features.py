@@ -40,9 +40,9 @@ class FeatureField:
     def from_mesh(
         cls, surface: Surface, *, generator: torch.Generator, count: int = 8192, normal_scale: float = 0.0
     ) -> "FeatureField":
-        """Return `count` points drawn evenly from a surface's triangles, with positions and normals as features.
+        """Return `count` points drawn evenly from a surface's triangles, with their positions as features.
 
-        `normal_scale` is the length of the normals beside positions of about unit size. Thin walls have two sides
+        `normal_scale` adds their normals, of this length beside positions of about unit size. Thin walls have two sides
         that sound alike and opposite normals, between which a contact's nearest point flips, so that normals mislead
         there: they are left out unless asked for. A surface of points alone keeps its points, which have no normals.
         """

@@ -1,0 +1,65 @@
+"""The modes of an unfinished fit, kept beside its checkpoint.
+
+Linear algebra rounds differently from one run to the next, so modes that are found again differ in their last digits;
+a fit that goes on from a checkpoint needs the very ones it began with.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+import avmsf
+from avmsf.capture import Impacts
+from avmsf.field.files import write_whole
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extract import ModeFinder, extract
+from avmsf.modal.extraction import Extraction
+from avmsf.modal.residual import Residual
+
+_KEY = "avmsf-modes"
+
+
+def extract_once(train: Impacts, method: ModeFinder, path: Path) -> Extraction:
+    """Return the modes that `path` keeps of these recordings and this method; find and keep them where it has none.
+
+    Raises as `extract` and `write_whole`.
+    """
+    digest = _digest(train, method)
+    kept = _read(path, digest)
+    if kept is not None:
+        return kept
+    found = extract(train, method)
+    tensors = {
+        "frequency": found.bank.frequency,
+        "damping": found.bank.damping,
+        "gains": found.gains,
+        "quadrature": found.quadrature,
+        "residual": found.residual.magnitude,
+    }
+    content = save({name: tensor.contiguous() for name, tensor in tensors.items()}, {_KEY: digest})
+    write_whole(path, lambda place: place.write_bytes(content))
+    return found
+
+
+def _read(path: Path, digest: str) -> Extraction | None:
+    try:
+        with safe_open(path, framework="pt") as file:
+            if (file.metadata() or {}).get(_KEY) != digest:
+                return None
+            # Clones, for what the file maps into memory goes with it.
+            read = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError):
+        return None
+    return Extraction(
+        ModalBank(read["frequency"], read["damping"]), read["gains"], Residual(read["residual"]), read["quadrature"]
+    )
+
+
+def _digest(train: Impacts, method: ModeFinder) -> str:
+    words = [avmsf.__version__, repr(method), train.names, train.sample_rate]
+    digest = hashlib.sha256(json.dumps(words).encode())
+    digest.update(train.sounds.contiguous().numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,337 @@
+"""The command line: every verb end to end, what goes to which stream, exit codes, one line an error."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+import avmsf
+from avmsf.capture import read_capture
+from avmsf.cli import VERBS, main
+from avmsf.field.store import load
+from avmsf.modal.extract import HighResolution, extract
+from avmsf.simulate.plate import plate_modes
+from plate_capture import CONTACT_TIME, HIGHEST, PLATE, RATE, TINY, fill_plate
+
+Streams = pytest.CaptureFixture[str]
+AT = ("--at", "0.05", "0.06", "0")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fill_plate(tmp_path_factory.mktemp("captures") / "plate")
+
+
+@pytest.fixture(scope="module")
+def field(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("fields") / "plate.safetensors"
+    words = ["fit", str(capture), "--output", str(path), "--train-count", "5", "--start", "1", *TINY]
+    assert main(words) == 0
+    return path
+
+
+def python(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+
+
+def interrupt(*arguments: object) -> None:
+    raise KeyboardInterrupt
+
+
+def error_line(streams: Streams) -> str:
+    """Return the one line that an error prints, with nothing on the standard output."""
+    out, err = streams.readouterr()
+    assert out == ""
+    assert len(err.splitlines()) == 1, err
+    assert "Traceback" not in err
+    return err
+
+
+def test_help_names_every_verb_and_imports_no_torch() -> None:
+    ran = python(
+        "import sys\nfrom avmsf.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit as ended: print('torch' in sys.modules, 'scipy' in sys.modules, ended.code)"
+    )
+    assert ran.stdout.splitlines()[-1] == "False False 0"
+    for verb in VERBS:
+        assert f"• {verb} " in ran.stdout
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_verbs_help_starts_with_the_sentence_that_the_list_has(verb: str, capsys: Streams) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([verb, "--help"])
+    assert ended.value.code == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"usage: avmsf {verb}" in told
+    # The list ends the sentence where a verb's own help may go on after a colon.
+    assert VERBS[verb].rstrip(".") in told
+
+
+def test_what_is_no_verb_ends_with_2_on_the_standard_error(capsys: Streams) -> None:
+    for words in (["fti"], ["fit"], ["fit", "capture", "--output", "x", "--steps", "many"]):
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+        assert ended.value.code == 2
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err
+
+
+def test_every_public_name_is_there_and_no_other() -> None:
+    for name in avmsf.__all__:
+        assert getattr(avmsf, name) is not None
+    assert set(avmsf.__all__) <= set(dir(avmsf))
+    with pytest.raises(AttributeError, match="no attribute 'fitt'"):
+        avmsf.fitt  # noqa: B018
+
+
+def test_the_version_is_the_packages(capsys: Streams) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.strip() == avmsf.__version__
+
+
+def test_check_of_a_good_capture_ends_with_0(capture: Path, capsys: Streams) -> None:
+    assert main(["check", str(capture)]) == 0
+    out, err = capsys.readouterr()
+    assert "001.wav" in out
+    assert "008.wav" in out
+    assert "no problem found" in out
+    assert err == ""
+
+
+def test_check_shows_every_problem_and_ends_with_2_where_it_cannot_be_read(tmp_path: Path, capsys: Streams) -> None:
+    folder = fill_plate(tmp_path / "plate")
+    (folder / "003.wav").unlink()
+    soundfile.write(folder / "004.wav", np.zeros(2400), 8000, subtype="FLOAT")
+    assert main(["check", str(folder), "--json"]) == 2
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    assert not report["readable"]
+    assert [row["readable"] for row in report["recordings"]] == [True, True, False, False, True, True, True, True]
+    assert "003.wav: there is no such file" in err
+    assert "004.wav: the sound is silent" in err
+    assert err.splitlines()[-1].startswith(f"avmsf check: {folder} cannot be read")
+
+
+def test_a_capture_that_looks_wrong_is_noted_as_a_sentence(tmp_path: Path, capsys: Streams) -> None:
+    folder = fill_plate(tmp_path / "plate")
+    soundfile.write(folder / "stray.wav", np.zeros(100), 8000)
+    table = (folder / "impacts.csv").read_text().splitlines()
+    sound, rate = soundfile.read(folder / "002.wav")
+    soundfile.write(folder / "002.wav", np.clip(5 * sound / np.abs(sound).max(), -1, 1), rate, subtype="FLOAT")
+    assert main(["modes", str(folder), "--modes", "8"]) == 0
+    err = capsys.readouterr().err
+    notes = [line for line in err.splitlines() if line.startswith("note: ")]
+    assert len(notes) == 1
+    assert "002.wav: " in notes[0]
+    assert "clipped" in notes[0]
+    assert "CaptureWarning" not in err
+    assert len(table) == 9
+
+
+def test_modes_prints_the_plates(capture: Path, tmp_path: Path, capsys: Streams) -> None:
+    picture = tmp_path / "modes.png"
+    assert main(["modes", str(capture), "--json", "--picture", str(picture)]) == 0
+    out, err = capsys.readouterr()
+    found = json.loads(out)
+    impacts = read_capture(capture).impacts
+    truth = plate_modes(PLATE, impacts.contacts, highest=HIGHEST, contact_time=CONTACT_TIME)
+    strongest = max(found["modes"], key=lambda mode: mode["level_db"])
+    nearest = int((truth.frequency - strongest["frequency_hertz"]).abs().argmin())
+    # .05 % of the frequency: what extraction is to reach with noise 40 dB down.
+    assert strongest["frequency_hertz"] == pytest.approx(float(truth.frequency[nearest]), rel=5e-4)
+    assert strongest["t60_seconds"] == pytest.approx(np.log(1000) / float(truth.damping[nearest]), rel=0.05)
+    assert strongest["level_db"] == 0.0
+    assert strongest["heard_in"] >= 7
+    assert (found["recordings"], found["sample_rate"]) == (8, RATE)
+    assert f"{strongest['frequency_hertz']:.2f}" in err
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    # The table is the verb's output where no JSON is.
+    main(["modes", str(capture), "--method", "short-time", "--modes", "4"])
+    assert "4 modes of plate" in capsys.readouterr().out
+
+
+def test_a_mode_counts_as_heard_where_it_stands_clear_of_the_noise(capture: Path) -> None:
+    from avmsf.cli.modetable import heard_in
+
+    impacts = read_capture(capture).impacts
+    extraction = extract(impacts, HighResolution(modes=8))
+    silent = extraction.gains.clone()
+    silent[2:] = 0.0
+    quiet = type(extraction)(extraction.bank, silent, extraction.residual, torch.zeros_like(silent))
+    loud = type(extraction)(extraction.bank, silent + 1e6, extraction.residual, torch.zeros_like(silent))
+    length = {"sample_rate": impacts.sample_rate, "samples": impacts.sounds.shape[1]}
+    assert max(heard_in(quiet, **length)) <= 2
+    assert heard_in(loud, **length) == [8] * len(extraction.bank)
+
+
+def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys: Streams) -> None:
+    path = tmp_path / "deep" / "plate.safetensors"
+    words = ["fit", str(capture), "--output", str(path), "--train-fraction", "0.5", "--start", "2", "--json", *TINY]
+    assert main([*words, "--seed", "3"]) == 0
+    out, err = capsys.readouterr()
+    told = json.loads(out)
+    field = load(path)
+    assert told["modes"] == len(field.bank) <= 12
+    assert told["trained_on"] == list(field.origin.trained_on)
+    assert told["trained_on"][0] == "003.wav"
+    assert len(told["trained_on"]) == len(told["tested_on"]) == 4
+    assert set(told["trained_on"]).isdisjoint(told["tested_on"])
+    config = field.origin.config
+    assert (config.seed, config.clusters, config.fft_sizes) == (3, 8, (1024, 256))
+    assert set(told["scores"]) == {
+        "field",
+        "nearest strike",
+        "mean waveform of 3 nearest",
+        "mean gains of 3 nearest",
+        "white noise",
+        "floor: the test strikes' own gains",
+    }
+    errors = {method: each["relative_stft"] for method, each in told["scores"].items()}
+    assert min(errors, key=lambda method: errors[method]) == "floor: the test strikes' own gains"
+    assert max(errors, key=lambda method: errors[method]) == "white noise"
+    assert "fit: 18 steps, loss" in err
+    assert [each.name for each in path.parent.iterdir()] == ["plate.safetensors"]
+
+
+def test_a_recipes_settings_hold_where_the_options_say_nothing() -> None:
+    from avmsf.cli.fit import parse
+
+    words = ["bowl", "--output", "bowl.safetensors"]
+    assert parse(words).config == avmsf.FitConfig()
+    assert parse([*words, "--recipe", "paper"]).config == avmsf.PAPER
+    mixed = parse(["--recipe", "paper", *words, "--steps", "7"]).config
+    assert (mixed.steps, mixed.clusters) == (7, avmsf.PAPER.clusters)
+
+
+def test_without_a_surface_the_contacts_box_stands_for_the_object(tmp_path: Path, capsys: Streams) -> None:
+    folder = fill_plate(tmp_path / "plate", surface=False)
+    path = tmp_path / "plate.safetensors"
+    assert main(["fit", str(folder), "--output", str(path), *TINY]) == 0
+    assert "has no surface" in capsys.readouterr().err
+    points = load(path).gain_field.points
+    contacts = read_capture(folder).impacts.contacts
+    # Points are float32.
+    assert torch.allclose(points.amax(0).double(), contacts.amax(0), atol=1e-7)
+
+
+def test_render_is_the_fields_own(field: Path, tmp_path: Path, capsys: Streams) -> None:
+    output = tmp_path / "sounds"
+    words = ["render", str(field), *AT, "--at", "50e-3", "0.12", "-1e-3", "--output", str(output), "--force", "2"]
+    assert main(words) == 0
+    out, err = capsys.readouterr()
+    assert out.startswith(f"wrote 2 sounds to {output}")
+    assert "forces are not known" in err
+    contacts = torch.tensor([[0.05, 0.06, 0.0], [0.05, 0.12, -1e-3]], dtype=torch.float64)
+    expected = load(field).render(contacts, force=2.0)
+    for row, name in enumerate(("001.wav", "002.wav")):
+        sound, rate = soundfile.read(output / name, dtype="float32")
+        assert rate == RATE
+        assert soundfile.info(output / name).subtype == "FLOAT"
+        assert np.array_equal(sound, expected[row].numpy())
+    assert sorted(each.name for each in output.iterdir()) == ["001.wav", "002.wav"]
+
+
+def test_render_takes_a_table_in_any_unit_and_a_length(field: Path, tmp_path: Path) -> None:
+    table = tmp_path / "places.csv"
+    table.write_text("File;X;Y;Z;who\nrim/one.wav;50,0;60;0;a\nwall;50;120;0;b\n")
+    words = ["render", str(field), "--contacts", str(table), "--unit", "mm", "--output", str(tmp_path / "out")]
+    assert main([*words, "--seconds", "0.1"]) == 0
+    contacts = torch.tensor([[0.05, 0.06, 0.0], [0.05, 0.12, 0.0]], dtype=torch.float64)
+    expected = load(field).render(contacts, samples=800)
+    for row, name in enumerate(("rim/one.wav", "wall.wav")):
+        assert np.array_equal(soundfile.read(tmp_path / "out" / name, dtype="float32")[0], expected[row].numpy())
+
+
+def test_render_sets_levels_by_one_factor_for_all(field: Path, tmp_path: Path) -> None:
+    places = ["--at", "0.05", "0.06", "0", "--at", "0.02", "0.02", "0"]
+    words = ["render", str(field), *places, "--output", str(tmp_path), "--normalise", "peak", "--level-db", "-6"]
+    assert main([*words, "--coding", "int16"]) == 0
+    plain = load(field).render(torch.tensor([[0.05, 0.06, 0.0], [0.02, 0.02, 0.0]]))
+    expected = plain / plain.abs().max() * 10 ** (-6 / 20)
+    for row, name in enumerate(("001.wav", "002.wav")):
+        sound = soundfile.read(tmp_path / name)[0]
+        # One step of 16 bits.
+        assert np.abs(sound - expected[row].numpy()).max() <= 2**-15
+        assert soundfile.info(tmp_path / name).subtype == "PCM_16"
+
+
+def test_nothing_clips_in_silence(field: Path, tmp_path: Path, capsys: Streams) -> None:
+    path = tmp_path / "loud.wav"
+    words = ["render", str(field), *AT, "--output", str(path), "--normalise", "peak", "--level-db", "6"]
+    assert main([*words, "--coding", "int16"]) == 2
+    assert "peaks at 2" in error_line(capsys)
+    assert not path.exists()
+    assert main(words) == 0
+    assert "peaks at +6.0 dB over full scale" in capsys.readouterr().err
+    assert np.abs(soundfile.read(path)[0]).max() == pytest.approx(10 ** (6 / 20), rel=1e-6)
+
+
+def test_show_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys: Streams) -> None:
+    output = tmp_path / "pictures"
+    assert main(["show", str(field), str(capture), "--output", str(output), "--json"]) == 0
+    out, err = capsys.readouterr()
+    told, fitted = json.loads(out), load(field)
+    assert told["capture"] == "plate"
+    assert told["sample_rate"] == RATE
+    assert told["mode_count"] == len(told["modes"]) == len(fitted.bank)
+    assert told["modes"][0]["frequency_hertz"] == float(fitted.bank.frequency[0])
+    assert told["compared_with"]["which"] == "not trained on"
+    assert set(told["compared_with"]["recordings"]).isdisjoint(fitted.origin.trained_on)
+    assert len(told["compared_with"]["recordings"]) == 3
+    assert (len(told["trained_on"]), told["trained_on"][0]) == (5, "002.wav")
+    assert "field of plate" in err
+    for name in ("modes", "gains", "spectrograms"):
+        assert (output / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    # Without a capture, and without pictures.
+    assert main(["show", str(field)]) == 0
+    assert "field of plate" in capsys.readouterr().out
+
+
+def test_the_demo_goes_all_the_way(tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
+    from avmsf.cli import demo
+    from plate_field import QUICK
+
+    monkeypatch.setattr(demo, "SECONDS", 0.25)
+    monkeypatch.setattr(demo, "CONTACTS", 8)
+    monkeypatch.setattr(demo, "TRAIN", 4)
+    monkeypatch.setattr(demo, "FitConfig", lambda damping: QUICK)
+    monkeypatch.setattr(demo, "SAMPLE_RATE", 17000.0)
+    folder = tmp_path / "demo"
+    assert main(["demo", str(folder)]) == 0
+    assert f"Listen to {folder}/sounds/walk.wav" in capsys.readouterr().out
+    told = json.loads((folder / "demo.json").read_text())
+    error = {method: each["relative_stft"] for method, each in told["scores"].items()}
+    assert error["floor: the test strikes' own gains"] < error["field"] < error["white noise"]
+    assert "| field |" in (folder / "scores.md").read_text()
+    assert {each.name for each in (folder / "pictures").iterdir()} == {
+        "gains.png",
+        "modes.png",
+        "scores.png",
+        "spectrograms.png",
+    }
+    sounds = sorted((folder / "sounds").iterdir())
+    assert len(sounds) == 10
+    assert all(np.abs(soundfile.read(sound)[0]).max() <= 1 for sound in sounds)
+    assert len((folder / "capture" / "impacts.csv").read_text().splitlines()) == 9
+    assert len(load(folder / "plate.safetensors").origin.trained_on) == 4
+    assert list(tmp_path.iterdir()) == [folder]
+    # A demo's own folder is replaced as a whole, another's is left alone, and Ctrl-C leaves all as it was.
+    monkeypatch.setattr(demo, "extract", interrupt)
+    assert main(["demo", str(folder)]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "avmsf demo: interrupted"
+    assert list(tmp_path.iterdir()) == [folder]
+    monkeypatch.setattr(demo, "_go_all_the_way", lambda begun: (begun / "new.txt").write_text("new") and "told")
+    assert main(["demo", str(folder)]) == 0
+    assert [each.name for each in folder.iterdir()] == ["new.txt"]
+    capsys.readouterr()
+    assert main(["demo", str(folder)]) == 2
+    assert "holds no earlier demo" in error_line(capsys)
+    assert (folder / "new.txt").exists()
