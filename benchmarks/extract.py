@@ -15,7 +15,7 @@ from avmsf.errors import ExtractionError
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extract import HighResolution, ModeFinder, ShortTime, extract, extract_sounds
 from avmsf.simulate.plate import PlateModes, plate_modes
-from benchmarks.material import IMPULSE, Clip, clips_in_place
+from benchmarks.material import IMPULSE, clips_in_place
 from benchmarks.report import Options, Report, Table, tell
 
 METHODS: dict[str, ModeFinder] = {"pencil": HighResolution(), "stft": ShortTime()}
@@ -128,9 +128,9 @@ def _bowl(options: Options, key: str, highpass: float) -> Report:
         errors[method] = []
         for row in left_out:
             others = torch.cat([sounds[:row], sounds[row + 1 :]])
-            bank = extract_sounds(others, sample_rate=rate, method=finder).bank
-            errors[method].append(_error(sounds[row], bank, rate))
-            tell(f"{key} without {clips[row].name}, {method}: {len(bank)} modes, error {errors[method][-1]:.3f}")
+            bank = _modes_of(others, rate, finder)
+            errors[method].append(1.0 if bank is None else _error(sounds[row], bank, rate))
+            tell(f"{key} without {clips[row].name}, {method}: {len(bank or ())} modes, error {errors[method][-1]:.3f}")
         figures[f"{key}.error_{method}"] = sum(errors[method]) / len(errors[method])
     bank = extract_sounds(sounds, sample_rate=rate, method=METHODS["pencil"]).bank
     low, high = (float(bank.frequency[(bank.frequency - place).abs().argmin()]) for place in DOUBLET)
@@ -172,7 +172,7 @@ def _own_modes(key: str, options: Options) -> Report:
     for clip in clips:
         row: list[str | float] = [clip.name, len(clip.sound) / clip.sample_rate]
         for method, finder in METHODS.items():
-            bank = _modes_of(clip, finder)
+            bank = _modes_of(clip.sound[None], clip.sample_rate, finder)
             error = 1.0 if bank is None else _error(clip.sound, bank, clip.sample_rate)
             modes = 0 if bank is None else len(bank)
             figures |= {f"{key}.{clip.name}.error_{method}": error, f"{key}.{clip.name}.modes_{method}": float(modes)}
@@ -187,11 +187,11 @@ def _own_modes(key: str, options: Options) -> Report:
     return Report(tables=(Table(f"{key}: each clip by its own modes", columns, rows),), figures=figures)
 
 
-def _modes_of(clip: Clip, finder: ModeFinder) -> ModalBank | None:
+def _modes_of(sounds: Float[Tensor, "contacts samples"], sample_rate: float, finder: ModeFinder) -> ModalBank | None:
     try:
-        return extract_sounds(clip.sound[None], sample_rate=clip.sample_rate, method=finder).bank
+        return extract_sounds(sounds, sample_rate=sample_rate, method=finder).bank
     except ExtractionError as error:
-        tell(f"{clip.name}: {error}")
+        tell(str(error))
         return None
 
 

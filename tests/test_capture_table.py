@@ -3,7 +3,9 @@
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
+import soundfile
 import torch
 import trimesh
 
@@ -11,7 +13,7 @@ from avmsf.capture import CaptureWarning, read_capture
 from avmsf.errors import CaptureError
 from capture_folder import HEADER, ROWS, fill
 
-CONTACTS = torch.tensor([[0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]])
+CONTACTS = torch.tensor([[0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]], dtype=torch.float64)
 
 
 def test_rows_keep_their_order_and_contacts_are_metres(tmp_path: Path) -> None:
@@ -50,8 +52,8 @@ def test_units_scale_contacts_and_surface_alike(tmp_path: Path) -> None:
     trimesh.creation.box((600, 600, 600)).export(folder / "surface.stl")
     capture = read_capture(folder)
     assert capture.name == "cup"
-    # One part in 10 million is float32's resolution.
-    assert torch.allclose(capture.impacts.contacts, CONTACTS, rtol=1e-6, atol=0)
+    # A few roundings in float64.
+    assert torch.allclose(capture.impacts.contacts, CONTACTS, rtol=1e-15, atol=0)
     assert capture.surface is not None
     assert capture.surface.vertices.abs().max() == pytest.approx(0.3, rel=1e-6)
 
@@ -149,3 +151,23 @@ def test_a_surface_in_millimetres_beside_contacts_in_metres_is_recognised(tmp_pa
     surface = read_capture(folder).surface
     assert surface is not None
     assert surface.vertices.amax().item() == pytest.approx(0.25, rel=1e-6)
+
+
+def test_what_is_no_table_says_so(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    (folder / "impacts.csv").write_text("file,x,y,z\n" + "a" * 200_000 + ".wav,0,0,0\n")
+    with pytest.raises(CaptureError, match=r"impacts\.csv: not a table that can be read: field larger"):
+        read_capture(folder)
+
+
+def test_a_name_that_no_file_can_have_is_reported(tmp_path: Path) -> None:
+    folder = fill(tmp_path, rows=("a" * 300 + ".wav,0,0,0", "b.wav,0,0.2,0", "c.wav,0,0,0.3"))
+    with pytest.raises(CaptureError, match=r"a…: no file can be called that"):
+        read_capture(folder)
+
+
+def test_a_clip_too_short_for_the_highpass_is_too_short(tmp_path: Path) -> None:
+    folder = fill(tmp_path, settings="highpass = 20.0")
+    soundfile.write(folder / "a.wav", np.linspace(-0.1, 0.1, 12), 48_000)
+    with pytest.raises(CaptureError, match=r"a\.wav: too short, 12 samples"):
+        read_capture(folder)

@@ -37,7 +37,7 @@ WRONG = {
     "modes nowhere": "there is no such folder",
     "modes plate --settings nowhere.toml": "nowhere.toml: there is no such file of capture settings",
     "modes plate --picture modes.gif": "ends in .png, .pdf or .svg, found .gif",
-    "modes plate --modes 0": "modes",
+    "modes plate --modes 0": "modes = 0: expected 1 or more",
     "fit nowhere --output f.safetensors": "there is no such folder",
     "fit plate --output plate": "is a folder",
     "fit plate --output words.csv/f.safetensors": "is a file, so there can be no folder",

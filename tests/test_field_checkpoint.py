@@ -80,7 +80,10 @@ def test_an_interrupted_fit_goes_on_to_the_same_result(tmp_path, stage, step):
     expect_same(fitted(checkpoint, keys), uninterrupted())
     # It went on from there: no step was taken twice.
     assert keys.told[done:] == [(each, number) for each in STAGES for number in range(1, 15)][done:]
-    assert not list(tmp_path.iterdir())
+    # The finished fit's state stays until its field is saved, and gives the field again without a step.
+    done = len(keys.told)
+    expect_same(fitted(checkpoint, keys), uninterrupted())
+    assert keys.told[done:] == []
 
 
 def test_a_fit_may_be_interrupted_again_and_again(tmp_path):
@@ -166,7 +169,16 @@ def test_a_path_may_be_a_word(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         fit(*arguments, checkpoint=str(tmp_path / "state"), progress=keys)
     expect_same(fit(*arguments, checkpoint=str(tmp_path / "state")), uninterrupted())
-    assert not list(tmp_path.iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == ["state"]
+
+
+def test_a_full_disk_costs_the_checkpoint_and_not_the_fit(tmp_path, monkeypatch):
+    def full(path: Path, state: dict[str, object]) -> None:
+        raise FieldFileError(f"{path}: cannot be written (No space left on device)")
+
+    monkeypatch.setattr("avmsf.field.fit.write_checkpoint", full)
+    with pytest.warns(UserWarning, match="goes on without a new checkpoint: .*No space left"):
+        expect_same(fitted(tmp_path / "fit.checkpoint"), uninterrupted())
 
 
 def _louder(impacts, features, modes):

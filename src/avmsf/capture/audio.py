@@ -76,7 +76,11 @@ def read_recording(path: Path, name: str | None = None) -> Recording:
     Raises `CaptureError` where the file is missing, corrupt or empty, or holds samples that are not numbers.
     """
     name = name or str(path)
-    if not path.is_file():
+    try:
+        missing = not path.is_file()
+    except OSError as error:
+        raise CaptureError(f"{name[:80]}…: no file can be called that ({error.strerror})") from error
+    if missing:
         raise CaptureError(f"{name}: there is no such file{_nearest_name(path)}")
     try:
         with soundfile.SoundFile(path) as file:

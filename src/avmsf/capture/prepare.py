@@ -37,6 +37,7 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
     refuse_rate(recording.sample_rate * settings.playback_speed, recording.name)
     sound = recording.response(settings.response_channel, force_channel=settings.force_channel)
     refuse_silence(sound, recording.name)
+    refuse_short(sound, recording)
     sound = remove_rumble(sound, settings.highpass, recording)
     pulse, onset = None, 0
     if settings.force_channel is not None:

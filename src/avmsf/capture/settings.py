@@ -40,8 +40,8 @@ class CaptureSettings:
     as a smaller object would."""
     normalise: str = "auto"
     """peak: divide by the peak force. deconvolve: divide the spectrum by the force's. none: leave as recorded. done:
-    the files hold sounds per newton already, and force_newtons is only kept. auto: peak where a force is known by
-    channel or column, else none."""
+    the files are divided already, by the force_newtons that the table keeps, where it has them. auto: peak where a
+    force is known by channel or column, else none."""
     regularisation: float = 1e-4
     """For deconvolve: the power, relative to the greatest of the force's spectrum, below which the force counts as
     absent. Larger is quieter and duller."""

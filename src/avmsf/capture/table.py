@@ -48,6 +48,24 @@ class Strike:
     newtons: float | None
 
 
+def read_cells(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
+    """Return a table's lines that are not blank, each with its number and its cells, and what separates the cells.
+
+    Raises `CaptureError` for a file that is no table of UTF-8 text.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        first = text.lstrip().split("\n", 1)[0]
+        separator = max(",;\t", key=first.count)
+        reader = csv.reader(io.StringIO(text), delimiter=separator)
+        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+    except UnicodeDecodeError as error:
+        raise CaptureError(f"{path}: not UTF-8 text: save it from the spreadsheet as 'CSV UTF-8'") from error
+    except (OSError, csv.Error) as error:
+        raise CaptureError(f"{path}: not a table that can be read: {error}") from error
+    return [(line, cells) for line, cells in lines if any(cells)], separator
+
+
 def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
     """Read the rows of the folder's `impacts.csv`, and remarks about columns that are not used.
 
@@ -60,15 +78,7 @@ def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
         raise CaptureError(f"{folder}: there is no such folder")
     if not path.is_file():
         raise CaptureError(f"{folder}: there is no {TABLE} in this folder; {HOW_TO_WRITE}")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise CaptureError(f"{path}: not UTF-8 text: save it from the spreadsheet as 'CSV UTF-8'") from error
-    first = text.lstrip().split("\n", 1)[0]
-    separator = max(",;\t", key=first.count)
-    reader = csv.reader(io.StringIO(text), delimiter=separator)
-    lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
-    lines = [(line, cells) for line, cells in lines if any(cells)]
+    lines, separator = read_cells(path)
     if not lines:
         raise CaptureError(f"{path}: the table is empty; {HOW_TO_WRITE}")
     header = [name.lower() for name in lines[0][1]]

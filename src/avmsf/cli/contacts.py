@@ -1,7 +1,5 @@
 """Contacts to render, from the command line or from a table, each with the name of its sound."""
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from avmsf.capture.table import read_cells
 from avmsf.cli.writing import OutputError
 from avmsf.errors import CaptureError
 from avmsf.field.soundfield import SoundField
@@ -41,15 +40,7 @@ def read_contacts(path: Path, *, metres: float) -> Contacts:
 
     Sounds are called as the column `file` says, else by number. Raises `CaptureError` with the line at fault.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{path}: not a table that can be read: {error}") from error
-    first = text.lstrip().split("\n", 1)[0]
-    separator = max(",;\t", key=first.count)
-    reader = csv.reader(io.StringIO(text), delimiter=separator)
-    lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
-    lines = [(line, cells) for line, cells in lines if any(cells)]
+    lines, separator = read_cells(path)
     header = [name.lower() for name in lines[0][1]] if lines else []
     missing = [name for name in _COLUMNS if name not in header]
     if missing or len(lines) < 2:

@@ -11,7 +11,8 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction import Extraction
 
 _HEARD = 4.0
-"""An amplitude this many times what noise alone shows on average: noise reaches it once in 3000 (exp(-4^2 / 2))."""
+"""An amplitude this many times the standard deviation of one phase under noise: noise reaches it once in 3000
+(exp(-4^2 / 2))."""
 
 
 @dataclass(frozen=True)

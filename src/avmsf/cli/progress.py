@@ -38,12 +38,16 @@ class FitBar:
 
     def show(self, progress: FitProgress) -> None:
         """Take note of one step."""
-        new = progress.stage != self.stage
-        if new and self.live:
+        if progress.step <= progress.warmup:
+            stage, step, steps = f"{progress.stage}, warm-up", progress.step, progress.warmup
+        else:
+            stage, step = f"{progress.stage}, end to end", progress.step - progress.warmup
+            steps = progress.steps - progress.warmup
+        if stage != self.stage and self.live:
             self.bar.remove_task(self.task)
-            self.task = self.bar.add_task(progress.stage, total=progress.steps, loss="–")
-        self.stage = progress.stage
+            self.task = self.bar.add_task(stage, total=steps, loss="–")
+        self.stage = stage
         if self.live:
-            self.bar.update(self.task, completed=progress.step, loss=figure(progress.loss))
-        elif progress.step == progress.steps:
-            say(f"{progress.stage}: {progress.steps} steps, loss {figure(progress.loss)}")
+            self.bar.update(self.task, completed=step, loss=figure(progress.loss))
+        elif step == steps:
+            say(f"{stage}: {steps} steps, loss {figure(progress.loss)}")

@@ -48,6 +48,8 @@ class Progress:
     """Steps of this run."""
     loss: float
     """Loss of the last step: relative squared gain error in warm-up, spectral loss after."""
+    warmup: int
+    """Steps of this run that are warm-up: each takes a small part of the time of one end to end."""
 
 
 def fit(
@@ -65,8 +67,8 @@ def fit(
     `modes` as extracted from `train`. Choices that the config leaves open are made on a part of the training contacts
     held out for the purpose, then the field is fitted to all. With `checkpoint`, the state is kept there while the fit
     runs, on interruption and at the end, and a fit of the same arguments goes on from it to the same result; delete the
-    file once the field is saved. Raises `FitError` for arguments that do not fit together and for a fit that diverges, and
-    `FieldFileError` for a checkpoint that is none of this fit's.
+    file once the field is saved. Raises `FitError` for arguments that do not fit together and for a fit that diverges,
+    and `FieldFileError` for a checkpoint that is none of this fit's.
     """
     config = FitConfig() if config is None else config
     expect_fitting(train, modes)
@@ -225,7 +227,7 @@ class _Job:
 
     def _tell(self, name: str, run: TrainingRun, end: int, loss: float) -> None:
         if self.progress is not None:
-            self.progress(Progress(name, run.step, end, loss))
+            self.progress(Progress(name, run.step, end, loss, self.config.warmup_steps))
 
     def _save(self, name: str, run: TrainingRun, look: "_Look | None") -> None:
         if self.checkpoint is None:

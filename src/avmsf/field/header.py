@@ -92,7 +92,7 @@ def read_header(words: str, path: Path) -> Header:
     if found != FORMAT:
         raise FieldFileError(
             f"{path}: expected a sound field of format {FORMAT}, found format {found}, written by avmsf {writer} "
-            f"(this is avmsf {version('avmsf')}): install that version or a newer one, pip install 'avmsf>={writer}'"
+            f"(this is avmsf {version('avmsf')}): install avmsf {writer} or newer"
         )
     try:
         return _header(record)

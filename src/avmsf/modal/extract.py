@@ -56,6 +56,9 @@ class HighResolution:
     lowest_hertz: float = 0.0
     """Lowest frequency to look at, Hz; zero for what the length of the sounds allows (about fifty periods)."""
 
+    def __post_init__(self) -> None:
+        expect_modes(self.modes)
+
     def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:
         """Return the modes of `sounds`, at most `modes` of them."""
         level = _level(sounds)
@@ -139,6 +142,9 @@ class ShortTime:
     least_damping: float = 0.5
     """A bin that decays more slowly than this is hum, 1/s."""
 
+    def __post_init__(self) -> None:
+        expect_modes(self.modes)
+
     def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:
         """Return the modes of `sounds`, at most `modes` of them."""
         fft_size = _power_of_two(self.fft_seconds * sample_rate, least=32)
@@ -152,6 +158,12 @@ class ShortTime:
             least_damping=self.least_damping,
             count=self.modes,
         )
+
+
+def expect_modes(modes: int) -> None:
+    """Raise `ExtractionError` unless at least one mode is asked for."""
+    if modes < 1:
+        raise ExtractionError(f"modes = {modes}: expected 1 or more, the most that are kept")
 
 
 def extract(impacts: Impacts, method: ModeFinder | None = None) -> Extraction:
