@@ -20,10 +20,12 @@ from benchmarks.report import Options, Report, Table, tell
 
 PARTS = ("network",)
 GLASS = PlateCase(
-    Plate(length=0.3, width=0.22, thickness=0.005, young=6.2e10, density=2600, poisson=0.2, alpha=8, beta=1e-7), 3e-4
+    Plate(length=0.3, width=0.22, thickness=0.005, young=6.2e10, density=2600.0, poisson=0.2, alpha=8.0, beta=1e-7),
+    3e-4,
 )
 WOOD = PlateCase(
-    Plate(length=0.2, width=0.17, thickness=0.004, young=1.1e10, density=750, poisson=0.25, alpha=30, beta=1e-6), 6e-4
+    Plate(length=0.2, width=0.17, thickness=0.004, young=1.1e10, density=750.0, poisson=0.25, alpha=30.0, beta=1e-6),
+    6e-4,
 )
 AIRCRAFT = ((28, 18, 14), (28, 37, 14), (15, 18, 8), (28, 0, 9))
 """Training contacts of `field`, their start, and how many of them are trained on here."""

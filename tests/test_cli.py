@@ -197,7 +197,8 @@ def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys
     errors = {method: each["relative_stft"] for method, each in told["scores"].items()}
     assert min(errors, key=lambda method: errors[method]) == "floor: the test strikes' own gains"
     assert max(errors, key=lambda method: errors[method]) == "white noise"
-    assert "fit: 18 steps, loss" in err
+    assert "fit, warm-up: 12 steps, loss" in err
+    assert "fit, end to end: 6 steps, loss" in err
     assert [each.name for each in path.parent.iterdir()] == ["plate.safetensors"]
 
 

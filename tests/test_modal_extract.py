@@ -280,3 +280,9 @@ def test_the_bowls_doublet_is_resolved(shared: Path):
         assert float(found.bank.damping[nearest]) == pytest.approx(3.1, abs=0.3)
     loudest = torch.hypot(found.gains, found.quadrature).amax(1) / torch.stack(clips).abs().amax(1)
     assert float(loudest.max()) < 5.0
+
+
+@pytest.mark.parametrize("method", [HighResolution, ShortTime])
+def test_no_modes_at_all_cannot_be_asked_for(method) -> None:
+    with pytest.raises(ExtractionError, match="modes = 0: expected 1 or more"):
+        method(modes=0)
