@@ -111,7 +111,10 @@ def _poles(band: Complex[Tensor, "contacts times"]) -> Complex128[Tensor, " pole
     noise = values[span // 2 :].clamp_min(float(values[0]) * 1e-13).median()
     order = min(int((values > _ABOVE_NOISE * noise).sum()), span // 2)
     subspace = vectors[:, :order]
-    poles = torch.linalg.eigvals(torch.linalg.lstsq(subspace[:-1], subspace[1:]).solution)
+    # By normal equations, for the upper rows of orthonormal columns are all but orthonormal: torch's complex lstsq
+    # rounds otherwise from call to call, and a selection among hundreds of candidates makes that visible.
+    upper, lower = subspace[:-1], subspace[1:]
+    poles = torch.linalg.eigvals(torch.linalg.solve(upper.mH @ upper, upper.mH @ lower))
     return poles[torch.isfinite(poles.abs()) & (poles != 0)]
 
 
