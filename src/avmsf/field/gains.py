@@ -15,17 +15,17 @@ from avmsf.scene.features import FeatureField, Regions
 class AttentionShape:
     """The network's sizes."""
 
-    clusters: int = 128
+    clusters: int
     """Regions K that the network attends to."""
-    bands: int = 4
+    bands: int
     """Octaves of sines and cosines in the encoding of offsets."""
-    width: int = 64
+    width: int
     """Size d of queries, keys and values."""
-    hidden: int = 256
+    hidden: int
     """Neurons in each hidden layer of the head."""
-    layers: int = 2
+    layers: int
     """Hidden layers of the head."""
-    feature_scale: float = 4.0
+    feature_scale: float
     """Factor on the features as the network reads them."""
     spatial_damping: bool = False
     """Whether damping, too, depends on the contact."""

@@ -112,24 +112,24 @@ def _header(record: dict[str, Any]) -> Header:
         samples=_count(record["samples"], "samples"),
         **{name: _count(sizes[name], f"sizes.{name}") for name in ("points", "dim", "modes", "bins")},
         encoder=_like(network["encoder"], "", "gain_field.encoder"),
-        shape=_record_of(AttentionShape, network["shape"], "gain_field.shape"),
+        shape=_record_of(FitConfig().shape, network["shape"], "gain_field.shape"),
         origin=Origin(
             capture=_like(origin["capture"], "", "origin.capture"),
             trained_on=tuple(_like(name, "", "origin.trained_on") for name in origin["trained_on"]),
             per_newton=_like(origin["per_newton"], True, "origin.per_newton"),
-            config=_record_of(FitConfig, record["config"], "config"),
+            config=_record_of(FitConfig(), record["config"], "config"),
             report=_like(origin["report"], {}, "origin.report"),
         ),
     )
 
 
-def _record_of(kind: type[_Record], values: dict[str, Any], name: str) -> _Record:
-    """Build a record of settings from exactly its fields, each of its default's type."""
-    examples = {each.name: each.default for each in fields(kind)}
+def _record_of(example: _Record, values: dict[str, Any], name: str) -> _Record:
+    """Build a record of settings from exactly the example's fields, each of the type that it has there."""
+    examples = {each.name: getattr(example, each.name) for each in fields(example)}
     if values.keys() != examples.keys():
         differing = ", ".join(sorted(values.keys() ^ examples.keys()))
         raise ValueError(f"{name} lacks or adds {differing}")
-    return kind(**{each: _like(value, examples[each], f"{name}.{each}") for each, value in values.items()})
+    return type(example)(**{each: _like(value, examples[each], f"{name}.{each}") for each, value in values.items()})
 
 
 def _like(value: Any, example: Any, name: str) -> Any:

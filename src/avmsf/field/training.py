@@ -109,11 +109,6 @@ class TrainingRun:
             return Residual(torch.zeros_like(self.start.residual.magnitude))
         return Residual(self.start.residual.magnitude * torch.exp(self.noise))
 
-    @property
-    def steps(self) -> int:
-        """Steps of both stages together."""
-        return self.config.warmup_steps + self.config.steps
-
     def sounds(self, rows: Int[Tensor, " contacts"]) -> Float[Tensor, "contacts samples"]:
         """Return the sounds at points of the gain field, with a fresh draw of noise (paper, eq. 12)."""
         gains, factors = self.network.read(rows)
