@@ -9,6 +9,10 @@ class CaptureError(AvmsfError):
     """A capture folder, its table, its settings or one of its sound files cannot be used."""
 
 
+class SceneError(AvmsfError):
+    """Views, Gaussians, features or symmetries cannot be made or read."""
+
+
 class ExtractionError(AvmsfError):
     """No modes can be drawn from these recordings."""
 

@@ -1,0 +1,143 @@
+"""Pinhole cameras and the photographs they took: OpenCV axes, world to camera, whatever the files say."""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from avmsf.errors import CaptureError
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera without distortion: x to the right, y down, z forward.
+
+    A pixel's center lies half a pixel from its edges, so that the image spans (0, 0) to (width, height).
+    """
+
+    world_to_camera: Float[Tensor, "4 4"]
+    """Rigid transform of the object frame, metres, into the camera's; float64."""
+    focal: tuple[float, float]
+    """Focal lengths along x and y, pixels."""
+    principal: tuple[float, float]
+    """Where the optical axis meets the image, pixels."""
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+
+    def __post_init__(self) -> None:
+        numbers = [*self.focal, *self.principal, *self.world_to_camera.flatten().tolist()]
+        if not all(map(math.isfinite, numbers)) or min(self.focal) <= 0 or min(self.width, self.height) < 1:
+            raise CaptureError(
+                f"expected a camera with finite numbers, positive focal lengths and a size in pixels, found focal "
+                f"lengths {self.focal}, principal point {self.principal}, size {self.width} x {self.height}: check "
+                "the file that holds the cameras"
+            )
+
+    @classmethod
+    def looking(
+        cls,
+        position: Float[Tensor, " 3"],
+        target: Float[Tensor, " 3"],
+        *,
+        up: Float[Tensor, " 3"],
+        focal: float,
+        width: int,
+        height: int,
+    ) -> "Camera":
+        """Return a camera at `position` that sees `target` in the middle of its image, with `up` upwards in it.
+
+        Raises CaptureError where position and target are one place, or `up` is parallel to the line of sight.
+        """
+        position, target, up = position.double(), target.double(), up.double()
+        forward = target - position
+        right = torch.linalg.cross(forward, up)
+        if float(right.norm()) < 1e-9 * max(float(forward.norm()) * float(up.norm()), 1e-300):
+            raise CaptureError(f"expected a camera that looks across its up direction {up.tolist()}; choose another up")
+        forward, right = forward / forward.norm(), right / right.norm()
+        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+        return cls(pose, (focal, focal), (width / 2, height / 2), width, height)
+
+    @cached_property
+    def position(self) -> Float[Tensor, " 3"]:
+        """The camera's place in the object frame, metres."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+    @cached_property
+    def intrinsics(self) -> Float[Tensor, "3 3"]:
+        """The matrix that takes the camera's frame to homogeneous pixels."""
+        return torch.tensor(
+            [[self.focal[0], 0.0, self.principal[0]], [0.0, self.focal[1], self.principal[1]], [0.0, 0.0, 1.0]],
+            dtype=torch.float64,
+        )
+
+    def project(self, points: Float[Tensor, "points 3"]) -> tuple[Float[Tensor, "points 2"], Float[Tensor, " points"]]:
+        """Return the points' places in the image, pixels, and their depths along the optical axis, metres; float64.
+
+        A point at or behind the camera has no place: its pixels are NaN.
+        """
+        inside = points.double() @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        depth = inside[:, 2]
+        ahead = torch.where(depth > 0, depth, torch.nan)
+        scale = inside.new_tensor(self.focal)
+        return inside[:, :2] / ahead[:, None] * scale + inside.new_tensor(self.principal), depth
+
+    def rays(self) -> Float[Tensor, "height width 3"]:
+        """Return the unit direction, in the object frame, in which each pixel's center looks; float64."""
+        across = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.principal[0]) / self.focal[0]
+        down = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.principal[1]) / self.focal[1]
+        directions = torch.ones(self.height, self.width, 3, dtype=torch.float64)
+        directions[..., 0], directions[..., 1] = across[None, :], down[:, None]
+        directions = directions @ self.world_to_camera[:3, :3]
+        return directions / directions.norm(dim=-1, keepdim=True)
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """Return the camera of the same picture with another number of pixels."""
+        across, down = width / self.width, height / self.height
+        return replace(
+            self,
+            focal=(self.focal[0] * across, self.focal[1] * down),
+            principal=(self.principal[0] * across, self.principal[1] * down),
+            width=width,
+            height=height,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One photograph with the camera that took it."""
+
+    name: str
+    """The file's name, or another by which a message can speak of it."""
+    image: UInt8[Tensor, "height width 3"]
+    """Red, green, blue as displayed (sRGB)."""
+    camera: Camera
+    mask: UInt8[Tensor, "height width"] | None = None
+    """How much of each pixel the object covers, 255 for all of it; None where nobody knows."""
+
+    def __post_init__(self) -> None:
+        found = tuple(self.image.shape[:2])
+        expected = (self.camera.height, self.camera.width)
+        if found != expected or (self.mask is not None and tuple(self.mask.shape) != expected):
+            raise CaptureError(
+                f"{self.name}: the camera takes {expected[1]} x {expected[0]} pixels, the image has {found[1]} x "
+                f"{found[0]}"
+                + ("" if self.mask is None else f", its mask {self.mask.shape[1]} x {self.mask.shape[0]}")
+                + ": give the camera of this very image"
+            )
+
+    @property
+    def color(self) -> Float[Tensor, "height width 3"]:
+        """The image as numbers from 0 to 1, float32."""
+        return self.image.float() / 255
+
+    @property
+    def coverage(self) -> Float[Tensor, "height width"] | None:
+        """The mask as numbers from 0 to 1, float32."""
+        return None if self.mask is None else self.mask.float() / 255

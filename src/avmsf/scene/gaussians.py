@@ -1,0 +1,46 @@
+"""An object as 3D Gaussians: soft ellipsoids with an opacity and a colour that depends on the direction of view."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianCloud:
+    """The Gaussians of one object, in the object frame (Kerbl et al. 2023, "3D Gaussian Splatting")."""
+
+    centers: Float[Tensor, "points 3"]
+    """Metres."""
+    rotations: Float[Tensor, "points 4"]
+    """Quaternions w, x, y, z from each Gaussian's own axes to the object frame; normalised where they are used."""
+    log_scales: Float[Tensor, "points 3"]
+    """Natural logarithms of the standard deviations along the own axes, metres."""
+    logit_opacities: Float[Tensor, " points"]
+    """Opacity at the center is the sigmoid of these."""
+    harmonics: Float[Tensor, "points coefficients 3"]
+    """Spherical harmonics of red, green and blue: 1, 4, 9 or 16 coefficients, degree 0 to 3, in the order of 3DGS."""
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+    @property
+    def opacities(self) -> Float[Tensor, " points"]:
+        """Opacity at each center, 0 to 1."""
+        return torch.sigmoid(self.logit_opacities)
+
+    @property
+    def degree(self) -> int:
+        """Degree of the spherical harmonics."""
+        return int(self.harmonics.shape[1] ** 0.5) - 1
+
+    def take(self, chosen: Int[Tensor, " chosen"] | Bool[Tensor, " points"]) -> "GaussianCloud":
+        """Return the Gaussians of the given rows."""
+        return GaussianCloud(
+            self.centers[chosen],
+            self.rotations[chosen],
+            self.log_scales[chosen],
+            self.logit_opacities[chosen],
+            self.harmonics[chosen],
+        )
