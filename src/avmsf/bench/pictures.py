@@ -17,7 +17,7 @@ from torch import Tensor
 
 from avmsf.bench.evaluation import Scores
 from avmsf.errors import EvaluationError
-from avmsf.field.files import write_whole
+from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.spectra import magnitude_stft, scaled_fft_size
 

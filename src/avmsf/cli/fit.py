@@ -11,7 +11,7 @@ import tyro
 from avmsf.bench.evaluation import split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.kept import extract_once
+from avmsf.pipeline.keptmodes import extract_once
 from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.progress import FitBar

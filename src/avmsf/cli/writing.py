@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.errors import AvmsfError
-from avmsf.field.files import write_whole
+from avmsf.files import write_whole
 
 SUBTYPES = {"float32": "FLOAT", "int16": "PCM_16"}
 Coding = Literal["float32", "int16"]

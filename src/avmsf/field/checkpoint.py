@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from avmsf.errors import FieldFileError
-from avmsf.field.files import write_whole
+from avmsf.files import write_whole
 
 
 def write_checkpoint(path: Path, state: dict[str, Any]) -> None:

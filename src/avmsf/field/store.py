@@ -12,10 +12,10 @@ from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from avmsf.errors import FieldFileError
-from avmsf.field.files import write_whole
 from avmsf.field.gains import AttentionGains
 from avmsf.field.header import FORMAT, Header, read_header
 from avmsf.field.soundfield import SoundField
+from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.scene.features import FeatureField, Regions

@@ -5,14 +5,14 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from avmsf.errors import FieldFileError
+from avmsf.errors import AvmsfError, FieldFileError
 
 
-def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+def write_whole(path: Path, write: Callable[[Path], object], *, raising: type[AvmsfError] = FieldFileError) -> None:
     """Let `write` fill a temporary file beside `path`, then move it there in one step; missing folders are made.
 
     What was there stays whole until then: a full disk or a kill leaves the old file, a kill perhaps a hidden
-    `.NAME.….part` beside it, which nothing reads. Raises `FieldFileError`.
+    `.NAME.….part` beside it, which nothing reads. Raises `raising`.
     """
     temporary = None
     try:
@@ -29,7 +29,7 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
         temporary.chmod(0o666 & ~mask)
         os.replace(temporary, path)
     except OSError as error:
-        raise FieldFileError(
+        raise raising(
             f"{path}: cannot be written ({error.strerror or error}); what was there is untouched: free some space or "
             "choose another place"
         ) from error

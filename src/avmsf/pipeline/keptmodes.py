@@ -13,7 +13,7 @@ from safetensors.torch import save
 
 import avmsf
 from avmsf.capture import Impacts
-from avmsf.field.files import write_whole
+from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extract import ModeFinder, extract
 from avmsf.modal.extraction import Extraction

@@ -1,0 +1,91 @@
+"""What each stage of a reconstruction made, kept in a folder beside the record of what it was made from."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import avmsf
+from avmsf.errors import CaptureError
+from avmsf.files import write_whole
+
+_BLOCK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Kept:
+    """One stage's output."""
+
+    path: Path
+    """The file, or the folder of files, that the stage made."""
+    digest: str
+    """Of its content: what a later stage's recipe names it by."""
+    seconds: float
+    """How long the stage took when it ran."""
+    fresh: bool
+    """Whether it ran now."""
+
+
+class StageFolder:
+    """A folder of stages' outputs, `NAME` beside `NAME.stage.json`, its recipe.
+
+    A stage runs again where its recipe has changed, where its output was changed or is missing, and where another
+    version of this package made it. The record is written last: a stage that was interrupted has none and runs again.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def path(self, name: str) -> Path:
+        """Return where a stage's output is."""
+        return self.folder / name
+
+    def keep(self, name: str, recipe: Mapping[str, Any], make: Callable[[Path], object]) -> Kept:
+        """Return the output called `name`, made by `make(path)` where what is kept is not of this recipe.
+
+        `recipe` holds plain values that decide the output, digests of inputs among them. `make` leaves the output whole
+        or not at all. Raises as `make`, and `CaptureError` where the folder cannot be written.
+        """
+        path, record = self.path(name), self.folder / f"{name}.stage.json"
+        wanted = json.loads(json.dumps({"version": avmsf.__version__, **recipe}, sort_keys=True))
+        known = _read(record)
+        if known.get("recipe") == wanted and path.exists() and digest_of(path) == known.get("digest"):
+            return Kept(path, known["digest"], float(known["seconds"]), fresh=False)
+        record.unlink(missing_ok=True)
+        begun = time.monotonic()
+        make(path)
+        digest, seconds = digest_of(path), time.monotonic() - begun
+        words = json.dumps({"recipe": wanted, "digest": digest, "seconds": round(seconds, 3)}, indent=1)
+        write_whole(record, lambda place: place.write_text(words, encoding="utf-8"), raising=CaptureError)
+        return Kept(path, digest, seconds, fresh=True)
+
+
+def digest_of(path: Path) -> str:
+    """Return a digest of a file's content, or of the names and contents of all files in a folder."""
+    if path.is_dir():
+        return digest_files((each for each in path.rglob("*") if each.is_file()), beneath=path)
+    return digest_files([path], beneath=path.parent)
+
+
+def digest_files(paths: Iterable[Path], *, beneath: Path) -> str:
+    """Return a digest of files' contents and of their names relative to the folder `beneath`, in sorted order."""
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        digest.update(f"{path.relative_to(beneath).as_posix()}\0{path.stat().st_size}\0".encode())
+        with open(path, "rb") as file:
+            while block := file.read(_BLOCK):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def _read(record: Path) -> dict[str, Any]:
+    """Return a record, or an empty one where there is none that can be read: its stage then runs again."""
+    try:
+        known = json.loads(record.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    complete = isinstance(known, dict) and {"recipe", "digest", "seconds"} <= known.keys()
+    return known if complete else {}

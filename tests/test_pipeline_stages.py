@@ -1,0 +1,100 @@
+"""A stage runs when something that decides its output changed, and only then."""
+
+from pathlib import Path
+
+import pytest
+
+from avmsf.pipeline.stages import StageFolder, digest_files
+
+
+class Maker:
+    """Writes its words, and counts how often it was asked to."""
+
+    def __init__(self, words: str = "made") -> None:
+        self.words, self.runs = words, 0
+
+    def __call__(self, path: Path) -> None:
+        self.runs += 1
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(self.words)
+
+
+def test_an_unchanged_recipe_runs_once(tmp_path: Path) -> None:
+    make = Maker()
+    first = StageFolder(tmp_path / "kept").keep("cloud.ply", {"steps": 3}, make)
+    second = StageFolder(tmp_path / "kept").keep("cloud.ply", {"steps": 3}, make)
+    assert (make.runs, first.fresh, second.fresh) == (1, True, False)
+    assert second.digest == first.digest
+    assert second.seconds == pytest.approx(first.seconds, abs=1e-3)  # seconds; the record rounds to milliseconds
+
+
+@pytest.mark.parametrize("recipe", [{"steps": 4}, {"steps": 3, "more": None}, {}])
+def test_another_recipe_runs_again(tmp_path: Path, recipe: dict) -> None:
+    make, folder = Maker(), StageFolder(tmp_path)
+    folder.keep("cloud.ply", {"steps": 3}, make)
+    assert folder.keep("cloud.ply", recipe, make).fresh
+    assert make.runs == 2
+
+
+def test_tuples_are_the_lists_that_they_are_read_back_as(tmp_path: Path) -> None:
+    make, folder = Maker(), StageFolder(tmp_path)
+    folder.keep("cloud.ply", {"sizes": (1, 2)}, make)
+    assert not folder.keep("cloud.ply", {"sizes": (1, 2)}, make).fresh
+
+
+def test_an_output_that_was_changed_or_lost_is_made_again(tmp_path: Path) -> None:
+    make, folder = Maker(), StageFolder(tmp_path)
+    kept = folder.keep("cloud.ply", {}, make)
+    kept.path.write_text("changed")
+    assert folder.keep("cloud.ply", {}, make).fresh
+    assert kept.path.read_text() == "made"
+    kept.path.unlink()
+    assert folder.keep("cloud.ply", {}, make).fresh
+
+
+def test_a_stage_that_fails_midway_runs_again_even_under_an_older_recipe(tmp_path: Path) -> None:
+    make, folder = Maker("old"), StageFolder(tmp_path)
+    folder.keep("cloud.ply", {"steps": 1}, make)
+
+    def fail(path: Path) -> None:
+        path.write_text("half of the new")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        folder.keep("cloud.ply", {"steps": 2}, fail)
+    assert folder.keep("cloud.ply", {"steps": 1}, make).fresh
+    assert folder.path("cloud.ply").read_text() == "old"
+
+
+def test_a_record_of_another_version_or_a_damaged_one_does_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make, folder = Maker(), StageFolder(tmp_path)
+    folder.keep("cloud.ply", {}, make)
+    monkeypatch.setattr("avmsf.__version__", "0.0.0")
+    assert folder.keep("cloud.ply", {}, make).fresh
+    (tmp_path / "cloud.ply.stage.json").write_text("[]")
+    assert folder.keep("cloud.ply", {}, make).fresh
+
+
+def test_a_folder_counts_by_the_names_and_contents_of_its_files(tmp_path: Path) -> None:
+    def make(path: Path) -> None:
+        path.mkdir(exist_ok=True)
+        (path / "a.png").write_text("a")
+
+    folder = StageFolder(tmp_path)
+    kept = folder.keep("frames", {}, make)
+    assert not folder.keep("frames", {}, make).fresh
+    (kept.path / "a.png").rename(kept.path / "b.png")
+    assert folder.keep("frames", {}, make).fresh
+
+
+def test_the_order_of_files_does_not_matter_but_what_stands_in_which_does(tmp_path: Path) -> None:
+    for name, words in (("a", "1"), ("b", "2"), ("c", "12")):
+        (tmp_path / name).write_text(words)
+    a, b = tmp_path / "a", tmp_path / "b"
+    digest = digest_files([a, b], beneath=tmp_path)
+    assert digest == digest_files([b, a], beneath=tmp_path)
+    a.write_text("2")
+    b.write_text("1")
+    assert digest != digest_files([a, b], beneath=tmp_path)
