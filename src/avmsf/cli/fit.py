@@ -11,7 +11,6 @@ import tyro
 from avmsf.bench.evaluation import split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.cli import INTERRUPTED
-from avmsf.pipeline.keptmodes import extract_once
 from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.progress import FitBar
@@ -22,6 +21,7 @@ from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
+from avmsf.pipeline.keptmodes import extract_once
 from avmsf.scene.features import FeatureField
 
 

@@ -1,1 +1,1 @@
-"""All the way from a capture folder to a field, stage by stage, each kept and made anew only where something changed."""
+"""All the way from a capture folder to a field, stage by stage; only what changed is made anew."""
