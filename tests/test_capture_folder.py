@@ -27,15 +27,18 @@ from capture_folder import fill, ring
 def invented(*, names: tuple[str, ...] = ("takes/one.wav", "two.wav"), sample_rate: float = 48_000.0) -> Capture:
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(2, 3, generator=generator)
+    contacts = torch.randn(2, 3, dtype=torch.float64, generator=generator) / 7
     impacts = Impacts(
-        contacts=torch.randn(2, 3, dtype=torch.float64, generator=generator) / 7,
+        contacts=contacts,
         sounds=torch.from_numpy(np.stack([ring(1.0, seed=1), ring(1.0, seed=2)]).astype(np.float32)),
         sample_rate=sample_rate,
         names=names,
         directions=directions / directions.norm(dim=1, keepdim=True),
         forces=torch.rand(2, generator=generator) + 1,
     )
-    surface = Surface(torch.randn(6, 3, generator=generator) / 5, torch.tensor([[0, 1, 2], [3, 4, 5]]))
+    # Its corners are the contacts and others, so that the contacts lie on it.
+    corners = torch.cat([contacts.float(), torch.randn(4, 3, generator=generator) / 5])
+    surface = Surface(corners, torch.tensor([[0, 1, 2], [3, 4, 5]]))
     return Capture('a "cup" \\ für Tee', impacts, surface)
 
 
@@ -149,11 +152,11 @@ def test_a_failed_write_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytes
 @pytest.mark.parametrize("kind", ["obj", "ply", "glb", "stl"])
 def test_the_usual_surfaces_are_found_and_read(tmp_path: Path, kind: str) -> None:
     folder = fill(tmp_path)
-    trimesh.creation.box((0.4, 0.5, 0.6)).export(folder / f"surface.{kind}")
+    trimesh.creation.box((0.2, 0.4, 0.6)).export(folder / f"surface.{kind}")
     surface = read_capture(folder).surface
     assert surface is not None
     assert surface.faces.shape == (12, 3)
-    assert surface.vertices.amax(0).tolist() == pytest.approx([0.2, 0.25, 0.3], rel=1e-6)
+    assert surface.vertices.amax(0).tolist() == pytest.approx([0.1, 0.2, 0.3], rel=1e-6)
 
 
 def test_a_scene_keeps_each_part_where_it_lies(tmp_path: Path) -> None:

@@ -5,7 +5,9 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 
+from avmsf.capture.placement import Mistake, judge_placement, surface_points
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.capture.surface import Surface
@@ -92,30 +94,35 @@ def judge_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list
 
 
 def judge_surface(strikes: Sequence[Strike], surface: Surface, *, settings: CaptureSettings) -> list[str]:
-    """Say whether contacts and surface differ in size; `CaptureError` where a contact lies far outside the surface."""
-    low, high = surface.vertices.double().amin(0).numpy(), surface.vertices.double().amax(0).numpy()
-    size = float(np.linalg.norm(high - low))
-    contacts = np.array([strike.contact for strike in strikes])
-    across = _diagonal(contacts.tolist())
-    outside = np.linalg.norm(np.maximum(0, np.maximum(low - contacts, contacts - high)), axis=1)
-    if outside.max() > size:
-        worst = strikes[int(outside.argmax())]
+    """Say whether contacts lie off the surface; `CaptureError` where one lies farther off than the surface is large."""
+    contacts = torch.tensor([strike.contact for strike in strikes], dtype=torch.float64)
+    placement = judge_placement(contacts, surface_points(surface))
+    if placement.on_surface:
+        return []
+    found = placement.describe([f"line {strike.line}" for strike in strikes]) + _mending(placement.mistake, settings)
+    farthest = float(placement.distances.max())
+    if farthest > placement.diagonal:
+        worst = strikes[int(placement.distances.argmax())]
         raise CaptureError(
-            f"{TABLE} line {worst.line}: the contact lies {outside.max():.3g} m outside the surface, which is only "
-            f"{size:.3g} m across: both must be in one frame{_fitting_surface_unit(size, across, settings)}"
+            f"{TABLE} line {worst.line}: the contact lies {farthest:.3g} m off the surface, which is only "
+            f"{placement.diagonal:.3g} m across: {found}"
         )
-    if across and not across / size >= 0.05:
-        return [
-            f"the contacts lie within {across:.3g} m on a surface {size:.3g} m across: both must be in one frame"
-            f"{_fitting_surface_unit(size, across, settings)}"
-        ]
-    return []
+    return [f"{TABLE}: {found}"]
 
 
-def _fitting_surface_unit(size: float, across: float, settings: CaptureSettings) -> str:
-    written = size / settings.surface_metres
-    fitting = [unit for unit, metres in METRES.items() if across and 0.7 <= written * metres / across <= 3]
-    return f'; surface_unit = "{fitting[0]}" would fit' if fitting else ""
+def _mending(mistake: Mistake | None, settings: CaptureSettings) -> str:
+    """Return what to write in capture.toml where a unit alone is wrong."""
+    if mistake is None or not mistake.unit_only:
+        return ""
+
+    def named(metres: float) -> list[str]:
+        return [unit for unit, length in METRES.items() if abs(length / metres - 1) < 1e-6]
+
+    contacts, shape = named(settings.metres * mistake.factor), named(settings.surface_metres / mistake.factor)
+    if contacts and (mistake.factor < 1 or not shape):
+        shape_unit = settings.surface_unit or settings.unit
+        return f' If so, write unit = "{contacts[0]}" and surface_unit = "{shape_unit}" in capture.toml'
+    return f' If so, write surface_unit = "{shape[0]}" in capture.toml' if shape else ""
 
 
 def _diagonal(points: Sequence[Sequence[float]]) -> float:

@@ -1,0 +1,309 @@
+"""Cameras of photographs that have none, by structure from motion (COLMAP, through the optional package pycolmap)."""
+
+import contextlib
+import importlib.util
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import uuid
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from avmsf.capture.views.pictures import SUFFIXES, Picture, read_mask, read_picture
+from avmsf.capture.warning import CaptureWarning
+from avmsf.errors import CaptureError
+
+CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+WORKER = Path(__file__).with_name("sfm_worker.py")
+FEWEST = 3
+"""Images without which there is nothing to estimate."""
+ALL_PAIRS = 150
+"""Images up to which every pair is matched; of more, each with the next ones in the order of their names."""
+POLL = 0.2
+"""Seconds between two looks at the worker."""
+
+
+@dataclass(frozen=True)
+class MotionProgress:
+    """How far structure from motion is."""
+
+    stage: str
+    """features, matches or cameras; starting before the first."""
+    done: int
+    """Steps of the stage that are done, as far as COLMAP tells."""
+    total: int
+    """Steps of the stage; 0 where nobody knows."""
+    seconds: float
+    """Time since the start."""
+
+
+@dataclass(frozen=True)
+class EstimatedCameras:
+    """What structure from motion found, and where it lies."""
+
+    model: Path
+    """Folder of COLMAP's binary model, `sparse/0` in the output folder."""
+    registered: tuple[str, ...]
+    """Images that have a camera now, by name, sorted."""
+    missing: tuple[str, ...]
+    """Images that have none."""
+    points: int
+    """Points of the scene that were found on the way."""
+    error: float
+    """Mean distance between points as seen and as computed, pixels: above 1, something is wrong."""
+
+
+def estimate_cameras(
+    images: str | Path,
+    output: str | Path,
+    *,
+    timeout: float = 3600.0,
+    seed: int = 0,
+    camera_model: str = "SIMPLE_RADIAL",
+    shared_camera: bool = True,
+    features: int = 4096,
+    longest: int = 1600,
+    least: float = 0.5,
+    threads: int | None = None,
+    progress: Callable[[MotionProgress], None] | None = None,
+) -> EstimatedCameras:
+    """Find the cameras of a folder's photographs and write them as COLMAP's binary model `sparse/0` in `output`.
+
+    Where `output` is the folder that holds `images/`, `read_views` reads it. What moves with the object counts, so
+    masks are used where there are any: alpha channels, or files in `masks/` beside the images. All photographs come
+    from one camera with one zoom unless `shared_camera` is false. `features` and `longest` bound the features of an
+    image and the pixels of the longer side on which they are sought. One and the same seed gives the same cameras to
+    the last bit with `threads=1`, and to about one part in 100,000 with more; None takes all cores.
+
+    The work runs in a process of its own, which ends with this call, whether that returns, raises, or is interrupted;
+    `sparse/0` is whole or absent. Frame and scale of the result are arbitrary: see `align_similarity`. Warns with
+    CaptureWarning of images that could not be read, that got no camera, or that form a model apart. Raises
+    CaptureError where pycolmap is missing, `sparse/0` exists, images differ in size but share a camera, the work takes
+    more than `timeout` seconds or crashes, or less than the part `least` of the images gets a camera.
+    """
+    images, output = Path(images), Path(output)
+    _expect_job(images, output, camera_model=camera_model, timeout=timeout)
+    begun = output / f".sfm.{uuid.uuid4().hex[:8]}"
+    try:
+        begun.mkdir(parents=True)
+        names, lost = _stage_images(images, begun, shared_camera=shared_camera)
+        job = {
+            "folder": str(begun.resolve()),
+            "names": list(names),
+            "true_names": names,
+            "masks": (begun / "masks").is_dir(),
+            "seed": seed,
+            "camera_model": camera_model,
+            "shared_camera": shared_camera,
+            "features": features,
+            "longest": longest,
+            "threads": -1 if threads is None else threads,
+            "exhaustive": len(names) <= ALL_PAIRS,
+        }
+        (begun / "job.json").write_text(json.dumps(job), encoding="utf-8")
+        _run_worker(begun, timeout=timeout, progress=progress)
+        models = json.loads((begun / "result.json").read_text(encoding="utf-8"))
+        models.sort(key=lambda model: -len(model["names"]))
+        everything = sorted([*names.values(), *lost])
+        _refuse_few(models, everything, least=least, images=images)
+        (output / "sparse").mkdir(exist_ok=True)
+        os.rename(begun / "models" / str(models[0]["number"]), output / "sparse" / "0")
+    except OSError as error:
+        raise CaptureError(f"{output}: the cameras cannot be written: {error}") from error
+    finally:
+        shutil.rmtree(begun, ignore_errors=True)
+    registered = tuple(models[0]["names"])
+    missing = tuple(name for name in everything if name not in set(registered))
+    for remark in _remarks(models, lost, missing):
+        warnings.warn(f"{images}: {remark}", CaptureWarning, stacklevel=2)
+    return EstimatedCameras(output / "sparse" / "0", registered, missing, models[0]["points"], models[0]["error"])
+
+
+def _expect_job(images: Path, output: Path, *, camera_model: str, timeout: float) -> None:
+    if importlib.util.find_spec("pycolmap") is None:
+        raise CaptureError("photographs without cameras need the package pycolmap: pip install 'avmsf[sfm]'")
+    if camera_model not in CAMERA_MODELS:
+        raise CaptureError(f"camera_model is {camera_model!r}; expected one of {', '.join(CAMERA_MODELS)}")
+    if not timeout > 0:
+        raise CaptureError(f"timeout is {timeout:g} s; expected a time above 0")
+    if not images.is_dir():
+        raise CaptureError(f"{images}: there is no such folder of photographs")
+    if (output / "sparse" / "0").exists():
+        raise CaptureError(f"{output / 'sparse' / '0'}: exists; cameras are there already: remove it to find them anew")
+
+
+def _stage_images(images: Path, begun: Path, *, shared_camera: bool) -> tuple[dict[str, str], list[str]]:
+    """Put links to the images and their masks where COLMAP wants them.
+
+    Returns the images' names there with their true ones, and the names of those that cannot be read. Raises
+    CaptureError for too few images, and for images of different sizes from one camera.
+    """
+    found = sorted(path for path in images.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    names, lost, sizes = {}, [], {}
+    for path in found:
+        name = path.relative_to(images).as_posix()
+        try:
+            picture = read_picture(path)
+        except CaptureError:
+            lost.append(name)
+            continue
+        staged = _stage_image(path, picture, name, begun)
+        names[staged], sizes[name] = name, picture.size
+        _stage_mask(images, picture, name, begun / "masks" / f"{staged}.png")
+    if len(names) < FEWEST:
+        raise CaptureError(
+            f"{images}: expected at least {FEWEST} photographs ({', '.join(SUFFIXES)}), found {len(names)}"
+            + (f" and {len(lost)} that cannot be read: {_some(lost)}" if lost else "")
+        )
+    kinds = sorted(set(sizes.values()), key=list(sizes.values()).count)
+    if shared_camera and len(kinds) > 1:
+        odd = [name for name, size in sizes.items() if size != kinds[-1]]
+        raise CaptureError(
+            f"{images}: the photographs differ in size: most have {kinds[-1][0]} x {kinds[-1][1]} pixels, but not "
+            f"{_some(odd)}: give photographs of one camera held one way, or say shared_camera=False"
+        )
+    return names, lost
+
+
+def _stage_image(path: Path, picture: Picture, name: str, begun: Path) -> str:
+    """Put one image in the job's folder and return its name there."""
+    if path.suffix.lower() == ".webp":
+        name += ".png"
+    staged = begun / "images" / name
+    staged.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix.lower() == ".webp":
+        cv2.imwrite(str(staged), picture.color[..., ::-1])
+        return name
+    try:
+        staged.symlink_to(path.resolve())
+    except OSError:  # file systems without links
+        shutil.copyfile(path, staged)
+    return name
+
+
+def _stage_mask(images: Path, picture: Picture, name: str, staged: Path) -> None:
+    """Write the image's mask, where it has one, as COLMAP reads it."""
+    mask = picture.mask
+    folder = images.parent / "masks"
+    places = [folder / Path(name).with_suffix(".png"), folder / f"{name}.png"]
+    for place in places if mask is None else ():
+        if place.is_file():
+            mask = read_mask(place)
+            break
+    if mask is None:
+        return
+    if mask.shape[::-1] != picture.size:
+        mask = cv2.resize(mask, picture.size, interpolation=cv2.INTER_NEAREST)
+    staged.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(staged), np.where(mask >= 128, 255, 0).astype(np.uint8))
+
+
+def _run_worker(begun: Path, *, timeout: float, progress: Callable[[MotionProgress], None] | None) -> None:
+    """Run the worker to its end; raises CaptureError where that is not a good one or comes too late."""
+    log = begun / "worker.log"
+    start = time.monotonic()
+    # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
+    command = [sys.executable, "-P", str(WORKER), str(begun / "job.json")]
+    with open(log, "wb") as output:
+        worker = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+        )
+        try:
+            while worker.poll() is None:
+                seconds = time.monotonic() - start
+                if seconds > timeout:
+                    raise CaptureError(
+                        f"structure from motion took more than {timeout:g} s, while it sought "
+                        f"{_progress(log, seconds).stage}: allow more time, or give fewer or smaller photographs"
+                    )
+                if progress is not None:
+                    progress(_progress(log, seconds))
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    worker.wait(POLL)
+        finally:
+            _end(worker)
+    if worker.returncode != 0 or not (begun / "result.json").is_file():
+        raise CaptureError(
+            f"structure from motion broke off while it sought {_progress(log, 0.0).stage} "
+            f"({_ending(worker.returncode)}); its last lines:\n{_last_lines(log)}"
+        )
+
+
+def _end(worker: "subprocess.Popen[bytes]") -> None:
+    """Kill the worker and whatever it started."""
+    # A group outlives its leader, so it is asked to end even after that has.
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(worker.pid, signal.SIGKILL)
+    worker.wait()
+    if worker.stdin is not None:
+        worker.stdin.close()
+
+
+def _progress(log: Path, seconds: float) -> MotionProgress:
+    text = log.read_text(encoding="utf-8", errors="replace")
+    stage, _, rest = text.rpartition("stage ")[2].partition("\n")
+    steps = re.findall(r"\[(\d+)/(\d+)", rest)
+    done, total = (int(number) for number in steps[-1]) if steps else (0, 0)
+    return MotionProgress(stage if "stage " in text else "starting", done, total, seconds)
+
+
+def _ending(code: int) -> str:
+    if code >= 0:
+        return f"exit status {code}"
+    name = signal.Signals(-code).name
+    return name + (", as where memory runs out: lower `features` or `longest`" if name == "SIGKILL" else "")
+
+
+def _last_lines(log: Path, count: int = 6) -> str:
+    text = log.read_text(encoding="utf-8", errors="replace")
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("stage ")]
+    return "\n".join(f"  {line[:200]}" for line in lines[-count:])
+
+
+def _refuse_few(models: Sequence[dict[str, Any]], everything: Sequence[str], *, least: float, images: Path) -> None:
+    registered = models[0]["names"] if models else []
+    if len(registered) >= max(FEWEST, least * len(everything)):
+        return
+    lacking = [name for name in everything if name not in registered]
+    apart = f"; they fall into {len(models)} groups that could not be joined" if len(models) > 1 else ""
+    raise CaptureError(
+        f"{images}: only {len(registered)} of {len(everything)} photographs got a camera{apart}; without one: "
+        f"{_some(lacking)}: photograph the object sharply from closer neighbouring places (10 to 15 degrees apart), "
+        "with a patterned, unmoved ground in view"
+    )
+
+
+def _remarks(models: Sequence[dict[str, Any]], lost: Sequence[str], missing: Sequence[str]) -> list[str]:
+    remarks = []
+    if lost:
+        remarks.append(f"{len(lost)} images cannot be read and are left out: {_some(lost)}")
+    # Groups overlap: an image may have a place in several that could not be joined.
+    kept = set(models[0]["names"])
+    others = [[name for name in model["names"] if name not in kept] for model in models[1:]]
+    others = [names for names in others if names]
+    if others:
+        groups = "; ".join(_some(names) for names in others)
+        remarks.append(
+            f"the photographs fall into {len(models)} groups that could not be joined, of which the largest is kept "
+            f"({len(kept)} images); the rest: {groups}"
+        )
+    apart = {name for names in others for name in names}
+    unseen = [name for name in missing if name not in apart and name not in lost]
+    if unseen:
+        remarks.append(f"{len(unseen)} images got no camera: {_some(unseen)}")
+    return remarks
+
+
+def _some(names: Sequence[str], most: int = 8) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

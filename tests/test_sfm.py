@@ -1,0 +1,321 @@
+"""Cameras found from pictures alone, against those that took them; and whatever can go wrong on the way."""
+
+import json
+import math
+import subprocess
+import sys
+import textwrap
+import time
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from avmsf.capture import CaptureWarning
+from avmsf.capture.cameras import Camera, View
+from avmsf.capture.meshviews import render_views
+from avmsf.capture.sfm import WORKER, EstimatedCameras, MotionProgress, estimate_cameras
+from avmsf.capture.similarity import align_similarity, move_views
+from avmsf.capture.texturedmesh import TexturedMesh
+from avmsf.capture.views import read_views
+from avmsf.errors import CaptureError
+
+VIEWS, SIZE = 10, 256
+
+
+def scene() -> TexturedMesh:
+    """A hilly ground, 0.4 m wide, with a texture that has details of every size."""
+    rng = np.random.default_rng(3)
+    texture = np.zeros((512, 512, 3), dtype=np.float32)
+    for cells in (4, 8, 16, 32, 64, 128):
+        texture += cv2.resize(rng.normal(size=(cells, cells, 3)).astype(np.float32), (512, 512))
+    side = 21
+    heights = cv2.resize(rng.normal(size=(6, 6)), (side, side), interpolation=cv2.INTER_CUBIC)
+    grid = np.stack(np.meshgrid(np.linspace(0, 1, side), np.linspace(0, 1, side)), axis=-1)
+    vertices = np.concatenate([0.4 * (grid - 0.5), 0.02 * heights[..., None]], axis=-1).reshape(-1, 3)
+    corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    squares = np.stack([corner, corner + 1, corner + side + 1, corner, corner + side + 1, corner + side], axis=1)
+    faces = squares.reshape(-1, 3)
+    return TexturedMesh.build(
+        torch.from_numpy(vertices),
+        torch.from_numpy(faces),
+        coordinates=torch.from_numpy(grid.reshape(-1, 2)[faces]),
+        textures=[torch.from_numpy(np.clip(128 + 40 * texture, 0, 255).astype(np.uint8))],
+    )
+
+
+def true_views() -> tuple[View, ...]:
+    cameras = []
+    for number in range(VIEWS):
+        azimuth, elevation = math.radians(12 * number), math.radians(50 + 12 * (number % 2))
+        place = 0.5 * torch.tensor(
+            [
+                math.cos(azimuth) * math.cos(elevation),
+                math.sin(azimuth) * math.cos(elevation),
+                math.sin(elevation),
+            ]
+        )
+        cameras.append(
+            Camera.looking(
+                place, torch.zeros(3), up=torch.tensor([0.0, 0.0, 1.0]), focal=1.1 * SIZE, width=SIZE, height=SIZE
+            )
+        )
+    return render_views(scene(), cameras, supersample=2)
+
+
+@pytest.fixture(scope="module")
+def taken() -> tuple[View, ...]:
+    return true_views()
+
+
+@pytest.fixture(scope="module")
+def found(taken: tuple[View, ...], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, EstimatedCameras, list]:
+    """Pictures of the scene, one of them WebP, with one that shows nothing and one that is cut short."""
+    folder = tmp_path_factory.mktemp("scene")
+    fill(folder / "images", taken)
+    (folder / "images/view_004.png").unlink()
+    cv2.imwrite(
+        str(folder / "images/view_004.webp"), taken[4].image.numpy()[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 101]
+    )
+    cv2.imwrite(str(folder / "images/wall.png"), np.full((SIZE, SIZE, 3), 90, dtype=np.uint8))
+    (folder / "images/zero.jpg").write_bytes(b"\xff\xd8\xff")
+    stages: list[MotionProgress] = []
+    with pytest.warns(CaptureWarning) as caught:
+        result = estimate_cameras(
+            folder / "images", folder, features=1024, threads=1, timeout=120.0, progress=stages.append
+        )
+    return folder, result, [*caught, *stages]
+
+
+def fill(folder: Path, views: tuple[View, ...]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for view in views:
+        cv2.imwrite(str(folder / f"{view.name}.png"), view.image.numpy()[..., ::-1])
+    return folder
+
+
+def test_cameras_agree_with_the_true_ones_up_to_a_similarity(
+    taken: tuple[View, ...], found: tuple[Path, EstimatedCameras, list]
+) -> None:
+    folder, result, _ = found
+    assert len(result.registered) == VIEWS
+    assert "view_004.webp" in result.registered
+    assert result.model == folder / "sparse/0"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CaptureWarning)  # of the two images without cameras
+        views = read_views(folder)
+    places = torch.stack([view.camera.position for view in views])
+    true_places = torch.stack([view.camera.position for view in taken])
+    moved = move_views(views, align_similarity(places, true_places))
+    for view, true in zip(moved, taken, strict=True):
+        # Features are found to a tenth of a pixel, here a 3000th of the distance.
+        assert float((view.camera.position - true.camera.position).norm()) < 0.01 * 0.5
+        turn = view.camera.world_to_camera[:3, :3] @ true.camera.world_to_camera[:3, :3].T
+        assert math.degrees(math.acos(min(1.0, (float(turn.trace()) - 1) / 2))) < 0.5
+    assert result.error < 1
+    assert result.points > 200
+
+
+def test_images_without_a_camera_are_named(found: tuple[Path, EstimatedCameras, list]) -> None:
+    _, result, reports = found
+    assert result.missing == ("wall.png", "zero.jpg")
+    remarks = [str(report.message) for report in reports if isinstance(report, warnings.WarningMessage)]
+    assert any("1 images cannot be read and are left out: zero.jpg" in remark for remark in remarks)
+    assert any("1 images got no camera: wall.png" in remark for remark in remarks)
+
+
+def test_progress_tells_the_stages(found: tuple[Path, EstimatedCameras, list]) -> None:
+    stages = [report for report in found[2] if isinstance(report, MotionProgress)]
+    names = list(dict.fromkeys(stage.stage for stage in stages))
+    # A stage shorter than the time between two looks goes unseen.
+    assert set(names) <= {"starting", "features", "matches", "cameras"}
+    assert "features" in names
+    assert max(stage.done for stage in stages if stage.stage == "features") > 0
+    assert [stage.seconds for stage in stages] == sorted(stage.seconds for stage in stages)
+
+
+def test_only_the_model_is_left(found: tuple[Path, EstimatedCameras, list]) -> None:
+    folder, _, _ = found
+    assert sorted(path.name for path in folder.iterdir()) == ["images", "sparse"]
+    assert {"cameras.bin", "images.bin", "points3D.bin"} <= {path.name for path in (folder / "sparse/0").iterdir()}
+
+
+def test_cameras_that_are_there_are_not_overwritten(found: tuple[Path, EstimatedCameras, list]) -> None:
+    folder, _, _ = found
+    with pytest.raises(CaptureError, match="exists; cameras are there already"):
+        estimate_cameras(folder / "images", folder)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_masks_count(taken: tuple[View, ...], tmp_path: Path) -> None:
+    contents = []
+    for name in ("one", "two", "masked"):
+        fill(tmp_path / name / "images", taken[:4])
+        if name == "masked":
+            mask = np.zeros((SIZE, SIZE), dtype=np.uint8)
+            mask[:, : SIZE // 2] = 255
+            (tmp_path / name / "masks").mkdir()
+            for view in taken[:4]:
+                cv2.imwrite(str(tmp_path / name / "masks" / f"{view.name}.png"), mask)
+        estimate_cameras(tmp_path / name / "images", tmp_path / name, features=512, threads=1, seed=5)
+        contents.append((tmp_path / name / "sparse/0/images.bin").read_bytes())
+    assert contents[0] == contents[1]
+    # Each feature is 24 bytes, x and y in float64 first, behind the image's 64 bytes, name and count.
+    for content, most in ((contents[0], SIZE), (contents[2], SIZE // 2)):
+        start = content.index(b".png\0") + len(b".png\0")
+        count = int.from_bytes(content[start : start + 8], "little")
+        rows = np.frombuffer(content[start + 8 : start + 8 + 24 * count], dtype=np.dtype("<f8, <f8, <u8"))
+        assert count > 50
+        assert most - 30 < rows["f0"].max() < most + 1
+
+
+def pretend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
+    """Let another script do the worker's part."""
+    path = tmp_path / "pretended.py"
+    path.write_text("import json, os, pathlib, subprocess, sys, time\n" + textwrap.dedent(script))
+    monkeypatch.setattr("avmsf.capture.sfm.WORKER", path)
+
+
+def write_models(*groups: tuple[str, ...]) -> str:
+    return f"""
+        folder = pathlib.Path(json.loads(pathlib.Path(sys.argv[1]).read_text())["folder"])
+        models = []
+        for number, names in enumerate({groups!r}):
+            (folder / "models" / str(number)).mkdir(parents=True)
+            (folder / "models" / str(number) / "names").write_text(" ".join(names))
+            models.append(dict(number=number, names=names, points=7, error=0.5))
+        (folder / "result.json").write_text(json.dumps(models))
+    """
+
+
+def pictures(folder: Path, names: str) -> Path:
+    (folder / "images").mkdir(parents=True)
+    for name in names:
+        cv2.imwrite(str(folder / "images" / f"{name}.png"), np.zeros((8, 8, 3), dtype=np.uint8))
+    return folder
+
+
+def test_of_several_models_the_largest_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = pictures(tmp_path / "cup", "abcdefgh")
+    pretend(tmp_path, monkeypatch, write_models(("a.png", "b.png", "c.png"), ("c.png", "d.png", "e.png", "f.png")))
+    with pytest.warns(CaptureWarning) as caught:
+        result = estimate_cameras(folder / "images", folder)
+    remarks = [str(warning.message) for warning in caught]
+    assert any("fall into 2 groups" in remark and remark.endswith("the rest: a.png, b.png") for remark in remarks)
+    assert any("2 images got no camera: g.png, h.png" in remark for remark in remarks)
+    assert result.registered == ("c.png", "d.png", "e.png", "f.png")
+    assert (folder / "sparse/0/names").read_text() == "c.png d.png e.png f.png"
+
+
+@pytest.mark.parametrize("groups", [(), (("a.png", "b.png", "c.png"),), (("a.png", "b.png"), ("c.png", "d.png"))])
+def test_too_few_cameras_are_refused_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, groups: tuple[tuple[str, ...], ...]
+) -> None:
+    folder = pictures(tmp_path / "cup", "abcdefgh")
+    pretend(tmp_path, monkeypatch, write_models(*groups))
+    with pytest.raises(CaptureError, match=r"only \d of 8 photographs got a camera.*without one: .*h\.png"):
+        estimate_cameras(folder / "images", folder)
+    assert [path.name for path in folder.iterdir()] == ["images"]
+
+
+def test_a_crash_shows_the_workers_last_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = pictures(tmp_path / "cup", "abc")
+    pretend(tmp_path, monkeypatch, 'print("stage matches")\nprint("no memory left", flush=True)\nos.abort()')
+    with pytest.raises(CaptureError, match=r"broke off while it sought matches \(SIGABRT\)[^$]*no memory left"):
+        estimate_cameras(folder / "images", folder)
+    pretend(tmp_path, monkeypatch, "raise RuntimeError('odd images')")
+    with pytest.raises(CaptureError, match=r"exit status 1[^$]*RuntimeError: odd images"):
+        estimate_cameras(folder / "images", folder)
+    assert [path.name for path in folder.iterdir()] == ["images"]
+
+
+SLEEP = """
+    child = subprocess.Popen(["sleep", "60"])
+    print("stage features", flush=True)
+    pathlib.Path(__file__).with_name("pids").write_text(f"{os.getpid()} {child.pid}")
+    time.sleep(60)
+"""
+
+
+def gone(pids: list[int]) -> bool:
+    def alive(pid: int) -> bool:
+        try:
+            return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except (FileNotFoundError, ProcessLookupError):
+            return False
+
+    deadline = time.monotonic() + 10
+    while any(map(alive, pids)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return not any(map(alive, pids))
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="sees processes through /proc")
+@pytest.mark.parametrize("how", ["time", "interrupt"])
+def test_time_and_interruption_end_the_worker_and_its_children(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    folder = pictures(tmp_path / "cup", "abc")
+    pretend(tmp_path, monkeypatch, SLEEP)
+
+    def interrupt(progress: MotionProgress) -> None:
+        if (tmp_path / "pids").exists() and progress.stage == "features":
+            raise KeyboardInterrupt
+
+    if how == "time":
+        with pytest.raises(CaptureError, match="took more than 3 s, while it sought features"):
+            estimate_cameras(folder / "images", folder, timeout=3.0)
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            estimate_cameras(folder / "images", folder, progress=interrupt)
+    assert gone([int(pid) for pid in (tmp_path / "pids").read_text().split()])
+    assert [path.name for path in folder.iterdir()] == ["images"]
+
+
+def test_the_worker_ends_when_its_parent_does(taken: tuple[View, ...], tmp_path: Path) -> None:
+    fill(tmp_path / "images", taken)
+    job = {
+        "folder": str(tmp_path),
+        "names": sorted(path.name for path in (tmp_path / "images").iterdir()),
+        "true_names": {},
+        "masks": False,
+        "seed": 0,
+        "camera_model": "PINHOLE",
+        "shared_camera": True,
+        "features": 8192,
+        "longest": SIZE,
+        "threads": 1,
+        "exhaustive": True,
+    }
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    command = [sys.executable, "-P", str(WORKER), str(tmp_path / "job.json")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as worker:
+        assert worker.stdout is not None
+        assert worker.stdin is not None
+        assert worker.stdout.readline() == b"stage features\n"
+        # What a dying parent leaves behind: its end of the pipe, closed.
+        worker.stdin.close()
+        assert worker.wait(10) == 1
+    assert not (tmp_path / "result.json").exists()
+
+
+def test_what_cannot_begin_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = pictures(tmp_path / "cup", "ab")
+    with pytest.raises(CaptureError, match=r"at least 3 photographs \(\.png, .*\), found 2"):
+        estimate_cameras(folder / "images", folder)
+    with pytest.raises(CaptureError, match="there is no such folder of photographs"):
+        estimate_cameras(folder / "pictures", folder)
+    cv2.imwrite(str(folder / "images/c.png"), np.zeros((8, 8, 3), dtype=np.uint8))
+    cv2.imwrite(str(folder / "images/d.png"), np.zeros((8, 12, 3), dtype=np.uint8))
+    with pytest.raises(CaptureError, match=r"most have 8 x 8 pixels, but not d\.png: .*shared_camera=False"):
+        estimate_cameras(folder / "images", folder)
+    with pytest.raises(CaptureError, match="camera_model is 'FISHEYE'; expected one of SIMPLE_PINHOLE"):
+        estimate_cameras(folder / "images", folder, camera_model="FISHEYE")
+    with pytest.raises(CaptureError, match="timeout is 0 s"):
+        estimate_cameras(folder / "images", folder, timeout=0.0)
+    monkeypatch.setattr("avmsf.capture.sfm.importlib.util.find_spec", lambda _: None)
+    with pytest.raises(CaptureError, match=r"pip install 'avmsf\[sfm\]'"):
+        estimate_cameras(folder / "images", folder)
+    assert sorted(path.name for path in folder.iterdir()) == ["images"]
