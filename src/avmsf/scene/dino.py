@@ -1,0 +1,225 @@
+"""DINOv2 through transformers (extra `vision`): by name, from the hub or its cache, or from a local folder."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+from urllib.request import Request, urlopen
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+from torch.nn import functional
+
+from avmsf.errors import SceneError
+from avmsf.scene.encode import unit_image
+
+MODELS: Final = tuple(
+    f"facebook/dinov2{registers}-{size}" for registers in ("", "-with-registers") for size in ("small", "base", "large")
+)
+"""Names under which the hub has them; small, base and large give 384, 768 and 1024 features."""
+IMAGENET_MEAN: Final = (0.485, 0.456, 0.406)
+IMAGENET_DEVIATION: Final = (0.229, 0.224, 0.225)
+_CONFIG, _WEIGHTS, _PREPROCESSOR = "config.json", "model.safetensors", "preprocessor_config.json"
+_SECONDS = 5.0
+"""How long to wait for the hub's first word."""
+
+
+class DinoEncoder:
+    """A DINOv2 model, with or without registers, as an encoder: its patches' last hidden states.
+
+    The image is brought to `longest` pixels on its longer side, continued by its last row and column to whole patches,
+    and the class and register tokens are dropped. Where the image ends inside a patch the tokens are interpolated at
+    the middles of equal cells of the image, so that the map covers the image alone.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        *,
+        name: str,
+        longest: int | None = 518,
+        mean: Sequence[float] = IMAGENET_MEAN,
+        deviation: Sequence[float] = IMAGENET_DEVIATION,
+    ) -> None:
+        """Wrap a transformers model on whatever device and in whatever precision it is.
+
+        `longest`, pixels, is the resolution encoded, None for each image's own; `mean` and `deviation` are what the
+        model was trained to have colours normalised with.
+        """
+        if longest is not None and longest < 1:
+            raise SceneError(f"longest = {longest}: expected the pixels of the longer side, such as 518")
+        self.model, self.name, self.longest = model.eval().requires_grad_(False), name, longest
+        self._mean, self._deviation = torch.tensor(mean), torch.tensor(deviation)
+
+    @classmethod
+    def load(
+        cls,
+        source: str | Path,
+        *,
+        longest: int | None = 518,
+        device: str | torch.device = "cpu",
+        dtype: torch.dtype | None = None,
+    ) -> "DinoEncoder":
+        """Load a model of the hub (one of `MODELS`), or a folder with config.json and model.safetensors.
+
+        The default precision is bfloat16 on a GPU and on processors with matrix units for it, else float32. Raises
+        SceneError where transformers is missing, where the model is neither here nor to be downloaded, and for a folder
+        that holds another model or a part of one.
+        """
+        device = torch.device(device)
+        folder, name = _find(source)
+        model = _load_model(folder, torch.device(device), dtype or _fast_dtype(device))
+        mean, deviation = _constants(folder / _PREPROCESSOR)
+        return cls(model, name=name, longest=longest, mean=mean, deviation=deviation)
+
+    def describe(
+        self, image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"]
+    ) -> Float[Tensor, "dim rows columns"]:
+        """Return the patches' features, float32, on a grid that covers the image evenly."""
+        color = unit_image(image).permute(2, 0, 1)
+        height, width = self._size(color.shape[1], color.shape[2])
+        color = functional.interpolate(
+            color[None], (height, width), mode="bicubic", align_corners=False, antialias=True
+        ).clamp(0.0, 1.0)
+        color = (color - self._mean.to(color)[:, None, None]) / self._deviation.to(color)[:, None, None]
+        patch = int(self.model.config.patch_size)  # type: ignore[union-attr,arg-type]
+        rows, columns = -(-height // patch), -(-width // patch)
+        color = functional.pad(color, (0, columns * patch - width, 0, rows * patch - height), mode="replicate")
+        weights = next(self.model.parameters())
+        with torch.no_grad():
+            tokens = self.model(pixel_values=color.to(weights)).last_hidden_state[0].float()
+        tokens = tokens[len(tokens) - rows * columns :].T.reshape(-1, rows, columns)
+        down, across = _interpolation(height, patch).to(tokens), _interpolation(width, patch).to(tokens)
+        return (down @ tokens @ across.T).to(image.device)
+
+    def _size(self, height: int, width: int) -> tuple[int, int]:
+        if self.longest is None:
+            return height, width
+        factor = self.longest / max(height, width)
+        return max(1, round(height * factor)), max(1, round(width * factor))
+
+
+def _interpolation(length: int, patch: int) -> Float[Tensor, "cells patches"]:
+    """Return what interpolates linearly from patches' centers to those of as many equal cells of `length` pixels.
+
+    The identity where the patches end with the image.
+    """
+    count = -(-length // patch)
+    places = (torch.arange(count, dtype=torch.float64) + 0.5) * length / count / patch - 0.5
+    places = places.clamp(0.0, count - 1.0)
+    return (1 - (places[:, None] - torch.arange(count)).abs()).clamp(min=0.0)
+
+
+def _fast_dtype(device: torch.device) -> torch.dtype:
+    """Return bfloat16 where the device multiplies matrices of it faster than of float32."""
+    if device.type == "cuda":
+        return torch.bfloat16
+    # Emulated, bfloat16 is slower than float32; processors with AMX tiles name them among their flags.
+    flags = Path("/proc/cpuinfo")
+    tiles = flags.is_file() and " amx_bf16" in flags.read_text(errors="replace")
+    return torch.bfloat16 if tiles else torch.float32
+
+
+def _find(source: str | Path) -> tuple[Path, str]:
+    """Return the folder that holds a model, and what its features are to be called."""
+    folder = Path(source).expanduser()
+    if folder.is_dir():
+        return folder, f"DINOv2 from the folder {folder.resolve().name}"
+    name = str(source)
+    if name not in MODELS:
+        raise SceneError(
+            f"{name}: expected a folder with {_CONFIG} and {_WEIGHTS}, or one of {', '.join(MODELS)}; found no such "
+            "folder: check the path"
+        )
+    return _from_hub(name), name
+
+
+def _from_hub(name: str) -> Path:
+    """Return the folder of a model in the hub's cache, after downloading it where it is not there."""
+    _transformers()
+    from huggingface_hub import constants, hf_hub_download, try_to_load_from_cache
+
+    wanted = (_CONFIG, _PREPROCESSOR, _WEIGHTS)
+    cached = [try_to_load_from_cache(name, file) for file in wanted]
+    if all(isinstance(path, str) for path in cached):
+        return Path(str(cached[0])).parent
+    try:
+        if not constants.HF_HUB_OFFLINE:
+            # Without a network the hub's client tries again for half a minute; one question tells at once.
+            question = Request(f"{constants.ENDPOINT}/{name}/resolve/main/{_CONFIG}", method="HEAD")
+            urlopen(question, timeout=_SECONDS).close()
+        paths = [hf_hub_download(name, file, etag_timeout=_SECONDS) for file in wanted]
+    except Exception as error:  # the hub's client raises whatever the network beneath it does
+        raise SceneError(
+            f"{name}: not in the cache of downloaded models, and it cannot be downloaded ({type(error).__name__}: "
+            f"{error}). Where there is a network, save {_CONFIG}, {_WEIGHTS} and {_PREPROCESSOR} from "
+            f"https://huggingface.co/{name}/tree/main into one FOLDER, copy it here, and say --encoder FOLDER; or use "
+            "the embedded encoder, --encoder descriptors, which needs no download"
+        ) from error
+    return Path(paths[0]).parent
+
+
+def _load_model(folder: Path, device: torch.device, dtype: torch.dtype) -> nn.Module:
+    transformers = _transformers()
+    lacking = [name for name in (_CONFIG, _WEIGHTS) if not (folder / name).is_file()]
+    if lacking:
+        raise SceneError(
+            f"{folder}: expected a DINOv2 model, found no {' and no '.join(lacking)}: copy {_CONFIG}, {_WEIGHTS} and "
+            f"{_PREPROCESSOR} of a model such as {MODELS[0]} there"
+        )
+    kind = _record(folder / _CONFIG).get("model_type")
+    classes = {"dinov2": "Dinov2Model", "dinov2_with_registers": "Dinov2WithRegistersModel"}
+    if kind not in classes:
+        raise SceneError(f"{folder / _CONFIG}: expected a model of type {' or '.join(classes)}, found {kind!r}")
+    try:
+        model, report = getattr(transformers, classes[kind]).from_pretrained(
+            folder, local_files_only=True, use_safetensors=True, dtype=dtype, output_loading_info=True
+        )
+    except Exception as error:  # whatever is wrong with the file, transformers and safetensors have their own errors
+        raise SceneError(f"{folder / _WEIGHTS}: cannot be loaded ({error}): copy the model's files again") from error
+    # The mask token is for training alone. Any other weight would be left random.
+    missing = sorted(name for name in report["missing_keys"] if not name.endswith("mask_token"))
+    if missing:
+        raise SceneError(
+            f"{folder / _WEIGHTS}: lacks {len(missing)} of the model's weights, {missing[0]} among them: it belongs to "
+            f"another {_CONFIG}; copy both from one model"
+        )
+    return model.to(device)
+
+
+def _constants(path: Path) -> tuple[Sequence[float], Sequence[float]]:
+    """Return the mean and deviation of colours that a preprocessor's file asks for, ImageNet's without one."""
+    if not path.is_file():
+        return IMAGENET_MEAN, IMAGENET_DEVIATION
+    record = _record(path)
+    found = record.get("image_mean", list(IMAGENET_MEAN)), record.get("image_std", list(IMAGENET_DEVIATION))
+    if not all(isinstance(each, list) and len(each) == 3 and all(map(_is_number, each)) for each in found):
+        raise SceneError(f"{path}: expected image_mean and image_std of three numbers, found {found}: copy it again")
+    return found
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, float | int)
+
+
+def _record(path: Path) -> dict[str, Any]:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{path}: cannot be read as JSON ({error}): copy it again") from error
+    if not isinstance(record, dict):
+        raise SceneError(f"{path}: expected a JSON object, found {type(record).__name__}: copy it again")
+    return record
+
+
+def _transformers() -> Any:
+    try:
+        import transformers
+        from transformers import Dinov2Model, Dinov2WithRegistersModel  # noqa: F401
+    except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
+        raise SceneError(
+            f"DINOv2 needs the package transformers, which cannot be imported ({error}): "
+            "pip install 'avmsf[vision]', or use the embedded encoder, --encoder descriptors"
+        ) from error
+    return transformers

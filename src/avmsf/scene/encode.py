@@ -1,0 +1,84 @@
+"""What turns an image into features: one interface for DINOv2, for descriptors that need no download, for anyone's own.
+
+A feature map covers its image evenly, whatever its size: cell [row, column] stands for the rectangle that many equal
+columns and rows cut out, so that its center lies at ((column + 1/2) width / columns, (row + 1/2) height / rows) pixels.
+"""
+
+from typing import Protocol, cast, runtime_checkable
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from numpy.typing import NDArray
+from torch import Tensor
+
+from avmsf.errors import SceneError
+
+_Pixels = NDArray[np.float32]
+
+
+@runtime_checkable
+class Encoder(Protocol):
+    """Anything that describes what an image shows at each place."""
+
+    @property
+    def name(self) -> str:
+        """What a feature field keeps, so that its features are never taken for another encoder's."""
+        ...
+
+    def describe(
+        self, image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"]
+    ) -> Float[Tensor, "dim rows columns"]:
+        """Return one feature vector a cell of a grid that covers the image evenly.
+
+        The image is red, green and blue as displayed: bytes, or numbers from 0 to 1.
+        """
+        ...
+
+
+def unit_image(
+    image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"],
+) -> Float[Tensor, "height width 3"]:
+    """Return an image as float32 numbers from 0 to 1. Raises SceneError for numbers that no image holds."""
+    color = image.float() / 255 if image.dtype == torch.uint8 else image.float()
+    lowest, highest = (float(color.min()), float(color.max())) if color.numel() else (float("nan"),) * 2
+    # Renderings overshoot a little; a factor of 255 is a mistake.
+    if not -1.0 <= lowest <= highest <= 2.0:
+        raise SceneError(
+            f"expected an image of bytes or of numbers from 0 to 1, found {tuple(image.shape)} numbers from {lowest:g} "
+            f"to {highest:g}: divide by the largest value that a pixel can have"
+        )
+    return color.clamp(0.0, 1.0)
+
+
+def continue_outside(
+    color: Float[Tensor, "height width 3"], coverage: Float[Tensor, "height width"]
+) -> Float[Tensor, "height width 3"]:
+    """Return the image with the object's colours carried on smoothly over what lies outside its mask.
+
+    Whatever an encoder then computes near the silhouette speaks of the object: the background, and the edge between
+    the two, differ from view to view at one place of the surface. Pixels that the object covers in part go, too, and
+    so do those beside them, for masks err by a pixel. An empty mask leaves the image as it is.
+    """
+    inside = (coverage.cpu().numpy() > 0.99).astype(np.uint8)
+    core = cv2.erode(inside, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    weight = core if core.any() else inside
+    if not weight.any():
+        return color
+    filled = _pull_and_push(color.float().cpu().numpy(), weight.astype(np.float32))
+    return torch.from_numpy(filled).to(color)
+
+
+def _pull_and_push(color: _Pixels, weight: _Pixels) -> _Pixels:
+    """Fill where the weight is zero from the same image at half its size, which is filled likewise."""
+    height, width = weight.shape
+    if weight.all():
+        return color
+    half = ((width + 1) // 2, (height + 1) // 2)
+    share = cast(_Pixels, cv2.resize(weight, half, interpolation=cv2.INTER_AREA))
+    sums = cast(_Pixels, cv2.resize(color * weight[..., None], half, interpolation=cv2.INTER_AREA))
+    means = cast(_Pixels, sums / np.maximum(share, np.float32(1e-9))[..., None])
+    coarse = _pull_and_push(means, (share > 1e-6).astype(np.float32))
+    fine = cast(_Pixels, cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR))
+    return np.where(weight[..., None] > 0, color, fine)

@@ -1,0 +1,127 @@
+"""A feature field as one file: safetensors with `points` and `features`, and one JSON in the header for the rest.
+
+{"format": 1, "version": "0.1.0", "encoder": "descriptors", "sizes": {"points": 8192, "dim": 36}, "report": {...}}
+"""
+
+import json
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as to_bytes
+from torch import Tensor
+
+from avmsf.errors import SceneError
+from avmsf.files import write_whole
+from avmsf.scene.features import FeatureField
+
+FORMAT = 1
+"""Number of this format; it grows with every change that older versions could not read."""
+_KEY = "avmsf_features"
+
+
+def save_features(features: FeatureField, path: str | Path, *, report: dict[str, Any] | None = None) -> None:
+    """Write features to one file, which `load_features` reads back to the last bit.
+
+    `report` is what else its owner wants to keep, as JSON holds it. A file that is there stays whole until the new one
+    is. Raises SceneError where the file cannot be written, or could not be read back.
+    """
+    path = Path(path)
+    tensors = {
+        name: tensor.detach().float().cpu().clone(memory_format=torch.contiguous_format)
+        for name, tensor in (("points", features.points), ("features", features.features))
+    }
+    record = {
+        "format": FORMAT,
+        "version": version("avmsf"),
+        "encoder": features.encoder,
+        "sizes": {"points": features.features.shape[0], "dim": features.features.shape[1]},
+        "report": report or {},
+    }
+    _expect_values(tensors, path)
+    try:
+        words = json.dumps(record, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise SceneError(
+            f"{path}: expected a report of finite numbers, words, lists and dicts ({error}): take the rest out of it"
+        ) from error
+    content = to_bytes(tensors, {_KEY: words})
+    write_whole(path, lambda place: place.write_bytes(content), raising=SceneError)
+
+
+def load_features(path: str | Path) -> FeatureField:
+    """Read features that `save_features` wrote.
+
+    Raises SceneError for a file that is missing, cut short, of another kind or of another format, and where its
+    tensors are not those that its header speaks of.
+    """
+    path = Path(path)
+    words, tensors = _read(path)
+    record = _understand(words, path)
+    sizes = record["sizes"]
+    expected = {"points": (sizes["points"], 3), "features": (sizes["points"], sizes["dim"])}
+    found = {name: tuple(tensor.shape) for name, tensor in tensors.items() if tensor.dtype == torch.float32}
+    if found != expected or tensors.keys() != expected.keys():
+        raise SceneError(
+            f"{path}: expected the float32 tensors {expected}, found "
+            f"{ {name: tuple(tensor.shape) for name, tensor in tensors.items()} }: lift the features again"
+        )
+    _expect_values(tensors, path)
+    return FeatureField(tensors["points"], tensors["features"], record["encoder"])
+
+
+def read_report(path: str | Path) -> dict[str, Any]:
+    """Return the report that features were saved with. Raises SceneError as `load_features`."""
+    path = Path(path)
+    return _understand(_read(path)[0], path)["report"]
+
+
+def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
+    if not path.is_file():
+        raise SceneError(f"{path}: expected a file of features, found no such file: check the name, or lift them first")
+    try:
+        with safe_open(path, framework="pt") as file:
+            words = (file.metadata() or {}).get(_KEY)
+            # Clones, for what the file maps into memory would change with it.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise SceneError(
+            f"{path}: expected a file of features, found one of another kind or cut short ({error}): lift them again"
+        ) from error
+    if words is None:
+        raise SceneError(
+            f"{path}: expected a file of features, found a safetensors file of something else (its metadata has no "
+            f"entry {_KEY!r}): name a file that `avmsf lift` wrote"
+        )
+    return words, tensors
+
+
+def _understand(words: str, path: Path) -> dict[str, Any]:
+    """Return the header's record after looking at every entry of it."""
+    try:
+        record = json.loads(words)
+        found, writer = record["format"], record["version"]
+        if found == FORMAT:
+            counts = [record["sizes"][name] for name in ("points", "dim")]
+            kinds = isinstance(record["encoder"], str) and isinstance(record["report"], dict)
+            if not kinds or any(type(count) is not int or count < 1 for count in counts):
+                raise ValueError(f"sizes {record['sizes']}, encoder {record['encoder']!r}")
+    except (ValueError, TypeError, KeyError) as error:
+        raise SceneError(
+            f"{path}: expected the header of a file of features, found a damaged one ({type(error).__name__}: {error}):"
+            " lift them again"
+        ) from error
+    if found != FORMAT:
+        raise SceneError(
+            f"{path}: expected features of format {FORMAT}, found format {found}, written by avmsf {writer} (this is "
+            f"avmsf {version('avmsf')}): install avmsf {writer} or newer, or lift them again"
+        )
+    return record
+
+
+def _expect_values(tensors: dict[str, Tensor], path: Path) -> None:
+    for name, tensor in tensors.items():
+        if not tensor.numel() or not bool(torch.isfinite(tensor).all()):
+            raise SceneError(f"{path}: expected {name} to be finite numbers, found otherwise: lift the features again")

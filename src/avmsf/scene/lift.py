@@ -1,0 +1,191 @@
+"""From features in images to features on the object: every point looked up in all views that see it (paper, 3.2)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from avmsf.capture.cameras import Camera, View
+from avmsf.errors import SceneError
+from avmsf.scene.encode import Encoder, continue_outside
+from avmsf.scene.features import FeatureField
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.points import nearest_points
+from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
+from avmsf.scene.visibility import DepthMap, Sight, depth_of_cloud, depth_reach, look
+
+_REACH = 1.0
+"""Standard deviations by which a Gaussian may lie behind the depth that is seen and still be of that surface. Two let
+twice as many through thin walls; what one turns away is seen at a slant, and by other views better."""
+_NEIGHBOURS = 3
+"""Seen points whose features an unseen one takes the mean of."""
+
+Weighting = Callable[[Sight], Float[Tensor, " points"]]
+"""How much one view's word counts for each point, given what it sees of them; zero where it sees nothing."""
+
+
+@dataclass(frozen=True)
+class LiftProgress:
+    """How far a lift has come."""
+
+    view: str
+    """Name of the view just described."""
+    done: int
+    """Views described."""
+    total: int
+
+
+@dataclass(frozen=True, eq=False)
+class Lifted:
+    """Features of points, and how much the views had to say about them."""
+
+    features: FeatureField
+    seen: Int[Tensor, " points"]
+    """Number of views that see each point; where it is 0 the feature is its neighbours'."""
+    agreement: float
+    """Share of the features' variance over points and views that lies between points, not between views of a point."""
+
+    @property
+    def unseen(self) -> int:
+        """Number of points that no view sees."""
+        return int((self.seen == 0).sum())
+
+
+def by_presence(sight: Sight) -> Float[Tensor, " points"]:
+    """Weigh all views that see a point alike: the paper's plain mean."""
+    return sight.seen.double()
+
+
+def by_visibility(sight: Sight) -> Float[Tensor, " points"]:
+    """Weigh a view by how surely it sees a point, and by the pixels that it spends on a piece of surface there."""
+    nearness = torch.where(sight.share > 0, sight.camera.focal[0] * sight.camera.focal[1] / sight.depth**2, 0.0)
+    return sight.share * nearness
+
+
+def lift(
+    cloud: GaussianCloud,
+    views: Sequence[View],
+    encoder: Encoder,
+    *,
+    rasteriser: Rasteriser | None = None,
+    weighting: Weighting = by_presence,
+    progress: Callable[[LiftProgress], None] | None = None,
+) -> Lifted:
+    """Give every Gaussian the mean of the features at its places in the views that see it.
+
+    A view sees a Gaussian whose center lies inside its mask, where it has one, and no deeper than the depth that the
+    cloud shows there plus the Gaussian's own standard deviation along the view and two pixels: a surface of Gaussians
+    is as thick as they are. The `rasteriser` is by default the one for the cloud's device. Raises as `lift_points`.
+    """
+    rasteriser = choose_rasteriser(cloud.centers.device) if rasteriser is None else rasteriser
+    return lift_points(
+        cloud.centers,
+        views,
+        encoder,
+        depth_map=depth_of_cloud(cloud, rasteriser),
+        reach=lambda camera: _REACH * depth_reach(cloud, camera),
+        weighting=weighting,
+        progress=progress,
+    )
+
+
+def lift_points(
+    points: Float[Tensor, "points 3"],
+    views: Sequence[View],
+    encoder: Encoder,
+    *,
+    depth_map: DepthMap,
+    reach: Callable[[Camera], Float[Tensor, " points"]] | None = None,
+    weighting: Weighting = by_presence,
+    progress: Callable[[LiftProgress], None] | None = None,
+) -> Lifted:
+    """Give points of a surface, whose depth in a camera `depth_map` knows, the mean of the features in their views.
+
+    `reach` says how far behind that depth a point may lie, metres; without it, points lie on the surface. One view is
+    described at a time. Raises SceneError where there is nothing to lift or where no view sees any point.
+    """
+    if not len(points) or not len(views):
+        raise SceneError(f"expected points and views to lift features from, found {len(points)} and {len(views)}")
+    tally = _Tally(len(points))
+    for done, view in enumerate(views, start=1):
+        behind = points.new_zeros(len(points)) if reach is None else reach(view.camera)
+        sight = look(points.detach(), view, depth_map(view.camera), reach=behind)
+        found = _sample(_describe(view, encoder), sight)
+        tally.add(found, torch.where(sight.seen, weighting(sight), 0.0).float(), view.name)
+        if progress is not None:
+            progress(LiftProgress(view.name, done, len(views)))
+    return tally.result(points, encoder.name)
+
+
+class _Tally:
+    """Sums over the views so far."""
+
+    def __init__(self, count: int) -> None:
+        self.weights, self.seen = torch.zeros(count), torch.zeros(count, dtype=torch.long)
+        self.sums, self.squares = torch.zeros(count, 0), torch.zeros(count, dtype=torch.float64)
+
+    def add(self, found: Float[Tensor, "points dim"], weights: Float[Tensor, " points"], view: str) -> None:
+        """Add what one view says."""
+        if not self.sums.shape[1]:
+            self.sums = torch.zeros(found.shape)
+        if found.shape != self.sums.shape:
+            raise SceneError(
+                f"{view}: expected {self.sums.shape[1]} features as in the views before, found {found.shape[1]}: an "
+                "encoder gives every image the same number"
+            )
+        self.seen += weights > 0
+        self.weights += weights
+        self.sums += weights[:, None] * found
+        self.squares += weights * found.double().square().sum(1)
+
+    def result(self, points: Float[Tensor, "points 3"], encoder: str) -> Lifted:
+        """Return the means, with those of seen neighbours where there is none."""
+        known = self.seen > 0
+        if not bool(known.any()):
+            raise SceneError(
+                f"no view sees any of the {len(points)} points: the cameras look elsewhere, or the points and the "
+                "cameras are in different frames or units (metres?), or the masks are empty: look at one view's points "
+                "in its image"
+            )
+        means = self.sums[known] / self.weights[known][:, None]
+        features = torch.zeros_like(self.sums)
+        features[known] = means
+        if not bool(known.all()):
+            places = points.detach().cpu()
+            near = nearest_points(places[known], places[~known], count=min(_NEIGHBOURS, int(known.sum())))
+            features[~known] = means[near].mean(1)
+        field = FeatureField(points.detach().float(), features.to(points.device), encoder)
+        return Lifted(field, self.seen.to(points.device), self._agreement())
+
+    def _agreement(self) -> float:
+        """Return 1 - (variance between views of one point) / (variance in all), of the points that two views see."""
+        often = self.seen > 1
+        weights, sums = self.weights[often].double(), self.sums[often].double()
+        own = float((self.squares[often] - sums.square().sum(1) / weights).sum())
+        total = float(self.squares[often].sum() - sums.sum(0).square().sum() / weights.sum())
+        return 1.0 - own / total if total > 0 else 1.0
+
+
+def _describe(view: View, encoder: Encoder) -> Float[Tensor, "dim rows columns"]:
+    coverage = view.coverage
+    color = view.color if coverage is None else continue_outside(view.color, coverage)
+    found = encoder.describe(color)
+    if found.ndim != 3 or not found.numel() or not bool(torch.isfinite(found).all()):
+        raise SceneError(
+            f"{view.name}: expected finite features [dim, rows, columns] from the encoder {encoder.name!r}, found "
+            f"{list(found.shape)}" + (" with numbers that are not finite" if found.numel() else "")
+        )
+    return found.float()
+
+
+def _sample(features: Float[Tensor, "dim rows columns"], sight: Sight) -> Float[Tensor, "points dim"]:
+    """Return the map's values at the places that are seen, bilinear between the cells' centers."""
+    size = sight.places.new_tensor([sight.camera.width, sight.camera.height])
+    # Without aligned corners, -1 and 1 are the image's edges, as in the pixels' own convention.
+    grid = (2 * sight.places / size - 1).float().to(features.device)
+    return functional.grid_sample(
+        features[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
+    )[0, :, 0].T.cpu()

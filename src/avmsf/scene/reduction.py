@@ -1,0 +1,44 @@
+"""Features as a gain network wants them: few, of about unit size, and beside the positions where these help."""
+
+import torch
+
+from avmsf.errors import SceneError
+from avmsf.scene.features import GEOMETRY, FeatureField
+
+
+def reduce(features: FeatureField, dim: int, *, whitening: float = 1.0) -> FeatureField:
+    """Return the features' first `dim` principal components, with the encoder's name followed by what was done.
+
+    `whitening` says how even they become: at 1 each has variance 1 over the points; at 0 they keep the proportions
+    that they have, the first having variance 1. A component's sign is that of its largest loading, so that the same
+    features give the same components anywhere. Fewer come out where the features vary in fewer directions. Raises
+    SceneError for features that are all alike.
+    """
+    if dim < 1 or not 0.0 <= whitening <= 1.0:
+        raise SceneError(f"expected dim of at least 1 and whitening from 0 to 1, found {dim} and {whitening:g}")
+    values = features.features.double()
+    values = values - values.mean(0)
+    variances, directions = torch.linalg.eigh(values.T @ values / len(values))
+    variances, directions = variances.flip(0), directions.flip(1)
+    # What is below the rounding of float32 features varies in no direction.
+    kept = min(dim, int((variances > 1e-10 * variances[0]).sum()))
+    if not float(variances[0]) > 0:
+        raise SceneError(
+            f"all {len(values)} features of the encoder {features.encoder!r} are alike: they tell no place of the "
+            "object from another; use another encoder, or geometry alone"
+        )
+    variances, directions = variances[:kept], directions[:, :kept]
+    largest = directions.gather(0, directions.abs().argmax(0, keepdim=True))
+    sizes = variances ** (whitening / 2) * variances[0] ** ((1 - whitening) / 2)
+    reduced = values @ (directions * largest.sign()) / sizes
+    return FeatureField(features.points, reduced.float(), f"{features.encoder}, {kept} components")
+
+
+def with_positions(features: FeatureField, *, scale: float = 1.0) -> FeatureField:
+    """Return the features with the points' positions before them, `scale` times as `FeatureField.from_points` has them.
+
+    Colour alone does not tell a bowl's left from its right; a gain field may need to.
+    """
+    positions = FeatureField.from_points(features.points).features * scale
+    joined = torch.cat([positions, features.features.float()], dim=1)
+    return FeatureField(features.points, joined, f"{GEOMETRY} and {features.encoder}")

@@ -1,0 +1,139 @@
+"""Which points of an object a camera sees: what lies no deeper than the surface that the camera sees there.
+
+The four pixels around a point's place each say whether their depth reaches the point, within a tolerance, and the
+point's share of sight is their mean, weighted as bilinear interpolation would. Depths themselves are not interpolated:
+between an object and what lies behind it a mean depth is nobody's.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+from avmsf.capture.cameras import Camera, View
+from avmsf.capture.surface import Surface
+from avmsf.errors import SceneError
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.rasteriser import Rasteriser
+
+_COVERED = 0.5
+"""Share of a pixel that the object must cover for the pixel to tell its depth."""
+
+DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
+"""What gives the depth of the first surface that each pixel of a camera sees, metres along the axis; 0 where none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What one camera sees of many points."""
+
+    places: Float[Tensor, "points 2"]
+    """In the image, pixels; meaningless where the share is zero."""
+    depth: Float[Tensor, " points"]
+    """Metres along the optical axis."""
+    share: Float[Tensor, " points"]
+    """From 0, hidden or outside the image or its mask, to 1, seen."""
+    camera: Camera
+
+    @property
+    def seen(self) -> Bool[Tensor, " points"]:
+        """Whether more than half of what surrounds a point's place shows the point."""
+        return self.share > 0.5
+
+
+def look(
+    points: Float[Tensor, "points 3"],
+    view: View,
+    depth: Float[Tensor, "height width"],
+    *,
+    reach: Float[Tensor, " points"],
+) -> Sight:
+    """Return what a view's camera sees of the points, given the depth that it sees at each pixel.
+
+    `reach`, metres, is how far behind the seen surface a point may lie and still be on it. Two pixels' width at the
+    point's depth is added to it, since a slanted surface is that much deeper or nearer in the next pixel.
+    """
+    camera = view.camera
+    places, deep = camera.project(points.cpu())
+    # Behind the camera there are no places, and NaN is not at least 0.
+    inside = (places >= 0).all(1) & (places <= places.new_tensor([camera.width, camera.height])).all(1)
+    places = torch.where(inside[:, None], places, 0.5)
+    limit = deep - reach.cpu().double() - 2 * deep / min(camera.focal)
+    surface, coverage = depth.detach().double().cpu(), view.coverage
+    share = torch.zeros_like(deep)
+    for rows, columns, weight in _corners(places, camera):
+        there = surface[rows, columns]
+        shows = (there > 0) & (there >= limit)
+        if coverage is not None:
+            shows &= coverage[rows, columns] >= _COVERED
+        share += weight * shows
+    return Sight(places, deep, torch.where(inside, share, 0.0), camera)
+
+
+def depth_of_cloud(cloud: GaussianCloud, rasteriser: Rasteriser) -> DepthMap:
+    """Return what renders the depth of Gaussians, 0 where they cover less than half of a pixel."""
+
+    def render(camera: Camera) -> Float[Tensor, "height width"]:
+        with torch.no_grad():
+            rendering = rasteriser(cloud, camera, background=cloud.centers.new_zeros(3))
+            return torch.where(rendering.alpha >= _COVERED, rendering.depth, 0.0)
+
+    return render
+
+
+def depth_of_surface(surface: Surface) -> DepthMap:
+    """Return what casts a ray through each pixel's center at a surface. Raises SceneError for one without triangles."""
+    if len(surface.faces) == 0:
+        raise SceneError(
+            f"expected a surface of triangles, which can hide points from a camera, found {len(surface.vertices)} "
+            "points: lift onto Gaussians instead, or give a mesh"
+        )
+    mesh = trimesh.Trimesh(surface.vertices.double().cpu().numpy(), surface.faces.cpu().numpy(), process=False)
+    caster = RayMeshIntersector(mesh)
+
+    def cast(camera: Camera) -> Float[Tensor, "height width"]:
+        rays = camera.rays().reshape(-1, 3).numpy()
+        origins = np.broadcast_to(camera.position.numpy(), rays.shape)
+        places, rows, _ = caster.intersects_location(origins, rays, multiple_hits=False)
+        depth = torch.zeros(camera.height * camera.width, dtype=torch.float64)
+        depth[torch.from_numpy(np.asarray(rows))] = camera.project(torch.from_numpy(np.asarray(places)))[1]
+        return depth.reshape(camera.height, camera.width)
+
+    return cast
+
+
+def depth_reach(cloud: GaussianCloud, camera: Camera) -> Float[Tensor, " points"]:
+    """Return each Gaussian's standard deviation along a camera's optical axis, metres."""
+    axis = camera.world_to_camera[2, :3].to(cloud.centers)
+    w, x, y, z = torch.nn.functional.normalize(cloud.rotations, dim=1).unbind(1)
+    # The axis in each Gaussian's own frame: the rotation matrix's columns times it.
+    own = torch.stack(
+        [
+            (1 - 2 * (y * y + z * z)) * axis[0] + 2 * (x * y + w * z) * axis[1] + 2 * (x * z - w * y) * axis[2],
+            2 * (x * y - w * z) * axis[0] + (1 - 2 * (x * x + z * z)) * axis[1] + 2 * (y * z + w * x) * axis[2],
+            2 * (x * z + w * y) * axis[0] + 2 * (y * z - w * x) * axis[1] + (1 - 2 * (x * x + y * y)) * axis[2],
+        ],
+        dim=1,
+    )
+    return (own * cloud.log_scales.exp()).norm(dim=1)
+
+
+def _corners(
+    places: Float[Tensor, "points 2"], camera: Camera
+) -> list[tuple[Int[Tensor, " points"], Int[Tensor, " points"], Float[Tensor, " points"]]]:
+    """Return the rows, columns and weights of the four pixels whose centers surround each place."""
+    x, y = places[:, 0] - 0.5, places[:, 1] - 0.5
+    left, top = x.floor(), y.floor()
+    corners = []
+    for right in (0, 1):
+        for below in (0, 1):
+            weight = (1 - (x - left - right).abs()) * (1 - (y - top - below).abs())
+            rows = (top + below).long().clamp(0, camera.height - 1)
+            columns = (left + right).long().clamp(0, camera.width - 1)
+            corners.append((rows, columns, weight))
+    return corners
