@@ -24,6 +24,8 @@ class CaptureSettings:
     """Unit of the coordinates in impacts.csv: m, cm, mm, in or ft."""
     surface_unit: str | None = None
     """Unit of the surface's coordinates; the same as `unit` where it is not given."""
+    views_unit: str = "m"
+    """Unit of the cameras' positions, where there are photographs."""
     surface: str | None = None
     """Surface file in the folder; the first of surface.obj, .ply, .glb, .stl where it is not given."""
     response_channel: int | None = None
@@ -52,7 +54,7 @@ class CaptureSettings:
     """Move each onset to sample zero. Set it false for impulse responses, whose first sample is the blow already."""
 
     def __post_init__(self) -> None:
-        for key in ("unit", "surface_unit"):
+        for key in ("unit", "surface_unit", "views_unit"):
             if getattr(self, key) not in (*METRES, *((None,) if key == "surface_unit" else ())):
                 raise CaptureError(f"{key} is {getattr(self, key)!r}; expected one of {', '.join(METRES)}")
         for key in ("seconds", "playback_speed", "regularisation"):
@@ -83,6 +85,11 @@ class CaptureSettings:
     def surface_metres(self) -> float:
         """Metres in one unit of the surface's coordinates."""
         return METRES[self.surface_unit or self.unit]
+
+    @property
+    def views_metres(self) -> float:
+        """Metres in one unit of the cameras' positions."""
+        return METRES[self.views_unit]
 
     @classmethod
     def read(cls, path: str | Path) -> "CaptureSettings":

@@ -51,17 +51,20 @@ def read_surface(path: str | Path, *, metres: float = 1.0) -> Surface:
     return Surface(torch.from_numpy((joined * metres).astype(np.float32)), torch.from_numpy(np.concatenate(faces)))
 
 
-def find_surface(folder: Path, settings: CaptureSettings) -> Surface | None:
-    """Read the surface that the settings name, or the first of the usual names; None where there is none of these."""
+def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
+    """Return the surface file that the settings name, or the first of the usual names; None where there is none."""
     if settings.surface is not None:
         named = Path(settings.surface)
         if named.is_absolute() or ".." in named.parts:
             raise CaptureError(f"surface = {settings.surface!r} lies outside the capture folder: copy it there")
-        return read_surface(folder / named, metres=settings.surface_metres)
-    for name in SURFACE_FILES:
-        if (folder / name).is_file():
-            return read_surface(folder / name, metres=settings.surface_metres)
-    return None
+        return folder / named
+    return next((folder / name for name in SURFACE_FILES if (folder / name).is_file()), None)
+
+
+def find_surface(folder: Path, settings: CaptureSettings) -> Surface | None:
+    """Read what `find_surface_file` finds; None where it finds nothing."""
+    path = find_surface_file(folder, settings)
+    return None if path is None else read_surface(path, metres=settings.surface_metres)
 
 
 def write_surface(surface: Surface, path: Path) -> None:

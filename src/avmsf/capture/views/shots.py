@@ -1,0 +1,62 @@
+"""What a camera file says of one photograph, before any pixel is read."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.capture.views.lenses import Lens
+from avmsf.capture.views.pictures import SUFFIXES
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A photograph that a camera file names."""
+
+    name: str
+    """Its path below `images/`, with forward slashes: what messages and masks know it by."""
+    image: Path
+    world_to_camera: Float[Tensor, "4 4"]
+    """Rigid, OpenCV's axes; in the file's unit of length."""
+    lens_of: Callable[[int, int], Lens]
+    """The lens, given the image's width and height, which count only where the camera file leaves out its own."""
+    mask: Path | None = None
+    """The mask that the file names for it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shots:
+    """All that a camera file names."""
+
+    origin: Path
+    """The camera file, or the folder that holds its parts."""
+    shots: tuple[Shot, ...]
+    remarks: tuple[str, ...] = ()
+    """What looks wrong but could be mended."""
+
+
+def without_camera(shots: Sequence[Shot], folder: Path) -> list[str]:
+    """Return the names of image files that lie among the shots' but have no camera."""
+    known = {path.resolve() for shot in shots for path in (shot.image, shot.mask) if path is not None}
+    images = folder / "images"
+    if images.is_dir():
+        candidates = set(images.rglob("*"))
+    else:
+        candidates = {path for parent in {shot.image.parent for shot in shots} for path in parent.glob("*")}
+    strangers = [path for path in candidates if path.suffix.lower() in SUFFIXES and path.resolve() not in known]
+    return sorted(path.relative_to(images).as_posix() if images.is_dir() else path.name for path in strangers)
+
+
+def mask_places(shot: Shot, folder: Path) -> list[Path]:
+    """Return where a shot's mask may lie, the likeliest place first."""
+    name = PurePosixPath(shot.name)
+    places = [folder / "masks" / name.with_suffix(".png"), folder / "masks" / f"{name}.png"]
+    return places if shot.mask is None else [shot.mask, *places]
+
+
+def listed(names: Sequence[str], *, most: int = 5) -> str:
+    """Return the first names and how many more there are."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,54 @@
+"""The points that structure from motion left beside its cameras."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from avmsf.capture.views.colmap import find_model, read_points
+from avmsf.capture.views.transforms import load_record
+from avmsf.errors import CaptureError
+
+
+def read_sparse_points(
+    folder: str | Path, *, metres: float = 1.0
+) -> tuple[Float[Tensor, "points 3"], UInt8[Tensor, "points 3"]] | None:
+    """Return the points that structure from motion found and their colours; None where there are none.
+
+    Metres, float64. They lie in the frame of `read_views`' cameras: the COLMAP model's own points, or beside a
+    `transforms.json` the file that it names as `ply_file_path`. Raises CaptureError where such a file cannot be read.
+    """
+    folder = Path(folder)
+    transforms = folder if folder.suffix.lower() == ".json" else folder / "transforms.json"
+    if transforms.is_file():
+        found = _read_ply(transforms)
+    else:
+        model = find_model(folder)
+        found = None if model is None else read_points(model)
+    if found is None:
+        return None
+    return torch.from_numpy(found[0] * metres), torch.from_numpy(found[1])
+
+
+def _read_ply(transforms: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the points of the file that transforms.json names, grey where it has no colours."""
+    named = load_record(transforms).get("ply_file_path")
+    if not isinstance(named, str) or not named:
+        return None
+    path = transforms.parent / named.replace("\\", "/")
+    try:
+        cloud: Any = trimesh.load(path, process=False)
+        points = np.asarray(cloud.vertices, dtype=np.float64)
+    except Exception as error:  # trimesh's readers raise whatever their format's parsing raises
+        raise CaptureError(
+            f"{path} ({transforms.name} names it): not a point cloud that can be read: {error}"
+        ) from error
+    colors = np.full((len(points), 3), 128, dtype=np.uint8)
+    painted = np.asarray(getattr(cloud.visual, "vertex_colors", colors))
+    if painted.shape[:1] == points.shape[:1]:
+        colors = painted[:, :3].astype(np.uint8)
+    return (points, colors) if len(points) else None

@@ -1,0 +1,145 @@
+"""`transforms.json` as nerfstudio, instant-ngp and the synthetic NeRF scenes write it."""
+
+import json
+import math
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from avmsf.capture.views.lenses import Lens
+from avmsf.capture.views.pictures import SUFFIXES
+from avmsf.capture.views.poses import TOLERANCE, opencv_from_opengl, rigid
+from avmsf.capture.views.shots import Shot, Shots, listed
+from avmsf.errors import CaptureError
+
+PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+
+
+def read_transforms(path: Path) -> Shots:
+    """Read the shots of a transforms.json; paths in it count from its folder.
+
+    Poses are camera to world with OpenGL's axes; intrinsics stand at the top or in each frame. Raises CaptureError
+    where the file is not JSON, lacks something, or holds a pose or a camera model that cannot be used.
+    """
+    record = load_record(path)
+    frames = record.get("frames")
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise CaptureError(f"{path}: expected a list named 'frames', each with file_path and transform_matrix")
+    shots, scaled = [], []
+    for row, frame in enumerate(frames):
+        where = f"{path}, frame {row}"
+        file = _text(frame, "file_path", where)
+        where = f"{where} ({file})"
+        pose, scale = rigid(_matrix(frame, where), where)
+        image = _with_suffix(path.parent / file)
+        name = _name(file, image)
+        if abs(scale - 1) > TOLERANCE:
+            scaled.append(f"{name} ({scale:.4g})")
+        settings = {key: value for key, value in record.items() if key != "frames"} | frame
+        mask = path.parent / _text(frame, "mask_path", where) if frame.get("mask_path") else None
+        _camera_model(settings, where)
+        shots.append(Shot(name, image, opencv_from_opengl(pose), partial(_lens, settings, where), mask))
+    remarks = (f"poses with a scaled rotation, whose scale was taken out: {listed(scaled)}",) if scaled else ()
+    return Shots(path, tuple(shots), remarks)
+
+
+def load_record(path: Path) -> dict[str, Any]:
+    """Return the file's JSON object; raises CaptureError where it is none."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError) as error:
+        raise CaptureError(f"{path}: not a JSON file that can be read: {error}") from error
+    if not isinstance(record, dict):
+        raise CaptureError(f"{path}: expected a JSON object with 'frames', found {type(record).__name__}")
+    return record
+
+
+def _lens(settings: dict[str, Any], where: str, image_width: int, image_height: int) -> Lens:
+    """Return a frame's lens; the image's size counts where the file states none."""
+    fisheye = _camera_model(settings, where) in FISHEYE
+    sized = "w" in settings and "h" in settings
+    width = int(_number(settings, "w", where)) if sized else image_width
+    height = int(_number(settings, "h", where)) if sized else image_height
+    across = _focal(settings, "x", width, where)
+    down = _focal(settings, "y", height, where)
+    if across is None and down is None:
+        raise CaptureError(f"{where}: expected fl_x or camera_angle_x, in the frame or at the top of the file")
+    # With one focal length alone, pixels are square.
+    focal = (across or down or 0.0, down or across or 0.0)
+    principal = (_number(settings, "cx", where, width / 2), _number(settings, "cy", where, height / 2))
+    k1, k2, k3, k4, p1, p2 = (_number(settings, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if not fisheye and k4:
+        raise CaptureError(f"{where}: k4 = {k4} means nothing for a perspective lens: calibrate with k1 k2 p1 p2 k3")
+    distortion = (k1, k2, k3, k4) if fisheye else (k1, k2, p1, p2, k3)
+    return Lens(focal, principal, width, height, distortion, fisheye, where)
+
+
+def _focal(settings: dict[str, Any], axis: str, pixels: int, where: str) -> float | None:
+    if f"fl_{axis}" in settings:
+        return _number(settings, f"fl_{axis}", where)
+    if f"camera_angle_{axis}" not in settings:
+        return None
+    angle = _number(settings, f"camera_angle_{axis}", where)
+    if not 0 < angle < math.pi:
+        raise CaptureError(f"{where}: expected camera_angle_{axis} in radians between 0 and pi, found {angle}")
+    return pixels / 2 / math.tan(angle / 2)
+
+
+def _camera_model(settings: dict[str, Any], where: str) -> str:
+    """Return the name of the frame's camera model, refusing what is neither perspective nor fisheye."""
+    fallback = "OPENCV_FISHEYE" if settings.get("is_fisheye") else "OPENCV"
+    name = str(settings.get("camera_model") or fallback).upper()
+    if name not in PERSPECTIVE + FISHEYE:
+        raise CaptureError(
+            f"{where}: camera model {name} cannot be read, only {', '.join(PERSPECTIVE + FISHEYE)}: undistort the "
+            "images first"
+        )
+    return name
+
+
+def _matrix(frame: dict[str, Any], where: str) -> np.ndarray:
+    if frame.get("transform_matrix") is None:
+        raise CaptureError(f"{where}: expected transform_matrix, the camera-to-world pose")
+    try:
+        matrix = np.array(frame["transform_matrix"], dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise CaptureError(f"{where}: transform_matrix is not a table of numbers: {error}") from error
+    if matrix.ndim != 2:
+        raise CaptureError(f"{where}: expected 4 rows of 4 numbers in transform_matrix, found {matrix.ndim} dimensions")
+    return matrix
+
+
+def _number(settings: dict[str, Any], key: str, where: str, fallback: float | None = None) -> float:
+    value = settings.get(key, fallback)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise CaptureError(f"{where}: expected {key} to be a finite number, found {value!r}")
+    return float(value)
+
+
+def _text(frame: dict[str, Any], key: str, where: str) -> str:
+    value = frame.get(key)
+    if not isinstance(value, str) or not value.strip():
+        raise CaptureError(f"{where}: expected {key}, the path of a file, found {value!r}")
+    return value.replace("\\", "/")
+
+
+def _with_suffix(path: Path) -> Path:
+    """Return the file itself, or the image file of that name where the suffix was left out."""
+    if path.suffix.lower() in SUFFIXES or path.is_file():
+        return path
+    spellings = [path.with_name(path.name + suffix) for small in SUFFIXES for suffix in (small, small.upper())]
+    return next((spelling for spelling in spellings if spelling.is_file()), path)
+
+
+def _name(file: str, image: Path) -> str:
+    """Return the image's path without a leading `./`, `../` or `images/`, with its suffix."""
+    stem = PurePosixPath(file)
+    parts = [part for part in stem.parts[:-1] if part not in (".", "..", "/")]
+    if stem.is_absolute() or Path(file).is_absolute():
+        parts = []
+    if parts and parts[0] == "images":
+        parts = parts[1:]
+    return "/".join([*parts, image.name])

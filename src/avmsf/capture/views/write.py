@@ -1,0 +1,74 @@
+"""Views written as a folder that `read_views` reads back, and any tool that knows transforms.json."""
+
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import cv2
+import numpy as np
+
+from avmsf.capture.cameras import View
+from avmsf.errors import CaptureError
+
+_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def write_views(views: Sequence[View], folder: str | Path) -> None:
+    """Write `transforms.json`, `images/NAME.png` and, for views that have one, `masks/NAME.png`.
+
+    `read_views` reads back the same pixels, masks and names but for the names' suffixes, and cameras to rounding. The
+    folder appears whole or not at all. Raises CaptureError where it exists and is not empty, where two views would
+    have one file, and where it cannot be written.
+    """
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise CaptureError(f"{folder}: exists and is not an empty folder; choose another name or remove it")
+    names = [str(PurePosixPath(view.name).with_suffix(".png")) for view in views]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise CaptureError(f"{folder}: more than one view would become {repeated[0]}; each needs a name of its own")
+    begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
+    try:
+        begun.mkdir(parents=True)
+        for name, view in zip(names, views, strict=True):
+            _write_image(begun / "images" / name, view.image.cpu().numpy()[..., ::-1])
+            if view.mask is not None:
+                _write_image(begun / "masks" / name, view.mask.cpu().numpy())
+        frames = [_frame(name, view) for name, view in zip(names, views, strict=True)]
+        (begun / "transforms.json").write_text(json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1))
+        if folder.exists():
+            folder.rmdir()
+        os.rename(begun, folder)
+    except OSError as error:
+        raise CaptureError(f"{folder}: the views cannot be written: {error}") from error
+    finally:
+        shutil.rmtree(begun, ignore_errors=True)
+
+
+def _frame(name: str, view: View) -> dict[str, Any]:
+    camera = view.camera
+    pose = np.linalg.inv(camera.world_to_camera.cpu().numpy()) @ _OPENCV_FROM_OPENGL
+    frame = {
+        "file_path": f"images/{name}",
+        "transform_matrix": pose.tolist(),
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.focal[0],
+        "fl_y": camera.focal[1],
+        "cx": camera.principal[0],
+        "cy": camera.principal[1],
+    }
+    return frame if view.mask is None else frame | {"mask_path": f"masks/{name}"}
+
+
+def _write_image(path: Path, pixels: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Low compression is several times faster, and these files are read once or twice.
+    written, content = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not written:
+        raise OSError(f"{path}: the image could not be encoded as PNG")
+    path.write_bytes(content.tobytes())
