@@ -1,12 +1,14 @@
 """What turns Gaussians into images: one interface, whoever computes behind it."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.cameras import Camera
+from avmsf.errors import SceneError
 from avmsf.scene.gaussians import GaussianCloud
 
 
@@ -21,14 +23,43 @@ class Rendering:
     depth: Float[Tensor, "height width"]
     """Mean depth of what covers the pixel, metres along the optical axis; 0 where nothing does."""
     screen: Float[Tensor, "points 2"]
-    """The centers' places in the image, pixels. No leaf: `retain_grad` keeps its gradient for densification."""
+    """The centers' places in the image, pixels. After `retain_grad`, the backward pass leaves the loss's derivative by
+    them in `grad`, for densification."""
     radii: Float[Tensor, " points"]
     """Reach of each Gaussian in the image, pixels; 0 for those that the camera does not see."""
 
 
+@runtime_checkable
 class Rasteriser(Protocol):
-    """Anything that renders clouds as `Rendering` says, tiles of Gaussians sorted by depth, front to back (3DGS)."""
+    """Anything that renders clouds as `Rendering` says: Gaussians sorted by depth, blended front to back (3DGS).
+
+    `choose_rasteriser` gives the one for a device. Derivatives are those by the cloud's tensors; camera and background
+    have none.
+    """
 
     def __call__(self, cloud: GaussianCloud, camera: Camera, *, background: Float[Tensor, " 3"]) -> Rendering:
         """Return what `camera` sees before a `background` colour."""
         ...
+
+
+def choose_rasteriser(device: torch.device | str) -> Rasteriser:
+    """Return what renders clouds whose tensors lie on `device`: numba kernels on the CPU, gsplat on CUDA.
+
+    Raises SceneError for any other device, and for CUDA where gsplat or the device is missing.
+    """
+    kind = torch.device(device).type
+    # Imported when they are chosen: both build on this module, and who renders nothing waits for no compiler.
+    if kind == "cpu":
+        from avmsf.scene.cpu import NumbaRasteriser
+
+        return NumbaRasteriser()
+    if kind != "cuda":
+        raise SceneError(f"expected a device of kind 'cpu' or 'cuda', found {str(device)!r}: move the cloud to one")
+    if not torch.cuda.is_available():
+        raise SceneError(
+            "expected a CUDA device, found none that this torch can use: choose the device 'cpu', or install the torch "
+            "that fits your graphics card"
+        )
+    from avmsf.scene.cuda import GsplatRasteriser
+
+    return GsplatRasteriser()

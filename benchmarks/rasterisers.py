@@ -1,0 +1,228 @@
+"""Rasterisers in plain torch, their gradients by autograd: one to be right, one to be as fast as torch alone is.
+
+Both are written from the definitions of 3D Gaussian Splatting (Kerbl et al. 2023) and share no line with the package's.
+`render_everywhere` puts every Gaussian at every pixel, in whatever precision the cloud comes in: the oracle.
+`render_padded` lists Gaussians tile by tile, pads the lists to one length and treats all tiles at once, as renderers in
+plain torch do.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from avmsf.capture.cameras import Camera
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.rasteriser import Rendering
+
+_NEAR, _BLUR, _MARGIN = 0.01, 0.3, 0.3
+_FAINTEST, _OPAQUE, _LEAST = 1 / 255, 0.999, 1e-4
+_CUT = 2e-4
+"""How near a cut, relative, rounding may decide on which side a number lies."""
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """A cloud's Gaussians in one image."""
+
+    screen: Float[Tensor, "points 2"]
+    """Pixels."""
+    covariances: Float[Tensor, "points 2 2"]
+    """Square pixels, blurred."""
+    opacities: Float[Tensor, " points"]
+    colors: Float[Tensor, "points 3"]
+    depths: Float[Tensor, " points"]
+    """Along the optical axis, metres."""
+
+    def take(self, chosen: Int[Tensor, " chosen"]) -> "Splats":
+        """Return the Gaussians of the given rows."""
+        return Splats(
+            self.screen[chosen],
+            self.covariances[chosen],
+            self.opacities[chosen],
+            self.colors[chosen],
+            self.depths[chosen],
+        )
+
+
+def splats(cloud: GaussianCloud, camera: Camera) -> Splats:
+    """Return the cloud's Gaussians as the camera sees them; of those behind its near plane the opacity is zero."""
+    pose = camera.world_to_camera.to(cloud.centers)
+    turn = pose[:3, :3]
+    inside = cloud.centers @ turn.T + pose[:3, 3]
+    ahead = inside[:, 2] >= _NEAR
+    # What lies behind is put where nothing is divided by zero; its opacity keeps it out.
+    inside = torch.where(ahead[:, None], inside, inside.new_tensor([0.0, 0.0, 1.0]))
+    x, y, z = inside.unbind(1)
+    focal, middle = inside.new_tensor(camera.focal), inside.new_tensor(camera.principal)
+    screen = torch.stack([x / z, y / z], 1) * focal + middle
+    size = inside.new_tensor([camera.width, camera.height])
+    margin = _MARGIN * size / (2 * focal)
+    tangents = torch.stack([x / z, y / z], 1)
+    tangents = torch.minimum(torch.maximum(tangents, -middle / focal - margin), (size - middle) / focal + margin)
+    nothing = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [focal[0] / z, nothing, -focal[0] * tangents[:, 0] / z, nothing, focal[1] / z, -focal[1] * tangents[:, 1] / z],
+        1,
+    ).reshape(-1, 2, 3)
+    stretched = _matrices(cloud.rotations) * cloud.log_scales.exp()[:, None, :]
+    flat = jacobian @ turn @ stretched
+    covariances = flat @ flat.mT + _BLUR * torch.eye(2).to(flat)
+    position = -turn.T @ pose[:3, 3]
+    directions = torch.nn.functional.normalize(cloud.centers - position, dim=1)
+    basis = _basis(directions)[:, : cloud.harmonics.shape[1]]
+    colors = (torch.einsum("pk,pkc->pc", basis, cloud.harmonics) + 0.5).clamp(min=0)
+    return Splats(screen, covariances, cloud.opacities * ahead, colors, z)
+
+
+def render_everywhere(
+    cloud: GaussianCloud, camera: Camera, *, background: Float[Tensor, " 3"], rows: range | None = None
+) -> tuple[Rendering, Bool[Tensor, "height width"]]:
+    """Return what the camera sees, or some rows of it, and at which pixels rounding could decide what counts.
+
+    There some Gaussian covers 1/255, or would leave 1e-4, within one part in 5,000: float32 may take either side of the
+    cut, and no tolerance on the image has a meaning. Memory grows with points times pixels: of a large image ask for a
+    few rows at a time. Gaussians four standard deviations from all of them are left out, for they cover less than
+    exp(-8), a twelfth of 1/255.
+    """
+    rows = range(camera.height) if rows is None else rows
+    every = splats(cloud, camera)
+    spread = 4 * every.covariances[:, 1, 1].sqrt()
+    near = (every.screen[:, 1] + spread > rows.start) & (every.screen[:, 1] - spread < rows.stop)
+    seen = every.take(torch.nonzero(near).flatten())
+    seen = seen.take(torch.argsort(seen.depths, stable=True))
+    down, across = torch.meshgrid(torch.tensor(rows), torch.arange(camera.width), indexing="ij")
+    pixels = torch.stack([across.flatten(), down.flatten()], 1).to(every.screen) + 0.5
+    covered = _coverage(seen, pixels)
+    near_cut = (covered * 255 - 1).abs() < _CUT
+    covered = torch.where(covered >= _FAINTEST, covered, 0.0)
+    # A row of ones before the first Gaussian, so that an empty cloud is like any other.
+    left = torch.cumprod(torch.cat([torch.ones_like(pixels[None, :, 0]), 1 - covered]), 0)
+    goes_on = left > _LEAST
+    weights = covered * left[:-1] * goes_on[1:]
+    undecided = (near_cut & goes_on[:-1]).any(0) | ((left / _LEAST - 1).abs() < _CUT).any(0)
+    alpha = 1 - torch.where(goes_on, left, 1.0).amin(0)
+    color = weights.T @ seen.colors + (1 - alpha)[:, None] * background.to(pixels)
+    depth = torch.where(alpha > 0, weights.T @ seen.depths / alpha.clamp(min=1e-10), 0.0)
+    shape = len(rows), camera.width
+    rendering = Rendering(
+        color.reshape(*shape, 3),
+        alpha.reshape(shape),
+        depth.reshape(shape),
+        every.screen,
+        torch.zeros_like(every.depths),
+    )
+    return rendering, undecided.reshape(shape)
+
+
+def _coverage(seen: Splats, pixels: Float[Tensor, "pixels 2"]) -> Float[Tensor, "points pixels"]:
+    offsets = pixels[None] - seen.screen[:, None]
+    squared = torch.einsum("npi,nij,npj->np", offsets, torch.linalg.inv(seen.covariances), offsets)
+    return (seen.opacities[:, None] * torch.exp(-squared / 2)).clamp(max=_OPAQUE)
+
+
+def render_padded(
+    cloud: GaussianCloud, camera: Camera, *, background: Float[Tensor, " 3"], side: int = 16
+) -> Rendering:
+    """Return what the camera sees, all tiles of `side` pixels at once, their lists padded to the longest of them."""
+    every = splats(cloud, camera)
+    with torch.no_grad():
+        rows, tiles, radii = _touched(every, camera, side)
+        across, down = math.ceil(camera.width / side), math.ceil(camera.height / side)
+        counts = torch.bincount(tiles, minlength=across * down)
+        busy = torch.nonzero(counts).flatten()
+        rank = torch.arange(len(rows)) - (counts.cumsum(0) - counts)[tiles]
+        place = torch.zeros_like(counts)
+        place[busy] = torch.arange(len(busy))
+        # The row after the last stands for nothing: its opacity is zero.
+        lists = torch.full((len(busy), int(counts.max())), len(every.depths))
+        lists[place[tiles], rank] = rows
+        one = torch.arange(side) + 0.5
+        within = torch.stack(torch.meshgrid(one, one, indexing="ij")[::-1], -1).reshape(1, -1, 2)
+        pixels = within + side * torch.stack([busy % across, busy // across], 1)[:, None]
+    conics = torch.linalg.inv(every.covariances)
+    numbers = [
+        every.screen,
+        conics[:, 0],
+        conics[:, 1, 1:],
+        every.opacities[:, None],
+        every.colors,
+        every.depths[:, None],
+    ]
+    packed = torch.nn.functional.pad(torch.cat(numbers, 1), (0, 0, 0, 1))[lists]
+    x = pixels[:, None, :, 0] - packed[..., 0, None]
+    y = pixels[:, None, :, 1] - packed[..., 1, None]
+    exponent = packed[..., 2, None] * x * x + 2 * packed[..., 3, None] * x * y + packed[..., 4, None] * y * y
+    covered = (packed[..., 5, None] * torch.exp(-exponent / 2)).clamp(max=_OPAQUE)
+    covered = torch.where(covered >= _FAINTEST, covered, 0.0)
+    left = torch.cumprod(1 - covered, 1)
+    goes_on = left > _LEAST
+    weights = covered * torch.nn.functional.pad(left[:, :-1], (0, 0, 1, 0), value=1.0) * goes_on
+    sums = weights.mT @ packed[..., 6:]
+    rest = torch.where(goes_on, left, 1.0).amin(1)
+    blended = torch.cat([sums[..., :3] + rest[..., None] * background, 1 - rest[..., None], sums[..., 3:]], -1)
+    image = torch.cat([background, background.new_zeros(2)]).repeat(across * down, side * side, 1)
+    image = image.index_copy(0, busy, blended).reshape(down, across, side, side, 5).transpose(1, 2)
+    image = image.reshape(down * side, across * side, 5)[: camera.height, : camera.width]
+    alpha = image[..., 3]
+    depth = torch.where(alpha > 0, image[..., 4] / alpha.clamp(min=1e-10), 0.0)
+    return Rendering(image[..., :3], alpha, depth, every.screen, radii)
+
+
+def _touched(
+    every: Splats, camera: Camera, side: int
+) -> tuple[Int[Tensor, " pairs"], Int[Tensor, " pairs"], Float[Tensor, " points"]]:
+    """Return pairs of Gaussian and tile whose rectangles meet, by tile and then by depth, and the Gaussians' reach."""
+    reach = (2 * torch.log((every.opacities / _FAINTEST).clamp(min=1.0))).sqrt()
+    extent = reach[:, None] * torch.diagonal(every.covariances, dim1=1, dim2=2).sqrt()
+    limits = torch.tensor([math.ceil(camera.width / side), math.ceil(camera.height / side)])
+    first = ((every.screen - extent) / side).floor().clamp(min=0).long()
+    last = torch.minimum(((every.screen + extent) / side).floor().clamp(min=-1).long(), limits - 1)
+    sizes = (last - first + 1).clamp(min=0) * (reach > 0)[:, None]
+    numbers = sizes.prod(1)
+    order = torch.argsort(every.depths, stable=True)
+    rows = torch.repeat_interleave(order, numbers[order])
+    passed = torch.repeat_interleave(numbers[order].cumsum(0) - numbers[order], numbers[order])
+    rank = torch.arange(len(rows)) - passed
+    column = first[rows, 0] + rank % sizes[rows, 0]
+    row = first[rows, 1] + rank // sizes[rows, 0]
+    tiles, sorting = torch.sort(row * limits[0] + column, stable=True)
+    return rows[sorting], tiles, extent.amax(1) * (numbers > 0)
+
+
+def _matrices(rotations: Float[Tensor, "points 4"]) -> Float[Tensor, "points 3 3"]:
+    """Return I + 2 w [v] + 2 [v]^2 of unit quaternions (w, v), [v] the matrix of the cross product with v."""
+    unit = torch.nn.functional.normalize(rotations, dim=1)
+    w, (x, y, z) = unit[:, 0], unit[:, 1:].unbind(1)
+    nothing = torch.zeros_like(x)
+    cross = torch.stack([nothing, -z, y, z, nothing, -x, -y, x, nothing], 1).reshape(-1, 3, 3)
+    return torch.eye(3).to(unit) + 2 * w[:, None, None] * cross + 2 * cross @ cross
+
+
+def _basis(directions: Float[Tensor, "points 3"]) -> Float[Tensor, "points 16"]:
+    """Return the real spherical harmonics to degree 3, from their normalised Legendre form."""
+    x, y, z = directions.unbind(1)
+    one, root = torch.ones_like(x), math.sqrt(1 / math.pi)
+    return torch.stack(
+        [
+            root / 2 * one,
+            -math.sqrt(3) / 2 * root * y,
+            math.sqrt(3) / 2 * root * z,
+            -math.sqrt(3) / 2 * root * x,
+            math.sqrt(15) / 2 * root * x * y,
+            -math.sqrt(15) / 2 * root * y * z,
+            math.sqrt(5) / 4 * root * (3 * z * z - 1),
+            -math.sqrt(15) / 2 * root * x * z,
+            math.sqrt(15) / 4 * root * (x * x - y * y),
+            -math.sqrt(35 / 2) / 4 * root * y * (3 * x * x - y * y),
+            math.sqrt(105) / 2 * root * x * y * z,
+            -math.sqrt(21 / 2) / 4 * root * y * (5 * z * z - 1),
+            math.sqrt(7) / 4 * root * z * (5 * z * z - 3),
+            -math.sqrt(21 / 2) / 4 * root * x * (5 * z * z - 1),
+            math.sqrt(105) / 4 * root * z * (x * x - y * y),
+            -math.sqrt(35 / 2) / 4 * root * x * (x * x - 3 * y * y),
+        ],
+        1,
+    )

@@ -1,0 +1,61 @@
+"""The rasteriser for processors: numba kernels over tiles of 8 x 8 pixels."""
+
+from dataclasses import fields
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.capture.cameras import Camera
+from avmsf.errors import SceneError
+from avmsf.scene.blending import Blending
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.projection import project
+from avmsf.scene.rasteriser import Rendering
+
+
+class NumbaRasteriser:
+    """Renders clouds on the CPU in float32, with as many threads as numba is given (`NUMBA_NUM_THREADS`).
+
+    The same cloud gives the same image and the same gradients to the last bit, whatever the number of threads. The
+    first use on a machine compiles, which takes some ten seconds; what was compiled is kept for the next time.
+    """
+
+    def __call__(self, cloud: GaussianCloud, camera: Camera, *, background: Float[Tensor, " 3"]) -> Rendering:
+        """Return what `camera` sees before a `background` colour.
+
+        Raises SceneError for tensors that are not float32 on the CPU, and for Gaussians with numbers that are not
+        finite or rotations without length.
+        """
+        _expect_plain(cloud, background)
+        screen, ellipses, opacities, colors, depths, radii, remainders = project(cloud, camera)
+        if bool(torch.isnan(radii).any()):
+            raise _fault(cloud, int(torch.nonzero(torch.isnan(radii[:, 0]))[0]))
+        color, alpha, depth = Blending.apply(  # type: ignore[no-untyped-call]
+            screen, ellipses, opacities, colors, depths, radii, remainders, background, (camera.width, camera.height)
+        )
+        return Rendering(color, alpha, depth, screen, radii[:, 0])
+
+
+def _expect_plain(cloud: GaussianCloud, background: Float[Tensor, " 3"]) -> None:
+    named = [(f"the cloud's {each.name}", getattr(cloud, each.name)) for each in fields(cloud)]
+    for name, tensor in [*named, ("the background", background)]:
+        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            raise SceneError(
+                f"expected float32 numbers on the CPU, found {name} in {str(tensor.dtype).removeprefix('torch.')} on "
+                f"{tensor.device}: convert it, or take the rasteriser that `choose_rasteriser` gives for that device"
+            )
+
+
+def _fault(cloud: GaussianCloud, row: int) -> SceneError:
+    """Return the error that tells what is wrong with one Gaussian."""
+    for each in fields(cloud):
+        values = getattr(cloud, each.name)[row].detach()
+        if not bool(torch.isfinite(values).all()):
+            return SceneError(
+                f"expected finite numbers, found {each.name} {values.tolist()} of Gaussian {row}: drop it with "
+                "`GaussianCloud.take`, and if training made it, lower the learning rate"
+            )
+    return SceneError(
+        f"expected a rotation, found a quaternion of length 0 for Gaussian {row}: write 1, 0, 0, 0 for no rotation"
+    )
