@@ -1,4 +1,4 @@
-"""`python -m benchmarks field`, `extract`, `speed` or `settings`."""
+"""`python -m benchmarks field`, `extract`, `speed`, `scene` or `settings`."""
 
 import argparse
 import sys
@@ -8,11 +8,17 @@ from types import ModuleType
 
 from avmsf.capture import CaptureWarning
 from avmsf.errors import AvmsfError
-from benchmarks import extract, field, settings, speed
+from benchmarks import extract, field, scene, settings, speed
 from benchmarks.material import MissingDataError
 from benchmarks.report import Options, show
 
-BENCHMARKS: dict[str, ModuleType] = {"field": field, "extract": extract, "speed": speed, "settings": settings}
+BENCHMARKS: dict[str, ModuleType] = {
+    "field": field,
+    "extract": extract,
+    "speed": speed,
+    "scene": scene,
+    "settings": settings,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -8,11 +8,13 @@ from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, WhiteN
 from avmsf.bench.conventions import PAPER
 from avmsf.bench.evaluation import Scores, evaluate, score, split
 from avmsf.bench.renderer import Renderer
-from avmsf.capture import Impacts
+from avmsf.capture import Impacts, Surface
+from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.modal.extract import extract
 from avmsf.scene.features import FeatureField
+from benchmarks.look import finish, lift_pictures, pictures, slab, speckled
 from benchmarks.material import IMPULSE, STRUCK, PlateCase, capture_in_place, surface_features
 from benchmarks.report import Options, Report, Table, tell
 
@@ -84,10 +86,57 @@ def _aircraft(options: Options) -> Report:
     return report
 
 
+def _visual(options: Options) -> Report:
+    """Fit the same recordings with positions alone and with lifted features, pooled over symmetries or not."""
+    cases = {"visual.plate": _visual_plate(options), "visual.aircraft": _visual_aircraft(options)}
+    report = Report()
+    for key, (train, test, surface, mesh, geometry) in cases.items():
+        views = pictures(mesh, count=12 if options.quick_look else 72, size=48 if options.quick_look else 256)
+        lifted = lift_pictures(surface, views)
+        variants = {
+            "positions": geometry,
+            "visual": finish(lifted, symmetry=False).features,
+            "visual_symmetric": finish(lifted, symmetry=True).features,
+            "visual_alone": finish(lifted, symmetry=False, positions=False).features,
+            "visual_alone_symmetric": finish(lifted, symmetry=True, positions=False).features,
+        }
+        modes, config = extract(train), QUICK_LOOK if options.quick_look else FitConfig()
+        figures: Figures = {}
+        rows: list[list[str | float]] = []
+        for name, features in variants.items():
+            means = evaluate(fit(train, features, modes, config), test).mean()
+            figures[f"{key}.{name}"] = means["relative_stft"]
+            rows.append([name, *means.values()])
+            tell(f"{key}, {name}: {means['relative_stft']:.3f}")
+        title = f"{key}: built-in descriptors of {len(views)} pictures, {len(train)} contacts to train on"
+        report += Report(
+            tables=(Table(title, ("features", "error", "l1", "l1_log", "envelope"), rows),), figures=figures
+        )
+    return report
+
+
+Visual = tuple[Impacts, Impacts, Surface, TexturedMesh, FeatureField]
+
+
+def _visual_plate(options: Options) -> Visual:
+    count, seconds = (20, 0.25) if options.quick_look else (100, 1.5)
+    train, test = split(STRUCK.strikes(count, seconds=seconds), fraction=0.2)
+    surface = slab(STRUCK.plate)
+    return train, test, surface, speckled(surface, seed=0), STRUCK.features()
+
+
+def _visual_aircraft(options: Options) -> Visual:
+    capture = capture_in_place("aircraft_response")
+    assert capture.surface is not None
+    train, test = split(capture.impacts, count=15)
+    return train, test, capture.surface, TexturedMesh.plain(capture.surface), surface_features(capture)
+
+
 PARTS: dict[str, Callable[[Options], Report]] = {
     "plate": _plate,
     "plate_impulse": _plate_impulse,
     "aircraft": _aircraft,
+    "visual": _visual,
 }
 
 

@@ -98,3 +98,25 @@ def test_the_order_of_files_does_not_matter_but_what_stands_in_which_does(tmp_pa
     a.write_text("2")
     b.write_text("1")
     assert digest != digest_files([a, b], beneath=tmp_path)
+
+
+def test_an_interrupted_stage_finds_its_checkpoint_unless_its_recipe_has_changed(tmp_path: Path) -> None:
+    folder = StageFolder(tmp_path)
+    checkpoint = folder.checkpoint("cloud.ply")
+
+    def stop(path: Path) -> None:
+        checkpoint.write_text("halfway")
+        raise KeyboardInterrupt
+
+    found: list[bool] = []
+
+    def go_on(path: Path) -> None:
+        found.append(checkpoint.exists())
+        path.write_text("done")
+
+    for begun, ended in ((1, 1), (2, 3)):
+        with pytest.raises(KeyboardInterrupt):
+            folder.keep("cloud.ply", {"steps": begun}, stop)
+        folder.keep("cloud.ply", {"steps": ended}, go_on)
+        assert not checkpoint.exists()
+    assert found == [True, False]

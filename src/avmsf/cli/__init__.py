@@ -15,6 +15,10 @@ VERBS = {
     "check": "Say what each recording of a capture is worth, and what is wrong.",
     "modes": "List the modes that a capture's recordings have in common.",
     "fit": "Fit a sound field to a capture and write it to one file.",
+    "splat": "Turn photographs, a video or a mesh into Gaussians",
+    "lift": "Describe what each place of an object looks like",
+    "reconstruct": "Go all the way from a capture folder to a field",
+    "view-cloud": "Draw Gaussians or features",
     "render": "Write the sounds of blows anywhere on the object as wav files.",
     "show": "Say what a field file holds, and draw it.",
     "demo": "Go all the way on a built-in example: capture, modes, field, sounds, pictures, figures.",
@@ -37,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _explain(words)
         return 2
     # Only the verb that is asked for is imported: torch takes seconds, and help on the whole needs none of it.
-    verb = import_module(f"avmsf.cli.{words[0]}")
+    verb = import_module(f"avmsf.cli.{words[0].replace('-', '_')}")
     with warnings.catch_warnings():
         _show_plainly()
         try:

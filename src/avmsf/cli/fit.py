@@ -22,7 +22,9 @@ from avmsf.field.fit import fit
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
 from avmsf.pipeline.keptmodes import extract_once
+from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.scene.features import FeatureField
+from avmsf.scene.featurestore import load_features
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ class Options:
     """Likewise with so many contacts."""
     start: int = 0
     """Row of impacts.csv, counted from 0, that this choice of contacts starts from."""
+    features: Path | None = None
+    """File of features that `avmsf lift` wrote, in the frame of the contacts; without it positions on the surface."""
     method: Method = "high-resolution"
     """How modes are found; see `avmsf modes --help`."""
     modes: int = 128
@@ -72,12 +76,16 @@ class _Recipe:
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell, with the recipe's settings where they say nothing."""
-    # The recipe is read first, for it decides what all others start from.
-    chosen, _ = tyro.cli(_Recipe, args=words, add_help=False, return_unknown_args=True)
-    kind = {"quick": Options, "paper": PaperOptions}[chosen.recipe]
+    kind = {"quick": Options, "paper": PaperOptions}[recipe_of(words)]
     return tyro.cli(
         kind, prog="avmsf fit", args=words, description=Options.__doc__, config=(tyro.conf.FlagCreatePairsOff,)
     )
+
+
+def recipe_of(words: Sequence[str]) -> str:
+    """Return the recipe that the words name; it is read first, for it decides what all others start from."""
+    chosen, _ = tyro.cli(_Recipe, args=words, add_help=False, return_unknown_args=True)
+    return chosen.recipe
 
 
 def run(options: Options) -> int:
@@ -85,7 +93,11 @@ def run(options: Options) -> int:
     expect_writable(options.output)
     settings = None if options.settings is None else CaptureSettings.read(options.settings)
     capture = read_capture(options.capture, settings)
-    train, test = _parts(capture, options)
+    train, test = part_contacts(
+        capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
+    )
+    features = features_of(capture, options.config) if options.features is None else load_features(options.features)
+    expect_on_object(capture.impacts, features)
     say(f"finding the modes of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     modes = extract_once(train, finder(options.method, options.modes), _beside(options.output, "modes"))
     say(f"fitting a field of {len(modes.bank)} modes")
@@ -94,7 +106,7 @@ def run(options: Options) -> int:
         with FitBar() as bar:
             fitted = fit(
                 train,
-                features_of(capture, options.config),
+                features,
                 modes,
                 options.config,
                 capture=capture.name,
@@ -113,7 +125,7 @@ def run(options: Options) -> int:
     if test is not None:
         title = f"{len(test)} contacts not trained on, {len(train)} trained on; lower is better"
         screen.print(score_table(title, scores))
-    screen.print(_summary(fitted, len(train)), soft_wrap=True)
+    screen.print(summary(fitted, len(train)), soft_wrap=True)
     screen.print(f"wrote {options.output}", soft_wrap=True)
     if options.json:
         print_json(
@@ -146,17 +158,21 @@ def features_of(capture: Capture, config: FitConfig) -> FeatureField:
     return FeatureField.from_mesh(capture.surface, generator=torch.Generator().manual_seed(config.seed))
 
 
-def _parts(capture: Capture, options: Options) -> tuple[Impacts, Impacts | None]:
-    if options.train_count is not None and options.train_fraction is not None:
+def part_contacts(
+    impacts: Impacts, *, fraction: float | None, count: int | None, start: int
+) -> tuple[Impacts, Impacts | None]:
+    """Return the recordings to fit to and those to score on, None where all are fitted to."""
+    if count is not None and fraction is not None:
         raise FitError("expected --train-count or --train-fraction, found both: leave one of them out")
-    if options.train_fraction is not None:
-        return split(capture.impacts, fraction=options.train_fraction, start=options.start)
-    if options.train_count is not None:
-        return split(capture.impacts, count=options.train_count, start=options.start)
-    return capture.impacts, None
+    if fraction is not None:
+        return split(impacts, fraction=fraction, start=start)
+    if count is not None:
+        return split(impacts, count=count, start=start)
+    return impacts, None
 
 
-def _summary(fitted: SoundField, contacts: int) -> str:
+def summary(fitted: SoundField, contacts: int) -> str:
+    """Say in a sentence what a fit came to."""
     report = fitted.origin.report
     how = "chosen on validation contacts" if report.get("validated") else "as set"
     return (

@@ -33,7 +33,8 @@ class StageFolder:
     """A folder of stages' outputs, `NAME` beside `NAME.stage.json`, its recipe.
 
     A stage runs again where its recipe has changed, where its output was changed or is missing, and where another
-    version of this package made it. The record is written last: a stage that was interrupted has none and runs again.
+    version of this package made it. The record gets the output's digest last, so that an interrupted stage runs again;
+    what it left in its checkpoint is there then, unless its recipe has changed meanwhile.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -42,6 +43,10 @@ class StageFolder:
     def path(self, name: str) -> Path:
         """Return where a stage's output is."""
         return self.folder / name
+
+    def checkpoint(self, name: str) -> Path:
+        """Return where a stage may leave its state until it is done."""
+        return self.folder / f"{name}.checkpoint"
 
     def keep(self, name: str, recipe: Mapping[str, Any], make: Callable[[Path], object]) -> Kept:
         """Return the output called `name`, made by `make(path)` where what is kept is not of this recipe.
@@ -54,12 +59,14 @@ class StageFolder:
         known = _read(record)
         if known.get("recipe") == wanted and path.exists() and digest_of(path) == known.get("digest"):
             return Kept(path, known["digest"], float(known["seconds"]), fresh=False)
-        record.unlink(missing_ok=True)
+        if known.get("recipe") != wanted:
+            self.checkpoint(name).unlink(missing_ok=True)
+        _write(record, {"recipe": wanted, "digest": None, "seconds": 0.0})
         begun = time.monotonic()
         make(path)
         digest, seconds = digest_of(path), time.monotonic() - begun
-        words = json.dumps({"recipe": wanted, "digest": digest, "seconds": round(seconds, 3)}, indent=1)
-        write_whole(record, lambda place: place.write_text(words, encoding="utf-8"), raising=CaptureError)
+        _write(record, {"recipe": wanted, "digest": digest, "seconds": round(seconds, 3)})
+        self.checkpoint(name).unlink(missing_ok=True)
         return Kept(path, digest, seconds, fresh=True)
 
 
@@ -79,6 +86,11 @@ def digest_files(paths: Iterable[Path], *, beneath: Path) -> str:
             while block := file.read(_BLOCK):
                 digest.update(block)
     return digest.hexdigest()
+
+
+def _write(record: Path, values: Mapping[str, Any]) -> None:
+    words = json.dumps(values, indent=1)
+    write_whole(record, lambda place: place.write_text(words, encoding="utf-8"), raising=CaptureError)
 
 
 def _read(record: Path) -> dict[str, Any]:

@@ -1,0 +1,119 @@
+"""From photographs to features: Gaussians of real photographs, the rasteriser, symmetries, and the way to a field."""
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from avmsf.bench.evaluation import evaluate, split
+from avmsf.capture import Capture, read_capture, write_capture
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.texturedmesh import TexturedMesh
+from avmsf.capture.views.write import write_views
+from avmsf.field.config import FitConfig
+from avmsf.field.store import load
+from avmsf.modal.extract import HighResolution
+from avmsf.pipeline.features import LiftConfig
+from avmsf.pipeline.reconstruct import ReconstructConfig, reconstruct
+from avmsf.pipeline.scene import Listener, SceneConfig
+from avmsf.pipeline.sources import ViewsConfig
+from avmsf.scene.refine import orbit_spread, refine
+from avmsf.scene.splatconfig import SplatConfig
+from benchmarks.dino import measure_dino
+from benchmarks.look import SHAPES, finish, lift_pictures, pictures, shape, slab, speckled
+from benchmarks.material import STRUCK
+from benchmarks.rasteriser import measure_rasteriser
+from benchmarks.report import Options, Report, Table, tell
+from benchmarks.symmetry import measure_symmetry
+
+
+def measure(options: Options) -> Report:
+    """Return the figures of the chosen parts."""
+    report = Report()
+    for part in options.parts:
+        report += PARTS[part](options)
+    return report
+
+
+def _symmetry(options: Options) -> Report:
+    return measure_symmetry(replace(options, parts=("made", "scanned")))
+
+
+def _consistency(options: Options) -> Report:
+    """Say how much features differ over orbits, before and after pooling, on plain shapes under one light."""
+    size, count, points = (48, 12, 800) if options.quick_look else (128, 36, 4096)
+    rows: list[list[str | float]] = []
+    figures: dict[str, float] = {}
+    for name in SHAPES:
+        surface = shape(name)
+        views = pictures(TexturedMesh.plain(surface), count=count, size=size)
+        lifted = lift_pictures(surface, views, points=points)
+        made = finish(lifted, symmetry=True, positions=False)
+        assert made.symmetries is not None
+        found = len(made.symmetries.rotations), len(made.symmetries.mirrors)
+        if made.symmetries:
+            before = orbit_spread(lifted.features, made.symmetries)
+            after = orbit_spread(refine(lifted.features, made.symmetries), made.symmetries)
+        else:
+            before = after = float("nan")
+        key = f"consistency.{name.replace(' ', '_')}"
+        figures |= {f"{key}.before": before, f"{key}.after": after}
+        rows.append([name, float(found[0]), float(found[1]), before, after])
+        tell(f"{name}: {before:.3f} before, {after:.3f} after")
+    convention = (
+        "consistency: root of the mean variance of descriptors over a point's symmetric places, in the features' own "
+        f"spread over the object; {count} pictures of {size} x {size} of grey shapes under one light."
+    )
+    table = Table("spread of features over orbits", ("shape", "axes", "planes", "before", "after"), rows)
+    return Report((convention,), (table,), figures)
+
+
+def _pipeline(options: Options) -> Report:
+    """Go from 60 pictures and 8 recordings of a slab to a field, and say what each stage took."""
+    count, size, seconds = (12, 48, 0.25) if options.quick_look else (60, 256, 3.0)
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / "slab"
+        train, test = split(STRUCK.strikes(40, seconds=seconds), count=8)
+        write_capture(Capture("slab", train), folder)
+        write_views(pictures(speckled(slab(STRUCK.plate), seed=0), count=count, size=size), Path(place) / "views")
+        for part in sorted((Path(place) / "views").iterdir()):
+            part.rename(folder / part.name)
+        config = ReconstructConfig(scene=SceneConfig(ViewsConfig(), SplatConfig(), LiftConfig(encoder="descriptors")))
+        if options.quick_look:
+            quick = SceneConfig(ViewsConfig(), SplatConfig(steps=30, start_points=500), config.scene.lift)
+            config = ReconstructConfig(scene=quick, fit=FitConfig(warmup_steps=20, steps=2, damping="shared"))
+        begun = time.perf_counter()
+        capture = read_capture(folder)
+        made = reconstruct(
+            folder,
+            capture,
+            capture.impacts,
+            config,
+            method=HighResolution(),
+            cache=Path(place) / "cache",
+            settings=CaptureSettings(),
+            listener=Listener(tell),
+        )
+        taken = time.perf_counter() - begun
+        error = evaluate(load(made.field), test).mean()["relative_stft"]
+    rows: list[list[str | float]] = [[each.stage, each.seconds] for each in made.stages]
+    title = f"{count} pictures of {size} x {size}, 8 recordings of {seconds:g} s: images to field, seconds"
+    figures = {"pipeline.seconds": taken, "pipeline.error": error}
+    figures |= {f"pipeline.{each.stage}_seconds": each.seconds for each in made.stages}
+    convention = (
+        f"pipeline: default settings, built-in descriptors; {torch.get_num_threads()} threads; pipeline.error: "
+        f"relative STFT error at the {len(test)} contacts that were not recorded."
+    )
+    return Report((convention,), (Table(title, ("stage", "seconds"), [*rows, ["in all", taken]]),), figures)
+
+
+PARTS: dict[str, Callable[[Options], Report]] = {
+    "dino": measure_dino,
+    "rasteriser": measure_rasteriser,
+    "symmetry": _symmetry,
+    "consistency": _consistency,
+    "pipeline": _pipeline,
+}

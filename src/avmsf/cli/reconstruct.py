@@ -1,0 +1,137 @@
+"""`avmsf reconstruct`: a capture folder with all that it shows and sounds like in, a field out."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from avmsf.capture import read_capture
+from avmsf.cli import INTERRUPTED
+from avmsf.cli.fit import part_contacts, recipe_of, summary
+from avmsf.cli.modes import Method, finder
+from avmsf.cli.printing import console, figure, print_json, say, table
+from avmsf.cli.progress import FitBar
+from avmsf.cli.scenebar import SceneBar
+from avmsf.cli.scenes import SceneOptions, copy_whole, features_words
+from avmsf.cli.scores import compare, score_table, score_values
+from avmsf.cli.writing import expect_writable
+from avmsf.field.config import PAPER, FitConfig
+from avmsf.field.store import load
+from avmsf.pipeline.features import LiftConfig
+from avmsf.pipeline.reconstruct import ReconstructConfig, reconstruct
+from avmsf.pipeline.scene import SceneConfig
+from avmsf.pipeline.sources import ViewsConfig
+from avmsf.scene.splatconfig import SplatConfig
+
+
+@dataclass(frozen=True)
+class Options(SceneOptions):
+    """Go all the way from a capture folder to a field: views, Gaussians, features, symmetries, modes, gains.
+
+    FOLDER also has impacts.csv and the wav files it names. Each stage's output is kept in the cache, only what changed
+    is made anew, and an interrupted run goes on with the same command.
+    """
+
+    output: Annotated[Path | None, tyro.conf.arg(metavar="FIELD.safetensors")] = None
+    """File to copy the field to."""
+    train_fraction: float | None = None
+    """Fit to this part of the contacts, spread as far apart as they go, and score the field on the others."""
+    train_count: int | None = None
+    """Likewise with so many contacts."""
+    start: int = 0
+    """Row of impacts.csv, counted from 0, that this choice of contacts starts from."""
+    method: Method = "high-resolution"
+    """How modes are found; see `avmsf modes --help`."""
+    modes: int = 128
+    """Most modes to keep."""
+    json: bool = False
+    """Print one JSON object on the standard output, all else on the standard error."""
+    features: Literal["validated", "visual", "positions"] = "validated"
+    """What the field reads of the object's points: their looks, their positions alone, or whichever of the two does
+    better on training contacts that are left out in turn."""
+    views: ViewsConfig = field(default_factory=ViewsConfig)
+    splat: SplatConfig = field(default_factory=SplatConfig)
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    recipe: Literal["quick", "paper"] = "quick"
+    """Where the settings of the fit start from; see `avmsf fit --help`."""
+    fit: FitConfig = field(default_factory=FitConfig)
+
+
+@dataclass(frozen=True)
+class PaperOptions(Options):
+    """The same, starting from the paper's settings of the fit."""
+
+    recipe: Literal["quick", "paper"] = "paper"
+    fit: FitConfig = field(default_factory=lambda: PAPER)
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell, with the recipe's settings where they say nothing."""
+    return tyro.cli(
+        {"quick": Options, "paper": PaperOptions}[recipe_of(words)],
+        prog="avmsf reconstruct",
+        args=words,
+        description=Options.__doc__,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+
+
+def run(options: Options) -> int:
+    """Reconstruct, and say what came of it; return 130 where Ctrl-C stopped it."""
+    if options.output is not None:
+        expect_writable(options.output)
+    settings = options.read_settings()
+    capture = read_capture(options.folder, settings)
+    train, test = part_contacts(
+        capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
+    )
+    try:
+        with SceneBar() as scene_bar, FitBar() as fit_bar:
+            made = reconstruct(
+                options.folder,
+                capture,
+                train,
+                ReconstructConfig(
+                    options.features, SceneConfig(options.views, options.splat, options.lift), options.fit
+                ),
+                method=finder(options.method, options.modes),
+                cache=options.kept,
+                settings=settings,
+                listener=scene_bar.listener,
+                fitting=fit_bar.show,
+            )
+    except KeyboardInterrupt:
+        say("avmsf reconstruct: interrupted; the same command goes on from where it was")
+        return INTERRUPTED
+    fitted = load(made.field)
+    scores = {} if test is None else compare(fitted, train, test, made.modes)
+    screen = console(errors=options.json)
+    if made.report:
+        screen.print(features_words(made.report), soft_wrap=True)
+    rows = [[each.stage, figure(each.seconds), "now" if each.fresh else "before"] for each in made.stages]
+    screen.print(table("stages", ["stage", "seconds", "made"], rows))
+    if test is not None:
+        title = f"{len(test)} contacts not trained on, {len(train)} trained on; lower is better"
+        screen.print(score_table(title, scores))
+    screen.print(summary(fitted, len(train)), soft_wrap=True)
+    screen.print(f"the field is {made.field}", soft_wrap=True)
+    if options.output is not None:
+        copy_whole(made.field, options.output)
+        screen.print(f"wrote {options.output}", soft_wrap=True)
+    if options.json:
+        print_json(
+            {
+                "field": str(options.output or made.field),
+                "capture": capture.name,
+                "features": made.report,
+                "stages": [asdict(each) for each in made.stages],
+                "modes": len(fitted.bank),
+                "trained_on": list(train.names),
+                "tested_on": [] if test is None else list(test.names),
+                "report": fitted.origin.report,
+                "scores": score_values(scores),
+            }
+        )
+    return 0

@@ -1,0 +1,65 @@
+"""How far splatting and lifting are, on the standard error."""
+
+import sys
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from avmsf.cli.printing import figure, say
+from avmsf.pipeline.scene import Listener
+from avmsf.scene.lift import LiftProgress
+from avmsf.scene.splat import SplatProgress
+
+_PARTS = 10
+"""Lines that a file or a pipe gets for the whole of a stage."""
+
+
+class SceneBar:
+    """One bar a stage; in a file or a pipe, a line for each tenth of the splatting and one for the lift."""
+
+    def __init__(self) -> None:
+        self.live = sys.stderr.isatty()
+        self.bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[words]}"),
+            TimeRemainingColumn(),
+            console=Console(file=sys.stderr, markup=False, highlight=False),
+            disable=not self.live,
+        )
+        self.tasks: dict[str, TaskID] = {}
+        self.told = 0
+
+    def __enter__(self) -> "SceneBar":
+        self.bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.bar.stop()
+
+    @property
+    def listener(self) -> Listener:
+        """Who hears of the stages."""
+        return Listener(say, self.splatting, self.lifting)
+
+    def splatting(self, progress: SplatProgress) -> None:
+        """Take note of some steps."""
+        words = f"loss {figure(progress.loss)}, {progress.psnr:.1f} dB, {progress.gaussians} Gaussians"
+        self._show("splat", progress.step, progress.steps, words)
+        part = progress.step * _PARTS // progress.steps
+        if not self.live and part > self.told:
+            say(f"splat: step {progress.step} of {progress.steps}, {words}, {progress.seconds:.0f} s")
+        self.told = part
+
+    def lifting(self, progress: LiftProgress) -> None:
+        """Take note of a view."""
+        self._show("lift", progress.done, progress.total, progress.view)
+
+    def _show(self, stage: str, done: int, total: int, words: str) -> None:
+        if stage not in self.tasks:
+            self.tasks[stage] = self.bar.add_task(stage, total=total, words="")
+        self.bar.update(self.tasks[stage], completed=done, words=words)

@@ -1,0 +1,65 @@
+"""`avmsf splat`: a folder's photographs, video or mesh in, Gaussians out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli import INTERRUPTED
+from avmsf.cli.printing import say
+from avmsf.cli.scenebar import SceneBar
+from avmsf.cli.scenes import SceneOptions, copy_whole, stage_line
+from avmsf.cli.writing import expect_writable
+from avmsf.pipeline.scene import SceneConfig, SceneStages
+from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.stages import StageFolder
+from avmsf.scene.ply import read_splats
+from avmsf.scene.splatconfig import SplatConfig
+
+
+@dataclass(frozen=True)
+class Options(SceneOptions):
+    """Turn photographs, a video or a mesh into Gaussians, as a .ply file that any 3DGS viewer opens.
+
+    Views and Gaussians are kept in the cache; an interrupted run goes on with the same command.
+    """
+
+    output: Annotated[Path | None, tyro.conf.arg(metavar="CLOUD.ply")] = None
+    """File to copy the Gaussians to."""
+    views: ViewsConfig = field(default_factory=ViewsConfig)
+    config: tyro.conf.OmitArgPrefixes[SplatConfig] = field(default_factory=SplatConfig)
+    """Settings of the splatting."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return tyro.cli(Options, prog="avmsf splat", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def run(options: Options) -> int:
+    """Make the Gaussians; return 130 where Ctrl-C stopped it."""
+    if options.output is not None:
+        expect_writable(options.output)
+    stages = StageFolder(options.kept)
+    try:
+        with SceneBar() as bar:
+            scene = SceneStages(
+                options.folder,
+                stages,
+                SceneConfig(views=options.views, splat=options.config),
+                settings=options.read_settings(),
+                listener=bar.listener,
+            )
+            cloud = scene.cloud
+    except KeyboardInterrupt:
+        say("avmsf splat: interrupted; the same command goes on from where it was")
+        return INTERRUPTED
+    print(f"{len(read_splats(cloud.path))} Gaussians")
+    for name, kept in scene.made().items():
+        print(stage_line(name, kept))
+    if options.output is not None:
+        copy_whole(cloud.path, options.output)
+        print(f"wrote {options.output}")
+    return 0

@@ -1,0 +1,151 @@
+"""From Gaussians and views to the features that a gain field reads: described, lifted, pooled over symmetries."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+
+from avmsf.capture.cameras import View
+from avmsf.capture.surface import Surface
+from avmsf.errors import SceneError
+from avmsf.scene.descriptors import ImageDescriptors
+from avmsf.scene.dino import DinoEncoder
+from avmsf.scene.encode import Encoder
+from avmsf.scene.features import FeatureField
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.lift import Lifted, LiftProgress, by_presence, by_visibility, lift, lift_points
+from avmsf.scene.points import sample_surface
+from avmsf.scene.rasteriser import Rasteriser
+from avmsf.scene.reduction import reduce, with_positions
+from avmsf.scene.refine import orbit_spread, refine
+from avmsf.scene.symmetry import Symmetries
+from avmsf.scene.symmetrysearch import find_symmetries
+from avmsf.scene.visibility import depth_of_surface
+
+DINO = "facebook/dinov2-base"
+DESCRIPTORS = "descriptors"
+_WEIGHTINGS = {"plain": by_presence, "visibility": by_visibility}
+
+
+@dataclass(frozen=True)
+class LiftConfig:
+    """Settings of the features."""
+
+    encoder: str = "auto"
+    """What describes the images: the name of a DINOv2 model (such as facebook/dinov2-base), a folder that holds one,
+    `descriptors` (built in, no download), or `auto`: DINOv2 base where it is to be had, else the built-in ones."""
+    longest: int = 518
+    """Pixels of an image's longer side as DINOv2 sees it."""
+    weighting: Literal["plain", "visibility"] = "visibility"
+    """How the views that see a point are averaged: by how well they see it, or plainly (paper)."""
+    components: int = 32
+    """Principal components of the features to keep; 0 keeps the features as they are."""
+    symmetry: bool = True
+    """Whether features are made alike where the object's symmetries make its shape alike."""
+    iterations: int = 3
+    """How often features are pooled over the symmetries (paper: T)."""
+    angles: int = 24
+    """Angles that stand for all of a continuous rotation (paper: the size of Theta)."""
+    positions: bool = True
+    """Whether the points' positions, relative to the object's size, stand before the features."""
+    size: float = 0.3
+    """Root mean square length of the features beside positions whose length is 1 at most."""
+    onto: Literal["mesh", "gaussians"] = "mesh"
+    """What is the object where a folder shows a mesh alone: its own surface, or Gaussians fitted to pictures of it."""
+    points: int = 8192
+    """Points of a mesh whose own surface is the object."""
+    seed: int = 0
+    """Start of all chance: which points of a mesh, which of them the search for symmetries looks at."""
+
+    def __post_init__(self) -> None:
+        for name, least in {"longest": 1, "components": 0, "iterations": 1, "angles": 2, "points": 100}.items():
+            if getattr(self, name) < least:
+                raise SceneError(f"{name} = {getattr(self, name)}: expected {least} or more")
+        if not 0 < self.size < math.inf:
+            raise SceneError(f"size = {self.size}: expected more than 0")
+
+
+@dataclass(frozen=True, eq=False)
+class MadeFeatures:
+    """Features, and what came to light on the way."""
+
+    features: FeatureField
+    symmetries: Symmetries | None
+    """None where none were looked for."""
+    report: dict[str, Any]
+    """Plain values: encoder, points that no view sees, agreement of the views, symmetries, spread over orbits."""
+
+
+def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None]) -> Encoder:
+    """Return the encoder that the settings name. Raises SceneError where it is not to be had."""
+    if config.encoder == DESCRIPTORS:
+        return ImageDescriptors()
+    if config.encoder != "auto":
+        return DinoEncoder.load(config.encoder, longest=config.longest, device=_device())
+    try:
+        return DinoEncoder.load(DINO, longest=config.longest, device=_device())
+    except SceneError as error:
+        tell(f"encoder: the built-in descriptors, for {DINO} is not to be had ({error})")
+        return ImageDescriptors()
+
+
+def lift_to_cloud(
+    cloud: GaussianCloud,
+    views: Sequence[View],
+    encoder: Encoder,
+    config: LiftConfig,
+    *,
+    rasteriser: Rasteriser,
+    progress: Callable[[LiftProgress], None] | None = None,
+) -> Lifted:
+    """Lift features onto Gaussians as the settings say."""
+    weighting = _WEIGHTINGS[config.weighting]
+    return lift(cloud, views, encoder, rasteriser=rasteriser, weighting=weighting, progress=progress)
+
+
+def lift_to_surface(
+    surface: Surface,
+    views: Sequence[View],
+    encoder: Encoder,
+    config: LiftConfig,
+    *,
+    progress: Callable[[LiftProgress], None] | None = None,
+) -> Lifted:
+    """Lift features onto points drawn evenly from a mesh, whose triangles hide what lies behind them."""
+    generator = torch.Generator().manual_seed(config.seed)
+    points = sample_surface(surface.vertices, surface.faces, config.points, generator=generator).points
+    weighting = _WEIGHTINGS[config.weighting]
+    depth_map = depth_of_surface(surface)
+    return lift_points(points, views, encoder, depth_map=depth_map, weighting=weighting, progress=progress)
+
+
+def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
+    """Reduce lifted features, pool them over the symmetries that the points have, and set positions beside them."""
+    features = lifted.features
+    if config.components:
+        features = reduce(features, config.components)
+    report: dict[str, Any] = {
+        "encoder": lifted.features.encoder,
+        "points": len(features.points),
+        "unseen": lifted.unseen,
+        "agreement": lifted.agreement,
+    }
+    symmetries = None
+    if config.symmetry:
+        symmetries = find_symmetries(features.points, generator=torch.Generator().manual_seed(config.seed))
+        report["symmetries"] = symmetries.to_dict()
+        if symmetries:
+            pooled = refine(features, symmetries, iterations=config.iterations, angles=config.angles)
+            report["orbit_spread"] = [orbit_spread(each, symmetries) for each in (features, pooled)]
+            features = pooled
+    length = float(features.features.double().square().sum(1).mean().sqrt())
+    features = replace(features, features=features.features * (config.size / length))
+    if config.positions:
+        features = with_positions(features)
+    return MadeFeatures(features, symmetries, report)
+
+
+def _device() -> str:
+    return "cuda" if torch.cuda.is_available() else "cpu"

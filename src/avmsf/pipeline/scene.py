@@ -1,0 +1,199 @@
+"""From what a folder shows of the object to features on its surface: views, Gaussians, features, each kept."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import torch
+
+from avmsf.capture.cameras import View
+from avmsf.capture.meshviews import orbit_cameras
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.surface import Surface, read_surface
+from avmsf.capture.views import read_sparse_points, read_views
+from avmsf.errors import SceneError
+from avmsf.pipeline.features import LiftConfig, choose_encoder, finish_features, lift_to_cloud, lift_to_surface
+from avmsf.pipeline.sources import Source, ViewsConfig, find_source, find_splats, keep_views, replace_views
+from avmsf.pipeline.stages import Kept, StageFolder, digest_of
+from avmsf.scene.encode import Encoder
+from avmsf.scene.featurestore import save_features
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.lift import Lifted, LiftProgress
+from avmsf.scene.ply import read_splats, write_splats
+from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
+from avmsf.scene.splat import SplatProgress, splat
+from avmsf.scene.splatconfig import SplatConfig
+from avmsf.scene.start import StartPoints
+
+CLOUD, FEATURES = "cloud.ply", "features.safetensors"
+"""What the stages call their outputs."""
+
+
+def _say_nothing(words: str) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Listener:
+    """Who is told how far the work is."""
+
+    tell: Callable[[str], None] = _say_nothing
+    """Hears a sentence as each stage begins."""
+    splatting: Callable[[SplatProgress], None] | None = None
+    lifting: Callable[[LiftProgress], None] | None = None
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """Settings of all stages up to the features."""
+
+    views: ViewsConfig = field(default_factory=ViewsConfig)
+    """How views are made of what the folder holds."""
+    splat: SplatConfig = field(default_factory=SplatConfig)
+    """How Gaussians are fitted to views."""
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    """How features are made of views and Gaussians."""
+
+
+class SceneStages:
+    """The stages that lead from a folder's photographs, video, mesh or Gaussians to features on the object.
+
+    Gaussians that lie in the folder are taken as they are; where there are no photographs beside them, pictures of
+    them from all sides are described. A mesh needs no Gaussians: its own surface is the object unless the settings say
+    otherwise, and pictures of it are described. Every stage runs when its output is first asked for and raises what it
+    raises; SceneError where the folder shows nothing of the object.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        stages: StageFolder,
+        config: SceneConfig,
+        *,
+        settings: CaptureSettings,
+        listener: Listener | None = None,
+    ) -> None:
+        self.folder, self.stages, self.config, self.settings = folder, stages, config, settings
+        self.listener = Listener() if listener is None else listener
+        self.splats = find_splats(folder)
+        found = find_source(folder, settings)
+        self.source: Source | None = None if self.splats and found and found.kind == "mesh" else found
+
+    def __bool__(self) -> bool:
+        """Whether the folder shows anything of the object."""
+        return self.source is not None or self.splats is not None
+
+    @cached_property
+    def views(self) -> Kept:
+        """The folder of views."""
+        if self.splats is not None and self.source is None:
+            return self._keep_views_of_cloud()
+        return keep_views(
+            self._source(), self.stages, self.config.views, settings=self.settings, tell=self.listener.tell
+        )
+
+    @cached_property
+    def cloud(self) -> Kept:
+        """The file of Gaussians: the folder's own, or fitted to its views, those of a mesh included."""
+        if self.splats is not None:
+            return Kept(self.splats, digest_of(self.splats), 0.0, fresh=False)
+
+        def make(path: Path) -> None:
+            write_splats(self._splat(read_views(self.views.path)), path)
+
+        recipe = {"views": self.views.digest, "splat": asdict(self.config.splat)}
+        return self.stages.keep(CLOUD, recipe, make)
+
+    @cached_property
+    def features(self) -> Kept:
+        """The file of features, on the Gaussians or on points of the mesh."""
+        encoder = choose_encoder(self.config.lift, tell=self.listener.tell)
+        on_mesh = self.splats is None and self._source().kind == "mesh" and self.config.lift.onto == "mesh"
+        recipe = {
+            "views": self.views.digest,
+            "cloud": None if on_mesh else self.cloud.digest,
+            "encoder": encoder.name,
+            "lift": asdict(self.config.lift),
+        }
+
+        def make(path: Path) -> None:
+            views = read_views(self.views.path)
+            lifted = self._lift_to_mesh(views, encoder) if on_mesh else self._lift_to_cloud(views, encoder)
+            made = finish_features(lifted, self.config.lift)
+            if made.symmetries is not None:
+                self.listener.tell(made.symmetries.summary())
+            save_features(made.features, path, report=made.report)
+
+        return self.stages.keep(FEATURES, recipe, make)
+
+    def made(self) -> dict[str, Kept]:
+        """Return the stages that were needed so far, in order."""
+        return {name: self.__dict__[name] for name in ("views", "cloud", "features") if name in self.__dict__}
+
+    def _source(self) -> Source:
+        if self.source is None:
+            raise SceneError(
+                f"{self.folder}: expected photographs (transforms.json, a COLMAP model or a folder images/), a video, "
+                "a mesh (surface.obj, .ply, .glb, .stl) or Gaussians (splats.ply), found none of these"
+            )
+        return self.source
+
+    def _splat(self, views: Sequence[View]) -> GaussianCloud:
+        """Start from the hull of the masks, or from structure from motion's points where masks are missing."""
+        source, start = self._source(), None
+        bare = [view.name for view in views if view.mask is None]
+        if bare:
+            moved = source.kind in ("photographs", "video")
+            found = read_sparse_points(
+                self.stages.path("motion") if moved else source.path, metres=self.settings.views_metres
+            )
+            if found is None:
+                raise SceneError(
+                    f"expected masks, or points of structure from motion, to start Gaussians from; {len(bare)} views "
+                    f"({bare[0]}, ...) have no mask and there are no points: give masks, or leave their search on"
+                )
+            start = StartPoints(found[0].float(), found[1].float() / 255)
+        self.listener.tell(f"splat: {self.config.splat.steps} steps on {len(views)} views")
+        return splat(
+            views,
+            self.config.splat,
+            start=start,
+            progress=self.listener.splatting,
+            checkpoint=self.stages.checkpoint(CLOUD),
+        )
+
+    def _lift_to_cloud(self, views: Sequence[View], encoder: Encoder) -> Lifted:
+        cloud = read_splats(self.cloud.path)
+        self.listener.tell(f"lift: {encoder.name} of {len(views)} views onto {len(cloud)} Gaussians")
+        rasteriser = choose_rasteriser(cloud.centers.device)
+        return lift_to_cloud(
+            cloud, views, encoder, self.config.lift, rasteriser=rasteriser, progress=self.listener.lifting
+        )
+
+    def _lift_to_mesh(self, views: Sequence[View], encoder: Encoder) -> Lifted:
+        surface = read_surface(self._source().path, metres=self.settings.surface_metres)
+        points = self.config.lift.points
+        self.listener.tell(f"lift: {encoder.name} of {len(views)} views onto {points} points of the mesh")
+        return lift_to_surface(surface, views, encoder, self.config.lift, progress=self.listener.lifting)
+
+    def _keep_views_of_cloud(self) -> Kept:
+        def make(path: Path) -> None:
+            cloud = read_splats(self.cloud.path)
+            rasteriser = choose_rasteriser(cloud.centers.device)
+            replace_views(views_of_cloud(cloud, rasteriser, size=self.config.views.rendered), path)
+
+        recipe = {"cloud": self.cloud.digest, "rendered": self.config.views.rendered}
+        return self.stages.keep("views", recipe, make)
+
+
+def views_of_cloud(cloud: GaussianCloud, rasteriser: Rasteriser, *, size: int) -> tuple[View, ...]:
+    """Return the 72 pictures of `orbit_cameras` of Gaussians before white, `size` pixels wide, with masks."""
+    box = Surface(cloud.centers.float(), torch.zeros(0, 3, dtype=torch.int64))
+    views = []
+    for number, camera in enumerate(orbit_cameras(box, size=size)):
+        with torch.no_grad():
+            seen = rasteriser(cloud, camera, background=cloud.centers.new_ones(3))
+        image, mask = ((255 * each.clamp(0, 1)).round().to(torch.uint8) for each in (seen.color, seen.alpha))
+        views.append(View(f"view_{number:03d}", image, camera, mask))
+    return tuple(views)

@@ -1,0 +1,182 @@
+"""What a folder holds of an object's look, and how that becomes views: whatever it is, one folder of them comes out."""
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from avmsf.capture.cameras import View
+from avmsf.capture.meshviews import orbit_cameras, render_views
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.sfm import FEWEST, estimate_cameras
+from avmsf.capture.surface import find_surface_file
+from avmsf.capture.texturedmesh import read_textured_mesh
+from avmsf.capture.video import pick_frames
+from avmsf.capture.views import find_foreground, read_views
+from avmsf.capture.views.colmap import find_model
+from avmsf.capture.views.pictures import SUFFIXES
+from avmsf.capture.views.write import write_views
+from avmsf.errors import SceneError
+from avmsf.pipeline.stages import Kept, StageFolder, digest_files
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+SPLATS = ("splats.ply", "point_cloud.ply", "cloud.ply")
+"""Names under which a folder may hold Gaussians that were made elsewhere."""
+
+Kind = Literal["cameras", "photographs", "video", "mesh"]
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class ViewsConfig:
+    """How views are made of what a folder holds."""
+
+    longest: int = 640
+    """Pixels of a photograph's longer side; larger ones are scaled down."""
+    masks: bool = True
+    """Whether photographs without masks get them, which needs a plain background."""
+    frames: int = 72
+    """Frames to pick from a video."""
+    rendered: int = 256
+    """Pixels along each side of the 72 pictures that are rendered of a mesh."""
+    minutes: float = 30.0
+    """Time that structure from motion may take."""
+    seed: int = 0
+    """Start of the chance in structure from motion."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a folder's views are made of."""
+
+    kind: Kind
+    files: tuple[Path, ...]
+    """All files that decide the views."""
+    path: Path
+    """Folder of cameras or photographs, or the video or the mesh itself."""
+    folder: Path
+    """The folder that holds all of it."""
+
+    @property
+    def digest(self) -> str:
+        """Of all that decides the views."""
+        return digest_files(self.files, beneath=self.folder)
+
+
+def find_source(folder: Path, settings: CaptureSettings) -> Source | None:
+    """Return what the folder's views can be made of, best first; None where it holds nothing of the kind.
+
+    Photographs with cameras (transforms.json or a COLMAP model) go before photographs alone, these before a video, a
+    video before a mesh. Raises SceneError for more than one video.
+    """
+    if not folder.is_dir():
+        raise SceneError(f"{folder}: there is no such folder; name the one with the photographs, the video or the mesh")
+    model = None if (folder / "transforms.json").is_file() else find_model(folder)
+    if model is not None or (folder / "transforms.json").is_file():
+        files = [folder / "transforms.json"] if model is None else [each for each in model.iterdir() if each.is_file()]
+        return Source("cameras", tuple(sorted([*files, *_images(folder)])), folder, folder)
+    photographs = folder / "images" if (folder / "images").is_dir() else folder
+    images = [path for path in _images(photographs) if "masks" not in path.relative_to(folder).parts]
+    # A mesh has its texture beside it, and a capture perhaps a picture of how it was made.
+    if len(images) >= FEWEST and (photographs != folder or find_surface_file(folder, settings) is None):
+        masks = _images(folder / "masks") if (folder / "masks").is_dir() else []
+        return Source("photographs", (*images, *masks), photographs, folder)
+    videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
+    if len(videos) > 1:
+        named = ", ".join(path.name for path in videos)
+        raise SceneError(f"{folder}: expected one video of the object, found {named}: leave one there")
+    if videos:
+        return Source("video", tuple(videos), videos[0], folder)
+    surface = find_surface_file(folder, settings)
+    if surface is None or not surface.is_file():
+        return None
+    return Source("mesh", (surface, *_images(folder), *sorted(folder.glob("*.mtl"))), surface, folder)
+
+
+def find_splats(folder: Path) -> Path | None:
+    """Return the file of Gaussians in the folder, where there is one."""
+    return next((folder / name for name in SPLATS if (folder / name).is_file()), None)
+
+
+def keep_views(
+    source: Source, stages: StageFolder, config: ViewsConfig, *, settings: CaptureSettings, tell: Tell
+) -> Kept:
+    """Make the folder `views` of a source's views, with masks, or return it where it is as it should be.
+
+    Photographs without cameras get them by structure from motion first, kept in `motion`. Raises as the readers do.
+    """
+    if source.kind in ("photographs", "video"):
+        moved = _keep_motion(source, stages, config, tell=tell)
+        recipe = {"motion": moved.digest}
+    else:
+        moved = None
+        recipe = {"files": source.digest}
+
+    def make(path: Path) -> None:
+        if source.kind == "mesh":
+            replace_views(_rendered(source.path, config, settings=settings, tell=tell), path)
+        else:
+            folder = source.path if moved is None else moved.path
+            replace_views(_photographed(folder, config, metres=settings.views_metres, tell=tell), path)
+
+    lengths = {"views_metres": settings.views_metres, "surface_metres": settings.surface_metres}
+    chosen = {name: value for name, value in asdict(config).items() if name in _matters(source.kind)}
+    return stages.keep("views", {"kind": source.kind, **recipe, **lengths, **chosen}, make)
+
+
+def replace_views(views: Sequence[View], folder: Path) -> None:
+    """Write views where others may lie."""
+    shutil.rmtree(folder, ignore_errors=True)
+    write_views(views, folder)
+
+
+def _matters(kind: Kind) -> Sequence[str]:
+    """Return the settings that decide views of one kind."""
+    return ("rendered",) if kind == "mesh" else ("longest", "masks")
+
+
+def _photographed(folder: Path, config: ViewsConfig, *, metres: float, tell: Tell) -> tuple[View, ...]:
+    views = read_views(folder, longest=config.longest, metres=metres)
+    bare = sum(view.mask is None for view in views)
+    if config.masks and bare:
+        tell(f"views: {len(views)}, looking for the object in {bare} without a mask")
+        views = find_foreground(views)
+    return views
+
+
+def _rendered(path: Path, config: ViewsConfig, *, settings: CaptureSettings, tell: Tell) -> tuple[View, ...]:
+    mesh = read_textured_mesh(path, metres=settings.surface_metres)
+    cameras = orbit_cameras(mesh.surface, size=config.rendered)
+    tell(f"views: rendering {len(cameras)} of {path.name}")
+    return render_views(mesh, cameras)
+
+
+def _keep_motion(source: Source, stages: StageFolder, config: ViewsConfig, *, tell: Tell) -> Kept:
+    """Return a folder of `images` and the COLMAP model `sparse/0` that was found for them."""
+    recipe: dict[str, str | int] = {"files": source.digest, "seed": config.seed}
+    if source.kind == "video":
+        recipe["frames"] = config.frames
+
+    def make(path: Path) -> None:
+        shutil.rmtree(path, ignore_errors=True)
+        if source.kind == "video":
+            tell(f"views: picking {config.frames} frames of {source.path.name}")
+            pick_frames(source.path, path / "images", count=config.frames)
+        else:
+            masks = source.folder / "masks"
+            for file in source.files:
+                masked = file.is_relative_to(masks)
+                place = path / ("masks" if masked else "images") / file.relative_to(masks if masked else source.path)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(file, place)
+        tell("views: finding the cameras by structure from motion")
+        estimate_cameras(path / "images", path, timeout=60 * config.minutes, seed=config.seed)
+
+    return stages.keep("motion", recipe, make)
+
+
+def _images(folder: Path) -> list[Path]:
+    """Return the image files beneath a folder, sorted, without those in hidden folders such as the kept stages'."""
+    paths = (path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    return sorted(path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts))

@@ -1,0 +1,197 @@
+"""From pictures, a mesh or Gaussians to a field on the command line: what is made, kept, made anew and refused."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from avmsf.capture.views.write import write_views
+from avmsf.cli import main
+from avmsf.cli.scenebar import SceneBar
+from avmsf.field.store import load
+from avmsf.scene.featurestore import load_features, read_report
+from avmsf.scene.ply import read_splats
+from avmsf.scene.splat import SplatProgress
+from plate_capture import PLATE, TINY, fill_plate
+from small_scene import SMALL_SPLAT, THICKNESS, slab_views, write_surface_file
+
+Streams = pytest.CaptureFixture[str]
+LIFT = ("--lift.encoder", "descriptors", "--lift.points", "600")
+MODES = ("--modes", "12")
+FIT = tuple(f"--fit.{word[2:]}" if word.startswith("--") else word for word in TINY[: -len(MODES)])
+SMALL = (*SMALL_SPLAT, *LIFT, *FIT, *MODES, "--features", "visual")
+
+
+def photograph(folder: Path) -> Path:
+    """Put the slab's pictures into a folder, which may hold recordings."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_views(slab_views(), folder / "pictures")
+    for part in sorted((folder / "pictures").iterdir()):
+        part.rename(folder / part.name)
+    (folder / "pictures").rmdir()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return photograph(fill_plate(tmp_path_factory.mktemp("captures") / "slab", surface=False))
+
+
+@pytest.fixture(scope="module")
+def kept(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The capture's cache after a first reconstruction."""
+    cache = tmp_path_factory.mktemp("cache") / "kept"
+    assert main(["reconstruct", str(capture), "--cache", str(cache), *SMALL]) == 0
+    return cache
+
+
+def made_now(streams: Streams) -> dict[str, bool]:
+    values = json.loads(streams.readouterr().out)
+    return {each["stage"]: each["fresh"] for each in values["stages"]}
+
+
+def test_pictures_and_blows_become_a_field_on_gaussians(kept: Path) -> None:
+    cloud, features = read_splats(kept / "cloud.ply"), load_features(kept / "features.safetensors")
+    assert torch.equal(features.points, cloud.centers)
+    field = load(kept / "field.safetensors")
+    assert torch.equal(field.gain_field.points, cloud.centers)
+    assert field.gain_field.encoder == features.encoder
+    assert "descriptors" in features.encoder
+    assert "dino" not in features.encoder
+    # The slab's box, widened by the reach of Gaussians that its pictures of 48 pixels leave unsure: a pixel is 9 mm.
+    a, b, c = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
+    assert (a, b) == (pytest.approx(0.24, abs=0.02), pytest.approx(0.17, abs=0.02))
+    assert c == pytest.approx(THICKNESS, abs=0.02)
+
+
+def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follows_it(
+    capture: Path, kept: Path, tmp_path: Path, capsys: Streams
+) -> None:
+    cache = tmp_path / "cache"
+    shutil.copytree(kept, cache)
+    words = ["reconstruct", str(capture), "--cache", str(cache), *SMALL, "--json"]
+    assert main(words) == 0
+    assert made_now(capsys) == {"views": False, "cloud": False, "features": False, "modes": False, "fit": False}
+    assert main([*words, "--lift.components", "4"]) == 0
+    assert made_now(capsys) == {"views": False, "cloud": False, "features": True, "modes": False, "fit": True}
+    assert main([*words, "--fit.seed", "5"]) == 0
+    assert made_now(capsys) == {"views": False, "cloud": False, "features": True, "modes": False, "fit": True}
+
+
+def test_a_changed_picture_makes_everything_anew(capture: Path, kept: Path, tmp_path: Path, capsys: Streams) -> None:
+    cache, changed = tmp_path / "cache", tmp_path / "slab"
+    shutil.copytree(kept, cache)
+    shutil.copytree(capture, changed)
+    pictures = sorted((changed / "images").iterdir())
+    # One picture in another's place: names stay, contents do not.
+    first, second = pictures[0].read_bytes(), pictures[1].read_bytes()
+    pictures[0].write_bytes(second)
+    pictures[1].write_bytes(first)
+    assert main(["lift", str(changed), "--cache", str(cache), *SMALL_SPLAT, "--encoder", "descriptors", "--json"]) == 0
+    capsys.readouterr()
+    assert (cache / "views" / "images" / pictures[0].name).read_bytes() != (
+        kept / "views" / "images" / pictures[0].name
+    ).read_bytes()
+    assert (cache / "cloud.ply").read_bytes() != (kept / "cloud.ply").read_bytes()
+
+
+def test_an_interrupted_splatting_goes_on_to_the_same_gaussians(
+    capture: Path, kept: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache = tmp_path / "cache"
+    show = SceneBar.splatting
+    seen: list[int] = []
+
+    def interrupt(self: SceneBar, progress: SplatProgress) -> None:
+        seen.append(progress.step)
+        if len(seen) == 3:
+            raise KeyboardInterrupt
+        show(self, progress)
+
+    monkeypatch.setattr(SceneBar, "splatting", interrupt)
+    words = ["splat", str(capture), "--cache", str(cache), "--output", str(tmp_path / "cloud.ply")]
+    words += [word.replace("--splat.", "--") for word in SMALL_SPLAT]
+    assert main(words) == 130
+    assert "the same command goes on" in capsys.readouterr().err
+    assert not (tmp_path / "cloud.ply").exists()
+    del seen[:]
+    seen += [0, 0, 0]
+    assert main(words) == 0
+    assert seen[3] > 30
+    assert (tmp_path / "cloud.ply").read_bytes() == (kept / "cloud.ply").read_bytes()
+    assert sorted(each.name for each in cache.iterdir() if "checkpoint" in each.name) == []
+
+
+def test_a_mesh_is_the_object_itself(tmp_path: Path, capsys: Streams) -> None:
+    folder = tmp_path / "slab"
+    folder.mkdir()
+    write_surface_file(folder)
+    output = tmp_path / "features.safetensors"
+    words = ["lift", str(folder), "--encoder", "descriptors", "--points", "700", "--views.rendered", "48"]
+    assert main([*words, "--output", str(output)]) == 0
+    capsys.readouterr()
+    features, report = load_features(output), read_report(output)
+    assert len(features.points) == 700
+    assert report["encoder"] == "descriptors"
+    assert not (folder / ".avmsf" / "cloud.ply").exists()
+    # Every point lies on one of the box's sides, to the rounding of float32.
+    corner = torch.tensor([PLATE.length, PLATE.width, 0.0])
+    low = corner.new_tensor([0.0, 0.0, -THICKNESS])
+    sides = torch.cat([(features.points - low).abs(), (features.points - corner).abs()], dim=1)
+    assert float(sides.amin(1).max()) < 1e-6
+
+
+def test_gaussians_made_elsewhere_are_looked_at_from_all_sides(kept: Path, tmp_path: Path, capsys: Streams) -> None:
+    folder = tmp_path / "slab"
+    folder.mkdir()
+    shutil.copy(kept / "cloud.ply", folder / "splats.ply")
+    assert main(["lift", str(folder), "--encoder", "descriptors", "--views.rendered", "48"]) == 0
+    out, _ = capsys.readouterr()
+    assert "features: descriptors" in out
+    features = load_features(folder / ".avmsf" / "features.safetensors")
+    assert torch.equal(features.points, read_splats(kept / "cloud.ply").centers)
+
+
+def test_features_serve_the_fit_of_another_command(kept: Path, capture: Path, tmp_path: Path, capsys: Streams) -> None:
+    output = tmp_path / "field.safetensors"
+    words = ["fit", str(capture), "--features", str(kept / "features.safetensors"), "--output", str(output), *TINY]
+    assert main(words) == 0
+    capsys.readouterr()
+    assert torch.equal(load(output).gain_field.points, load(kept / "field.safetensors").gain_field.points)
+
+
+def test_clouds_and_features_are_drawn(kept: Path, tmp_path: Path, capsys: Streams) -> None:
+    assert main(["view-cloud", str(kept / "cloud.ply"), "--output", str(tmp_path / "a")]) == 0
+    words = ["view-cloud", str(kept / "features.safetensors"), "--cloud", str(kept / "cloud.ply"), "--clusters", "8"]
+    assert main([*words, "--output", str(tmp_path / "b")]) == 0
+    out, _ = capsys.readouterr()
+    assert "features: descriptors" in out
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["cloud.png", "turntable.gif"]
+    assert sorted(path.name for path in (tmp_path / "b").iterdir()) == ["features.png", "turntable.gif"]
+
+
+def test_a_folder_without_any_look_is_refused_by_lift_and_fitted_in_a_box_by_reconstruct(
+    tmp_path: Path, capsys: Streams
+) -> None:
+    folder = fill_plate(tmp_path / "plate", surface=False)
+    assert main(["lift", str(folder), "--encoder", "descriptors"]) == 2
+    assert "expected photographs" in capsys.readouterr().err
+    assert main(["reconstruct", str(folder), *FIT, *MODES]) == 0
+    assert "shows nothing of the object" in capsys.readouterr().err
+
+
+def test_contacts_on_another_scale_than_the_gaussians_are_refused_with_the_scale(
+    capture: Path, kept: Path, tmp_path: Path, capsys: Streams
+) -> None:
+    folder = tmp_path / "slab"
+    shutil.copytree(capture, folder)
+    table = (folder / "impacts.csv").read_text().splitlines()
+    rows = [line.split(",") for line in table[1:]]
+    scaled = [",".join([row[0], *(f"{10 * float(value):.9g}" for value in row[1:4]), *row[4:]]) for row in rows]
+    (folder / "impacts.csv").write_text("\n".join([table[0], *scaled, ""]))
+    assert main(["reconstruct", str(folder), "--cache", str(kept), *SMALL]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "off the surface" in error
+    assert "divided by 10 they lie within" in error
