@@ -127,7 +127,8 @@ def memory_of_step(seconds: float) -> dict[str, float]:
     return figures
 
 
-def _peak_gigabytes() -> float:
+def peak_gigabytes() -> float:
+    """Return the most memory that this process has held, 10^9 bytes."""
     status = Path("/proc/self/status")
     if status.exists():
         # On Linux a new process's ru_maxrss begins at its parent's peak; the high-water mark is its own.
@@ -141,12 +142,12 @@ def _main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=3.0)
     seconds = parser.parse_args().seconds
-    imports = _peak_gigabytes()
+    imports = peak_gigabytes()
     run, targets = start(*full_setting(seconds), STEPS)
     pass_warmup(run, targets)
     for _ in range(3):
         run.advance(targets)
-    print(json.dumps({"total": _peak_gigabytes(), "imports": imports}))
+    print(json.dumps({"total": peak_gigabytes(), "imports": imports}))
 
 
 if __name__ == "__main__":

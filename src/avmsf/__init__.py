@@ -6,6 +6,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from avmsf.bench.evaluation import evaluate, split
     from avmsf.capture import Capture, CaptureSettings, Impacts, Surface, check, read_capture, write_capture
+    from avmsf.capture.cameras import Camera, View
+    from avmsf.capture.views import find_foreground, read_views
+    from avmsf.capture.views.write import write_views
     from avmsf.field.config import PAPER, FitConfig
     from avmsf.field.fit import fit
     from avmsf.field.soundfield import SoundField
@@ -14,37 +17,99 @@ if TYPE_CHECKING:
     from avmsf.modal.extract import HighResolution, ShortTime, extract
     from avmsf.modal.extraction import Extraction
     from avmsf.modal.residual import Residual
+    from avmsf.scene.descriptors import ImageDescriptors
+    from avmsf.scene.dino import DinoEncoder
     from avmsf.scene.features import FeatureField
+    from avmsf.scene.featurestore import load_features, save_features
+    from avmsf.scene.gaussians import GaussianCloud
+    from avmsf.scene.lift import lift
+    from avmsf.scene.ply import read_splats, write_splats
+    from avmsf.scene.reduction import reduce, with_positions
+    from avmsf.scene.refine import refine
+    from avmsf.scene.splat import splat
+    from avmsf.scene.splatconfig import SplatConfig
+    from avmsf.scene.symmetry import Symmetries
+    from avmsf.scene.symmetrysearch import find_symmetries
 
 __version__ = "0.1.0"
 
 __all__ = [
     "PAPER",
+    "Camera",
     "Capture",
     "CaptureSettings",
+    "DinoEncoder",
     "Extraction",
     "FeatureField",
     "FitConfig",
+    "GaussianCloud",
     "HighResolution",
+    "ImageDescriptors",
     "Impacts",
     "ModalBank",
     "Residual",
     "ShortTime",
     "SoundField",
+    "SplatConfig",
     "Surface",
+    "Symmetries",
+    "View",
     "check",
     "evaluate",
     "extract",
+    "find_foreground",
+    "find_symmetries",
     "fit",
+    "lift",
     "load",
+    "load_features",
     "read_capture",
+    "read_splats",
+    "read_views",
+    "reduce",
+    "refine",
     "save",
+    "save_features",
+    "splat",
     "split",
+    "with_positions",
     "write_capture",
+    "write_splats",
+    "write_views",
 ]
 
 # Names are fetched when they are first asked for: torch takes seconds to import, and `avmsf --help` needs none of it.
 _HOMES = {
+    "avmsf.capture.cameras": (
+        "Camera",
+        "View",
+    ),
+    "avmsf.capture.views": (
+        "find_foreground",
+        "read_views",
+    ),
+    "avmsf.capture.views.write": ("write_views",),
+    "avmsf.scene.descriptors": ("ImageDescriptors",),
+    "avmsf.scene.dino": ("DinoEncoder",),
+    "avmsf.scene.featurestore": (
+        "load_features",
+        "save_features",
+    ),
+    "avmsf.scene.gaussians": ("GaussianCloud",),
+    "avmsf.scene.lift": ("lift",),
+    "avmsf.scene.ply": (
+        "read_splats",
+        "write_splats",
+    ),
+    "avmsf.scene.reduction": (
+        "reduce",
+        "with_positions",
+    ),
+    "avmsf.scene.refine": ("refine",),
+    "avmsf.scene.splat": ("splat",),
+    "avmsf.scene.splatconfig": ("SplatConfig",),
+    "avmsf.scene.symmetry": ("Symmetries",),
+    "avmsf.scene.symmetrysearch": ("find_symmetries",),
     "avmsf.bench.evaluation": ("evaluate", "split"),
     "avmsf.capture": ("Capture", "CaptureSettings", "Impacts", "Surface", "check", "read_capture", "write_capture"),
     "avmsf.field.config": ("PAPER", "FitConfig"),

@@ -44,6 +44,9 @@ class LiftConfig:
     """Principal components of the features to keep; 0 keeps the features as they are."""
     symmetry: bool = True
     """Whether features are made alike where the object's symmetries make its shape alike."""
+    missing: float = 0.1
+    """Part of the object's surface that may have its counterpart in a hole of the points, for a symmetry to count: more
+    where large parts of the object were not seen, up to .45."""
     iterations: int = 3
     """How often features are pooled over the symmetries (paper: T)."""
     angles: int = 24
@@ -63,6 +66,8 @@ class LiftConfig:
         for name, least in {"longest": 1, "components": 0, "iterations": 1, "angles": 2, "points": 100}.items():
             if getattr(self, name) < least:
                 raise SceneError(f"{name} = {getattr(self, name)}: expected {least} or more")
+        if not 0 <= self.missing <= 0.45:
+            raise SceneError(f"missing = {self.missing}: expected 0 to 0.45")
         if not 0 < self.size < math.inf:
             raise SceneError(f"size = {self.size}: expected more than 0")
 
@@ -134,7 +139,8 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
     }
     symmetries = None
     if config.symmetry:
-        symmetries = find_symmetries(features.points, generator=torch.Generator().manual_seed(config.seed))
+        generator = torch.Generator().manual_seed(config.seed)
+        symmetries = find_symmetries(features.points, generator=generator, missing=config.missing)
         report["symmetries"] = symmetries.to_dict()
         if symmetries:
             pooled = refine(features, symmetries, iterations=config.iterations, angles=config.angles)

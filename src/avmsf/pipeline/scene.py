@@ -121,8 +121,6 @@ class SceneStages:
             views = read_views(self.views.path)
             lifted = self._lift_to_mesh(views, encoder) if on_mesh else self._lift_to_cloud(views, encoder)
             made = finish_features(lifted, self.config.lift)
-            if made.symmetries is not None:
-                self.listener.tell(made.symmetries.summary())
             save_features(made.features, path, report=made.report)
 
         return self.stages.keep(FEATURES, recipe, make)

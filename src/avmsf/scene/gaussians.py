@@ -1,5 +1,6 @@
 """An object as 3D Gaussians: soft ellipsoids with an opacity and a colour that depends on the direction of view."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -37,10 +38,31 @@ class GaussianCloud:
 
     def take(self, chosen: Int[Tensor, " chosen"] | Bool[Tensor, " points"]) -> "GaussianCloud":
         """Return the Gaussians of the given rows."""
+        return self._each(lambda values: values[chosen])
+
+    def to(self, device: torch.device | str) -> "GaussianCloud":
+        """Return the same Gaussians with their tensors on `device`."""
+        return self._each(lambda values: values.to(device))
+
+    def detach(self) -> "GaussianCloud":
+        """Return the same Gaussians, through which no derivative passes."""
+        return self._each(Tensor.detach)
+
+    def join(self, other: "GaussianCloud") -> "GaussianCloud":
+        """Return these Gaussians and then those of another cloud with harmonics of the same degree."""
         return GaussianCloud(
-            self.centers[chosen],
-            self.rotations[chosen],
-            self.log_scales[chosen],
-            self.logit_opacities[chosen],
-            self.harmonics[chosen],
+            torch.cat([self.centers, other.centers]),
+            torch.cat([self.rotations, other.rotations]),
+            torch.cat([self.log_scales, other.log_scales]),
+            torch.cat([self.logit_opacities, other.logit_opacities]),
+            torch.cat([self.harmonics, other.harmonics]),
+        )
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> "GaussianCloud":
+        return GaussianCloud(
+            change(self.centers),
+            change(self.rotations),
+            change(self.log_scales),
+            change(self.logit_opacities),
+            change(self.harmonics),
         )

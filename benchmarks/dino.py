@@ -1,0 +1,143 @@
+"""Gaussians from 64 real photographs of a ceramic dinosaur, judged on 10 that they never saw.
+
+`python -m benchmarks.dino` fits them in a process of its own, whose peak memory is theirs, and prints JSON.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from avmsf.capture.cameras import View
+from avmsf.capture.views import find_foreground, read_views
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.photographs import Photograph
+from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
+from avmsf.scene.splat import SplatProgress, splat
+from avmsf.scene.splatconfig import SplatConfig
+from avmsf.scene.ssim import psnr, ssim
+from benchmarks.material import REPOSITORY, shared_data
+from benchmarks.report import Options, Report, Table, tell
+from benchmarks.step import peak_gigabytes
+
+EVERY = 8
+"""Of the views in order of their names, every eighth is held out, the first of them too."""
+CONFIG = SplatConfig()
+QUICK = replace(CONFIG, steps=60, start_points=2000, gaussians=3000)
+_LOOKS = 10
+"""Points on the curve of PSNR over time."""
+
+
+def measure_dino(options: Options) -> Report:
+    """Fit the Gaussians and return how well they foretell photographs, and what that took."""
+    command = [sys.executable, "-m", "benchmarks.dino", *(["--quick-look"] if options.quick_look else [])]
+    shared_data()
+    done = subprocess.run(command, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode != 0:
+        raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}; its message is above")
+    found = json.loads(done.stdout.splitlines()[-1])
+    figures = {f"dino.{name}": value for name, value in found["figures"].items()}
+    return Report((_convention(options, found),), (_curve(found["curve"]), _result(figures)), figures)
+
+
+def hold_out(views: Sequence[View]) -> tuple[list[View], list[View]]:
+    """Return the views to fit, and every eighth by name, which is held out."""
+    ordered = sorted(views, key=lambda view: view.name)
+    return [view for row, view in enumerate(ordered) if row % EVERY], ordered[::EVERY]
+
+
+def judge(cloud: GaussianCloud, views: Sequence[View], *, rasteriser: Rasteriser) -> dict[str, float]:
+    """Return mean PSNR over the image and inside the mask, dB, and mean SSIM, against the photographs as they are."""
+    sums = {"psnr": 0.0, "psnr_mask": 0.0, "ssim": 0.0}
+    for view in views:
+        # Black: what lies behind the dinosaur in every photograph, and no parameter fitted to those held out.
+        image = rasteriser(cloud.detach(), view.camera, background=torch.zeros(3)).color
+        assert view.mask is not None
+        sums["psnr"] += psnr(image, view.color)
+        sums["psnr_mask"] += psnr(image, view.color, inside=view.mask > 127)
+        sums["ssim"] += float(ssim(image, view.color))
+    return {name: value / len(views) for name, value in sums.items()}
+
+
+def _fit(*, quick_look: bool) -> dict[str, Any]:
+    views = list(read_views(shared_data() / "dino"))
+    if quick_look:
+        views = [_small(view) for view in views]
+    config, rasteriser = QUICK if quick_look else CONFIG, choose_rasteriser("cpu")
+    began = time.perf_counter()
+    masked = find_foreground(views)
+    masking = time.perf_counter() - began
+    train, held = hold_out(masked)
+    began = time.perf_counter()
+    # A few steps on small images compile all that is compiled at first use, and loads it later.
+    splat([_small(view) for view in train], replace(QUICK, steps=10, densify_every=5), rasteriser=rasteriser)
+    compiling = time.perf_counter() - began
+    curve: list[dict[str, float]] = []
+    judging = 0.0
+
+    def look(progress: SplatProgress) -> None:
+        nonlocal judging
+        if progress.step % max(10, config.steps // _LOOKS // 10 * 10) == 0:
+            paused = time.perf_counter()
+            curve.append(
+                {
+                    "seconds": paused - began - judging,
+                    "step": progress.step,
+                    "gaussians": progress.gaussians,
+                    **judge(progress.cloud, held, rasteriser=rasteriser),
+                }
+            )
+            tell(f"dino: step {progress.step} of {config.steps}, {curve[-1]['psnr']:.2f} dB")
+            judging += time.perf_counter() - paused
+
+    began = time.perf_counter()
+    cloud = splat(train, config, rasteriser=rasteriser, progress=look)
+    seconds = time.perf_counter() - began - judging
+    figures = judge(cloud, held, rasteriser=rasteriser)
+    figures |= {"seconds": seconds, "gigabytes": peak_gigabytes(), "gaussians": float(len(cloud))}
+    return {"figures": figures, "curve": curve, "masking": masking, "compiling": compiling, "views": len(train)}
+
+
+def _small(view: View) -> View:
+    photograph = Photograph.of(view, halvings=2)
+    return View(view.name, photograph.images[-1], photograph.cameras[-1], photograph.masks[-1])
+
+
+def _convention(options: Options, found: dict[str, Any]) -> str:
+    config = QUICK if options.quick_look else CONFIG
+    return (
+        f"dino: {config.steps} steps on {found['views']} photographs of 640 x 480, every eighth view by name held out. "
+        "PSNR and SSIM are means over the held-out views of renderings before black against the photographs as they "
+        "are, background included; psnr_mask inside the found masks. seconds: from photographs and masks in memory to "
+        "the Gaussians that lie on the object, without the looks at held-out views; the masks took "
+        f"{found['masking']:.1f} s and compiling or loading the kernels {found['compiling']:.1f} s more."
+    )
+
+
+def _curve(curve: Sequence[dict[str, float]]) -> Table:
+    columns = ("seconds", "step", "gaussians", "psnr", "psnr_mask", "ssim")
+    rows: list[list[str | float]] = [
+        [f"{point['seconds']:.1f}", *(point[name] for name in columns[1:])] for point in curve
+    ]
+    return Table("dino: held-out views over time, before what lies off the object is removed", columns, rows)
+
+
+def _result(figures: dict[str, float]) -> Table:
+    names = tuple(name.removeprefix("dino.") for name in figures)
+    return Table("dino: the Gaussians on the object", ("", *names), [["dino", *figures.values()]])
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick-look", action="store_true")
+    print(json.dumps(_fit(quick_look=parser.parse_args().quick_look)))
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,392 @@
+"""How well the symmetries of known shapes and scanned objects are found: clean, noisy, and with a part missing."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from avmsf.capture.surface import read_surface
+from avmsf.scene.symmetry import Symmetries
+from avmsf.scene.symmetrysearch import find_symmetries
+from benchmarks.material import shared_data
+from benchmarks.report import Options, Report, Table, tell
+
+PARTS = ("made", "scanned")
+POINTS = 8000
+POSES = 2
+_FIRST_SEED = 100
+"""The settings were chosen on poses, cuts and noise of seeds 1 to 5."""
+_NEAR_DEGREES, _NEAR_GAP = 5.0, 0.05
+"""How far a found axis or plane may lie from a true one, degrees and diagonals, to count as it."""
+
+Points = Float[np.ndarray, "points 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Element:
+    """A true axis or plane in the shape's own frame."""
+
+    direction: Sequence[float]
+    point: Sequence[float] = (0.0, 0.0, 0.0)
+    order: int | None = None
+    mirror: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A shape with all its symmetries."""
+
+    mesh: Callable[[], trimesh.Trimesh]
+    elements: tuple[Element, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """What was found of one cloud."""
+
+    right: int
+    found: int
+    true: int
+    degrees: tuple[float, ...]
+    """Angles between true axes or normals and those found for them."""
+    fault: str = ""
+
+    @property
+    def exact(self) -> bool:
+        """Whether all was found, and nothing else."""
+        return self.right == self.found == self.true
+
+
+def _clean(points: Points, _: np.random.Generator) -> Points:
+    return points
+
+
+def _noisy(points: Points, random: np.random.Generator) -> Points:
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    return points + 0.01 * diagonal * random.normal(size=points.shape)
+
+
+def _cut(points: Points, random: np.random.Generator) -> Points:
+    along = points @ _direction(random)
+    return points[along < np.quantile(along, 0.7)]
+
+
+def _holed(points: Points, random: np.random.Generator) -> Points:
+    distance = np.linalg.norm(points - points[random.integers(len(points))], axis=1)
+    return points[distance > np.quantile(distance, 0.3)]
+
+
+def _thinned(points: Points, random: np.random.Generator) -> Points:
+    """Drop 30 % of the points, at one end of the object next to none and at the other most."""
+    along = points @ _direction(random)
+    kept = 1.0 - 0.6 * (along - along.min()) / np.ptp(along)
+    return points[random.random(len(points)) < kept]
+
+
+CONDITIONS = {
+    "clean": _clean,
+    "1 % noise": _noisy,
+    "thinned": _thinned,
+    "cut off": _cut,
+    "hole": _holed,
+}
+
+
+def _prism(sides: int) -> Shape:
+    """A prism of height 1.5 about z whose corners lie on the unit circle, the first of them on x."""
+    turn = math.pi / sides
+    across = [(math.cos(step * turn), math.sin(step * turn), 0.0) for step in range(sides)]
+    # Half turns about axes through corners and the middles of sides; planes contain z and such an axis.
+    elements = [Element((0, 0, 1), order=sides), Element((0, 0, 1), mirror=True)]
+    elements += [Element(axis, order=2) for axis in across]
+    elements += [Element((-axis[1], axis[0], 0.0), mirror=True) for axis in across]
+    return Shape(lambda: trimesh.creation.cylinder(1.0, 1.5, sections=sides), tuple(elements))
+
+
+def _ellipsoid() -> trimesh.Trimesh:
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    return trimesh.Trimesh(ball.vertices * np.array([1.0, 0.75, 0.5]), ball.faces)
+
+
+def _blob() -> trimesh.Trimesh:
+    """A ball with six bumps of different places, heights and widths."""
+    ball, random = trimesh.creation.icosphere(subdivisions=5), np.random.default_rng(7)
+    radius = np.ones(len(ball.vertices))
+    for _ in range(6):
+        cosine = ball.vertices @ _direction(random)
+        radius += random.uniform(0.15, 0.5) * np.exp((cosine - 1.0) / random.uniform(0.05, 0.3))
+    return trimesh.Trimesh(ball.vertices * radius[:, None] * np.array([1.0, 0.9, 0.8]), ball.faces)
+
+
+def _tetrahedron() -> trimesh.Trimesh:
+    return trimesh.convex.convex_hull(np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=float))
+
+
+def _propeller() -> trimesh.Trimesh:
+    """Three blades, set at an angle, on a shaft that is longer on one side: a three-fold axis and no plane."""
+    blades = []
+    for step in range(3):
+        blade = trimesh.creation.box((1.0, 0.4, 0.06))
+        tilted = Rotation.from_rotvec((0.7, 0.0, 0.0)).apply(blade.vertices) + np.array([0.7, 0.0, 0.0])
+        turned = Rotation.from_rotvec((0.0, 0.0, step * 2 * math.pi / 3)).apply(tilted)
+        blades.append(trimesh.Trimesh(turned, blade.faces))
+    shaft = trimesh.creation.cylinder(0.2, 1.0, sections=96)
+    shaft.apply_translation((0.0, 0.0, 0.25))
+    return _joined([*blades, shaft])
+
+
+def _can() -> trimesh.Trimesh:
+    """A can of one wall, 1 wide and 1.2 high, that is open on top."""
+    can = trimesh.creation.cylinder(0.5, 1.2, sections=256)
+    below = can.triangles_center[:, 2] < 0.59
+    return trimesh.Trimesh(can.vertices, can.faces[below])
+
+
+def _handled_can() -> trimesh.Trimesh:
+    ring = trimesh.creation.torus(0.3, 0.06)
+    upright = trimesh.Trimesh(ring.vertices[:, [0, 2, 1]] + np.array([0.55, 0.0, 0.0]), ring.faces)
+    outside = np.hypot(*upright.triangles_center[:, :2].T) > 0.5
+    return _joined([_can(), trimesh.Trimesh(upright.vertices, upright.faces[outside])])
+
+
+def _bracket() -> trimesh.Trimesh:
+    """Two plates at a right angle, of different lengths, with a rib off the middle: nothing is symmetric."""
+    floor, wall, rib = (trimesh.creation.box(size) for size in ((1.0, 0.6, 0.1), (0.1, 0.6, 0.7), (0.4, 0.08, 0.3)))
+    wall.apply_translation((-0.45, 0.0, 0.4))
+    rib.apply_translation((-0.2, 0.15, 0.2))
+    return _joined([floor, wall, rib])
+
+
+def _joined(parts: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    starts = np.cumsum([0] + [len(part.vertices) for part in parts])
+    faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
+    return trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces), process=False)
+
+
+_COORDINATES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+_DIAGONALS = ((1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1))
+_EDGES = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1), (0, 1, 1), (0, 1, -1))
+_THREE_OF_EACH = tuple(
+    element for axis in _COORDINATES for element in (Element(axis, order=2), Element(axis, mirror=True))
+)
+MADE = {
+    "box": Shape(lambda: trimesh.creation.box((1.0, 0.7, 0.4)), _THREE_OF_EACH),
+    "cube": Shape(
+        lambda: trimesh.creation.box((1.0, 1.0, 1.0)),
+        (
+            *(Element(axis, order=4) for axis in _COORDINATES),
+            *(Element(axis, order=3) for axis in _DIAGONALS),
+            *(Element(axis, order=2) for axis in _EDGES),
+            *(Element(axis, mirror=True) for axis in _COORDINATES + _EDGES),
+        ),
+    ),
+    **{f"prism of {sides}": _prism(sides) for sides in (3, 4, 5, 6, 8, 12)},
+    "tetrahedron": Shape(
+        _tetrahedron,
+        (
+            *(Element(axis, order=3) for axis in _DIAGONALS),
+            *(Element(axis, order=2) for axis in _COORDINATES),
+            *(Element(axis, mirror=True) for axis in _EDGES),
+        ),
+    ),
+    "ellipsoid": Shape(_ellipsoid, _THREE_OF_EACH),
+    "cone": Shape(lambda: trimesh.creation.cone(1.0, 2.0, sections=256), (Element((0, 0, 1)),)),
+    "cylinder": Shape(
+        lambda: trimesh.creation.cylinder(1.0, 2.0, sections=256),
+        (Element((0, 0, 1)), Element((0, 0, 1), mirror=True)),
+    ),
+    "can without lid": Shape(_can, (Element((0, 0, 1)),)),
+    "can with handle": Shape(_handled_can, (Element((0, 1, 0), mirror=True),)),
+    "propeller": Shape(_propeller, (Element((0, 0, 1), order=3),)),
+    "bracket": Shape(_bracket),
+    "blob": Shape(_blob),
+}
+
+
+def _plane(normal: tuple[float, float, float], offset: float) -> Element:
+    return Element(normal, (offset * normal[0], offset * normal[1], offset * normal[2]), mirror=True)
+
+
+# What the scans' shapes have. The planes lie where 60,000 points of a scan lie nearest to their mirror images, by a
+# simplex search on exact nearest distances; 95 % of the images then lie within .4 (bowl, plate holder), .5 to .6 (cup,
+# hammer, spoon) and 1.1 % (mug, whose inside is scanned badly) of the diagonal. Every other plane leaves 7 % and more.
+SCANNED = {
+    "bowl": (Element((0.0, 0.008, 1.0)),),
+    "blue_cup": (_plane((0.01127, 0.99994, 0.00093), -1.2e-5),),
+    "mug": (_plane((-0.01529, 0.99988, -0.00224), 5.79e-4),),
+    "mini_claw_hammer_1": (_plane((-0.01238, 0.01668, 0.99978), -9.1e-5),),
+    "spoon": (_plane((-0.00713, 0.99958, 0.02799), -0.001611),),
+    "plate_holder": (
+        _plane((1.0, 0.0, 0.0), -0.0225),
+        _plane((0.0, 0.0, 1.0), 0.01),
+        Element((0.0, 1.0, 0.0), (-0.0225, 0.0, 0.01), order=2),
+    ),
+}
+
+
+def measure_symmetry(options: Options) -> Report:
+    """Return precision, recall and angles over all shapes, conditions and poses."""
+    shapes: dict[str, Shape] = {}
+    if "made" in options.parts:
+        shapes |= MADE
+    if "scanned" in options.parts:
+        shapes |= {name: Shape(_scan(name), elements) for name, elements in SCANNED.items()}
+    poses = 1 if options.quick_look else POSES
+    if options.quick_look:
+        shapes = dict(list(shapes.items())[:: max(1, len(shapes) // 3)])
+    scores: dict[tuple[str, str], list[Score]] = {}
+    for number, (name, shape) in enumerate(shapes.items()):
+        tell(f"symmetry: {name}")
+        mesh = shape.mesh()
+        for kind, (condition, change) in enumerate(CONDITIONS.items()):
+            scores[name, condition] = [
+                score_cloud(mesh, shape.elements, change, seed=_FIRST_SEED + 1000 * number + 100 * kind + pose)
+                for pose in range(poses)
+            ]
+    return _report(scores, shapes)
+
+
+measure = measure_symmetry
+
+
+def score_cloud(
+    mesh: trimesh.Trimesh,
+    elements: Sequence[Element],
+    change: Callable[[Points, np.random.Generator], Points],
+    *,
+    seed: int,
+) -> Score:
+    """Draw a cloud, change it, pose and scale it by chance, and compare what is found with the truth."""
+    random = np.random.default_rng(seed)
+    points = change(np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=seed)[0]), random)
+    turn = Rotation.random(random_state=seed)
+    size, shift = random.uniform(0.1, 3.0), random.normal(size=3)
+    posed = torch.from_numpy(size * turn.apply(points) + shift)
+    found = find_symmetries(posed, generator=torch.Generator().manual_seed(seed))
+    true = [
+        Element(
+            tuple(turn.apply(each.direction)), tuple(size * turn.apply(each.point) + shift), each.order, each.mirror
+        )
+        for each in elements
+    ]
+    diagonal = float(np.linalg.norm(mesh.extents)) * size
+    return _compare(found, true, middle=size * turn.apply(mesh.bounds.mean(axis=0)) + shift, diagonal=diagonal)
+
+
+def _compare(found: Symmetries, true: list[Element], *, middle: Float[np.ndarray, " 3"], diagonal: float) -> Score:
+    claims = [Element(tuple(r.axis.tolist()), tuple(r.point.tolist()), r.order) for r in found.rotations]
+    claims += [Element(tuple(m.normal.tolist()), tuple(m.point.tolist()), mirror=True) for m in found.mirrors]
+    open_, degrees, wrong = list(true), [], []
+    for claim in claims:
+        fitting = []
+        for each in open_:
+            angle, gap = _apart(claim, each, middle)
+            alike = (each.mirror, each.order) == (claim.mirror, claim.order)
+            if alike and angle < _NEAR_DEGREES and gap < _NEAR_GAP * diagonal:
+                fitting.append((angle, each))
+        if fitting:
+            angle, each = min(fitting, key=lambda pair: pair[0])
+            open_.remove(each)
+            degrees.append(angle)
+        else:
+            wrong.append(_name(claim))
+    fault = "; ".join(
+        f"{what} {_counted(names)}" for what, names in (("missed", [*map(_name, open_)]), ("wrong", wrong)) if names
+    )
+    return Score(len(degrees), len(claims), len(true), tuple(degrees), fault)
+
+
+def _apart(one: Element, other: Element, middle: Float[np.ndarray, " 3"]) -> tuple[float, float]:
+    """Return the angle between two axes or planes, degrees, and how far apart they pass the middle."""
+    feet = []
+    for each in (one, other):
+        direction = np.asarray(each.direction) / np.linalg.norm(each.direction)
+        offset = middle - np.asarray(each.point)
+        along = (offset @ direction) * direction
+        feet.append((direction, along if each.mirror else offset - along))
+    cosine = min(1.0, abs(float(feet[0][0] @ feet[1][0])))
+    return math.degrees(math.acos(cosine)), float(np.linalg.norm(feet[0][1] - feet[1][1]))
+
+
+def _name(element: Element) -> str:
+    if element.mirror:
+        return "plane"
+    return "any turn" if element.order is None else f"{element.order}-fold"
+
+
+def _counted(names: list[str]) -> str:
+    return ", ".join(f"{names.count(name)} {name}" for name in dict.fromkeys(names))
+
+
+def _direction(random: np.random.Generator) -> Float[np.ndarray, " 3"]:
+    direction = random.normal(size=3)
+    return direction / np.linalg.norm(direction)
+
+
+def _scan(name: str) -> Callable[[], trimesh.Trimesh]:
+    def read() -> trimesh.Trimesh:
+        surface = read_surface(shared_data() / "meshes" / name / "textured.obj")
+        vertices: Tensor = surface.vertices.double()
+        return trimesh.Trimesh(vertices.numpy(), surface.faces.numpy(), process=False)
+
+    return read
+
+
+def _report(scores: dict[tuple[str, str], list[Score]], shapes: dict[str, Shape]) -> Report:
+    everything = [score for each in scores.values() for score in each]
+    rows: list[list[str | float]] = [
+        [name, len(shapes[name].elements), *(_cell(scores[name, condition]) for condition in CONDITIONS)]
+        for name in shapes
+    ]
+    totals: list[list[str | float]] = [
+        [condition, *_totals([score for (_, each), made in scores.items() for score in made if each == condition])]
+        for condition in CONDITIONS
+    ]
+    totals.append(["all", *_totals(everything)])
+    faults: list[list[str | float]] = []
+    for (name, condition), made in scores.items():
+        for pose, score in enumerate(made):
+            if not score.exact:
+                faults.append([score.fault, f"{name}, {condition}, pose {pose}"])
+    precision, recall, mean, worst = _totals(everything)[:4]
+    figures = {
+        "symmetry.precision": precision,
+        "symmetry.recall": recall,
+        "symmetry.axis_degrees": mean,
+        "symmetry.axis_degrees_worst": worst,
+    }
+    return Report(
+        (
+            f"symmetry: {POINTS} points drawn from each surface, turned, scaled and shifted by chance, anew for every "
+            "cell. An axis counts as found if the order is right, to within 5 degrees and 5 % of the diagonal. A "
+            "continuous axis stands for the planes that contain it and for the half turns across it.",
+            "noise: 1 % of the diagonal, normal, on every coordinate. thinned: 30 % dropped, next to none at one end "
+            "and most at the other. cut off: the 30 % farthest along a direction. hole: the 30 % nearest to a point. "
+            "Where a cut takes the mug's handle, what is left turns about its axis, and counts as wrong all the same.",
+        ),
+        (
+            Table("symmetries: right/found of the true ones, over all poses", ("shape", "true", *CONDITIONS), rows),
+            Table("in all", ("", "precision", "recall", "mean degrees", "worst degrees"), totals),
+            Table("what went wrong", ("fault", "cloud"), faults),
+        ),
+        figures,
+    )
+
+
+def _cell(scores: list[Score]) -> str:
+    return f"{sum(score.right for score in scores)}/{sum(score.found for score in scores)}"
+
+
+def _totals(scores: list[Score]) -> tuple[float, float, float, float]:
+    right, found, true = (sum(getattr(score, name) for score in scores) for name in ("right", "found", "true"))
+    degrees = [angle for score in scores for angle in score.degrees]
+    # Where nothing was claimed, nothing was wrong.
+    precision = right / found if found else 1.0
+    mean = sum(degrees) / len(degrees) if degrees else math.nan
+    return precision, right / true if true else 1.0, mean, max(degrees, default=math.nan)

@@ -1,0 +1,210 @@
+"""Pictures of a cloud from all sides: its colours, features, clusters and symmetries, as a sheet or a turntable."""
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import hsv_to_rgb
+from matplotlib.figure import Figure
+from PIL import Image
+from torch import Tensor
+
+from avmsf.errors import EvaluationError
+from avmsf.files import write_whole
+from avmsf.scene.features import FeatureField
+from avmsf.scene.points import cluster
+from avmsf.scene.symmetry import Symmetries
+
+UP = (0.0, 0.0, 1.0)
+_GREY = 0.62
+_AXIS, _PLANE = "#c8502d", "#1f3b5c"
+_ELEVATION = 25.0
+
+
+def draw_cloud(
+    points: Float[Tensor, "points 3"],
+    colours: Mapping[str, Float[Tensor, "points 3"]],
+    *,
+    title: str,
+    symmetries: Symmetries | None = None,
+    azimuths: Sequence[float] = (30.0, 120.0, 210.0, 300.0),
+    up: Sequence[float] = UP,
+) -> Figure:
+    """Draw a cloud from each azimuth (degrees) in a column, once for every named set of colours (0 to 1) in a row.
+
+    Symmetries get a row of their own: axes as lines with their order, mirror planes as outlines. The camera is far
+    away, 25 degrees above the horizon; `up` is the direction that points to the sky. Raises EvaluationError where there
+    is nothing to draw.
+    """
+    rows = dict(colours)
+    if symmetries is not None:
+        rows["symmetries"] = torch.full((len(points), 3), _GREY)
+    if not rows or not azimuths or not len(points):
+        raise EvaluationError(
+            f"expected points, colours or symmetries, and azimuths to draw, found {len(points)} points, {len(rows)} "
+            f"sets of colours and {len(azimuths)} azimuths"
+        )
+    figure = Figure(figsize=(3.0 * len(azimuths), 3.0 * len(rows) + 0.5), layout="constrained")
+    grid = figure.subplots(len(rows), len(azimuths), squeeze=False)
+    for (name, shown), line in zip(rows.items(), grid, strict=True):
+        for azimuth, axes in zip(azimuths, line, strict=True):
+            view = _view(azimuth, up)
+            _scatter(axes, points, shown, view, size=3.0)
+            if symmetries is not None and name == "symmetries":
+                _draw_symmetries(axes, points, symmetries, view)
+            axes.set_title(f"{name}, {azimuth:g}°", fontsize=9)
+    figure.suptitle(title)
+    return figure
+
+
+def draw_features(
+    features: FeatureField,
+    *,
+    title: str,
+    colours: Float[Tensor, "points 3"] | None = None,
+    clusters: int | None = None,
+    symmetries: Symmetries | None = None,
+    azimuths: Sequence[float] = (30.0, 120.0, 210.0, 300.0),
+    up: Sequence[float] = UP,
+) -> Figure:
+    """Draw what is known of an object's points, as `draw_cloud` does.
+
+    Rows: the points in their own colours if given, their features' first three principal components as red, green and
+    blue, `clusters` k-means groups if asked for, and the symmetries if given.
+    """
+    rows = {} if colours is None else {"colour": colours}
+    rows["features"] = component_colours(features.features)
+    if clusters is not None:
+        rows[f"{clusters} clusters"] = label_colours(cluster(features.points, clusters).labels)
+    return draw_cloud(features.points, rows, title=title, symmetries=symmetries, azimuths=azimuths, up=up)
+
+
+def component_colours(features: Float[Tensor, "points dim"]) -> Float[Tensor, "points 3"]:
+    """Return the first three principal components as red, green and blue, from the 2nd to the 98th percentile.
+
+    Each component's largest weight is positive. What features do not fill, of fewer than three, stays grey.
+    """
+    centred = (features - features.mean(0)).double()
+    _, sizes, directions = torch.linalg.svd(centred, full_matrices=False)
+    colours = torch.full((len(features), 3), 0.5)
+    for column, (size, direction) in enumerate(zip(sizes[:3].tolist(), directions, strict=False)):
+        if size < 1e-6 * max(1.0, float(sizes[0])) or size == 0.0:
+            break
+        value = centred @ (direction * torch.sign(direction[direction.abs().argmax()]))
+        low, high = np.quantile(value.numpy(), [0.02, 0.98])
+        colours[:, column] = ((value - low) / max(high - low, 1e-12)).clamp(0.0, 1.0).float()
+    return colours
+
+
+def label_colours(labels: Int[Tensor, " points"]) -> Float[Tensor, "points 3"]:
+    """Return a colour for each label; labels that follow one another get hues far apart."""
+    number = labels.numpy()
+    hue = (number * 0.618034) % 1.0
+    saturation = 0.55 + 0.4 * ((number * 0.37) % 1.0)
+    value = 0.6 + 0.4 * ((number * 0.73) % 1.0)
+    return torch.from_numpy(hsv_to_rgb(np.stack([hue, saturation, value], axis=1))).float()
+
+
+def save_turntable(
+    points: Float[Tensor, "points 3"],
+    colours: Float[Tensor, "points 3"],
+    path: Path,
+    *,
+    symmetries: Symmetries | None = None,
+    frames: int = 36,
+    up: Sequence[float] = UP,
+) -> None:
+    """Write an animated GIF of the cloud turning once in three seconds. Raises EvaluationError for another ending."""
+    if path.suffix.lower() != ".gif" or frames < 2:
+        raise EvaluationError(f"{path}: expected a turntable of 2 or more frames named .gif, found {frames} frames")
+    pictures = []
+    for frame in range(frames):
+        figure = Figure(figsize=(4.0, 4.0), dpi=100)
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        view = _view(360.0 * frame / frames, up)
+        _scatter(axes, points, colours, view, size=4.0)
+        if symmetries is not None:
+            _draw_symmetries(axes, points, symmetries, view)
+        still = io.BytesIO()
+        FigureCanvasAgg(figure).print_figure(still, format="png", dpi=100)
+        pictures.append(Image.open(still).convert("RGB"))
+    memory = io.BytesIO()
+    first, *others = pictures
+    first.save(memory, format="GIF", save_all=True, append_images=others, duration=round(3000 / frames), loop=0)
+    write_whole(path, lambda place: place.write_bytes(memory.getvalue()))
+
+
+def _view(azimuth: float, up: Sequence[float]) -> Float[np.ndarray, "3 3"]:
+    """Return rows right, up and towards the eye, for a camera at an azimuth in degrees about the `up` direction."""
+    sky = np.asarray(up, dtype=float)
+    if sky.shape != (3,) or not np.isfinite(sky).all() or np.linalg.norm(sky) == 0.0:
+        raise EvaluationError(f"expected a direction of three numbers that points up, found {list(up)}")
+    sky = sky / np.linalg.norm(sky)
+    # Azimuth 0 looks from the next coordinate axis: from x where z is up, from z where y is.
+    first = np.roll(np.eye(3)[np.argmax(np.abs(sky))], 1)
+    first = first - (first @ sky) * sky
+    first /= np.linalg.norm(first)
+    angle, height = math.radians(azimuth), math.radians(_ELEVATION)
+    level = math.cos(angle) * first + math.sin(angle) * np.cross(sky, first)
+    eye = math.cos(height) * level + math.sin(height) * sky
+    right = np.cross(sky, level)
+    return np.stack([right, np.cross(eye, right), eye])
+
+
+def _middle(points: Float[Tensor, "points 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
+    places = points.double().numpy()
+    middle = (places.min(0) + places.max(0)) / 2
+    return middle, float(np.linalg.norm(places - middle, axis=1).max())
+
+
+def _scatter(
+    axes: Axes,
+    points: Float[Tensor, "points 3"],
+    colours: Float[Tensor, "points 3"],
+    view: Float[np.ndarray, "3 3"],
+    *,
+    size: float,
+) -> None:
+    middle, radius = _middle(points)
+    seen = (points.double().numpy() - middle) @ view.T
+    order = np.argsort(seen[:, 2])
+    # What is farther is darker: flat dots alone show no depth.
+    shade = 0.72 + 0.28 * (seen[:, 2:] / max(radius, 1e-30) + 1) / 2
+    shown = np.clip(colours.numpy() * shade, 0.0, 1.0)
+    dots = size * max(0.4, math.sqrt(6000 / len(seen)))
+    axes.scatter(seen[order, 0], seen[order, 1], c=shown[order], s=dots, linewidths=0, rasterized=True)
+    reach = 1.12 * radius if radius > 0.0 else 1.0
+    axes.set_xlim(-reach, reach)
+    axes.set_ylim(-reach, reach)
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+
+
+def _draw_symmetries(
+    axes: Axes, points: Float[Tensor, "points 3"], symmetries: Symmetries, view: Float[np.ndarray, "3 3"]
+) -> None:
+    middle, radius = _middle(points)
+    for mirror in symmetries.mirrors:
+        normal, point = mirror.normal.double().numpy(), mirror.point.double().numpy()
+        center = middle - ((middle - point) @ normal) * normal
+        first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+        first /= np.linalg.norm(first)
+        second = np.cross(normal, first)
+        signs = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
+        corners = np.array([center + 0.72 * radius * (a * first + b * second) for a, b in signs])
+        seen = (corners - middle) @ view.T
+        axes.plot(seen[:, 0], seen[:, 1], color=_PLANE, linewidth=1.0, alpha=0.8)
+    for rotation in symmetries.rotations:
+        axis, point = rotation.axis.double().numpy(), rotation.point.double().numpy()
+        center = point + ((middle - point) @ axis) * axis
+        ends = np.array([center - 1.05 * radius * axis, center + 1.05 * radius * axis])
+        seen = (ends - middle) @ view.T
+        axes.plot(seen[:, 0], seen[:, 1], color=_AXIS, linewidth=1.6)
+        name = "∞" if rotation.order is None else f"{rotation.order}"
+        axes.annotate(name, (seen[1, 0], seen[1, 1]), color=_AXIS, fontsize=9, annotation_clip=False)

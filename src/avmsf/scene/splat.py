@@ -1,0 +1,142 @@
+"""From views to Gaussians: 3D Gaussian Splatting (Kerbl et al. 2023), in steps that a processor can afford."""
+
+import importlib.util
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from avmsf.capture.cameras import View
+from avmsf.errors import SceneError
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.hull import visual_hull
+from avmsf.scene.keep import keep_object
+from avmsf.scene.photographs import choose_backdrop, prepare_photographs
+from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
+from avmsf.scene.splatcheckpoint import fingerprint, read_checkpoint, write_checkpoint
+from avmsf.scene.splatconfig import SplatConfig
+from avmsf.scene.splatrun import SplatRun
+from avmsf.scene.ssim import psnr
+from avmsf.scene.start import StartPoints, photographed_colors, starting_cloud
+
+_TELL_EVERY = 10
+"""Steps between words of progress."""
+_CHECKPOINT_SECONDS = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class SplatProgress:
+    """Where a splatting stands."""
+
+    step: int
+    """Steps done."""
+    steps: int
+    """Steps in all."""
+    loss: float
+    """Loss of the last step."""
+    psnr: float
+    """Of the last step's image against its photograph, dB: one view, at the size that it is fitted at just then."""
+    seconds: float
+    """Since the start, or since it was resumed."""
+    cloud: GaussianCloud
+    """The Gaussians as they are; they change with the next step, so copy what is to be kept."""
+
+    @property
+    def gaussians(self) -> int:
+        """How many there are."""
+        return len(self.cloud)
+
+
+def splat(
+    views: Sequence[View],
+    config: SplatConfig | None = None,
+    *,
+    start: StartPoints | None = None,
+    device: torch.device | str | None = None,
+    rasteriser: Rasteriser | None = None,
+    progress: Callable[[SplatProgress], None] | None = None,
+    checkpoint: str | Path | None = None,
+) -> GaussianCloud:
+    """Fit Gaussians to views and return those that lie on the object.
+
+    They start at the points of `start`, or on the visual hull of the views' masks. Without a `device` or `rasteriser`
+    they are fitted on a CUDA device where there is one and gsplat beside it, else on the CPU; they come back on the
+    CPU. There the same views, config and start give the same Gaussians on the same machine.
+
+    With `checkpoint`, the state is kept there while it runs, on interruption and at the end, and a splatting of the
+    same arguments goes on from it to the same result; delete the file once the Gaussians are written. Raises
+    `SceneError` for views or settings that nothing can be made of, and for a checkpoint that is not of these.
+    """
+    config = SplatConfig() if config is None else config
+    device = _device(device, rasteriser)
+    rasteriser = choose_rasteriser(device) if rasteriser is None else rasteriser
+    began = time.monotonic()
+    backdrop = choose_backdrop(views, config)
+    photographs = prepare_photographs(views, backdrop, halvings=config.halvings)
+    cloud = starting_cloud(
+        _hull_points(views, config) if start is None else start,
+        degree=config.degree,
+        scale=config.start_scale,
+        opacity=config.start_opacity,
+        flatness=config.start_flatness,
+    )
+    run = SplatRun(cloud.to(device), photographs, backdrop, config, rasteriser=rasteriser)
+    keeper = _Keeper(None if checkpoint is None else Path(checkpoint), fingerprint(views, cloud, config))
+    keeper.resume(run)
+    try:
+        while run.step < config.steps:
+            loss, rendering, target = run.advance()
+            if progress is not None and (run.step % _TELL_EVERY == 0 or run.step == config.steps):
+                likeness = psnr(rendering.color, target.image)
+                elapsed = time.monotonic() - began
+                progress(SplatProgress(run.step, config.steps, loss, likeness, elapsed, run.cloud))
+            keeper.look(run)
+    except KeyboardInterrupt:
+        # Amid a step's changes there is nothing to keep but what was saved before.
+        if run.whole:
+            keeper.save(run)
+        raise
+    keeper.save(run)
+    return keep_object(run.cloud, views, rasteriser=rasteriser).to("cpu")
+
+
+class _Keeper:
+    """Saves a run's state now and then."""
+
+    def __init__(self, path: Path | None, fingerprint: str) -> None:
+        self.path, self.fingerprint, self.saved_at = path, fingerprint, time.monotonic()
+
+    def resume(self, run: SplatRun) -> None:
+        state = None if self.path is None else read_checkpoint(self.path, fingerprint=self.fingerprint)
+        if state is not None:
+            run.resume(state["run"])
+
+    def look(self, run: SplatRun) -> None:
+        if time.monotonic() - self.saved_at > _CHECKPOINT_SECONDS:
+            self.save(run)
+
+    def save(self, run: SplatRun) -> None:
+        if self.path is None:
+            return
+        try:
+            write_checkpoint(self.path, {"fingerprint": self.fingerprint, "run": run.state()})
+        except SceneError as error:
+            # A full disk costs the checkpoint, not the run.
+            warnings.warn(f"splatting goes on without a new checkpoint: {error}", stacklevel=3)
+        self.saved_at = time.monotonic()
+
+
+def _hull_points(views: Sequence[View], config: SplatConfig) -> StartPoints:
+    hull = visual_hull(views, points=config.start_points, dissent=config.dissent)
+    colors = photographed_colors(hull.points, views, spacing=hull.spacing)
+    return StartPoints(hull.points, colors, hull.normals)
+
+
+def _device(device: torch.device | str | None, rasteriser: Rasteriser | None) -> torch.device:
+    if device is not None:
+        return torch.device(device)
+    usable = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+    return torch.device("cuda" if usable and rasteriser is None else "cpu")

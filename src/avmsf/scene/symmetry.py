@@ -1,0 +1,213 @@
+"""Symmetries of an object: rotations about an axis and mirror planes, each with how well it was found to hold."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.errors import SceneError
+
+
+@dataclass(frozen=True, eq=False)
+class RotationalSymmetry:
+    """Turning about an axis leaves the object as it is: by 1/order of a turn, or by any angle."""
+
+    axis: Float[Tensor, " 3"]
+    """Unit vector along the axis, of either sign."""
+    point: Float[Tensor, " 3"]
+    """Where the axis passes the object's middle, metres."""
+    order: int | None
+    """How many turns make a whole one, 2 or more; None where every angle is a symmetry. Then every plane that contains
+    the axis mirrors the object too, and is not listed."""
+    error: float
+    """How far turned points lie from the surface, root mean square, in point spacings; see `find_symmetries`."""
+    missing: float
+    """Part of the surface, 0 to 1, whose counterpart lies in a hole of the cloud, so that nothing speaks for or against
+    it."""
+
+    @property
+    def continuous(self) -> bool:
+        """Whether every angle is a symmetry."""
+        return self.order is None
+
+    def turn(self, points: Float[Tensor, "points 3"], angle: float) -> Float[Tensor, "points 3"]:
+        """Return the points turned about the axis by `angle`, radians."""
+        axis, offset = self.axis.double(), points.double() - self.point.double()
+        along = (offset @ axis)[:, None] * axis
+        across = offset - along
+        turned = math.cos(angle) * across + math.sin(angle) * torch.linalg.cross(axis.expand_as(across), across)
+        return (self.point.double() + along + turned).to(points)
+
+    def angles(self, count: int) -> list[float]:
+        """Return the angles of an orbit, radians, 0 first: those of the order, or `count` even ones if continuous."""
+        steps = count if self.order is None else self.order
+        return [2 * math.pi * step / steps for step in range(steps)]
+
+    def __str__(self) -> str:
+        what = "any turn" if self.order is None else f"{self.order}-fold turn"
+        return f"{what} about the axis ({_numbers(self.axis)}) through ({_numbers(self.point)}) m"
+
+
+@dataclass(frozen=True, eq=False)
+class MirrorSymmetry:
+    """Reflection in a plane leaves the object as it is."""
+
+    normal: Float[Tensor, " 3"]
+    """Unit normal of the plane, of either sign."""
+    point: Float[Tensor, " 3"]
+    """The point of the plane nearest to the object's middle, metres."""
+    error: float
+    """As for a rotation."""
+    missing: float
+    """As for a rotation."""
+
+    def reflect(self, points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
+        """Return the points' mirror images."""
+        normal, places = self.normal.double(), points.double()
+        return (places - 2 * ((places - self.point.double()) @ normal)[:, None] * normal).to(points)
+
+    def __str__(self) -> str:
+        return f"mirror plane with normal ({_numbers(self.normal)}) through ({_numbers(self.point)}) m"
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetries:
+    """The symmetries found on one cloud, best first, and what they were judged by."""
+
+    rotations: tuple[RotationalSymmetry, ...]
+    mirrors: tuple[MirrorSymmetry, ...]
+    spacing: float
+    """Distance between neighbouring points of the cloud that was judged, metres: the unit of the errors."""
+    tolerance: float
+    """Errors up to this were accepted, in point spacings."""
+    rejected: float
+    """The least error of what was not accepted, in point spacings; infinite where nothing else came near."""
+
+    def __bool__(self) -> bool:
+        return bool(self.rotations or self.mirrors)
+
+    def summary(self) -> str:
+        """Say in plain words what was found and how sure that is."""
+        found: list[RotationalSymmetry | MirrorSymmetry] = [*self.rotations, *self.mirrors]
+        against = (
+            f"no other candidate came near (the next has an error of {self.rejected:.2f})"
+            if math.isfinite(self.rejected)
+            else "there was no other candidate"
+        )
+        measure = f"in point spacings of {1000 * self.spacing:.2g} mm; accepted up to {self.tolerance:g}"
+        if not found:
+            nearest = (
+                f"the nearest candidate has an error of {self.rejected:.2f}" if math.isfinite(self.rejected) else ""
+            )
+            return f"no symmetry found{': ' + nearest if nearest else ''} ({measure})"
+        lines = [
+            f"{each}: error {each.error:.2f}, {_sureness(each.error, self.tolerance, self.rejected)}"
+            + (
+                f"; {100 * each.missing:.0f} % of the surface has its counterpart in a hole"
+                if each.missing >= 0.02
+                else ""
+            )
+            for each in found
+        ]
+        return "\n".join([*lines, f"errors are {measure}; {against}"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers, lists and strings, as JSON holds them; `from_dict` reads them back to the last bit."""
+        return {
+            "rotations": [
+                {"axis": each.axis.tolist(), "point": each.point.tolist(), "order": each.order}
+                | {"error": each.error, "missing": each.missing}
+                for each in self.rotations
+            ],
+            "mirrors": [
+                {"normal": each.normal.tolist(), "point": each.point.tolist()}
+                | {"error": each.error, "missing": each.missing}
+                for each in self.mirrors
+            ],
+            "spacing": self.spacing,
+            "tolerance": self.tolerance,
+            # JSON knows no infinity.
+            "rejected": self.rejected if math.isfinite(self.rejected) else None,
+        }
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> "Symmetries":
+        """Read what `to_dict` returned. Raises SceneError for anything else, and names the entry."""
+        rotations = [
+            RotationalSymmetry(
+                _unit(each, "axis", place),
+                _vector(each, "point", place),
+                _order(each, place),
+                _number(each, "error", place),
+                _number(each, "missing", place),
+            )
+            for each, place in _entries(stored, "rotations")
+        ]
+        mirrors = [
+            MirrorSymmetry(
+                _unit(each, "normal", place),
+                _vector(each, "point", place),
+                _number(each, "error", place),
+                _number(each, "missing", place),
+            )
+            for each, place in _entries(stored, "mirrors")
+        ]
+        rejected = math.inf if stored.get("rejected", 0) is None else _number(stored, "rejected", "symmetries")
+        spacing, tolerance = (_number(stored, name, "symmetries") for name in ("spacing", "tolerance"))
+        return cls(tuple(rotations), tuple(mirrors), spacing, tolerance, rejected)
+
+
+def _sureness(error: float, tolerance: float, rejected: float) -> str:
+    if error > 0.7 * tolerance:
+        return "close to the limit"
+    return "sure" if rejected > 2 * max(error, 0.5 * tolerance) else "likely, but other candidates come close"
+
+
+def _numbers(values: Float[Tensor, " 3"]) -> str:
+    # Adding zero turns -0 into 0.
+    return " ".join(f"{round(value, 4) + 0.0:.4g}" for value in values.tolist())
+
+
+def _entries(stored: Mapping[str, Any], name: str) -> list[tuple[Mapping[str, Any], str]]:
+    entries = stored.get(name) if isinstance(stored, Mapping) else None
+    if not isinstance(entries, Sequence) or not all(isinstance(each, Mapping) for each in entries):
+        raise SceneError(f"symmetries: expected a list {name!r} of entries, found {entries!r}: find them again")
+    return [(each, f"{name}[{number}]") for number, each in enumerate(entries)]
+
+
+def _number(entry: Mapping[str, Any], name: str, place: str) -> float:
+    value = entry.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise SceneError(f"symmetries: {place}: expected a number {name!r}, found {value!r}: find them again")
+    return float(value)
+
+
+def _vector(entry: Mapping[str, Any], name: str, place: str) -> Float[Tensor, " 3"]:
+    value = entry.get(name)
+    numbers = value if isinstance(value, Sequence) and not isinstance(value, str) else []
+    if len(numbers) != 3 or not all(isinstance(each, int | float) and math.isfinite(each) for each in numbers):
+        raise SceneError(f"symmetries: {place}: expected three numbers {name!r}, found {value!r}: find them again")
+    return torch.tensor(numbers, dtype=torch.float64)
+
+
+def _unit(entry: Mapping[str, Any], name: str, place: str) -> Float[Tensor, " 3"]:
+    vector = _vector(entry, name, place)
+    if abs(float(vector.norm()) - 1.0) > 1e-6:
+        raise SceneError(
+            f"symmetries: {place}: expected a unit vector {name!r}, found {vector.tolist()}: find them again"
+        )
+    return vector
+
+
+def _order(entry: Mapping[str, Any], place: str) -> int | None:
+    value = entry.get("order")
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 2):
+        raise SceneError(
+            f"symmetries: {place}: expected an order of 2 or more, or none for any angle, found {value!r}: find them "
+            "again"
+        )
+    return value

@@ -1,0 +1,103 @@
+"""Pictures of clouds show what they are given, where it is."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from avmsf.bench.clouds import component_colours, draw_cloud, draw_features, label_colours, save_turntable
+from avmsf.errors import EvaluationError
+from avmsf.scene.features import FeatureField
+from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
+
+GENERATOR = torch.Generator().manual_seed(0)
+POINTS = torch.rand(300, 3, generator=GENERATOR) * torch.tensor([0.2, 0.1, 0.3])
+FOUND = Symmetries(
+    (RotationalSymmetry(torch.tensor([0.0, 0.0, 1.0]).double(), torch.tensor([0.1, 0.05, 0.0]).double(), 4, 0.1, 0.0),),
+    (MirrorSymmetry(torch.tensor([1.0, 0.0, 0.0]).double(), torch.tensor([0.1, 0.0, 0.0]).double(), 0.1, 0.0),),
+    0.01,
+    0.35,
+    1.0,
+)
+
+
+def test_a_sheet_has_a_row_for_each_set_of_colours_and_a_column_for_each_azimuth():
+    field = FeatureField(POINTS, torch.randn(300, 8, generator=GENERATOR), "test")
+    figure = draw_features(
+        field, title="a box", colours=torch.rand(300, 3), clusters=5, symmetries=FOUND, azimuths=(0.0, 90.0)
+    )
+    titles = [axes.get_title() for axes in figure.axes]
+    assert titles == [
+        f"{name}, {azimuth}°" for name in ("colour", "features", "5 clusters", "symmetries") for azimuth in (0, 90)
+    ]
+    assert all(len(axes.collections[0].get_offsets()) == 300 for axes in figure.axes)
+    assert [len(axes.lines) for axes in figure.axes] == [0] * 6 + [2, 2]
+
+
+def test_an_axis_and_a_plane_are_drawn_where_they_are():
+    figure = draw_cloud(POINTS, {}, title="a box", symmetries=FOUND, azimuths=(90.0,))
+    plane, axis = figure.axes[0].lines
+    # Seen from y, with z up, the upright axis is upright; and the plane, whose normal is x, is seen edge-on. The
+    # cloud's middle is a few thousandths from that of the box.
+    assert np.ptp(axis.get_xdata()) < 1e-12
+    assert np.abs(axis.get_xdata()).max() < 0.005
+    assert np.ptp(axis.get_ydata()) == pytest.approx(2.1 * np.cos(np.radians(25)) * 0.187, rel=0.05)
+    assert np.abs(plane.get_xdata()).max() < 0.005
+    assert [text.get_text() for text in figure.axes[0].texts] == ["4"]
+
+
+def test_what_points_up_is_up_and_nearer_points_come_last():
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.5, 0.0, 0.0]])
+    colours = torch.eye(3)
+    axes = draw_cloud(points, {"colour": colours}, title="", azimuths=(90.0,), up=(0.0, 1.0, 0.0)).axes[0]
+    drawn = axes.collections[0]
+    place = {
+        int(np.argmax(face[:3])): spot for face, spot in zip(drawn.get_facecolors(), drawn.get_offsets(), strict=True)
+    }
+    assert place[1][1] - place[0][1] == pytest.approx(np.cos(np.radians(25)))
+    # With y up the camera begins at z and goes towards x, where the third point is: nearest, drawn last but for the
+    # second, which lies above and so nearer to a camera that looks down on it.
+    order = [int(np.argmax(face[:3])) for face in drawn.get_facecolors()]
+    assert order == [0, 1, 2]
+
+
+def test_colours_follow_the_principal_components():
+    value = torch.linspace(-1, 1, 101)
+    features = torch.stack([3 * value, torch.cos(20 * value), torch.zeros(101)], dim=1)
+    colours = component_colours(features)
+    assert bool((colours[:, 0].diff() >= 0).all())
+    assert float(colours.min()) == 0.0
+    assert float(colours.max()) == 1.0
+    # Two components fill two colours; the third stays grey.
+    assert bool((colours[:, 2] == 0.5).all())
+    assert bool((component_colours(torch.ones(9, 4)) == 0.5).all())
+
+
+def test_labels_have_colours_of_their_own():
+    colours = label_colours(torch.arange(64))
+    assert len(torch.unique((255 * colours).round(), dim=0)) == 64
+
+
+def test_a_turntable_turns(tmp_path: Path):
+    path = tmp_path / "deep" / "turn.gif"
+    save_turntable(POINTS, torch.rand(300, 3, generator=GENERATOR), path, symmetries=FOUND, frames=4)
+    with Image.open(path) as picture:
+        assert picture.n_frames == 4
+        stills = []
+        for frame in range(4):
+            picture.seek(frame)
+            stills.append(np.asarray(picture.convert("RGB"), dtype=float))
+    assert all(np.abs(one - other).mean() > 1.0 for one, other in itertools.pairwise(stills))
+    assert [each.name for each in path.parent.iterdir()] == ["turn.gif"]
+
+
+def test_what_cannot_be_drawn_is_refused(tmp_path: Path):
+    with pytest.raises(EvaluationError, match="0 sets of colours"):
+        draw_cloud(POINTS, {}, title="")
+    with pytest.raises(EvaluationError, match=r"named \.gif"):
+        save_turntable(POINTS, POINTS, tmp_path / "turn.png")
+    with pytest.raises(EvaluationError, match="three numbers that points up"):
+        draw_cloud(POINTS, {"colour": POINTS}, title="", up=(0.0, 0.0, 0.0))
