@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from avmsf.errors import SceneError
+from avmsf.files import write_whole
 from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.writing import write_whole
 
 _WORDS = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
 _KINDS = "i1 u1 i2 u2 i4 u4 f4 f8 i1 u1 i2 u2 i4 u4 f4 f8"
@@ -56,7 +56,8 @@ def write_splats(cloud: GaussianCloud, path: str | Path) -> None:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
     header += [f"property float {name}" for name in columns] + ["end_header", ""]
     table = np.stack([column.cpu().numpy() for column in columns.values()], axis=1)
-    write_whole(Path(path), "\n".join(header).encode("ascii") + table.astype("<f4").tobytes())
+    content = "\n".join(header).encode("ascii") + table.astype("<f4").tobytes()
+    write_whole(Path(path), lambda place: place.write_bytes(content), raising=SceneError)
 
 
 def read_splats(path: str | Path) -> GaussianCloud:

@@ -11,9 +11,9 @@ import torch
 
 from avmsf.capture.cameras import View
 from avmsf.errors import SceneError
+from avmsf.files import write_whole
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.splatconfig import SplatConfig
-from avmsf.scene.writing import write_whole
 
 _VERSION = 1
 
@@ -35,7 +35,7 @@ def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """Write a run's state: tensors, numbers, words and containers of these. Raises `SceneError`."""
     content = io.BytesIO()
     torch.save(state, content)
-    write_whole(path, content.getvalue())
+    write_whole(path, lambda place: place.write_bytes(content.getvalue()), raising=SceneError)
 
 
 def read_checkpoint(path: Path, *, fingerprint: str) -> dict[str, Any] | None:

@@ -57,15 +57,16 @@ def find_symmetries(
     up to 3 spacings. So `tolerance` lets the whole surface be off by that many spacings, or a part of
     (tolerance / 3)^2 of it, 1.4 % at the usual .35, have no counterpart at all.
 
-    **Holes.** Moved points that find no surface are gathered into pieces. A piece fills a hole, and speaks neither for
-    nor against, where it continues the surface: at least 45 % of its border lies beyond an open edge, within the plane
-    that the surface has there. Otherwise it is a part that the object has on one side only, like a mug's handle, and
-    counts. The part `missing` may fall into holes, of an object of
-    which 30 % are lost 43 %; the tolerance shrinks by what does. A cloud that covers its object needs far less, and has
-    then less to be fooled by: where walls are no thicker than a few spacings, their rims look like the edges of holes. What follows from two symmetries one
-    after the other may have twice the error. A hole that one of the symmetries found carries onto itself is no damage
-    but an opening of the shape, like a cup's, and what would fill it is no symmetry. So if a cut takes just what made
-    an object asymmetric, it is found symmetric, and a symmetry whose every counterpart was cut away goes unnoticed.
+    **Holes.** Moved points that find no surface are gathered into pieces. A piece fills a hole, and speaks neither
+    for nor against, where it continues the surface: at least 45 % of its border lies beyond an open edge, within
+    the plane that the surface has there. Otherwise it is a part that the object has on one side only, like a mug's
+    handle, and counts. The part `missing` may fall into holes, of an object of which 30 % are lost 43 %; the
+    tolerance shrinks by what does. A cloud that covers its object needs far less, and has then less to be fooled
+    by: where walls are no thicker than a few spacings, their rims look like the edges of holes. What follows from
+    two symmetries one after the other may have twice the error. A hole that one of the symmetries found carries
+    onto itself is no damage but an opening of the shape, like a cup's, and what would fill it is no symmetry. So if
+    a cut takes just what made an object asymmetric, it is found symmetric, and a symmetry whose every counterpart
+    was cut away goes unnoticed.
 
     Orders 2 to 12 are told apart; an axis is continuous if every angle holds and no order holds better than the angles
     between its turns. Planes that contain a continuous axis and half turns across it follow from it and are not listed;

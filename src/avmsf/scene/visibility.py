@@ -8,15 +8,14 @@ between an object and what lies behind it a mean depth is nobody's.
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-import trimesh
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from avmsf.capture.cameras import Camera, View
+from avmsf.capture.meshviews import MeshTracer
 from avmsf.capture.surface import Surface
+from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.errors import SceneError
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.rasteriser import Rasteriser
@@ -93,16 +92,11 @@ def depth_of_surface(surface: Surface) -> DepthMap:
             f"expected a surface of triangles, which can hide points from a camera, found {len(surface.vertices)} "
             "points: lift onto Gaussians instead, or give a mesh"
         )
-    mesh = trimesh.Trimesh(surface.vertices.double().cpu().numpy(), surface.faces.cpu().numpy(), process=False)
-    caster = RayMeshIntersector(mesh)
+    tracer = MeshTracer(TexturedMesh.plain(surface))
 
     def cast(camera: Camera) -> Float[Tensor, "height width"]:
-        rays = camera.rays().reshape(-1, 3).numpy()
-        origins = np.broadcast_to(camera.position.numpy(), rays.shape)
-        places, rows, _ = caster.intersects_location(origins, rays, multiple_hits=False)
-        depth = torch.zeros(camera.height * camera.width, dtype=torch.float64)
-        depth[torch.from_numpy(np.asarray(rows))] = camera.project(torch.from_numpy(np.asarray(places)))[1]
-        return depth.reshape(camera.height, camera.width)
+        depth = tracer.look(camera).depth
+        return torch.where(torch.isfinite(depth), depth, 0.0)
 
     return cast
 
