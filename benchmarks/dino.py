@@ -1,4 +1,4 @@
-"""Gaussians from 64 real photographs of a ceramic dinosaur, judged on 10 that they never saw.
+"""Gaussians from 63 real photographs of a ceramic dinosaur, judged on 10 that they never saw.
 
 `python -m benchmarks.dino` fits them in a process of its own, whose peak memory is theirs, and prints JSON.
 """
@@ -74,6 +74,7 @@ def _fit(*, quick_look: bool) -> dict[str, Any]:
     masked = find_foreground(views)
     masking = time.perf_counter() - began
     train, held = hold_out(masked)
+    size = f"{train[0].camera.width} x {train[0].camera.height}"
     began = time.perf_counter()
     # A few steps on small images compile all that is compiled at first use, and loads it later.
     splat([_small(view) for view in train], replace(QUICK, steps=10, densify_every=5), rasteriser=rasteriser)
@@ -101,7 +102,14 @@ def _fit(*, quick_look: bool) -> dict[str, Any]:
     seconds = time.perf_counter() - began - judging
     figures = judge(cloud, held, rasteriser=rasteriser)
     figures |= {"seconds": seconds, "gigabytes": peak_gigabytes(), "gaussians": float(len(cloud))}
-    return {"figures": figures, "curve": curve, "masking": masking, "compiling": compiling, "views": len(train)}
+    return {
+        "figures": figures,
+        "curve": curve,
+        "masking": masking,
+        "compiling": compiling,
+        "views": len(train),
+        "size": size,
+    }
 
 
 def _small(view: View) -> View:
@@ -112,10 +120,10 @@ def _small(view: View) -> View:
 def _convention(options: Options, found: dict[str, Any]) -> str:
     config = QUICK if options.quick_look else CONFIG
     return (
-        f"dino: {config.steps} steps on {found['views']} photographs of 640 x 480, every eighth view by name held out. "
-        "PSNR and SSIM are means over the held-out views of renderings before black against the photographs as they "
-        "are, background included; psnr_mask inside the found masks. seconds: from photographs and masks in memory to "
-        "the Gaussians that lie on the object, without the looks at held-out views; the masks took "
+        f"dino: {config.steps} steps on {found['views']} photographs of {found['size']} pixels, every eighth view by "
+        "name held out. PSNR and SSIM are means over the held-out views of renderings before black against the "
+        "photographs as they are, background included; psnr_mask inside the found masks. seconds: from photographs and "
+        "masks in memory to the Gaussians that lie on the object, without the looks at held-out views; the masks took "
         f"{found['masking']:.1f} s and compiling or loading the kernels {found['compiling']:.1f} s more."
     )
 

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from avmsf.capture import Surface
+from avmsf.capture.surface import write_surface
 from avmsf.capture.views.write import write_views
 from avmsf.cli import main
 from avmsf.cli.scenebar import SceneBar
@@ -73,11 +75,12 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     shutil.copytree(kept, cache)
     words = ["reconstruct", str(capture), "--cache", str(cache), *SMALL, "--json"]
     assert main(words) == 0
-    assert made_now(capsys) == {"views": False, "cloud": False, "features": False, "modes": False, "fit": False}
-    assert main([*words, "--lift.components", "4"]) == 0
-    assert made_now(capsys) == {"views": False, "cloud": False, "features": True, "modes": False, "fit": True}
+    kept_all = dict.fromkeys(("views", "cloud", "features", "modes", "choice", "fit"), False)
+    assert made_now(capsys) == kept_all
     assert main([*words, "--fit.seed", "5"]) == 0
-    assert made_now(capsys) == {"views": False, "cloud": False, "features": True, "modes": False, "fit": True}
+    assert made_now(capsys) == kept_all | {"choice": True, "fit": True}
+    assert main([*words, "--lift.components", "4"]) == 0
+    assert made_now(capsys) == kept_all | {"features": True, "choice": True, "fit": True}
 
 
 def test_a_changed_picture_makes_everything_anew(capture: Path, kept: Path, tmp_path: Path, capsys: Streams) -> None:
@@ -151,6 +154,7 @@ def test_gaussians_made_elsewhere_are_looked_at_from_all_sides(kept: Path, tmp_p
     out, _ = capsys.readouterr()
     assert "features: descriptors" in out
     features = load_features(folder / ".avmsf" / "features.safetensors")
+    # A reader in metres changes nothing: the same Gaussians, written once more.
     assert torch.equal(features.points, read_splats(kept / "cloud.ply").centers)
 
 
@@ -170,6 +174,27 @@ def test_clouds_and_features_are_drawn(kept: Path, tmp_path: Path, capsys: Strea
     assert "features: descriptors" in out
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["cloud.png", "turntable.gif"]
     assert sorted(path.name for path in (tmp_path / "b").iterdir()) == ["features.png", "turntable.gif"]
+
+
+def test_two_photographs_are_too_few(capture: Path, tmp_path: Path, capsys: Streams) -> None:
+    folder = tmp_path / "slab"
+    shutil.copytree(capture / "images", folder / "images")
+    for extra in sorted((folder / "images").iterdir())[2:]:
+        extra.unlink()
+    assert main(["lift", str(folder), "--encoder", "descriptors"]) == 2
+    assert "expected 3 photographs or more, found 2" in capsys.readouterr().err
+
+
+def test_a_surface_of_points_is_the_object_without_any_look(tmp_path: Path, capsys: Streams) -> None:
+    folder = fill_plate(tmp_path / "plate", surface=False)
+    places = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([PLATE.length, PLATE.width])
+    write_surface(
+        Surface(torch.cat([places, torch.zeros(500, 1)], dim=1), torch.zeros(0, 3, dtype=torch.int64)),
+        folder / "surface.ply",
+    )
+    assert main(["reconstruct", str(folder), *FIT, *MODES]) == 0
+    capsys.readouterr()
+    assert len(load(folder / ".avmsf" / "field.safetensors").gain_field.points) == 500
 
 
 def test_a_folder_without_any_look_is_refused_by_lift_and_fitted_in_a_box_by_reconstruct(

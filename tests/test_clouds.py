@@ -45,6 +45,7 @@ def test_an_axis_and_a_plane_are_drawn_where_they_are():
     assert np.ptp(axis.get_xdata()) < 1e-12
     assert np.abs(axis.get_xdata()).max() < 0.005
     assert np.ptp(axis.get_ydata()) == pytest.approx(2.1 * np.cos(np.radians(25)) * 0.187, rel=0.05)
+    assert abs(np.mean(axis.get_ydata())) < 0.005
     assert np.abs(plane.get_xdata()).max() < 0.005
     assert [text.get_text() for text in figure.axes[0].texts] == ["4"]
 

@@ -171,10 +171,10 @@ def test_a_place_that_cannot_be_read_or_written_is_named(tmp_path: Path) -> None
 def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_splats(_cloud(), tmp_path / "cloud.ply")
 
-    def full(_: int) -> None:
+    def full(*_: Path) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("os.fsync", full)
+    monkeypatch.setattr("os.replace", full)
     with pytest.raises(SceneError, match="No space left on device"):
         write_splats(_cloud(3), tmp_path / "cloud.ply")
     _expect_same(read_splats(tmp_path / "cloud.ply"), _cloud())

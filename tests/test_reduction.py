@@ -5,7 +5,7 @@ import torch
 
 from avmsf.errors import SceneError
 from avmsf.scene.features import FeatureField
-from avmsf.scene.reduction import reduce, with_positions
+from avmsf.scene.reduction import reduce, resize, with_positions
 
 
 def field(count: int = 400) -> FeatureField:
@@ -62,9 +62,17 @@ def test_features_that_tell_nothing_are_refused():
             reduce(field(), dim, whitening=whitening)
 
 
+def test_a_size_is_the_root_mean_square_length():
+    sized = resize(field(), 0.3).features.double()
+    assert float(sized.square().sum(1).mean().sqrt()) == pytest.approx(0.3, rel=1e-6)  # float32's rounding
+    torch.testing.assert_close(sized / sized.norm(), field().features.double() / field().features.double().norm())
+    with pytest.raises(SceneError, match="are zero"):
+        resize(FeatureField(torch.rand(9, 3), torch.zeros(9, 4), "anyone"), 1.0)
+
+
 def test_positions_stand_beside_the_features():
-    joined = with_positions(field(), scale=0.5)
+    joined = with_positions(field())
     geometry = FeatureField.from_points(field().points).features
-    torch.testing.assert_close(joined.features[:, :3], 0.5 * geometry)
+    torch.testing.assert_close(joined.features[:, :3], geometry)
     assert torch.equal(joined.features[:, 3:], field().features)
     assert joined.encoder == "geometry and anyone"

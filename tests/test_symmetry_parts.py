@@ -138,3 +138,14 @@ def test_the_order_of_a_turn_is_the_largest_that_holds():
     smooth = np.stack([0.3 * np.cos(angle), 0.3 * np.sin(angle), height], axis=1)
     judge = Judge(halves(smooth), 0.35)
     assert judge.find_order(judge.judge(Motion(Z, MIDDLE, 2 * math.pi / 5))).continuous
+
+
+def test_a_tube_of_twelve_sides_is_nearly_round_and_yet_has_an_order():
+    random = np.random.default_rng(0)
+    side, place, height = random.integers(12, size=8000), random.random((8000, 1)), random.random(8000)
+    corners = 0.3 * np.stack([np.cos(np.arange(13) * math.pi / 6), np.sin(np.arange(13) * math.pi / 6)], axis=1)
+    tube = np.c_[corners[side] + place * (corners[side + 1] - corners[side]), 0.7 * height]
+    judge = Judge(halves(tube), 0.35)
+    # Any turn is within the tolerance: the sides lie 3.4 % of the radius inside the corners' circle at most.
+    assert judge.as_order(Motion(Z, MIDDLE, math.pi), None) is not None
+    assert judge.find_order(judge.judge(Motion(Z, MIDDLE, math.pi))).order == 12

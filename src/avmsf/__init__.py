@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from avmsf.scene.gaussians import GaussianCloud
     from avmsf.scene.lift import lift
     from avmsf.scene.ply import read_splats, write_splats
-    from avmsf.scene.reduction import reduce, with_positions
+    from avmsf.scene.reduction import reduce, resize, with_positions
     from avmsf.scene.refine import refine
     from avmsf.scene.splat import splat
     from avmsf.scene.splatconfig import SplatConfig
@@ -68,6 +68,7 @@ __all__ = [
     "read_views",
     "reduce",
     "refine",
+    "resize",
     "save",
     "save_features",
     "splat",
@@ -103,6 +104,7 @@ _HOMES = {
     ),
     "avmsf.scene.reduction": (
         "reduce",
+        "resize",
         "with_positions",
     ),
     "avmsf.scene.refine": ("refine",),

@@ -97,7 +97,7 @@ def run(options: Options) -> int:
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
     )
     features = features_of(capture, options.config) if options.features is None else load_features(options.features)
-    expect_on_object(capture.impacts, features)
+    expect_on_object(capture.impacts, features.points)
     say(f"finding the modes of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     modes = extract_once(train, finder(options.method, options.modes), _beside(options.output, "modes"))
     say(f"fitting a field of {len(modes.bank)} modes")

@@ -28,7 +28,6 @@ class FitBar:
         self.task = self.bar.add_task("", total=None, loss="–", visible=False)
 
     def __enter__(self) -> "FitBar":
-        self.bar.start()
         return self
 
     def __exit__(
@@ -38,6 +37,7 @@ class FitBar:
 
     def show(self, progress: FitProgress) -> None:
         """Take note of one step."""
+        self.bar.start()
         if progress.step <= progress.warmup:
             stage, step, steps = f"{progress.stage}, warm-up", progress.step, progress.warmup
         else:

@@ -18,6 +18,7 @@ from avmsf.cli.scenes import SceneOptions, copy_whole, features_words
 from avmsf.cli.scores import compare, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.field.config import PAPER, FitConfig
+from avmsf.field.fit import Progress
 from avmsf.field.store import load
 from avmsf.pipeline.features import LiftConfig
 from avmsf.pipeline.reconstruct import ReconstructConfig, reconstruct
@@ -28,7 +29,7 @@ from avmsf.scene.splatconfig import SplatConfig
 
 @dataclass(frozen=True)
 class Options(SceneOptions):
-    """Go all the way from a capture folder to a field: views, Gaussians, features, symmetries, modes, gains.
+    """Go all the way from a capture folder to a field: views, Gaussians, features, modes, gains.
 
     FOLDER also has impacts.csv and the wav files it names. Each stage's output is kept in the cache, only what changed
     is made anew, and an interrupted run goes on with the same command.
@@ -100,7 +101,7 @@ def run(options: Options) -> int:
                 cache=options.kept,
                 settings=settings,
                 listener=scene_bar.listener,
-                fitting=fit_bar.show,
+                fitting=lambda progress: _show_fit(progress, scene_bar, fit_bar),
             )
     except KeyboardInterrupt:
         say("avmsf reconstruct: interrupted; the same command goes on from where it was")
@@ -110,6 +111,9 @@ def run(options: Options) -> int:
     screen = console(errors=options.json)
     if made.report:
         screen.print(features_words(made.report), soft_wrap=True)
+    if made.errors:
+        told = ", ".join(f"{name} {figure(error)}" for name, error in made.errors.items())
+        screen.print(f"read by the field: {made.features}; errors at training contacts left out in turn: {told}")
     rows = [[each.stage, figure(each.seconds), "now" if each.fresh else "before"] for each in made.stages]
     screen.print(table("stages", ["stage", "seconds", "made"], rows))
     if test is not None:
@@ -125,7 +129,9 @@ def run(options: Options) -> int:
             {
                 "field": str(options.output or made.field),
                 "capture": capture.name,
-                "features": made.report,
+                "features": made.features,
+                "features_errors": made.errors,
+                "features_report": made.report,
                 "stages": [asdict(each) for each in made.stages],
                 "modes": len(fitted.bank),
                 "trained_on": list(train.names),
@@ -135,3 +141,9 @@ def run(options: Options) -> int:
             }
         )
     return 0
+
+
+def _show_fit(progress: Progress, scene_bar: SceneBar, fit_bar: FitBar) -> None:
+    """Show the fit on a screen that holds one bar at a time."""
+    scene_bar.stop()
+    fit_bar.show(progress)

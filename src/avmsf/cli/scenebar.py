@@ -16,7 +16,7 @@ _PARTS = 10
 
 
 class SceneBar:
-    """One bar a stage; in a file or a pipe, a line for each tenth of the splatting and one for the lift."""
+    """One bar a stage; in a file or a pipe, a line for each tenth of the splatting."""
 
     def __init__(self) -> None:
         self.live = sys.stderr.isatty()
@@ -33,7 +33,6 @@ class SceneBar:
         self.told = 0
 
     def __enter__(self) -> "SceneBar":
-        self.bar.start()
         return self
 
     def __exit__(
@@ -45,6 +44,10 @@ class SceneBar:
     def listener(self) -> Listener:
         """Who hears of the stages."""
         return Listener(say, self.splatting, self.lifting)
+
+    def stop(self) -> None:
+        """Leave the screen to another bar."""
+        self.bar.stop()
 
     def splatting(self, progress: SplatProgress) -> None:
         """Take note of some steps."""
@@ -60,6 +63,7 @@ class SceneBar:
         self._show("lift", progress.done, progress.total, progress.view)
 
     def _show(self, stage: str, done: int, total: int, words: str) -> None:
+        self.bar.start()
         if stage not in self.tasks:
             self.tasks[stage] = self.bar.add_task(stage, total=total, words="")
         self.bar.update(self.tasks[stage], completed=done, words=words)

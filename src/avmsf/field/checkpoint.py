@@ -27,7 +27,7 @@ def read_checkpoint(path: Path, *, fingerprint: str) -> dict[str, Any] | None:
     if not path.exists():
         return None
     try:
-        state: dict[str, Any] = torch.load(path, weights_only=True)
+        state: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
         found = state["fingerprint"]
     # torch.load raises whatever unpacking raises, in words that advise to trust the file.
     except Exception as error:

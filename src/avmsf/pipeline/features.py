@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -18,8 +18,8 @@ from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.lift import Lifted, LiftProgress, by_presence, by_visibility, lift, lift_points
 from avmsf.scene.points import sample_surface
 from avmsf.scene.rasteriser import Rasteriser
-from avmsf.scene.reduction import reduce, with_positions
-from avmsf.scene.refine import orbit_spread, refine
+from avmsf.scene.reduction import reduce, resize, with_positions
+from avmsf.scene.refine import ANGLES, orbit_spread, refine
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.scene.visibility import depth_of_surface
@@ -49,12 +49,12 @@ class LiftConfig:
     where large parts of the object were not seen, up to .45."""
     iterations: int = 3
     """How often features are pooled over the symmetries (paper: T)."""
-    angles: int = 24
+    angles: int = ANGLES
     """Angles that stand for all of a continuous rotation (paper: the size of Theta)."""
     positions: bool = True
     """Whether the points' positions, relative to the object's size, stand before the features."""
     size: float = 0.3
-    """Root mean square length of the features beside positions whose length is 1 at most."""
+    """Root mean square length of the features beside positions, which are about .5 long; alone they have length 1."""
     onto: Literal["mesh", "gaussians"] = "mesh"
     """What is the object where a folder shows a mesh alone: its own surface, or Gaussians fitted to pictures of it."""
     points: int = 8192
@@ -131,6 +131,8 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
     features = lifted.features
     if config.components:
         features = reduce(features, config.components)
+    # Before pooling, which is meant to shrink what is noise.
+    features = resize(features, config.size if config.positions else 1.0)
     report: dict[str, Any] = {
         "encoder": lifted.features.encoder,
         "points": len(features.points),
@@ -144,10 +146,9 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
         report["symmetries"] = symmetries.to_dict()
         if symmetries:
             pooled = refine(features, symmetries, iterations=config.iterations, angles=config.angles)
-            report["orbit_spread"] = [orbit_spread(each, symmetries) for each in (features, pooled)]
+            spreads = (orbit_spread(each, symmetries, angles=config.angles) for each in (features, pooled))
+            report["orbit_spread"] = list(spreads)
             features = pooled
-    length = float(features.features.double().square().sum(1).mean().sqrt())
-    features = replace(features, features=features.features * (config.size / length))
     if config.positions:
         features = with_positions(features)
     return MadeFeatures(features, symmetries, report)

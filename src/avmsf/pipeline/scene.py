@@ -1,7 +1,9 @@
 """From what a folder shows of the object to features on its surface: views, Gaussians, features, each kept."""
 
+import hashlib
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from avmsf.pipeline.stages import Kept, StageFolder, digest_of
 from avmsf.scene.encode import Encoder
 from avmsf.scene.featurestore import save_features
 from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.keep import keep_object
 from avmsf.scene.lift import Lifted, LiftProgress
 from avmsf.scene.ply import read_splats, write_splats
 from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
@@ -59,10 +62,10 @@ class SceneConfig:
 class SceneStages:
     """The stages that lead from a folder's photographs, video, mesh or Gaussians to features on the object.
 
-    Gaussians that lie in the folder are taken as they are; where there are no photographs beside them, pictures of
-    them from all sides are described. A mesh needs no Gaussians: its own surface is the object unless the settings say
-    otherwise, and pictures of it are described. Every stage runs when its output is first asked for and raises what it
-    raises; SceneError where the folder shows nothing of the object.
+    Gaussians that lie in the folder are the object's; where there are no photographs beside them, pictures of them from
+    all sides are described. A mesh needs no Gaussians: its own surface is the object unless the settings say otherwise,
+    and pictures of it are described. Every stage runs when its output is first asked for and raises what it raises;
+    SceneError where the folder shows nothing of the object.
     """
 
     def __init__(
@@ -97,12 +100,23 @@ class SceneStages:
     def cloud(self) -> Kept:
         """The file of Gaussians: the folder's own, or fitted to its views, those of a mesh included."""
         if self.splats is not None:
-            return Kept(self.splats, digest_of(self.splats), 0.0, fresh=False)
+            return self._keep_given(self.splats)
+        views = read_views(self.views.path)
+        start = self._start(views)
 
         def make(path: Path) -> None:
-            write_splats(self._splat(read_views(self.views.path)), path)
+            self.listener.tell(f"splat: {self.config.splat.steps} steps on {len(views)} views")
+            cloud = splat(
+                views,
+                self.config.splat,
+                start=start,
+                progress=self.listener.splatting,
+                checkpoint=self.stages.checkpoint(CLOUD),
+            )
+            write_splats(cloud, path)
 
-        recipe = {"views": self.views.digest, "splat": asdict(self.config.splat)}
+        begun = None if start is None else hashlib.sha256(start.points.numpy().tobytes()).hexdigest()
+        recipe = {"views": self.views.digest, "splat": asdict(self.config.splat), "start": begun}
         return self.stages.keep(CLOUD, recipe, make)
 
     @cached_property
@@ -137,29 +151,19 @@ class SceneStages:
             )
         return self.source
 
-    def _splat(self, views: Sequence[View]) -> GaussianCloud:
-        """Start from the hull of the masks, or from structure from motion's points where masks are missing."""
-        source, start = self._source(), None
-        bare = [view.name for view in views if view.mask is None]
-        if bare:
-            moved = source.kind in ("photographs", "video")
-            found = read_sparse_points(
-                self.stages.path("motion") if moved else source.path, metres=self.settings.views_metres
+    def _start(self, views: Sequence[View]) -> StartPoints | None:
+        """Return structure from motion's points where masks are missing; None lets the masks' hull be the start."""
+        source, bare = self._source(), [view.name for view in views if view.mask is None]
+        if not bare:
+            return None
+        where = source.path if source.kind == "cameras" else self.stages.path("motion")
+        found = read_sparse_points(where, metres=self.settings.views_metres)
+        if found is None:
+            raise SceneError(
+                f"expected masks, or points of structure from motion, to start Gaussians from; {len(bare)} views "
+                f"({bare[0]}, ...) have no mask and there are no points: give masks, or leave their search on"
             )
-            if found is None:
-                raise SceneError(
-                    f"expected masks, or points of structure from motion, to start Gaussians from; {len(bare)} views "
-                    f"({bare[0]}, ...) have no mask and there are no points: give masks, or leave their search on"
-                )
-            start = StartPoints(found[0].float(), found[1].float() / 255)
-        self.listener.tell(f"splat: {self.config.splat.steps} steps on {len(views)} views")
-        return splat(
-            views,
-            self.config.splat,
-            start=start,
-            progress=self.listener.splatting,
-            checkpoint=self.stages.checkpoint(CLOUD),
-        )
+        return StartPoints(found[0].float(), found[1].float() / 255)
 
     def _lift_to_cloud(self, views: Sequence[View], encoder: Encoder) -> Lifted:
         cloud = read_splats(self.cloud.path)
@@ -175,6 +179,24 @@ class SceneStages:
         self.listener.tell(f"lift: {encoder.name} of {len(views)} views onto {points} points of the mesh")
         return lift_to_surface(surface, views, encoder, self.config.lift, progress=self.listener.lifting)
 
+    def _keep_given(self, splats: Path) -> Kept:
+        """Keep the Gaussians of a file that came with the folder: in metres, and those on the object alone."""
+        views = None if self.source is None else self.views
+
+        def make(path: Path) -> None:
+            self.listener.tell(f"splat: the Gaussians of {splats.name}, as they are")
+            cloud = scaled(read_splats(splats), self.settings.views_metres)
+            if views is not None:
+                cloud = keep_object(cloud, read_views(views.path), rasteriser=choose_rasteriser(cloud.centers.device))
+            write_splats(cloud, path)
+
+        recipe = {
+            "given": digest_of(splats),
+            "views": None if views is None else views.digest,
+            "metres": self.settings.views_metres,
+        }
+        return self.stages.keep(CLOUD, recipe, make)
+
     def _keep_views_of_cloud(self) -> Kept:
         def make(path: Path) -> None:
             cloud = read_splats(self.cloud.path)
@@ -183,6 +205,11 @@ class SceneStages:
 
         recipe = {"cloud": self.cloud.digest, "rendered": self.config.views.rendered}
         return self.stages.keep("views", recipe, make)
+
+
+def scaled(cloud: GaussianCloud, factor: float) -> GaussianCloud:
+    """Return the Gaussians with all lengths times a factor."""
+    return replace(cloud, centers=cloud.centers * factor, log_scales=cloud.log_scales + math.log(factor))
 
 
 def views_of_cloud(cloud: GaussianCloud, rasteriser: Rasteriser, *, size: int) -> tuple[View, ...]:

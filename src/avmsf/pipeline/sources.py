@@ -21,7 +21,7 @@ from avmsf.errors import SceneError
 from avmsf.pipeline.stages import Kept, StageFolder, digest_files
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-SPLATS = ("splats.ply", "point_cloud.ply", "cloud.ply")
+SPLATS = ("splats.ply", "point_cloud.ply")
 """Names under which a folder may hold Gaussians that were made elsewhere."""
 
 Kind = Literal["cameras", "photographs", "video", "mesh"]
@@ -67,31 +67,32 @@ class Source:
 def find_source(folder: Path, settings: CaptureSettings) -> Source | None:
     """Return what the folder's views can be made of, best first; None where it holds nothing of the kind.
 
-    Photographs with cameras (transforms.json or a COLMAP model) go before photographs alone, these before a video, a
-    video before a mesh. Raises SceneError for more than one video.
+    Photographs with cameras (transforms.json or a COLMAP model) go before a mesh, whose frame is the contacts' as well;
+    a mesh before photographs alone, and these before a video, whose cameras are found in a frame of their own. Raises
+    SceneError for more than one video, and for one or two photographs alone.
     """
     if not folder.is_dir():
         raise SceneError(f"{folder}: there is no such folder; name the one with the photographs, the video or the mesh")
-    model = None if (folder / "transforms.json").is_file() else find_model(folder)
-    if model is not None or (folder / "transforms.json").is_file():
-        files = [folder / "transforms.json"] if model is None else [each for each in model.iterdir() if each.is_file()]
-        return Source("cameras", tuple(sorted([*files, *_images(folder)])), folder, folder)
+    transforms = folder / "transforms.json"
+    model = None if transforms.is_file() else find_model(folder)
     photographs = folder / "images" if (folder / "images").is_dir() else folder
-    images = [path for path in _images(photographs) if "masks" not in path.relative_to(folder).parts]
-    # A mesh has its texture beside it, and a capture perhaps a picture of how it was made.
-    if len(images) >= FEWEST and (photographs != folder or find_surface_file(folder, settings) is None):
-        masks = _images(folder / "masks") if (folder / "masks").is_dir() else []
+    images, masks = _images(photographs, deep=photographs != folder), _images(folder / "masks", deep=True)
+    if model is not None or transforms.is_file():
+        named = [transforms] if model is None else sorted(each for each in model.iterdir() if each.is_file())
+        return Source("cameras", (*named, *images, *masks, *sorted(folder.glob("*.ply"))), folder, folder)
+    surface = find_surface_file(folder, settings)
+    if surface is not None and surface.is_file():
+        beside = (*_images(surface.parent, deep=False), *sorted(surface.parent.glob("*.mtl")))
+        return Source("mesh", (surface, *beside), surface, folder)
+    if len(images) >= FEWEST or (images and photographs != folder):
+        if len(images) < FEWEST:
+            raise SceneError(f"{photographs}: expected {FEWEST} photographs or more, found {len(images)}: take more")
         return Source("photographs", (*images, *masks), photographs, folder)
     videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
     if len(videos) > 1:
-        named = ", ".join(path.name for path in videos)
-        raise SceneError(f"{folder}: expected one video of the object, found {named}: leave one there")
-    if videos:
-        return Source("video", tuple(videos), videos[0], folder)
-    surface = find_surface_file(folder, settings)
-    if surface is None or not surface.is_file():
-        return None
-    return Source("mesh", (surface, *_images(folder), *sorted(folder.glob("*.mtl"))), surface, folder)
+        named_videos = ", ".join(path.name for path in videos)
+        raise SceneError(f"{folder}: expected one video of the object, found {named_videos}: leave one there")
+    return Source("video", tuple(videos), videos[0], folder) if videos else None
 
 
 def find_splats(folder: Path) -> Path | None:
@@ -176,7 +177,7 @@ def _keep_motion(source: Source, stages: StageFolder, config: ViewsConfig, *, te
     return stages.keep("motion", recipe, make)
 
 
-def _images(folder: Path) -> list[Path]:
-    """Return the image files beneath a folder, sorted, without those in hidden folders such as the kept stages'."""
-    paths = (path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
-    return sorted(path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts))
+def _images(folder: Path, *, deep: bool) -> list[Path]:
+    """Return the image files in a folder, sorted, and `deep` in those beneath it; none where there is no folder."""
+    paths = folder.rglob("*") if deep else folder.glob("*")
+    return sorted(path for path in paths if path.suffix.lower() in SUFFIXES and path.is_file())

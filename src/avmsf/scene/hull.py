@@ -17,6 +17,7 @@ from torch import Tensor
 from avmsf.capture.cameras import View
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import SceneError
+from avmsf.scene.tiles import KERNELS
 
 _ROUGH = 48
 """Voxels along the longest side of the first carving, which finds where the object is."""
@@ -139,7 +140,8 @@ def _carve(
         grown = 0.5 * spacing * view.camera.focal[0] / max(depth, 1e-9)
         if grown >= 1.0:
             mask = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) <= grown
-        _vote(view.camera.intrinsics.numpy() @ pose[:3], mask, lowest + 0.5 * spacing, spacing, seen, against)
+        with KERNELS:
+            _vote(view.camera.intrinsics.numpy() @ pose[:3], mask, lowest + 0.5 * spacing, spacing, seen, against)
     agreed = against <= dissent * seen
     looks = seen[agreed & (seen > 0)]
     enough = 0.5 * float(np.quantile(looks, 0.9)) if len(looks) else 1.0

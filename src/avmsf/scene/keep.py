@@ -99,7 +99,7 @@ def blended_weight(cloud: GaussianCloud, views: Sequence[View], *, rasteriser: R
 
 def _sized(cloud: GaussianCloud) -> Bool[Tensor, " points"]:
     places = cloud.centers
-    low, high = torch.quantile(places[:: max(1, len(places) // 100_000)], torch.tensor([0.01, 0.99]), dim=0)
+    low, high = torch.quantile(places[:: max(1, len(places) // 100_000)], places.new_tensor([0.01, 0.99]), dim=0)
     return cloud.log_scales.amax(1).exp() <= _OVERSIZE * float((high - low).norm())
 
 

@@ -34,11 +34,23 @@ def reduce(features: FeatureField, dim: int, *, whitening: float = 1.0) -> Featu
     return FeatureField(features.points, reduced.float(), f"{features.encoder}, {kept} components")
 
 
-def with_positions(features: FeatureField, *, scale: float = 1.0) -> FeatureField:
-    """Return the features with the points' positions before them, `scale` times as `FeatureField.from_points` has them.
+def resize(features: FeatureField, size: float) -> FeatureField:
+    """Return the features times what makes their root mean square length over the points `size`.
 
-    Colour alone does not tell a bowl's left from its right; a gain field may need to.
+    Raises SceneError for features that are all zero.
     """
-    positions = FeatureField.from_points(features.points).features * scale
+    length = float(features.features.double().square().sum(1).mean().sqrt())
+    if not length > 0:
+        raise SceneError(f"all features of the encoder {features.encoder!r} are zero: they tell nothing; use another")
+    return FeatureField(features.points, features.features * (size / length), features.encoder)
+
+
+def with_positions(features: FeatureField) -> FeatureField:
+    """Return the features with the points' positions before them, as `FeatureField.from_points` has them.
+
+    Colour alone does not tell a bowl's left from its right; a gain field may need to. Positions are 1 long at most,
+    and root mean square about .5: `resize` keeps features from drowning them.
+    """
+    positions = FeatureField.from_points(features.points).features
     joined = torch.cat([positions, features.features.float()], dim=1)
     return FeatureField(features.points, joined, f"{GEOMETRY} and {features.encoder}")

@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from avmsf.scene.tiles import KERNELS
+
 _REACH = 5
 """Pixels from the window's middle to its end."""
 _WINDOW = np.exp(-0.5 * (np.arange(-_REACH, _REACH + 1) / 1.5) ** 2)
@@ -62,18 +64,20 @@ class _Similarity(torch.autograd.Function):
     def forward(context: Any, image: Tensor, target: Tensor) -> Tensor:
         height, width = image.shape[:2]
         # Channels lie side by side in a row, so that one run over memory filters all three.
-        first = image.detach().contiguous().numpy().reshape(height, 3 * width)
-        second = target.contiguous().numpy().reshape(height, 3 * width)
+        first = image.detach().cpu().contiguous().numpy().reshape(height, 3 * width)
+        second = target.cpu().contiguous().numpy().reshape(height, 3 * width)
         across = np.empty((5, height, 3 * width), dtype=first.dtype)
         similar = np.empty(height)
         slopes = np.empty((3, height, 3 * width), dtype=first.dtype)
         window = _WINDOW.astype(first.dtype)
-        _filter_products(first, second, window, across)
-        _compare(across, window, similar, slopes)
+        gradient = np.empty_like(first)
+        with KERNELS:
+            _filter_products(first, second, window, across)
+            _compare(across, window, similar, slopes)
+            if context.needs_input_grad[0]:
+                _filter_slopes(first, second, slopes, window, across[:3], gradient)
         if context.needs_input_grad[0]:
-            gradient = np.empty_like(first)
-            _filter_slopes(first, second, slopes, window, across[:3], gradient)
-            context.save_for_backward(torch.from_numpy(gradient).reshape(image.shape))
+            context.save_for_backward(torch.from_numpy(gradient).reshape(image.shape).to(image.device))
         return image.new_tensor(similar.sum() / image.numel())
 
     @staticmethod

@@ -12,6 +12,8 @@ from avmsf.scene.symmetrymotion import Motion
 _ALIKE_DEGREES, _ALIKE_GAP = 6.0, 0.03
 _RESPECTED, _FILLED = 0.02, 0.12
 """Part of the surface that falls into holes up to which a symmetry respects them, and from which on it fills them."""
+_PLAIN = 1.3
+"""Error, in tolerances, from which on a motion that fills few holes plainly does not hold."""
 _MANY = 64
 """More planes and axes than any solid has of which an axis has at most 12 turns; what implies more is no group."""
 _IMPLIED_SLACK = 2.0
@@ -76,14 +78,40 @@ class Group:
                     self.consider(motion, width=0.02, slack=_IMPLIED_SLACK)
 
     def leave_openings(self) -> None:
-        """Drop what would fill an opening that another symmetry carries onto itself: damage respects no symmetry.
+        """Drop what would fill an opening that a turn, or two planes, carry onto itself: damage respects no symmetry.
 
-        A can without a lid is half of a longer can that is closed at both ends, but for this.
+        A can without a lid is half of a longer can that is closed at both ends, but for this. One plane alone may pass
+        through the middle of a damage by chance.
         """
-        if any(each.missing < _RESPECTED for each in [*self.mirrors, *self.turns]):
-            for found in (self.mirrors, self.turns):
-                self.rejected += [each for each in found if each.missing > _FILLED]
-                found[:] = [each for each in found if each.missing <= _FILLED]
+        planes, turns = ([each for each in found if each.missing < _RESPECTED] for found in (self.mirrors, self.turns))
+        if turns or len(planes) > 1:
+            self._drop([each for each in [*self.mirrors, *self.turns] if each.missing > _FILLED])
+
+    def leave_contradictions(self) -> None:
+        """Drop what together with a symmetry that fills fewer holes would imply something that plainly does not hold.
+
+        A can with a handle seems to turn upside down, into a longer can, about any axis; two such turns would turn it
+        about its own axis, which the handle forbids.
+        """
+        found = sorted([*self.mirrors, *self.turns], key=lambda each: each.missing)
+        kept: list[Judged] = []
+        for each in found:
+            if each.missing <= _FILLED or not any(self._contradict(each, other) for other in kept):
+                kept.append(each)
+        self._drop([each for each in found if each not in kept])
+
+    def _contradict(self, one: Judged, other: Judged) -> bool:
+        for motion in _implied(one, other) + _implied(other, one):
+            if not self.knows(motion):
+                judged = self.judge.settle(motion, width=0.02, slack=_IMPLIED_SLACK)
+                if judged.missing < _FILLED and judged.error > _PLAIN * self.judge.tolerance:
+                    return True
+        return False
+
+    def _drop(self, wrong: list[Judged]) -> None:
+        self.rejected += wrong
+        self.mirrors = [each for each in self.mirrors if each not in wrong]
+        self.turns = [each for each in self.turns if each not in wrong]
 
     def _round(self) -> None:
         """Make an axis continuous where more planes contain it than its order has."""
@@ -162,7 +190,8 @@ def _motion_of(linear: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, " 3"])
     if not fractions or abs(turn @ shift) > 0.05 * angle:
         return None
     point = np.linalg.lstsq(np.eye(3) - linear, shift, rcond=0.05)[0]
-    return Motion(turn / angle, point, 2 * math.pi / fractions[0][0])
+    order, _ = min(fractions, key=lambda each: abs(angle - 2 * math.pi * each[1] / each[0]))
+    return Motion(turn / angle, point, 2 * math.pi / order)
 
 
 def _alike(one: Motion, other: Motion) -> bool:

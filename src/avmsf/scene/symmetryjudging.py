@@ -1,6 +1,7 @@
 """Whether a motion is a symmetry of the cloud, and of which order a turn is."""
 
 import math
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -107,12 +108,10 @@ class Judge:
         contrast = self._mean_square(motion, between, errors) - self._mean_square(motion, _angles(order), errors)
         if order < _NEARLY_ROUND:
             return contrast > _CONTRAST**2
-        # With so many turns chance does not make every one of them better than every one between.
-        worst, best = (
-            pick(errors[round(angle, 6)] for angle in angles)
-            for pick, angles in ((max, _angles(order)), (min, between))
-        )
-        return contrast > _FAINT_CONTRAST**2 and worst < best
+        # A faint one has to stand clear of what errors differ by from angle to angle.
+        groups = [[errors[round(angle, 6)] ** 2 for angle in angles] for angles in (_angles(order), between)]
+        chance = math.sqrt(sum(statistics.variance(squares) / len(squares) for squares in groups))
+        return contrast > max(_FAINT_CONTRAST**2, 3.0 * chance)
 
     def _mean_square(self, motion: Motion, angles: Sequence[float], errors: dict[float, float]) -> float:
         """Return the mean square error of turns; `errors` keeps what is known by the angle."""
