@@ -80,7 +80,7 @@ def test_an_interruption_as_training_begins_keeps_the_modes(
     from avmsf.cli import fit as verb
     from avmsf.pipeline import keptmodes as kept
 
-    def stop(*arguments: object) -> None:
+    def stop(*arguments: object, **named: object) -> None:
         raise KeyboardInterrupt
 
     def refuse(*arguments: object) -> None:
@@ -88,7 +88,7 @@ def test_an_interruption_as_training_begins_keeps_the_modes(
 
     words = ["fit", str(fill_plate(tmp_path / "plate")), "--output", str(tmp_path / "field.safetensors"), *TINY]
     with monkeypatch.context() as patched:
-        patched.setattr(verb, "features_of", stop)
+        patched.setattr(verb, "fit", stop)
         assert main(words) == 130
     assert capsys.readouterr().err.splitlines()[-1].endswith("go on from the start of training")
     with monkeypatch.context() as patched:
