@@ -20,8 +20,8 @@ _INCOMMENSURATE = tuple(2 * math.pi * ((step * (math.sqrt(5) - 1) / 2) % 1.0) fo
 """Angles that have no small part of a turn in common: fractions of the golden section."""
 _MISSING_SLACK = 4 / 3
 """Most by which slack raises the part that may be missing."""
-_SPARED = 2
-"""Of those angles, how many may go wrong: which way a hole goes is now and then misjudged."""
+_SPARED, _HOLED = 2, 0.05
+"""How many of those angles may go wrong where more than this part falls into holes: a hole may be misjudged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,10 @@ class Judge:
         ]
         standing = [order for order in orders if self._stands_out(judged.motion, order, errors)]
         round_ = len(orders) == HIGHEST_ORDER - 1
-        for order in [*standing, *([None] if round_ else []), *orders]:
+        anything: list[int | None] = [None] if round_ else []
+        # Where holes are, some angles come out worse than others by that alone, and a faint order may be none.
+        first_tried = [*anything, *standing] if judged.missing > _HOLED else [*standing, *anything]
+        for order in [*first_tried, *orders]:
             found = self.as_order(judged.motion, order, slack=slack)
             if found is not None:
                 return found
@@ -96,7 +99,7 @@ class Judge:
         angles = _INCOMMENSURATE if order is None else _angles(order)
         fitted = fit_motion(motion, self.halves, angles=angles, steps=6, width=0.02)
         each = sorted((self.judge(fitted.turning(angle)) for angle in angles), key=lambda one: one.error)
-        if order is None:
+        if order is None and max(one.missing for one in each) > _HOLED:
             each = each[:-_SPARED]
         together = _together(fitted.turning(angles[0]), each, order)
         holds = self.holds(together, slack=slack) and all(self.holds(one, slack=2 * slack) for one in each)

@@ -22,7 +22,7 @@ from avmsf.scene.symmetrycandidates import (
 from avmsf.scene.symmetrygroup import Group, follows
 from avmsf.scene.symmetryjudging import MISSING, Judge, Judged
 
-TOLERANCE = 0.4
+TOLERANCE = 0.38
 """Largest error of a symmetry, in point spacings; see `find_symmetries`."""
 LIMIT = 8000
 """Points of a cloud that are looked at."""
@@ -55,7 +55,7 @@ def find_symmetries(
     root mean square of their distances from it, without what the distances are when nothing is moved (noise), in
     spacings of that half; a spacing below 1 or above 1.6 % of the object's diagonal counts as that. A distance counts
     up to 3 spacings. So `tolerance` lets the whole surface be off by that many spacings, or a part of
-    (tolerance / 3)^2 of it, 1.8 % at the usual .4, have no counterpart at all.
+    (tolerance / 3)^2 of it, 1.6 % at the usual .38, have no counterpart at all.
 
     **Holes.** Moved points that find no surface are gathered into pieces. A piece fills a hole, and speaks neither
     for nor against, where it continues the surface: at least 45 % of its border lies beyond an open edge, within
@@ -63,10 +63,10 @@ def find_symmetries(
     handle, and counts. The part `missing` may fall into holes, of an object of which 30 % are lost 43 %; the
     tolerance shrinks by what does. A cloud that covers its object needs far less, and has then less to be fooled
     by: where walls are no thicker than a few spacings, their rims look like the edges of holes. What follows from
-    two symmetries one after the other may have twice the error. A hole that a turn or two planes carry onto
-    itself is no damage but an opening of the shape, like a cup's, and what would fill it is no symmetry; neither is
-    what fills holes and contradicts what does not. So if a cut takes just what made an object asymmetric, it is found symmetric, and a symmetry whose every counterpart
-    was cut away goes unnoticed.
+    two symmetries one after the other may have twice the error. A hole that a turn or two planes carry onto itself
+    is no damage but an opening of the shape, like a cup's, and what would fill it is no symmetry; neither is what
+    fills holes and contradicts what does not. So if a cut takes just what made an object asymmetric, it is found
+    symmetric, and a symmetry whose every counterpart was cut away goes unnoticed.
 
     Orders 2 to 12 are told apart; an axis is continuous if every angle holds and no order holds better than the angles
     between its turns. Planes that contain a continuous axis and half turns across it follow from it and are not listed;
