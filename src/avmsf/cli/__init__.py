@@ -40,11 +40,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not words or words[0] not in VERBS:
         _explain(words)
         return 2
-    # Only the verb that is asked for is imported: torch takes seconds, and help on the whole needs none of it.
-    verb = import_module(f"avmsf.cli.{words[0].replace('-', '_')}")
     with warnings.catch_warnings():
-        _show_plainly()
         try:
+            # Only the verb that is asked for is imported: torch takes seconds, and help on the whole needs none of it.
+            verb = import_module(f"avmsf.cli.{words[0].replace('-', '_')}")
+            _show_plainly()
             return verb.run(verb.parse(words[1:]))
         except AvmsfError as error:
             print(f"avmsf {words[0]}: {' '.join(str(error).split())}", file=sys.stderr)

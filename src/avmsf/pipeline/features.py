@@ -92,7 +92,8 @@ def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None]) -> Encode
     try:
         return DinoEncoder.load(DINO, longest=config.longest, device=_device())
     except SceneError as error:
-        tell(f"encoder: the built-in descriptors, for {DINO} is not to be had ({error})")
+        reason = str(error).split(":")[0]
+        tell(f"encoder: the built-in descriptors, for {DINO} is not to be had: {reason}")
         return ImageDescriptors()
 
 

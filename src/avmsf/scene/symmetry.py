@@ -94,7 +94,7 @@ class Symmetries:
         """Say in plain words what was found and how sure that is."""
         found: list[RotationalSymmetry | MirrorSymmetry] = [*self.rotations, *self.mirrors]
         against = (
-            f"no other candidate came near (the next has an error of {self.rejected:.2f})"
+            f"the best of what was not accepted, for its error or for holes, has an error of {self.rejected:.2f}"
             if math.isfinite(self.rejected)
             else "there was no other candidate"
         )

@@ -91,8 +91,12 @@ class Group:
         """Drop what together with a symmetry that fills fewer holes would imply something that plainly does not hold.
 
         A can with a handle seems to turn upside down, into a longer can, about any axis; two such turns would turn it
-        about its own axis, which the handle forbids.
+        about its own axis, which the handle forbids. Of planes that cross at less than 15 degrees, which an axis of at
+        most 12 turns does not have, only the better one is kept.
         """
+        for each in sorted(self.mirrors, key=lambda mirror: mirror.error):
+            if each in self.mirrors:
+                self._drop([other for other in self.mirrors if other.error > each.error and _too_near(each, other)])
         found = sorted([*self.mirrors, *self.turns], key=lambda each: each.missing)
         kept: list[Judged] = []
         for each in found:
@@ -152,6 +156,10 @@ def is_ball(continuous: list[Judged]) -> bool:
         for number, one in enumerate(continuous)
         for other in continuous[:number]
     )
+
+
+def _too_near(one: Judged, other: Judged) -> bool:
+    return one.motion.apart(other.motion, np.zeros(3))[0] < 180 / HIGHEST_ORDER - 2
 
 
 def _implied(one: Judged, other: Judged) -> list[Motion]:

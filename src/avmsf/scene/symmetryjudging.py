@@ -20,6 +20,8 @@ _INCOMMENSURATE = tuple(2 * math.pi * ((step * (math.sqrt(5) - 1) / 2) % 1.0) fo
 """Angles that have no small part of a turn in common: fractions of the golden section."""
 _MISSING_SLACK = 4 / 3
 """Most by which slack raises the part that may be missing."""
+_FIRM_SLACK = 1.15
+"""Most that slack lets pass where there are no holes."""
 _SPARED, _HOLED = 2, 0.05
 """How many of those angles may go wrong where more than this part falls into holes: a hole may be misjudged."""
 
@@ -55,7 +57,11 @@ class Judge:
         return Judged(motion, found.error, found.missing)
 
     def holds(self, judged: Judged, *, slack: float = 1.0) -> bool:
-        """Return whether a motion counts as a symmetry: what was seen of it less has to fit all the better."""
+        """Return whether a motion counts as a symmetry: what was seen of it less has to fit all the better.
+
+        `slack` lets more error pass where there are holes, by whose borders errors are uncertain.
+        """
+        slack = slack if judged.missing > _HOLED else min(slack, _FIRM_SLACK)
         limit = slack * self.tolerance * (1.0 - judged.missing)
         return judged.missing <= min(slack, _MISSING_SLACK) * self.missing and judged.error <= limit
 
