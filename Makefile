@@ -15,7 +15,7 @@ demo: .venv/installed
 	$(BIN)/avmsf demo demo
 
 test: .venv/installed
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto
 
 lint: .venv/installed
 	$(BIN)/ruff check .

@@ -10,7 +10,7 @@ from avmsf.scene.symmetryalignment import Halves
 from avmsf.scene.symmetrycandidates import CoarseCloud, matching_pairs, mirrors_of_pairs, turns_of_pairs
 from avmsf.scene.symmetryfit import fit_motion
 from avmsf.scene.symmetrygroup import Group
-from avmsf.scene.symmetryjudging import Judge
+from avmsf.scene.symmetryjudging import Judge, Judged
 from avmsf.scene.symmetrymotion import Motion
 
 X, Y, Z = np.eye(3)
@@ -149,3 +149,30 @@ def test_a_tube_of_twelve_sides_is_nearly_round_and_yet_has_an_order():
     # Any turn is within the tolerance: the sides lie 3.4 % of the radius inside the corners' circle at most.
     assert judge.as_order(Motion(Z, MIDDLE, math.pi), None) is not None
     assert judge.find_order(judge.judge(Motion(Z, MIDDLE, math.pi))).order == 12
+
+
+def test_of_planes_that_no_order_allows_side_by_side_the_better_stays():
+    group = Group(Judge(halves(egg(1000)), 0.38))
+    near = np.array([math.cos(0.15), math.sin(0.15), 0.0])
+    group.mirrors = [Judged(Motion(near, MIDDLE, None), 0.3, 0.0), Judged(Motion(X, MIDDLE, None), 0.2, 0.0)]
+    group.leave_contradictions()
+    assert [each.error for each in group.mirrors] == [0.2]
+    assert [each.error for each in group.rejected] == [0.3]
+
+
+def test_what_fills_an_opening_goes_if_a_turn_respects_it():
+    filling, respecting = Judged(Motion(Z, MIDDLE, None), 0.1, 0.3), Judged(Motion(Z, MIDDLE, 1.0), 0.1, 0.0, None)
+    for turns, kept in (([respecting], 0), ([], 1)):
+        group = Group(Judge(halves(egg(1000)), 0.38))
+        group.mirrors, group.turns = [filling], list(turns)
+        group.leave_openings()
+        assert len(group.mirrors) == kept
+
+
+def test_slack_is_for_what_rests_on_holes():
+    judge = Judge(halves(egg(1000)), 0.4)
+    assert judge.holds(Judged(Motion(X, MIDDLE, None), 0.39, 0.0))
+    assert not judge.holds(Judged(Motion(X, MIDDLE, None), 0.39, 0.1))
+    assert judge.holds(Judged(Motion(X, MIDDLE, None), 0.6, 0.1), slack=2.0)
+    assert not judge.holds(Judged(Motion(X, MIDDLE, None), 0.6, 0.0), slack=2.0)
+    assert not judge.holds(Judged(Motion(X, MIDDLE, None), 0.0, 0.46))
