@@ -14,8 +14,8 @@ _RESPECTED, _FILLED = 0.02, 0.12
 """Part of the surface that falls into holes up to which a symmetry respects them, and from which on it fills them."""
 _PLAIN = 1.3
 """Error, in tolerances, from which on a motion that fills few holes plainly does not hold."""
-_MANY = 64
-"""More planes and axes than any solid has of which an axis has at most 12 turns; what implies more is no group."""
+_CUBE, _ICOSAHEDRON = 13 + 9, 31 + 15
+"""Axes and planes of the two."""
 _IMPLIED_SLACK = 2.0
 """How much more error is let pass in what follows from two symmetries: that it is one is known, and where it is."""
 
@@ -58,22 +58,22 @@ class Group:
     def complete(self) -> None:
         """Add what follows from pairs of those found, until nothing new does; nothing where there is no end to it."""
         direct = (list(self.mirrors), list(self.turns))
-        done: set[tuple[int, int]] = set()
+        done: set[tuple[Judged, Judged]] = set()
         while not is_ball(self.continuous):
             pairs = [
                 (one, other)
                 for one in [*self.mirrors, *self.turns]
                 for other in [*self.mirrors, *self.turns]
-                if one is not other and (id(one), id(other)) not in done
+                if one is not other and (one, other) not in done
             ]
             if not pairs:
                 return
             self._round()
-            if len(self.mirrors) + len(self.turns) > _MANY:
+            if len(self.mirrors) + len(self.turns) > self._most():
                 self.mirrors, self.turns = direct
                 return
             for one, other in pairs:
-                done.add((id(one), id(other)))
+                done.add((one, other))
                 for motion in _implied(one, other):
                     self.consider(motion, width=0.02, slack=_IMPLIED_SLACK)
 
@@ -116,6 +116,14 @@ class Group:
         self.rejected += wrong
         self.mirrors = [each for each in self.mirrors if each not in wrong]
         self.turns = [each for each in self.turns if each not in wrong]
+
+    def _most(self) -> int:
+        """Return how many axes and planes a body can have whose axes are of these orders: a prism, cube or icosahedron.
+
+        What implies more is no group.
+        """
+        orders = [each.order or 0 for each in self.turns]
+        return _ICOSAHEDRON if orders.count(5) > 1 else max(_CUBE, 2 * max(orders, default=0) + 2)
 
     def _round(self) -> None:
         """Make an axis continuous where more planes contain it than its order has."""

@@ -16,6 +16,8 @@ _NEARLY_ROUND = 8
 _CONTRAST, _FAINT_CONTRAST = 0.2, 0.07
 """How much worse the angles between those of an order must be, in spacings, for the order to mean something: below and
 from order 8 on, where a prism is nearly round."""
+_HOLED_CONTRAST = 0.5
+"""The same for orders 2 and 3 where holes are: too few angles to say what they differ by."""
 _INCOMMENSURATE = tuple(2 * math.pi * ((step * (math.sqrt(5) - 1) / 2) % 1.0) for step in range(1, 9))
 """Angles that have no small part of a turn in common: fractions of the golden section."""
 _MISSING_SLACK = 4 / 3
@@ -89,12 +91,10 @@ class Judge:
             for order in range(HIGHEST_ORDER, 1, -1)
             if self._mean_square(judged.motion, _angles(order), errors) < (2 * slack * self.tolerance) ** 2
         ]
-        standing = [order for order in orders if self._stands_out(judged.motion, order, errors)]
+        standing = [order for order in orders if self._stands_out(judged, order, errors)]
         round_ = len(orders) == HIGHEST_ORDER - 1
         anything: list[int | None] = [None] if round_ else []
-        # Where holes are, some angles come out worse than others by that alone, and a faint order may be none.
-        first_tried = [*anything, *standing] if judged.missing > _HOLED else [*standing, *anything]
-        for order in [*first_tried, *orders]:
+        for order in [*standing, *anything, *orders]:
             found = self.as_order(judged.motion, order, slack=slack)
             if found is not None:
                 return found
@@ -111,16 +111,19 @@ class Judge:
         holds = self.holds(together, slack=slack) and all(self.holds(one, slack=2 * slack) for one in each)
         return together if holds else None
 
-    def _stands_out(self, motion: Motion, order: int, errors: dict[float, float]) -> bool:
+    def _stands_out(self, judged: Judged, order: int, errors: dict[float, float]) -> bool:
         """Return whether an order's turns hold better than those halfway between them."""
-        between = [math.pi * step / order for step in range(1, order + 1, 2)]
-        contrast = self._mean_square(motion, between, errors) - self._mean_square(motion, _angles(order), errors)
-        if order < _NEARLY_ROUND:
-            return contrast > _CONTRAST**2
-        # A faint one has to stand clear of what errors differ by from angle to angle.
-        groups = [[errors[round(angle, 6)] ** 2 for angle in angles] for angles in (_angles(order), between)]
-        chance = math.sqrt(sum(statistics.variance(squares) / len(squares) for squares in groups))
-        return contrast > max(_FAINT_CONTRAST**2, 3.0 * chance)
+        turns, between = _angles(order), [math.pi * step / order for step in range(1, order + 1, 2)]
+        means = [self._mean_square(judged.motion, angles, errors) for angles in (between, turns)]
+        holed = judged.missing > _HOLED
+        least = _FAINT_CONTRAST if order >= _NEARLY_ROUND and not holed else _CONTRAST
+        if order >= _NEARLY_ROUND or (holed and min(len(turns), len(between)) > 1):
+            # A faint one has to stand clear of what errors differ by from angle to angle, as they do where holes are.
+            groups = [[errors[round(angle, 6)] ** 2 for angle in angles] for angles in (turns, between)]
+            chance = 3.0 * math.sqrt(sum(statistics.variance(squares) / len(squares) for squares in groups))
+        else:
+            chance = _HOLED_CONTRAST**2 if holed else 0.0
+        return means[0] - means[1] > max(least**2, chance)
 
     def _mean_square(self, motion: Motion, angles: Sequence[float], errors: dict[float, float]) -> float:
         """Return the mean square error of turns; `errors` keeps what is known by the angle."""
