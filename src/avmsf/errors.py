@@ -27,3 +27,11 @@ class FieldFileError(AvmsfError):
 
 class EvaluationError(AvmsfError):
     """Sounds or contacts given to a metric, a baseline or a split do not fit together."""
+
+
+class DatasetError(AvmsfError):
+    """A dataset's folder is another dataset's, is incomplete, or has no object of this name."""
+
+
+class SimulationError(AvmsfError):
+    """A shape, a material or a setting from which no sounding object can be computed."""

@@ -1,0 +1,56 @@
+"""What a method is given to learn from: one object, some of its blows, and nothing of the others but their places."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.bench.renderer import Renderer
+from avmsf.capture.impacts import Impacts
+from avmsf.modal.extraction import Extraction
+from avmsf.scene.features import FeatureField
+
+Look = Literal["positions", "visual", "unaligned"]
+"""What a field reads of an object's points: positions alone; positions with what the places look like, made to obey the
+object's symmetries (the paper's form); the same without that."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """One object and one choice of training contacts.
+
+    What takes time is behind a function, which remembers what it made: methods that do not ask for it do not pay.
+    """
+
+    name: str
+    """What the object is called, in messages and as a folder of others' sounds."""
+    train: Impacts
+    """The blows to learn from."""
+    contacts: Float[Tensor, "contacts 3"]
+    """Contacts of all the object's blows, training and test alike, metres."""
+    names: tuple[str, ...]
+    """Names of their recordings, row for row."""
+    seed: int
+    """Start of all chance in the method."""
+    modes: Callable[[], Extraction]
+    """Finds the modes of `train`, row for row."""
+    features: Callable[[Look], FeatureField]
+    """Makes what a field reads of the object's points. Raises SceneError where nothing shows the object's look."""
+    stranger: Callable[[], Float[Tensor, " samples"]]
+    """Draws, by `seed`, the recording of another object, at the sample rate and of the length of `train`. Raises
+    EvaluationError where there is no other object."""
+
+
+class Method(Protocol):
+    """A way to learn an object's sounds from some of them."""
+
+    @property
+    def name(self) -> str:
+        """What tables and the command line call it; words joined by hyphens."""
+        ...
+
+    def fit(self, task: Task) -> Renderer:
+        """Learn from the task's training blows. Raises AvmsfError where it cannot."""
+        ...

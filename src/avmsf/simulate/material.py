@@ -1,0 +1,56 @@
+"""What objects are made of: the constants of linear elasticity, and how fast vibrations die in it."""
+
+import math
+from dataclasses import dataclass
+
+from avmsf.errors import SimulationError
+
+
+@dataclass(frozen=True)
+class Material:
+    """An isotropic linear material with Rayleigh damping."""
+
+    name: str
+    density: float
+    """Kilograms per cubic metre."""
+    young: float
+    """Young's modulus, pascals."""
+    poisson: float
+    """Poisson's ratio, between -1 and .5, both excluded."""
+    alpha: float
+    """Rayleigh damping in proportion to mass, 1/s."""
+    beta: float
+    """Rayleigh damping in proportion to stiffness, s."""
+
+    def __post_init__(self) -> None:
+        for constant, unit in (("density", "kg/m3"), ("young", "Pa")):
+            value = getattr(self, constant)
+            if not 0 < value < math.inf:
+                raise SimulationError(f"{self.name}: {constant} = {value:g} {unit}: expected more than 0")
+        if not -1 < self.poisson < 0.5:
+            raise SimulationError(
+                f"{self.name}: poisson = {self.poisson:g}: expected more than -1 and less than .5, outside of which a "
+                "body would gain energy by being squeezed; solids have .1 to .45"
+            )
+        for constant, unit in (("alpha", "1/s"), ("beta", "s")):
+            value = getattr(self, constant)
+            if not 0 <= value < math.inf:
+                raise SimulationError(f"{self.name}: {constant} = {value:g} {unit}: expected 0 or more")
+
+
+CERAMIC = Material("ceramic", 2700.0, 7.2e10, 0.19, 6.0, 1e-7)
+GLASS = Material("glass", 2600.0, 6.2e10, 0.20, 1.0, 1e-7)
+WOOD = Material("wood", 750.0, 1.1e10, 0.25, 60.0, 2e-6)
+PLASTIC = Material("plastic", 1070.0, 1.4e9, 0.35, 30.0, 1e-6)
+IRON = Material("iron", 8000.0, 2.1e11, 0.28, 10.0, 1e-7)
+POLYCARBONATE = Material("polycarbonate", 1190.0, 2.4e9, 0.37, 0.5, 4e-7)
+STEEL = Material("steel", 7850.0, 2e11, 0.29, 20.0, 3e-8)
+MATERIALS = {material.name: material for material in (CERAMIC, GLASS, WOOD, PLASTIC, IRON, POLYCARBONATE, STEEL)}
+"""The table that DiffSound simulates with, by name."""
+
+
+def material_named(name: str) -> Material:
+    """Return the material of this name, whatever its case. Raises SimulationError with the names there are."""
+    if name.lower() not in MATERIALS:
+        raise SimulationError(f"no material is called {name!r}; there are {', '.join(MATERIALS)}")
+    return MATERIALS[name.lower()]
