@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -43,6 +43,7 @@ class Task:
     EvaluationError where there is no other object."""
 
 
+@runtime_checkable
 class Method(Protocol):
     """A way to learn an object's sounds from some of them."""
 

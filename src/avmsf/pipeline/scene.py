@@ -76,11 +76,13 @@ class SceneStages:
         *,
         settings: CaptureSettings,
         listener: Listener | None = None,
+        name: str = FEATURES,
     ) -> None:
-        self.folder, self.stages, self.config, self.settings = folder, stages, config, settings
+        """Prepare the stages; `name` is what the features' file is called, for several may share their Gaussians."""
+        self.folder, self.stages, self.config, self.settings, self.name = folder, stages, config, settings, name
         self.listener = Listener() if listener is None else listener
         self.splats = find_splats(folder)
-        found = find_source(folder, settings)
+        found = find_source(folder, settings, prefer=config.views.source)
         self.source: Source | None = None if self.splats and found and found.kind == "mesh" else found
 
     def __bool__(self) -> bool:
@@ -137,7 +139,7 @@ class SceneStages:
             made = finish_features(lifted, self.config.lift)
             save_features(made.features, path, report=made.report)
 
-        return self.stages.keep(FEATURES, recipe, make)
+        return self.stages.keep(self.name, recipe, make)
 
     def made(self) -> dict[str, Kept]:
         """Return the stages that were needed so far, in order."""

@@ -6,6 +6,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+import torch
+
 from avmsf.capture.cameras import View
 from avmsf.capture.meshviews import orbit_cameras, render_views
 from avmsf.capture.settings import CaptureSettings
@@ -19,6 +21,7 @@ from avmsf.capture.views.pictures import SUFFIXES
 from avmsf.capture.views.write import write_views
 from avmsf.errors import SceneError
 from avmsf.pipeline.stages import Kept, StageFolder, digest_files
+from avmsf.scene.points import farthest_points
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 SPLATS = ("splats.ply", "point_cloud.ply")
@@ -32,6 +35,10 @@ Tell = Callable[[str], None]
 class ViewsConfig:
     """How views are made of what a folder holds."""
 
+    source: Literal["best", "mesh"] = "best"
+    """What shows the object: the best of what the folder holds, photographs with cameras before a mesh, or its mesh."""
+    count: int = 0
+    """Views to use at most, of cameras as far apart as they stand; 0 uses all."""
     longest: int = 640
     """Pixels of a photograph's longer side; larger ones are scaled down."""
     masks: bool = True
@@ -44,6 +51,10 @@ class ViewsConfig:
     """Time that structure from motion may take."""
     seed: int = 0
     """Start of the chance in structure from motion."""
+
+    def __post_init__(self) -> None:
+        if self.count < 0:
+            raise SceneError(f"count = {self.count}: expected 0 for all views, or how many to use")
 
 
 @dataclass(frozen=True)
@@ -64,12 +75,12 @@ class Source:
         return digest_files(self.files, beneath=self.folder)
 
 
-def find_source(folder: Path, settings: CaptureSettings) -> Source | None:
+def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["best", "mesh"] = "best") -> Source | None:
     """Return what the folder's views can be made of, best first; None where it holds nothing of the kind.
 
-    Photographs with cameras (transforms.json or a COLMAP model) go before a mesh, whose frame is the contacts' as well;
-    a mesh before photographs alone, and these before a video, whose cameras are found in a frame of their own. Raises
-    SceneError for more than one video, and for one or two photographs alone.
+    Photographs with cameras (transforms.json or a COLMAP model) go before a mesh, whose frame is the contacts' as well,
+    unless the mesh is preferred; a mesh before photographs alone, and these before a video, whose cameras are found in
+    a frame of their own. Raises SceneError for more than one video, and for one or two photographs alone.
     """
     if not folder.is_dir():
         raise SceneError(f"{folder}: there is no such folder; name the one with the photographs, the video or the mesh")
@@ -77,11 +88,12 @@ def find_source(folder: Path, settings: CaptureSettings) -> Source | None:
     model = None if transforms.is_file() else find_model(folder)
     photographs = folder / "images" if (folder / "images").is_dir() else folder
     images, masks = _images(photographs, deep=photographs != folder), _images(folder / "masks", deep=True)
-    if model is not None or transforms.is_file():
+    surface = find_surface_file(folder, settings)
+    shaped = surface is not None and surface.is_file()
+    if (model is not None or transforms.is_file()) and not (prefer == "mesh" and shaped):
         named = [transforms] if model is None else sorted(each for each in model.iterdir() if each.is_file())
         return Source("cameras", (*named, *images, *masks, *sorted(folder.glob("*.ply"))), folder, folder)
-    surface = find_surface_file(folder, settings)
-    if surface is not None and surface.is_file():
+    if surface is not None and shaped:
         beside = (*_images(surface.parent, deep=False), *sorted(surface.parent.glob("*.mtl")))
         return Source("mesh", (surface, *beside), surface, folder)
     if len(images) >= FEWEST or (images and photographs != folder):
@@ -116,10 +128,11 @@ def keep_views(
 
     def make(path: Path) -> None:
         if source.kind == "mesh":
-            replace_views(_rendered(source.path, config, settings=settings, tell=tell), path)
+            views = _rendered(source.path, config, settings=settings, tell=tell)
         else:
             folder = source.path if moved is None else moved.path
-            replace_views(_photographed(folder, config, metres=settings.views_metres, tell=tell), path)
+            views = _photographed(folder, config, metres=settings.views_metres, tell=tell)
+        replace_views(_spread(views, config.count), path)
 
     lengths = {"views_metres": settings.views_metres, "surface_metres": settings.surface_metres}
     chosen = {name: value for name, value in asdict(config).items() if name in _matters(source.kind)}
@@ -132,9 +145,17 @@ def replace_views(views: Sequence[View], folder: Path) -> None:
     write_views(views, folder)
 
 
+def _spread(views: Sequence[View], count: int) -> Sequence[View]:
+    """Return at most `count` views whose cameras are farthest apart, in the order of all; all for 0."""
+    if not 0 < count < len(views):
+        return views
+    positions = torch.stack([view.camera.position for view in views])
+    return [views[row] for row in sorted(farthest_points(positions, count).tolist())]
+
+
 def _matters(kind: Kind) -> Sequence[str]:
     """Return the settings that decide views of one kind."""
-    return ("rendered",) if kind == "mesh" else ("longest", "masks")
+    return ("rendered", "count") if kind == "mesh" else ("longest", "masks", "count")
 
 
 def _photographed(folder: Path, config: ViewsConfig, *, metres: float, tell: Tell) -> tuple[View, ...]:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from avmsf.capture.folder import Capture
 from avmsf.capture.settings import CaptureSettings
@@ -56,6 +56,7 @@ class DatasetReport:
     """What a user should know besides, such as objects shared with another dataset."""
 
 
+@runtime_checkable
 class Dataset(Protocol):
     """Many objects, each of which can be read as a capture."""
 

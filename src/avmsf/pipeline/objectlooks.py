@@ -1,0 +1,54 @@
+"""What fields may read of the objects of a dataset: made once an object, kept, and the same for every method."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from avmsf.bench.task import Look
+from avmsf.capture.datasets.dataset import Dataset
+from avmsf.errors import SceneError
+from avmsf.pipeline.scene import FEATURES, SceneConfig, SceneStages
+from avmsf.pipeline.stages import StageFolder
+from avmsf.scene.features import FeatureField
+from avmsf.scene.featurestore import load_features
+
+UNALIGNED = "unaligned.safetensors"
+
+
+@dataclass(frozen=True)
+class ObjectLooks:
+    """Makes the features of a dataset's objects, each in a folder of its own beneath `cache`."""
+
+    dataset: Dataset
+    cache: Path
+    config: SceneConfig = field(default_factory=SceneConfig)
+
+    def __call__(self, identifier: str, look: Look, views: int | None = None) -> FeatureField:
+        """Return what `look` means for an object, from at most `views` views, or from all for None.
+
+        Positions are those of the same points that looks are lifted onto, so that the two differ in nothing else; of an
+        object that nothing shows, they are its surface's, or fill the box of its contacts. Raises SceneError for the
+        looks of such an object, and DatasetError for an unknown one.
+        """
+        seen = self.dataset.look(identifier)
+        if seen is None and look == "positions":
+            return self._bare(identifier)
+        if seen is None:
+            raise SceneError(f"{identifier}: the dataset holds neither a mesh nor pictures of it, so it has no looks")
+        lift = replace(self.config.lift, symmetry=look != "unaligned")
+        config = replace(self.config, lift=lift, views=replace(self.config.views, count=views or 0))
+        place = self.cache / identifier / ("all views" if views is None else f"{views} views")
+        stages = SceneStages(
+            seen.folder,
+            StageFolder(place),
+            config,
+            settings=seen.settings,
+            name=UNALIGNED if look == "unaligned" else FEATURES,
+        )
+        features = load_features(stages.features.path)
+        return FeatureField.from_points(features.points) if look == "positions" else features
+
+    def _bare(self, identifier: str) -> FeatureField:
+        capture = self.dataset.capture(identifier)
+        if capture.surface is None:
+            return FeatureField.from_contacts(capture.impacts.contacts)
+        return FeatureField.from_points(capture.surface.vertices)

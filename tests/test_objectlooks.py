@@ -1,0 +1,102 @@
+"""What a dataset's objects look like is made once, from the views that were asked for."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from avmsf.capture.datasets.dataset import DatasetReport, Look, ObjectFacts
+from avmsf.capture.folder import Capture
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.views.write import write_views
+from avmsf.errors import SceneError
+from avmsf.pipeline.features import LiftConfig
+from avmsf.pipeline.objectlooks import ObjectLooks
+from avmsf.pipeline.scene import SceneConfig
+from avmsf.pipeline.sources import ViewsConfig, find_source
+from small_scene import slab_views, write_surface_file
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*neither texture nor colours")
+
+CONFIG = SceneConfig(
+    views=ViewsConfig(rendered=24), lift=LiftConfig(encoder="descriptors", points=400, components=4, missing=0.0)
+)
+
+
+class OneObject:
+    """A dataset of one object, which can be seen in `seen` or nowhere."""
+
+    name = "one"
+
+    def __init__(self, seen: Path | None) -> None:
+        self.seen = seen
+
+    def objects(self) -> tuple[str, ...]:
+        return ("slab",)
+
+    def facts(self, identifier: str) -> ObjectFacts:
+        return ObjectFacts(identifier, identifier)
+
+    def capture(self, identifier: str) -> Capture:
+        contacts = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.2, 0.0], [0.1, 0.0, 0.1]], dtype=torch.float64)
+        return Capture("slab", Impacts(contacts, torch.zeros(3, 8), 100.0, ("a", "b", "c")))
+
+    def look(self, identifier: str) -> Look | None:
+        return None if self.seen is None else Look(self.seen)
+
+    def check(self) -> DatasetReport:
+        return DatasetReport(self.name, ())
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("slab")
+    write_surface_file(folder)
+    return folder
+
+
+def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tmp_path: Path) -> None:
+    looks = ObjectLooks(OneObject(seen), tmp_path, CONFIG)
+    aligned, bare, unaligned = (looks("slab", look) for look in ("visual", "positions", "unaligned"))
+    assert torch.equal(aligned.points, bare.points)
+    assert torch.equal(aligned.points, unaligned.points)
+    assert bare.features.shape == (400, 3)
+    assert aligned.features.shape == (400, 3 + 4)
+    # A slab has symmetries, so that what is made to obey them is not what was seen.
+    assert not torch.allclose(aligned.features, unaligned.features)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
+    assert len(before) == 2
+    looks("slab", "visual")
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")} == before
+
+
+def test_fewer_views_are_kept_apart_from_all(seen: Path, tmp_path: Path) -> None:
+    looks = ObjectLooks(OneObject(seen), tmp_path, CONFIG)
+    few, every = looks("slab", "visual", 6), looks("slab", "visual")
+    assert not torch.allclose(few.features, every.features)
+    images = {place.name: len(list(place.rglob("images/*.png"))) for place in (tmp_path / "slab").iterdir()}
+    assert images == {"6 views": 6, "all views": 72}
+
+
+def test_an_object_that_nothing_shows_has_positions_alone(tmp_path: Path) -> None:
+    looks = ObjectLooks(OneObject(None), tmp_path, CONFIG)
+    points = looks("slab", "positions").points
+    assert points.amin(0).tolist() == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
+    assert points.amax(0).tolist() == pytest.approx([0.1, 0.2, 0.1], abs=0.02)
+    with pytest.raises(SceneError, match="slab: the dataset holds neither a mesh nor pictures"):
+        looks("slab", "visual")
+
+
+def test_a_mesh_may_be_preferred_to_the_photographs_beside_it(tmp_path: Path) -> None:
+    write_views(slab_views(), tmp_path)
+    write_surface_file(tmp_path)
+    best, mesh = (find_source(tmp_path, CaptureSettings(), prefer=each) for each in ("best", "mesh"))
+    assert best is not None
+    assert mesh is not None
+    assert (best.kind, mesh.kind) == ("cameras", "mesh")
+
+
+def test_a_negative_number_of_views_is_refused() -> None:
+    with pytest.raises(SceneError, match="count = -1: expected 0 for all views"):
+        ViewsConfig(count=-1)
