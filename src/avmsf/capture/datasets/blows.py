@@ -1,0 +1,147 @@
+"""From a dataset's recordings of one object to its capture, prepared as the files of a user's own folder are."""
+
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import soundfile
+import torch
+from jaxtyping import Float64
+
+from avmsf.capture.audio import Recording
+from avmsf.capture.folder import Capture
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.measure import measure
+from avmsf.capture.placement import judge_placement, surface_points
+from avmsf.capture.prepare import prepare
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.surface import Surface
+from avmsf.capture.together import common_length, common_rate
+from avmsf.capture.warning import CaptureWarning
+from avmsf.errors import CaptureError, DatasetError
+
+FEWEST = 2
+_SHOWN = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Blow:
+    """One recording of a dataset, with what is known of the blow."""
+
+    name: str
+    """What the capture calls it."""
+    recording: Recording
+    contact: Float64[np.ndarray, " 3"]
+    """Object frame, metres."""
+    newtons: float | None = None
+    """Peak force, where it is known."""
+    gain_db: float = 0.0
+    """By how much the recorder made the sound louder, which is divided out."""
+
+
+def gather(
+    blows: Iterable[Blow],
+    *,
+    name: str,
+    origin: str,
+    settings: CaptureSettings,
+    surface: Surface | None = None,
+    remarks: Sequence[str] = (),
+    recorded: bool = True,
+) -> Capture:
+    """Prepare an object's blows one after the other, as `read_capture` does, and return the object's capture.
+
+    `blows` may be read as it is asked for: only what is kept stays in memory. A recording that cannot be used (silent,
+    too short after its blow) is left out. A `CaptureWarning` tells of these, of recordings that look wrong, of contacts
+    off the surface or struck twice, and of the `remarks`. Sounds that were computed, not `recorded`, are not searched
+    for clipping, noise and second blows. Raises DatasetError, which names the `origin`, where fewer than two recordings
+    remain or they do not fit together.
+    """
+    kept: list[tuple[str, str, float, np.ndarray]] = []
+    sounds, forces, remarks = [], [], list(remarks)
+    try:
+        for blow in blows:
+            try:
+                prepared = prepare(blow.recording, settings, newtons=blow.newtons)
+            except CaptureError as error:
+                remarks.append(f"left out: {error}")
+                continue
+            if recorded:
+                # Clipping shows only before the amplifier's gain is divided out.
+                report = measure(blow.recording, prepared, settings=settings, line=len(kept) + 1)
+                remarks += [f"{blow.recording.name}: {problem}" for problem in report.problems]
+            sounds.append((prepared.sound * 10 ** (-blow.gain_db / 20)).astype(np.float32))
+            forces.append(prepared.newtons)
+            kept.append((blow.name, blow.recording.name, blow.recording.sample_rate, blow.contact))
+        refuse_few(len(kept), origin=origin, reasons=remarks)
+        names, files, rates, contacts = zip(*kept, strict=True)
+        rate = common_rate(rates, files)
+        length, cut = common_length([len(sound) for sound in sounds], files, rate=rate, settings=settings)
+    except CaptureError as error:
+        raise DatasetError(f"{origin}: {error}") from error
+    impacts = Impacts(
+        contacts=torch.from_numpy(np.stack(contacts).astype(np.float64)),
+        sounds=torch.from_numpy(np.stack([sound[:length] for sound in sounds])),
+        sample_rate=rate * settings.playback_speed,
+        names=names,
+        forces=None if None in forces else torch.tensor(forces, dtype=torch.float32),
+    )
+    remarks += cut + _repeated(impacts) + _misplaced(impacts, surface)
+    if remarks:
+        warnings.warn(f"{origin}: {listed(remarks)}", CaptureWarning, stacklevel=3)
+    return Capture(name, impacts, surface)
+
+
+def refuse_few(count: int, *, origin: str, reasons: Sequence[str]) -> None:
+    """Raise DatasetError with the reasons where fewer than two recordings can be used."""
+    if count < FEWEST:
+        raise DatasetError(
+            f"{origin}: expected at least {FEWEST} recordings with contacts, found {count} that can be used"
+            + (f": {listed(reasons)}" if reasons else "")
+        )
+
+
+def judge_wav(path: Path, *, shown: str, rate: float, frames: int) -> str | None:
+    """Return what is wrong with a sound file, from its header alone, in a sentence that calls it `shown`; or None.
+
+    Expected is one channel of at least so many frames at the rate, Hz.
+    """
+    if not path.is_file():
+        return f"{shown} is missing"
+    try:
+        header = soundfile.info(str(path))
+    except (soundfile.LibsndfileError, OSError) as error:
+        reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
+        return f"{shown} is no sound file that can be read ({reason}): unpack or download it again"
+    if header.samplerate != rate:
+        return (
+            f"{shown} has {header.samplerate} Hz, published with {rate:g} Hz: take the original, not a converted copy"
+        )
+    if header.channels != 1:
+        return f"{shown} has {header.channels} channels, published with one: take the original, not a converted copy"
+    if header.frames < frames:
+        return f"{shown} is cut short, {header.frames} of {frames} frames: unpack or download it again"
+    return None
+
+
+def listed(sentences: Sequence[str]) -> str:
+    """Return the first sentences, and how many more there are."""
+    more = f"; and {len(sentences) - _SHOWN} more" if len(sentences) > _SHOWN else ""
+    return "; ".join(sentences[:_SHOWN]) + more
+
+
+def _repeated(impacts: Impacts) -> list[str]:
+    places: dict[tuple[float, ...], list[str]] = {}
+    for name, contact in zip(impacts.names, impacts.contacts.tolist(), strict=True):
+        places.setdefault(tuple(round(value, 6) for value in contact), []).append(name)
+    repeated = [", ".join(names) for names in places.values() if len(names) > 1]
+    return [f"struck in one and the same place: {' and '.join(repeated[:_SHOWN])}"] if repeated else []
+
+
+def _misplaced(impacts: Impacts, surface: Surface | None) -> list[str]:
+    if surface is None:
+        return []
+    found = judge_placement(impacts.contacts, surface_points(surface)).describe(impacts.names)
+    return [found] if found else []

@@ -1,0 +1,135 @@
+"""Capture folders side by side in one folder, read as one dataset; a single capture is a collection of one."""
+
+from functools import cached_property
+from pathlib import Path
+
+import soundfile
+
+from avmsf.capture.datasets.dataset import DatasetReport, Look, ObjectFacts, ObjectReport
+from avmsf.capture.datasets.numbering import in_order, refuse_unknown
+from avmsf.capture.folder import Capture, read_capture, settings_of
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.surface import find_surface_file
+from avmsf.capture.table import TABLE, read_rows, refuse_repeated_files, understand
+from avmsf.capture.together import common_rate, refuse_few
+from avmsf.capture.views.colmap import find_model
+from avmsf.capture.views.pictures import SUFFIXES
+from avmsf.errors import CaptureError, DatasetError
+
+_SEEN_IN = ("*.mp4", "*.mov", "*.m4v", "*.avi", "*.mkv", "*.webm", "splats.ply", "point_cloud.ply", "transforms.json")
+"""Files other than meshes, photographs and COLMAP's models that show what an object looks like."""
+
+
+class CaptureCollection:
+    """A folder of capture folders, or one capture folder.
+
+    Hidden folders are passed over, and so are folders without a table of impacts, which `check` names. Objects are
+    called as their folders are.
+    """
+
+    name = "captures"
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+
+    def objects(self) -> tuple[str, ...]:
+        """Return the names of all capture folders, by numbers where they begin with one, else by the alphabet."""
+        return tuple(self._folders)
+
+    def facts(self, identifier: str) -> ObjectFacts:
+        """Return what the capture is called. Raises DatasetError for an unknown one."""
+        folder = self._expect(identifier)
+        try:
+            return ObjectFacts(identifier, settings_of(folder).name or identifier)
+        except CaptureError:
+            # Settings that cannot be read are reported where they are needed.
+            return ObjectFacts(identifier, identifier)
+
+    def capture(self, identifier: str) -> Capture:
+        """Read one capture as `read_capture` does. Raises DatasetError for an unknown one and for what that refuses."""
+        folder = self._expect(identifier)
+        try:
+            return read_capture(folder)
+        except CaptureError as error:
+            raise DatasetError(f"{folder}: {error}") from error
+
+    def look(self, identifier: str) -> Look | None:
+        """Return the capture's folder where there is anything in it to see. Raises DatasetError for an unknown one and
+        for settings that cannot be read."""
+        folder = self._expect(identifier)
+        try:
+            settings = settings_of(folder)
+            return Look(folder, settings) if _shows(folder, settings) else None
+        except CaptureError as error:
+            raise DatasetError(f"{folder}: {error}") from error
+
+    def check(self) -> DatasetReport:
+        """Say what is there and what is missing, from tables and headers; `avmsf check` also listens to a capture."""
+        reports = tuple(self._report(identifier) for identifier in self.objects())
+        known = set(self._folders.values())
+        others = in_order(path.name for path in _visible(self.folder) if path not in known and self.folder not in known)
+        remarks = (f"passed over, for there is no {TABLE} in them: {', '.join(others)}",) if others else ()
+        return DatasetReport(self.name, reports, (), remarks)
+
+    @cached_property
+    def _folders(self) -> dict[str, Path]:
+        if (self.folder / TABLE).is_file():
+            return {self.folder.resolve().name: self.folder}
+        found = {path.name: path for path in _visible(self.folder) if (path / TABLE).is_file()}
+        return {name: found[name] for name in in_order(found)}
+
+    def _expect(self, identifier: str) -> Path:
+        if identifier not in self._folders:
+            refuse_unknown(identifier, self._folders, str(self.folder))
+        return self._folders[identifier]
+
+    def _report(self, identifier: str) -> ObjectReport:
+        folder = self._folders[identifier]
+        facts = self.facts(identifier)
+        problems, files, rates = [], [], []
+        try:
+            settings = settings_of(folder)
+            rows, _ = read_rows(folder)
+            refuse_few(len(rows))
+        except CaptureError as error:
+            return ObjectReport(facts, 0, (str(error),))
+        strikes = []
+        for row in rows:
+            try:
+                strikes.append(understand(row, settings))
+                header = soundfile.info(str(folder / strikes[-1].file))
+            except CaptureError as error:
+                problems.append(str(error))
+            except (soundfile.LibsndfileError, OSError):
+                there = (folder / strikes[-1].file).is_file()
+                problems.append(f"{strikes[-1].file} {'is no sound file that can be read' if there else 'is missing'}")
+            else:
+                files.append(strikes[-1].file)
+                rates.append(float(header.samplerate))
+        try:
+            refuse_repeated_files(strikes)
+            if rates:
+                common_rate(rates, files)
+        except CaptureError as error:
+            problems.append(str(error))
+        surface = find_surface_file(folder, settings)
+        if surface is not None and not surface.is_file():
+            problems.append(f"{surface.name}, which capture.toml names as the surface, is missing")
+        # One row that cannot be read makes `read_capture` refuse the folder.
+        return ObjectReport(facts, 0 if problems else len(files), tuple(problems))
+
+
+def _visible(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
+
+
+def _shows(folder: Path, settings: CaptureSettings) -> bool:
+    """Return whether there is anything in a capture folder that shows the object."""
+    surface = find_surface_file(folder, settings)
+    pictures = (folder / "images").rglob("*") if (folder / "images").is_dir() else folder.iterdir()
+    return (
+        (surface is not None and surface.is_file())
+        or any(path.suffix.lower() in SUFFIXES for path in pictures)
+        or any(next(folder.glob(pattern), None) for pattern in _SEEN_IN)
+        or find_model(folder) is not None
+    )

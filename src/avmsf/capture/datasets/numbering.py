@@ -1,0 +1,115 @@
+"""How the objects of ObjectFolder Real and RealImpact are numbered, and what the numbers tell of an object."""
+
+import re
+from collections.abc import Collection, Iterable
+from difflib import get_close_matches
+from typing import NoReturn
+
+from avmsf.errors import DatasetError
+
+REALIMPACT_NAMES = (
+    "3_CeramicKoiBowl", "4_CeramicBowlFish", "6_Bowl", "9_BowlCeramic", "10_bowl", "17_IronSkillet", "19_Pan",
+    "22_Cup", "23_PurpleScoop", "27_WoodPlate", "28_WoodPlateSquare", "31_WoodSlab", "32_WoodChalice",
+    "33_WoodWineGlass", "34_WoodMug", "35_MeasuringCup", "36_SmallMeasuringCup", "37_PiePan", "43_IronMortar",
+    "48_PlasticBowl", "49_PlasticBowl", "50_PlasticBowl", "51_ShellPlate", "59_stand", "60_SkullCup",
+    "61_PlanterCeramic", "62_Pot_Hexagonal", "63_SmallPlanterCeramic", "64_CeramicMug", "65_PitcherCeramic",
+    "67_IronPlate", "68_WoodBoard", "73_PlasticBin", "74_FlowerPotLargeCeramic", "75_FlowerpotSmallCeramic",
+    "78_CeramicCup", "79_LargeSwanCeramic", "80_SmallSwanCeramic", "81_WoodPad", "83_WoodVase",
+    "86_MetalHoledSpoon", "89_MetalSpatula", "90_MetalLadle", "91_MetalSpoon", "92_MetalSpatula",
+    "93_GreenGoblet", "94_GlassGoblet", "96_Bowl", "97_PlasticScoop", "100_Frisbee",
+)  # fmt: skip
+"""All objects of RealImpact, as its archives and folders are called."""
+UNUSED = (72, 82)
+"""Numbers that no folder of ObjectFolder Real has; of 98 and 99 one is missing as well."""
+_FIRST_WORDS = ("ceramic", "iron", "wood", "glass")
+_LAST_WORDS = ("ceramic", "iron", "wood")
+
+
+def number_of(identifier: str) -> int | None:
+    """Return the number that a folder's name begins with, 100 of `100_Frisbee` and of `100`; None if there is none."""
+    found = re.match(r"(0|[1-9]\d*)(?:_|$)", identifier)
+    return int(found[1]) if found else None
+
+
+def in_order(names: Iterable[str]) -> tuple[str, ...]:
+    """Return names by their numbers, 2 before 10; those without a number come last."""
+    numbered = ((number_of(name), name) for name in names)
+    return tuple(name for _, _, name in sorted((number is None, number or 0, name) for number, name in numbered))
+
+
+def shared_objects() -> tuple[int, ...]:
+    """Return the numbers that are in both ObjectFolder Real and RealImpact.
+
+    The two number objects alike and share many of them physically, so that one who learns from one dataset and tests
+    on the other has to leave these out of one of them. That is every object of RealImpact.
+    """
+    return tuple(sorted(number for number in map(number_of, REALIMPACT_NAMES) if number is not None))
+
+
+def shared_remarks(names: Collection[str], other: str) -> list[str]:
+    """Return what to tell the owner of objects of these names, of which some may be in the `other` dataset as well."""
+    shared = [name for name in names if number_of(name) in shared_objects()]
+    if not shared:
+        return []
+    return [
+        f"{len(shared)} objects have a number of {other}'s and may be the same things, {', '.join(shared)}: never "
+        "train on one dataset and test on the other without leaving them out"
+    ]
+
+
+def realimpact_name(number: int) -> str | None:
+    """Return what RealImpact calls the object of this number, in words; None where it has none."""
+    found = next((name for name in REALIMPACT_NAMES if number_of(name) == number), None)
+    return None if found is None else in_words(found)
+
+
+def in_words(name: str) -> str:
+    """Return a folder's name as words: `wood plate square` of `28_WoodPlateSquare`."""
+    return " ".join(_words(name)) or name
+
+
+def material_in(name: str) -> str | None:
+    """Return the material that a folder's name tells beyond doubt, or None.
+
+    A name tells it by its first word, or by its last; a glass is a thing as well, so that as the last word it tells
+    nothing. Metal may be iron or steel, and what is called plastic may be polycarbonate: these stay open.
+    """
+    words = _words(name)
+    if not words:
+        return None
+    if words[0] in _FIRST_WORDS:
+        return words[0]
+    return words[-1] if words[-1] in _LAST_WORDS else None
+
+
+def folder_number(published: int, present: Collection[int]) -> int | None:
+    """Return the folder's number of an object that the published list of 100 counts as `published`.
+
+    The list has no gaps, the folders have. Its 96th object is 98 or 99: whichever of the two is present alone. None
+    where that is open, and beyond 100. The mapping was concluded from names that agree; nobody states it.
+    """
+    if published == 96:
+        candidates = [number for number in (98, 99) if number in present]
+        return candidates[0] if len(candidates) == 1 else None
+    for last, shift in ((71, 0), (80, 1), (95, 2), (100, 3)):
+        if published <= last:
+            return published + shift
+    return None
+
+
+def refuse_unknown(identifier: str, known: Collection[str], dataset: str) -> NoReturn:
+    """Raise `DatasetError` with the objects that may have been meant."""
+    number = number_of(identifier)
+    near = [name for name in known if number is not None and number_of(name) == number]
+    near += [name for name in get_close_matches(identifier, known, n=3, cutoff=0.5) if name not in near]
+    if not near and number is not None:
+        near = sorted(known, key=lambda name: abs((number_of(name) or 0) - number))[:4]
+    meant = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(in_order(known)[:8])}"
+    raise DatasetError(
+        f"{dataset} has no object {identifier!r} here, among {len(known)} that it has; {meant} "
+        "`avmsf dataset check` lists all"
+    )
+
+
+def _words(name: str) -> list[str]:
+    return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name)]

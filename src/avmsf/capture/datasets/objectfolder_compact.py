@@ -1,0 +1,228 @@
+"""ObjectFolder Real as its contact-localization benchmark copies it: 53 objects, no forces, a split of its own."""
+
+import json
+import math
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from avmsf.capture.audio import read_recording
+from avmsf.capture.datasets.arrays import ArrayForm, judge_array, read_array
+from avmsf.capture.datasets.blows import Blow, gather, judge_wav, listed, refuse_few
+from avmsf.capture.datasets.contactlists import ContactFolder
+from avmsf.capture.datasets.dataset import DatasetReport, Look, ObjectFacts, ObjectReport
+from avmsf.capture.datasets.meshes import find_mesh
+from avmsf.capture.datasets.names import facts_of, read_names
+from avmsf.capture.datasets.numbering import in_order, refuse_unknown, shared_remarks
+from avmsf.capture.datasets.objectfolder_raw import FRAMES, RATE
+from avmsf.capture.folder import Capture
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.surface import Surface, find_surface
+from avmsf.errors import CaptureError, DatasetError
+
+PARTS = ("audio", "contacts", "global_gt_points", "split.json", "scale.json")
+"""What a complete copy holds; pictures, touch and spectrograms beside them are not used."""
+POINTS = ArrayForm("float64", (1024, 3))
+SETTINGS = CaptureSettings(normalise="none")
+SPLITS = ("train", "val", "test")
+
+
+class ObjectFolderCompact:
+    """The compact copy: `audio/<object>/<contact>.wav` with `contacts/<object>/<contact>.npy`.
+
+    There is no force, so sounds start where they leave the noise and are as loud as they were recorded: blows of
+    another strength and recordings of another gain differ in level. The surface is a mesh where there is one in the
+    folder or beside it (`find_mesh`), else the copy's own 1,024 points. `table` is a list of names (`read_names`).
+    """
+
+    name = "ObjectFolder Real (compact)"
+
+    def __init__(self, folder: str | Path, *, table: str | Path | None = None) -> None:
+        self.folder = Path(folder)
+        self._table = None if table is None else Path(table)
+
+    def objects(self) -> tuple[str, ...]:
+        """Return the numbers of all objects with recordings, in their order."""
+        audio = self.folder / "audio"
+        found = [path.name for path in audio.iterdir() if path.name.isdecimal()] if audio.is_dir() else []
+        return in_order(name for name in found if any((audio / name).glob("*.wav")))
+
+    def facts(self, identifier: str) -> ObjectFacts:
+        """Return what is known of an object. Raises DatasetError for an unknown one."""
+        self._expect(identifier)
+        return facts_of(identifier, self._names)
+
+    def capture(self, identifier: str) -> Capture:
+        """Read one object's recordings, in the order of their numbers.
+
+        Raises DatasetError for an unknown object, where split.json names recordings that are not there, and where fewer
+        than two can be used; a warning tells of those that were left out.
+        """
+        self._expect(identifier)
+        contacts, problems, lost = self._examine(identifier)
+        origin = f"{self.name}, object {identifier}"
+        if lost:
+            raise DatasetError(
+                f"{origin}: split.json names {len(lost)} recordings that are not there: {listed(lost)}: unpack "
+                "audio.tar.gz again"
+            )
+        refuse_few(len(contacts), origin=origin, reasons=problems)
+        return gather(
+            self._blows(identifier, contacts),
+            name=self.facts(identifier).name,
+            origin=origin,
+            settings=SETTINGS,
+            surface=self._surface(identifier, origin),
+            remarks=problems,
+        )
+
+    def look(self, identifier: str) -> Look | None:
+        """Return the object's mesh, where the meshes of ObjectFolder Real were unpacked here or beside."""
+        self._expect(identifier)
+        return find_mesh(self.folder, identifier)
+
+    def split(self, identifier: str) -> dict[str, tuple[str, ...]]:
+        """Return the benchmark's own split of an object, names of recordings under `train`, `val` and `test`.
+
+        Raises DatasetError where split.json is missing or malformed, or gives one recording to two parts.
+        """
+        self._expect(identifier)
+        return {
+            part: tuple(f"{contact}.wav" for owner, contact in pairs if owner == identifier)
+            for part, pairs in self._splits.items()
+        }
+
+    def size(self, identifier: str) -> float:
+        """Return the object's size of scale.json, the denominator of the benchmark's contact error.
+
+        Raises DatasetError where there is none.
+        """
+        self._expect(identifier)
+        value = self._json("scale.json").get(identifier)
+        if not isinstance(value, int | float) or not 0 < value < math.inf:
+            raise DatasetError(
+                f"{self.folder / 'scale.json'}: {identifier} is {value!r}; expected the object's size, above 0"
+            )
+        return float(value)
+
+    def check(self) -> DatasetReport:
+        """Say what is there and what is missing, from names and headers alone."""
+        reports = []
+        for identifier in self.objects():
+            contacts, problems, lost = self._examine(identifier)
+            named = [f"{sentence}, and split.json names it" for sentence in lost]
+            reports.append(ObjectReport(self.facts(identifier), len(contacts), (*named, *problems)))
+        missing = [
+            f"{part}: unpack {part}.tar.gz of the contact-localization benchmark in {self.folder}"
+            if "." not in part
+            else f"{part}: download it from the contact-localization benchmark into {self.folder}"
+            for part in PARTS
+            if not (self.folder / part).exists()
+        ]
+        without = in_order(
+            {owner for pairs in self._splits_if_any.values() for owner, _ in pairs} - set(self.objects())
+        )
+        if without:
+            missing.append(
+                f"recordings of objects {', '.join(without)}, which split.json names: unpack audio.tar.gz again"
+            )
+        return DatasetReport(self.name, tuple(reports), tuple(missing), self._remarks())
+
+    @cached_property
+    def _names(self) -> dict[int, ObjectFacts]:
+        present = {int(name) for name in self.objects()}
+        return {} if self._table is None else read_names(self._table, present)
+
+    @cached_property
+    def _splits(self) -> dict[str, list[tuple[str, str]]]:
+        path = self.folder / "split.json"
+        table = self._json("split.json")
+        splits: dict[str, list[tuple[str, str]]] = {}
+        owner: dict[tuple[str, str], str] = {}
+        for part in SPLITS:
+            pairs = table.get(part)
+            if not isinstance(pairs, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in pairs):
+                raise DatasetError(f"{path}: {part} holds no list of [object, contact]: download it again")
+            splits[part] = [(str(pair[0]), str(pair[1])) for pair in pairs]
+            for pair in splits[part]:
+                if owner.setdefault(pair, part) != part:
+                    raise DatasetError(
+                        f"{path}: contact {pair[1]} of object {pair[0]} is in both {owner[pair]} and {part}: training "
+                        "and test must not share recordings; download the file again"
+                    )
+        return splits
+
+    @property
+    def _splits_if_any(self) -> dict[str, list[tuple[str, str]]]:
+        return self._splits if (self.folder / "split.json").is_file() else {}
+
+    def _json(self, name: str) -> dict[str, Any]:
+        path = self.folder / name
+        try:
+            value = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError as error:
+            raise DatasetError(f"{path}: there is no such file; the contact-localization benchmark has it") from error
+        except (OSError, ValueError) as error:
+            raise DatasetError(f"{path}: not a JSON file that can be read ({error}): download it again") from error
+        if not isinstance(value, dict):
+            raise DatasetError(f"{path}: expected a JSON object, found a {type(value).__name__}: download it again")
+        return value
+
+    def _expect(self, identifier: str) -> None:
+        if identifier not in self.objects():
+            if not self.objects():
+                raise DatasetError(f"{self.folder}: no recordings are here: unpack audio.tar.gz")
+            refuse_unknown(identifier, self.objects(), self.name)
+
+    def _examine(self, identifier: str) -> tuple[list[str], list[str], list[str]]:
+        """Return the contacts that can be used, why others cannot, and which recordings of the split are not there."""
+        folder = self.folder / "audio" / identifier
+        places = ContactFolder(self.folder / "contacts")
+        present = in_order(path.stem for path in folder.glob("*.wav"))
+        contacts, problems = [], []
+        for contact in present:
+            shown = f"audio/{identifier}/{contact}.wav"
+            wrong = judge_wav(folder / f"{contact}.wav", shown=shown, rate=RATE, frames=FRAMES)
+            wrong = wrong or places.judge(identifier, contact)
+            if wrong:
+                problems.append(wrong)
+            else:
+                contacts.append(contact)
+        cloud = self._points_path(identifier)
+        if cloud.parent.is_dir():
+            wrong = judge_array(cloud, POINTS, shown=f"global_gt_points/{identifier}.npy")
+            problems += [wrong] if wrong else []
+        named = [contact for pairs in self._splits_if_any.values() for owner, contact in pairs if owner == identifier]
+        lost = [f"audio/{identifier}/{contact}.wav is missing" for contact in in_order(set(named) - set(present))]
+        return contacts, problems, lost
+
+    def _blows(self, identifier: str, contacts: list[str]) -> Iterator[Blow]:
+        places = ContactFolder(self.folder / "contacts")
+        for contact in contacts:
+            file = f"audio/{identifier}/{contact}.wav"
+            recording = read_recording(self.folder / file, file)
+            yield Blow(f"{contact}.wav", recording, places.place(identifier, contact))
+
+    def _surface(self, identifier: str, origin: str) -> Surface | None:
+        look = self.look(identifier)
+        if look is not None:
+            try:
+                return find_surface(look.folder, look.settings)
+            except CaptureError as error:
+                raise DatasetError(f"{origin}: {error}") from error
+        path = self._points_path(identifier)
+        if judge_array(path, POINTS, shown=path.name) is not None:
+            return None
+        points = read_array(path, POINTS, shown=path.name)
+        return Surface(torch.from_numpy(points.astype(np.float32)), torch.zeros(0, 3, dtype=torch.int64))
+
+    def _points_path(self, identifier: str) -> Path:
+        return self.folder / "global_gt_points" / f"{identifier}.npy"
+
+    def _remarks(self) -> tuple[str, ...]:
+        forces = "no forces are here: sounds are as loud as they were recorded, whatever the blow and the gain"
+        return (forces, *shared_remarks(self.objects(), "RealImpact"))

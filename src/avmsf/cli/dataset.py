@@ -1,0 +1,85 @@
+"""`avmsf dataset check`: what of a dataset is there, and what is missing."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import tyro
+
+from avmsf.capture.datasets import DatasetReport, ObjectReport, open_dataset
+from avmsf.cli.printing import console, print_json, say, table
+
+UNREADABLE = 2
+
+
+@dataclass(frozen=True)
+class Options:
+    """Say what of a dataset is there, object by object, and what is missing.
+
+    Recognised are ObjectFolder Real (as published, or its compact copy), RealImpact, and folders of captures. Sounds
+    are not read. The exit code is 0 where at least one object can be read, and 2 where none can.
+    """
+
+    dataset: tyro.conf.Positional[Path]
+    """The dataset's folder."""
+    contacts: Path | None = None
+    """Where ObjectFolder Real's contacts are: a folder of arrays, or one of SonicGauss's lists."""
+    table: Path | None = None
+    """A CSV or JSON list id, name, material of ObjectFolder Real's objects, numbered as published."""
+    json: bool = False
+    """Print one JSON object on the standard output, all else on the standard error."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    options: Options = tyro.extras.subcommand_cli_from_dict(
+        {"check": Options}, prog="avmsf dataset", args=words, config=(tyro.conf.FlagCreatePairsOff,)
+    )
+    return options
+
+
+def run(options: Options) -> int:
+    """Print the report; return 2 where no object can be read."""
+    report = open_dataset(options.dataset, contacts=options.contacts, table=options.table).check()
+    screen = console(errors=options.json)
+    screen.print(_table(report, f"{report.dataset} in {options.dataset}"))
+    for line in _lines(report):
+        screen.print(line, soft_wrap=True)
+    if options.json:
+        print_json(asdict(report))
+    readable = sum(_readable(each) for each in report.objects)
+    if not readable:
+        say(f"avmsf dataset: no object of {options.dataset} can be read as it is: mend what is listed and check again")
+        return UNREADABLE
+    recordings = sum(each.recordings for each in report.objects)
+    screen.print(
+        f"{readable} of {len(report.objects)} objects can be read, with {recordings} recordings", soft_wrap=True
+    )
+    return 0
+
+
+def _readable(report: ObjectReport) -> bool:
+    return report.recordings >= 2
+
+
+def _lines(report: DatasetReport) -> list[str]:
+    """Return everything that is not in the table, a line each: what is missing, then problems, then remarks."""
+    problems = [f"{each.facts.identifier}: {problem}" for each in report.objects for problem in each.problems]
+    return [*(f"missing: {part}" for part in report.missing), *problems, *(f"note: {each}" for each in report.remarks)]
+
+
+def _table(report: DatasetReport, title: str) -> object:
+    rows = []
+    for each in report.objects:
+        facts = each.facts
+        inferred = " (inferred)" * facts.inferred
+        rows.append(
+            (
+                facts.identifier,
+                "unreadable" if not _readable(each) else "look" if each.problems else "good",
+                "–" if facts.name == facts.identifier else facts.name + inferred,
+                "–" if facts.material is None else facts.material + inferred,
+                str(each.recordings),
+            )
+        )
+    return table(title, ("object", "state", "name", "material", "recordings"), rows, words=4)

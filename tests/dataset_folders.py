@@ -1,0 +1,157 @@
+"""Folders in the layouts of published datasets, with their names, types, shapes and quirks, as the tests need them."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import soundfile
+import trimesh
+
+RATE = 48_000
+FRAMES = 288_000
+ONSET = 48_000
+ROWS = 3000
+AUDIO_CONTACTS = ("0", "1", "2", "10")
+
+
+@cache
+def transfer(seed: int) -> np.ndarray:
+    """Return the sound of a newton at 0 dB of gain, as a fraction of full scale, from the blow on."""
+    generator = np.random.default_rng(seed)
+    time = np.arange(FRAMES - ONSET) / RATE
+    modes = np.exp(-6 * time)[:, None] * np.sin(2 * np.pi * np.array([700.0, 1900.0, 4100.0]) * time[:, None])
+    return 0.02 * modes @ generator.uniform(0.4, 1.0, 3)
+
+
+def place(identifier: str, contact: str) -> np.ndarray:
+    """Return a contact on a sphere of 0.1 m, by the numbers of object and contact."""
+    direction = np.random.default_rng([int(identifier), int(contact)]).standard_normal(3)
+    return 0.1 * direction / np.linalg.norm(direction)
+
+
+def write_strike(folder: Path, *, newtons: float = 5.0, gain: float = 18.0, pad: int = 1, seed: int = 0) -> None:
+    """Write one contact of the raw layout: both wavs, and both notes with Windows line ends."""
+    folder.mkdir(parents=True, exist_ok=True)
+    sound = np.zeros(FRAMES)
+    sound[ONSET:] = transfer(seed) * newtons * 10 ** ((gain - 20 * pad) / 20)
+    sound[: ONSET - 100] += 1e-4 * np.random.default_rng(1000 + seed).standard_normal(ONSET - 100)
+    force = np.zeros(FRAMES)
+    # The first sample of the rise above a tenth of the peak is the onset.
+    force[ONSET : ONSET + 24] = 0.05 * newtons * np.sin(np.pi * (np.arange(24) + 1) / 25)
+    assert max(np.abs(sound).max(), np.abs(force).max()) < 1  # more would wrap round
+    for name, samples in (("mic.wav", sound), ("Force.wav", force)):
+        soundfile.write(folder / name, np.rint(samples * 32767).astype(np.int16), RATE, subtype="PCM_16")
+    (folder / "metadata.yaml").write_bytes(f"gain:\r\n- 12\r\n- {gain:g}\r\npad:\r\n- 1\r\n- {pad}\r\n".encode())
+    (folder / "striking_force.yaml").write_bytes(f"- striking_force_newtons: {newtons!r}\r\n".encode())
+
+
+def write_raw(folder: Path, objects: Mapping[str, Sequence[str]], *, contacts: bool = True) -> Path:
+    """Write objects of the raw layout, each blow of another force and gain, and perhaps the contacts as arrays."""
+    for identifier, names in objects.items():
+        for order, contact in enumerate(names):
+            write_strike(
+                folder / identifier / "audio" / contact,
+                newtons=2.0 + order,
+                gain=6.0 if order == 2 else 18.0 - 6 * (order % 2),
+                pad=int(order != 2),
+                seed=int(contact),
+            )
+        if contacts:
+            write_contacts(folder, identifier, names)
+    return folder
+
+
+def write_contacts(folder: Path, identifier: str, names: Sequence[str]) -> None:
+    """Write contacts as the compact layout has them."""
+    (folder / "contacts" / identifier).mkdir(parents=True, exist_ok=True)
+    for contact in names:
+        np.save(folder / "contacts" / identifier / f"{contact}.npy", place(identifier, contact))
+
+
+def records(identifier: str, names: Sequence[str]) -> list[dict[str, object]]:
+    """Return contacts as SonicGauss's lists have them."""
+    base = f"datas/OF_Real/ObjectFolderResults/{identifier}"
+    return [
+        {
+            "location": f"{base}/audio/{identifier}_{contact}_3sec_48000hz.wav",
+            "ply_file": f"{base}/model.ply",
+            "contact": place(identifier, contact).tolist(),
+            "duration": 3.0,
+        }
+        for contact in names
+    ]
+
+
+def write_compact(folder: Path, objects: Mapping[str, Sequence[str]]) -> Path:
+    """Write a compact copy whose split gives each object's last contact to the test."""
+    split: dict[str, list[list[object]]] = {"train": [], "val": [], "test": []}
+    for identifier, names in objects.items():
+        (folder / "audio" / identifier).mkdir(parents=True)
+        (folder / "global_gt_points").mkdir(exist_ok=True)
+        write_contacts(folder, identifier, names)
+        points = np.random.default_rng(int(identifier)).standard_normal((1024, 3))
+        np.save(
+            folder / "global_gt_points" / f"{identifier}.npy", 0.1 * points / np.linalg.norm(points, axis=1)[:, None]
+        )
+        for contact in names:
+            sound = np.zeros(FRAMES)
+            sound[ONSET:] = 8 * transfer(int(contact))
+            sound += 1e-4 * np.random.default_rng(int(contact)).standard_normal(FRAMES)
+            samples = np.rint(sound * 32767).astype(np.int16)
+            soundfile.write(folder / "audio" / identifier / f"{contact}.wav", samples, RATE, subtype="PCM_16")
+            split["test" if contact == names[-1] else "train"].append([int(identifier), int(contact)])
+    (folder / "split.json").write_text(json.dumps(split))
+    (folder / "scale.json").write_text(json.dumps(dict.fromkeys(objects, 0.29946)))
+    return folder
+
+
+def write_mesh(path: Path, *, radius: float = 0.1, middle: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
+    """Write a sphere."""
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    mesh.apply_translation(middle)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mesh.export(path)
+    return mesh
+
+
+def microphones(*, turned: float = 0.0) -> np.ndarray:
+    """Return where 600 microphones stand: angle > distance > microphone, a vertical row of 15 on an arm that turns."""
+    places = []
+    for angle in range(0, 181, 20):
+        for distance in (0, 333, 667, 1000):
+            for microphone in range(15):
+                radius, height = (230 + distance) / 1000, -0.91 + 1.82 * microphone / 14
+                turn = math.radians(angle + turned)
+                across, along = -0.04345, radius
+                places.append(
+                    (
+                        along * math.cos(turn) - across * math.sin(turn),
+                        along * math.sin(turn) + across * math.cos(turn),
+                        height,
+                    )
+                )
+    return np.array(places)
+
+
+def write_realimpact(folder: Path, name: str, *, samples: int = 2400, turned: Sequence[float] = (0.0,) * 5) -> Path:
+    """Write an object of RealImpact, each row's sound a decay as high as the row's number, over 3000, plus one."""
+    home = folder / name / "preprocessed"
+    mesh = write_mesh(home / "transformed.obj", radius=0.08, middle=(0.013, 0.047, 0.21))
+    vertices = np.array([5, 77, 190, 333, 601])
+    listeners = np.concatenate([microphones(turned=turn) for turn in turned])
+    np.save(home / "vertexID.npy", np.repeat(vertices, 600).astype(np.int64))
+    np.save(home / "vertexXYZ.npy", np.repeat(np.asarray(mesh.vertices)[vertices], 600, axis=0))
+    np.save(home / "listenerXYZ.npy", listeners)
+    angles, distances, numbers = np.meshgrid(range(0, 181, 20), (0, 333, 667, 1000), range(15), indexing="ij")
+    for file, grid in (("angle", angles), ("distance", distances), ("micID", numbers)):
+        np.save(home / f"{file}.npy", np.tile(grid.ravel(), 5).astype(np.int64))
+    sounds = np.lib.format.open_memmap(home / "deconvolved_0db.npy", mode="w+", dtype=np.float32, shape=(ROWS, samples))
+    time = np.arange(samples)
+    # Sound takes a while to arrive: the first samples, which belong to the response, are faint.
+    shape = np.where(time < 40, 0.01, 1) * np.exp(-time / 400) * (-1.0) ** time
+    sounds[:] = (1 + np.arange(ROWS)[:, None] / ROWS) * shape
+    sounds.flush()
+    return home

@@ -1,0 +1,169 @@
+"""RealImpact: the closest microphone by geometry, its rows alone read, and files that are not what they should be."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from avmsf.capture import CaptureWarning
+from avmsf.capture.datasets import RealImpact, shared_objects
+from avmsf.capture.datasets.listeners import closest_rows
+from avmsf.capture.datasets.numbering import REALIMPACT_NAMES, number_of
+from avmsf.errors import DatasetError
+from dataset_folders import ROWS, microphones, write_realimpact
+
+NAME = "43_IronMortar"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a dataset of one object; nobody changes it."""
+    home = tmp_path_factory.mktemp("realimpact")
+    write_realimpact(home, NAME)
+    return home
+
+
+@pytest.fixture
+def folder(whole: Path, tmp_path: Path) -> Path:
+    """Return a copy that a test may change."""
+    return Path(shutil.copytree(whole, tmp_path / "RealImpact"))
+
+
+def row_heard(sound: np.ndarray) -> float:
+    """Return the row that the height of a sound's first sample tells."""
+    return float((sound[0] / 0.01 - 1) * ROWS)
+
+
+def test_every_blow_is_heard_by_the_closest_microphone(whole: Path) -> None:
+    capture = RealImpact(whole).capture(NAME)
+    home = whole / NAME / "preprocessed"
+    listeners, vertices = np.load(home / "listenerXYZ.npy"), np.load(home / "vertexID.npy")
+    corners = np.asarray(trimesh.load(home / "transformed.obj", process=False).vertices)
+    # Every distance there is, the plain way.
+    distance = np.array([np.linalg.norm(corners - listener, axis=1).min() for listener in listeners[:600]])
+    best = int(distance.argmin())
+    rows = [round(row_heard(sound)) for sound in capture.impacts.sounds.numpy()]
+    assert rows == [best + 600 * blow for blow in range(5)]
+    assert np.partition(distance, 1)[1] > distance[best] + 1e-3
+    assert capture.impacts.names == tuple(f"vertex_{vertices[row]}.wav" for row in rows)
+    assert np.array_equal(capture.impacts.contacts.numpy(), np.load(home / "vertexXYZ.npy")[rows])
+
+
+def test_sounds_are_taken_as_published(whole: Path) -> None:
+    impacts = RealImpact(whole).capture(NAME).impacts
+    published = np.load(whole / NAME / "preprocessed/deconvolved_0db.npy", mmap_mode="r")
+    assert (impacts.sample_rate, impacts.forces) == (48_000.0, None)
+    row = round(row_heard(impacts.sounds[0].numpy()))
+    assert np.array_equal(impacts.sounds[0].numpy(), published[row])
+
+
+def test_one_place_for_all_blows_goes_before_a_closer_one_for_some() -> None:
+    vertices = np.repeat([0, 1], 3)
+    surface = np.zeros((1, 3))
+    listeners = np.array([[1.0, 0, 0], [0, 2, 0], [0, 0, 3], [0, 0, 3], [0, 2, 1e-4], [0.5, 0, 0]])
+    assert closest_rows(vertices, listeners, surface) == ([1, 4], True)
+    listeners[3:] += 0.01
+    assert closest_rows(vertices, listeners, surface) == ([0, 5], False)
+
+
+def test_blows_heard_from_nowhere_in_common_are_told(tmp_path: Path) -> None:
+    write_realimpact(tmp_path, NAME, turned=(0, 5, 0, 0, 0))
+    with pytest.warns(CaptureWarning, match="no microphone stood in one place for all blows"):
+        capture = RealImpact(tmp_path).capture(NAME)
+    assert len(capture.impacts) == 5
+
+
+def test_a_turned_grid_with_places_in_common_is_heard_from_one_of_them(tmp_path: Path) -> None:
+    write_realimpact(tmp_path, NAME, turned=(0, 20, 0, 40, 0))
+    impacts = RealImpact(tmp_path).capture(NAME).impacts
+    rows = [round(row_heard(sound)) for sound in impacts.sounds.numpy()]
+    listeners = np.concatenate([microphones(turned=turn) for turn in (0, 20, 0, 40, 0)])
+    assert np.ptp(listeners[rows], axis=0).max() < 1e-9
+
+
+def test_the_mesh_is_surface_and_look(whole: Path) -> None:
+    dataset = RealImpact(whole)
+    surface, look = dataset.capture(NAME).surface, dataset.look(NAME)
+    assert surface is not None
+    assert look is not None
+    assert (look.folder / (look.settings.surface or "")).is_file()
+    assert len(surface.faces) == 1280
+
+
+def test_facts_come_from_the_name(whole: Path) -> None:
+    facts = RealImpact(whole).facts(NAME)
+    assert (facts.name, facts.material, facts.inferred) == ("iron mortar", "iron", True)
+
+
+def test_check_counts_blows_and_names_what_is_not_here(whole: Path) -> None:
+    report = RealImpact(whole).check()
+    assert (report.objects[0].recordings, report.objects[0].problems) == (5, ())
+    assert report.missing[0].startswith("49 of 50 objects: unpack http://downloads.cs.stanford.edu/viscam/RealImpact")
+    assert "100_Frisbee" in report.missing[0]
+    assert "43_IronMortar" in report.remarks[0]
+    assert len(shared_objects()) == len(REALIMPACT_NAMES) == 50
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("deconvolved_0db.npy", "deconvolved_0db.npy is missing"),
+        ("vertexXYZ.npy", "vertexXYZ.npy is missing"),
+        ("transformed.obj", "transformed.obj is missing, from which the closest microphone is found"),
+    ],
+)
+def test_a_missing_file_is_named(folder: Path, name: str, message: str) -> None:
+    (folder / NAME / "preprocessed" / name).unlink()
+    dataset = RealImpact(folder)
+    assert any(message in problem for problem in dataset.check().objects[0].problems)
+    assert dataset.check().objects[0].recordings == 0
+    with pytest.raises(DatasetError, match=message):
+        dataset.capture(NAME)
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "message"),
+    [
+        ("vertexID.npy", np.zeros(3000, dtype=np.int32), r"holds int32 \(3000,\), expected int64 \(3000,\)"),
+        ("listenerXYZ.npy", np.zeros((2999, 3)), r"holds float64 \(2999, 3\), expected float64 \(3000, 3\)"),
+        ("vertexXYZ.npy", np.zeros((3000, 3), order="F"), "is stored by columns, expected by rows"),
+        ("deconvolved_0db.npy", np.zeros((3000, 2)), r"holds float64 \(3000, 2\), expected float32 \(3000, any\)"),
+        ("vertexXYZ.npy", np.ones((3000, 3)), "lies up to .* m off the vertices of transformed.obj"),
+    ],
+)
+def test_arrays_of_another_form_are_refused(folder: Path, name: str, array: np.ndarray, message: str) -> None:
+    np.save(folder / NAME / "preprocessed" / name, array)
+    with pytest.raises(DatasetError, match=message):
+        RealImpact(folder).capture(NAME)
+
+
+def test_sounds_cut_short_are_told_without_reading_them(folder: Path) -> None:
+    path = folder / NAME / "preprocessed/deconvolved_0db.npy"
+    with open(path, "r+b") as file:
+        file.truncate(1_000_000)
+    assert (
+        "deconvolved_0db.npy is cut short, 1000000 of 28800128 bytes"
+        in RealImpact(folder).check().objects[0].problems[0]
+    )
+    with pytest.raises(DatasetError, match="is cut short"):
+        RealImpact(folder).capture(NAME)
+
+
+def test_samples_that_are_no_numbers_are_refused(folder: Path) -> None:
+    path = folder / NAME / "preprocessed/deconvolved_0db.npy"
+    np.lib.format.open_memmap(path, mode="r+")[:, 7] = np.nan
+    with pytest.raises(DatasetError, match="holds samples that are not finite numbers"):
+        RealImpact(folder).capture(NAME)
+
+
+def test_a_number_alone_is_told_whose_it_is(whole: Path) -> None:
+    with pytest.raises(DatasetError, match="did you mean 43_IronMortar"):
+        RealImpact(whole).look("43")
+
+
+def test_names_stand_in_the_order_of_their_numbers() -> None:
+    numbers = [number_of(name) for name in REALIMPACT_NAMES]
+    assert all(number is not None for number in numbers)
+    assert numbers == sorted(set(numbers), key=lambda number: number or 0)
