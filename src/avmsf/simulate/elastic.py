@@ -1,11 +1,25 @@
 """The vibrations of an elastic body: natural frequencies, and how far each place moves in each."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
+import scipy.sparse
+import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
+from avmsf.errors import SimulationError
+from avmsf.simulate.closest import ClosestPoints
+from avmsf.simulate.eigen import lowest_vibrations, rigid_motions
+from avmsf.simulate.elements import SecondOrder, mass, stiffness
 from avmsf.simulate.material import Material
+from avmsf.simulate.solid import Solid
+
+_SHIFT = 1e-5
+"""Shift of the eigenvalues over E / (density size^2), which is a tenth of the squared angular frequency of a bar."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,4 +46,144 @@ class ElasticModes:
 
     def at(self, places: Float[Tensor, "contacts 3"]) -> Float64[Tensor, "contacts modes 3"]:
         """Return the shapes where the surface is nearest to each place, interpolated as the elements do."""
-        raise NotImplementedError
+        rows, weights = self._interpolation(places)
+        # A node at a time: the shapes of all six at once would be six times the result.
+        total = torch.zeros(len(places), *self.shapes.shape[1:], dtype=torch.float64)
+        for node in range(6):
+            total += weights[:, node, None, None] * self.shapes[rows[:, node]]
+        return total
+
+    def gains(
+        self, places: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"]
+    ) -> Float64[Tensor, "contacts modes"]:
+        """Return the shapes' components along `directions` where the surface is nearest to each place, 1 / sqrt(kg).
+
+        A blow of one newton-second along a unit vector gives a mode the velocity gain times shape. The response at
+        one place to a blow at another is the product of the two gains, whichever of them is struck.
+        """
+        rows, weights = self._interpolation(places)
+        total = torch.zeros(len(places), len(self), dtype=torch.float64)
+        for node in range(6):
+            along = torch.einsum("cmd,cd->cm", self.shapes[rows[:, node]], directions.double())
+            total += weights[:, node, None] * along
+        return total
+
+    def _interpolation(
+        self, places: Float[Tensor, "contacts 3"]
+    ) -> tuple[Int[Tensor, "contacts 6"], Float64[Tensor, "contacts 6"]]:
+        """Return the nodes of the nearest triangle, and the second-order shape functions in the nearest point of it."""
+        unfit = torch.nonzero(~torch.isfinite(places).all(dim=1)).flatten()
+        if len(unfit):
+            row = int(unfit[0])
+            raise SimulationError(f"place {row} is {places[row].tolist()}: expected finite coordinates, in metres")
+        found = self._closest(places.double().numpy())
+        corner = torch.from_numpy(found.weights)
+        weights = torch.cat([corner * (2.0 * corner - 1.0), 4.0 * corner * corner.roll(-1, dims=1)], dim=1)
+        return self.triangles[torch.from_numpy(found.rows)], weights
+
+    @cached_property
+    def _closest(self) -> ClosestPoints:
+        return ClosestPoints(self.nodes[self.triangles[:, :3]].numpy())
+
+
+def elastic_modes(
+    solid: Solid,
+    material: Material,
+    *,
+    count: int = 64,
+    stiffness_factor: Float[Tensor, " cells"] | None = None,
+    density_factor: Float[Tensor, " cells"] | None = None,
+    springs: Sequence[tuple[Float[Tensor, " 3"], float]] | None = None,
+    highest: float | None = None,
+) -> ElasticModes:
+    """Return the lowest `count` elastic modes of a body by second-order finite elements, none above `highest` Hz.
+
+    The factors multiply Young's modulus and the density in each cell. The body is free, or held by `springs`: places
+    on its surface and their stiffness in newtons per metre, the same in all directions. A free body's six rigid
+    motions are no modes of it. On soft springs they are slow modes, and every mode that has more than half of its
+    kinetic energy in a rigid motion is left out. Springs so stiff that the body bends before it moves as a whole
+    leave no such mode, and then none is left out.
+
+    Raises SimulationError for a body of several parts or too few nodes, factors and springs that are not positive,
+    and where no mode lies below `highest`.
+    """
+    if count < 1:
+        raise SimulationError(f"count = {count}: expected 1 mode or more")
+    _expect_whole(solid)
+    stiff, light = (
+        _factor(solid, factor, name)
+        for factor, name in ((stiffness_factor, "stiffness_factor"), (density_factor, "density_factor"))
+    )
+    mesh = SecondOrder.of(solid)
+    weights = mass(mesh, material.density * light)
+    forces = stiffness(mesh, material, stiff)
+    if springs:
+        forces = forces + _support(mesh, springs)
+    found = lowest_vibrations(
+        forces,
+        weights,
+        rigid_motions(mesh.nodes, weights),
+        count=count,
+        shift=_SHIFT * material.young / (material.density * solid.size**2),
+        supported=bool(springs),
+    )
+    frequency = torch.from_numpy(np.sqrt(found.squares) / (2.0 * math.pi))
+    kept = len(frequency) if highest is None else int((frequency <= highest).sum())
+    if not kept:
+        raise SimulationError(
+            f"no mode up to {highest:g} Hz, the lowest is at {float(frequency[0]):g} Hz: raise `highest`, or make the "
+            "body larger or thinner"
+        )
+    outer, triangles = np.unique(mesh.boundary, return_inverse=True)
+    shapes = found.shapes.reshape(len(mesh.nodes), 3, -1)[outer, :, :kept].transpose(0, 2, 1)
+    return ElasticModes(
+        frequency=frequency[:kept].clone(),
+        nodes=torch.from_numpy(mesh.nodes[outer]),
+        triangles=torch.from_numpy(triangles.reshape(-1, 6)),
+        shapes=torch.from_numpy(np.ascontiguousarray(shapes)),
+        material=material,
+        mass=float((solid.volumes * light).sum()) * material.density,
+    )
+
+
+def _support(mesh: SecondOrder, springs: Sequence[tuple[Tensor, float]]) -> scipy.sparse.csr_array:
+    """Return the stiffness that springs at the nearest points of the surface add, spread over a triangle's nodes."""
+    triangles = mesh.boundary
+    closest = ClosestPoints(mesh.nodes[triangles[:, :3]])
+    found = closest(np.stack([place.double().numpy() for place, _ in springs]))
+    total = scipy.sparse.csr_array((3 * len(mesh.nodes),) * 2)
+    for spring, (_, strength) in enumerate(springs):
+        if not 0 < strength < math.inf:
+            raise SimulationError(f"spring {spring} has {strength:g} N/m: expected more than 0")
+        corner = found.weights[spring]
+        weights = np.concatenate([corner * (2.0 * corner - 1.0), 4.0 * corner * np.roll(corner, -1)])
+        nodes = triangles[found.rows[spring]]
+        row = scipy.sparse.csr_array((weights, nodes, [0, 6]), shape=(1, len(mesh.nodes)))
+        total = total + scipy.sparse.kron(strength * (row.T @ row), scipy.sparse.eye_array(3), format="csr")
+    return total
+
+
+def _factor(solid: Solid, factor: Float[Tensor, " cells"] | None, name: str) -> Float64[Tensor, " cells"]:
+    if factor is None:
+        return torch.ones(len(solid.cells), dtype=torch.float64)
+    if len(factor) != len(solid.cells):
+        raise SimulationError(f"{name} has {len(factor)} numbers for {len(solid.cells)} cells: expected one a cell")
+    unfit = torch.nonzero(~((factor > 0) & torch.isfinite(factor))).flatten()
+    if len(unfit):
+        row = int(unfit[0])
+        raise SimulationError(f"{name}[{row}] = {float(factor[row]):g}: expected more than 0")
+    return factor.double()
+
+
+def _expect_whole(solid: Solid) -> None:
+    if not len(solid.cells):
+        raise SimulationError("expected tetrahedra, found none: the body has no volume; give a sheet a thickness")
+    solid.expect_volume()
+    number = int(solid.parts.max()) + 1
+    if number > 1:
+        volumes = torch.bincount(solid.parts, weights=solid.volumes)
+        told = ", ".join(f"{volume:.3g}" for volume in volumes[:4].tolist())
+        raise SimulationError(
+            f"the body has {number} parts that share no side ({told}{', ...' if number > 4 else ''} m3): one body "
+            "sounds as one; join them, or keep the largest"
+        )

@@ -1,0 +1,166 @@
+"""The lowest vibrations of a stiffness and a mass matrix, apart from the motions of a rigid body.
+
+Lanczos' method on the inverse of the stiffness, shifted by a little mass so that a free body has one, with a block of
+vectors at a time: solving for sixteen costs a third of solving for each, and of modes that share a frequency, as those
+of round things do, none is missed. All of a free body's six rigid motions are known beforehand and are projected out
+of every step, so that none is ever found and nothing of them is left in the vibrations. On soft supports the rigid
+motions become slow vibrations, which are computed like the others and told apart by their shape: more than half of
+their kinetic energy is a rigid motion's.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+from jaxtyping import Float64
+from scipy.sparse.linalg import splu
+
+from avmsf.errors import SimulationError
+
+_PRECISION = 1e-8
+"""Residual of a mode over its eigenvalue at which Lanczos' method stops; eigenvalues are as exact as its square."""
+_BLOCK = 16
+"""Vectors at a time."""
+_LONGEST = 6
+"""Most vectors altogether, over the number of modes and a block; three are usual."""
+_RIGID = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Vibrations:
+    """Lowest elastic eigenpairs by ascending frequency."""
+
+    squares: Float64[np.ndarray, " modes"]
+    """Squared angular frequencies, 1/s2."""
+    shapes: Float64[np.ndarray, "freedoms modes"]
+    """Mass-normalised displacements, 1 / sqrt(kg)."""
+
+
+def rigid_motions(nodes: Float64[np.ndarray, "nodes 3"], mass: scipy.sparse.csr_array) -> np.ndarray:
+    """Return three shifts and three turns of the nodes, mass-normalised and orthogonal, [3 nodes, 6]."""
+    total = mass.sum()
+    arms = nodes - (mass @ nodes).sum(axis=0) / total
+    motions = np.zeros((len(nodes), 3, _RIGID))
+    motions[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    for axis in range(3):
+        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arms)
+    flat = motions.reshape(-1, _RIGID)
+    # The turns are lengths and the shifts are not, so each is scaled before they are made orthogonal.
+    flat /= np.sqrt((flat * _times(mass, flat)).sum(axis=0))
+    lower = np.linalg.cholesky(flat.T @ _times(mass, flat))
+    return scipy.linalg.solve_triangular(lower, flat.T, lower=True).T
+
+
+def lowest_vibrations(
+    stiffness: scipy.sparse.sparray,
+    mass: scipy.sparse.csr_array,
+    rigid: Float64[np.ndarray, "freedoms 6"],
+    *,
+    count: int,
+    shift: float,
+    supported: bool,
+) -> Vibrations:
+    """Return the `count` lowest vibrations that are no rigid motions.
+
+    `mass` is over nodes, `stiffness` over their three components; `shift`, 1/s2, is far below the lowest squared
+    angular frequency. `supported` bodies are held by springs, others are free. Raises SimulationError where the body
+    has fewer vibrations, or cells of such bad form that none are found.
+    """
+    freedoms = stiffness.shape[0]
+    wanted = count + (_RIGID if supported else 0)
+    if wanted + 2 * _RIGID > freedoms:
+        raise SimulationError(
+            f"{count} modes of a body with {freedoms // 3} nodes: too coarse, expected {wanted // 3 + 5} nodes or "
+            "more; ask for fewer modes or a finer detail"
+        )
+    heavy = scipy.sparse.kron(mass, scipy.sparse.eye_array(3), format="csc")
+    try:
+        factored = splu(
+            (stiffness + shift * heavy).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )  # fmt: skip
+    except RuntimeError as error:
+        raise SimulationError(
+            f"the stiffness cannot be inverted ({error}): the tetrahedra are badly shaped; make them again with "
+            "another detail"
+        ) from error
+    weighted = _times(mass, rigid)
+
+    def respond(forces: np.ndarray) -> np.ndarray:
+        moved = factored.solve(np.asfortranarray(forces))
+        return moved if supported else moved - rigid @ (weighted.T @ moved)
+
+    responses, shapes = _largest_responses(respond, mass, wanted)
+    squares = 1.0 / responses - shift
+    if supported:
+        elastic = ((weighted.T @ shapes) ** 2).sum(axis=0) < 0.5
+        squares, shapes = squares[elastic][:count], shapes[:, elastic][:, :count]
+    return Vibrations(squares, shapes * _signs(shapes))
+
+
+def _largest_responses(
+    respond: Callable[[np.ndarray], np.ndarray], mass: scipy.sparse.csr_array, wanted: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest eigenvalues of what a body does to the forces mass x motion, and their motions.
+
+    Each step adds the response to the last block of motions, made orthogonal to all before. In the basis that grows so
+    the response is a band of blocks, whose eigenvectors end in how far each mode still is from its true shape.
+    """
+    freedoms = 3 * mass.shape[0]
+    longest = min(freedoms, _LONGEST * (wanted + _BLOCK))
+    basis = np.empty((freedoms, longest + _BLOCK), order="F")
+    band = np.zeros((longest + _BLOCK, longest + _BLOCK))
+    drawn = np.random.default_rng(0).standard_normal((freedoms, min(_BLOCK, freedoms)))
+    block, _ = _orthonormal(respond(drawn), mass, basis[:, :0])
+    begin, end = 0, block.shape[1]
+    basis[:, :end] = block
+    while True:
+        moved = respond(_times(mass, basis[:, begin:end]))
+        band[:end, begin:end] = basis[:, :end].T @ _times(mass, moved)
+        block, rest = _orthonormal(moved, mass, basis[:, :end])
+        size = block.shape[1]
+        if end >= wanted or not size:
+            values, vectors = np.linalg.eigh(band[:end, :end], UPLO="U")
+            chosen = np.argsort(-values, kind="stable")[:wanted]
+            residual = np.linalg.norm(rest @ vectors[begin:end, chosen], axis=0)
+            if not size or (residual <= _PRECISION * values[chosen]).all():
+                return values[chosen], basis[:, :end] @ vectors[:, chosen]
+        if end + size > longest + _BLOCK:
+            raise SimulationError(
+                f"the {wanted} lowest modes were not found in {end} steps: the tetrahedra are badly shaped; make them "
+                "again with another detail"
+            )
+        basis[:, end : end + size] = block
+        begin, end = end, end + size
+
+
+def _orthonormal(motions: np.ndarray, mass: scipy.sparse.csr_array, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return motions without their part in the basis, mass-normalised and orthogonal, and what makes them of those.
+
+    Directions in which nothing is left are left out.
+    """
+    scale = np.sqrt((motions * _times(mass, motions)).sum(axis=0).max())
+    made = np.eye(motions.shape[1])
+    # The second time mends what rounding left of the first.
+    for _ in range(2):
+        motions = motions - basis @ (basis.T @ _times(mass, motions))
+        squares, turned = np.linalg.eigh(motions.T @ _times(mass, motions))
+        kept = squares > (1e-12 * scale) ** 2
+        length = np.sqrt(squares[kept])
+        motions = motions @ (turned[:, kept] / length)
+        made = (length[:, None] * turned[:, kept].T) @ made
+        scale = 1.0
+    return motions, made
+
+
+def _times(mass: scipy.sparse.csr_array, vectors: np.ndarray) -> np.ndarray:
+    """Return the mass matrix, the same for all three components, times one vector or several."""
+    spread = np.ascontiguousarray(vectors).reshape(mass.shape[0], -1)
+    return (mass @ spread).reshape(vectors.shape)
+
+
+def _signs(shapes: Float64[np.ndarray, "freedoms modes"]) -> Float64[np.ndarray, " modes"]:
+    """Return the sign that makes the largest component of each shape positive."""
+    return np.sign(shapes[np.abs(shapes).argmax(axis=0), np.arange(shapes.shape[1])])

@@ -1,0 +1,107 @@
+"""Elastic modes as one file: safetensors with the tensors of `ElasticModes`, and one JSON in the header for the rest.
+
+{"format": 1, "version": "0.1.0", "mass": 0.31, "sizes": {"modes": 64, "nodes": 9000, "triangles": 4400},
+ "material": {"name": "ceramic", "density": 2700.0, "young": 7.2e10, "poisson": 0.19, "alpha": 6.0, "beta": 1e-7}}
+"""
+
+import json
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as to_bytes
+from torch import Tensor
+
+from avmsf.errors import SimulationError
+from avmsf.files import write_whole
+from avmsf.simulate.elastic import ElasticModes
+from avmsf.simulate.material import Material
+
+FORMAT = 1
+"""Number of this format; it grows with every change that older versions could not read."""
+_KEY = "avmsf_elastic"
+
+
+def save_modes(modes: ElasticModes, path: str | Path) -> None:
+    """Write modes to one file, which `load_modes` reads back to the last bit.
+
+    A file that is there stays whole until the new one is. Raises SimulationError where it cannot be written.
+    """
+    path = Path(path)
+    tensors = {
+        "frequency": modes.frequency,
+        "nodes": modes.nodes,
+        "triangles": modes.triangles,
+        "shapes": modes.shapes,
+    }
+    record = {
+        "format": FORMAT,
+        "version": version("avmsf"),
+        "mass": modes.mass,
+        "sizes": {"modes": len(modes), "nodes": len(modes.nodes), "triangles": len(modes.triangles)},
+        "material": asdict(modes.material),
+    }
+    content = to_bytes(
+        {name: tensor.cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()},
+        {_KEY: json.dumps(record, allow_nan=False)},
+    )
+    write_whole(path, lambda place: place.write_bytes(content), raising=SimulationError)
+
+
+def load_modes(path: str | Path) -> ElasticModes:
+    """Read modes that `save_modes` wrote.
+
+    Raises SimulationError for a file that is missing, cut short, of another kind or of another format, and where its
+    tensors are not those that its header speaks of.
+    """
+    path = Path(path)
+    words, tensors = _read(path)
+    try:
+        record = json.loads(words)
+        found, writer = record["format"], record["version"]
+        if found != FORMAT:
+            raise SimulationError(
+                f"{path}: expected elastic modes of format {FORMAT}, found format {found}, written by avmsf {writer} "
+                f"(this is avmsf {version('avmsf')}): compute them again"
+            )
+        sizes, material, weight = record["sizes"], Material(**record["material"]), float(record["mass"])
+        expected = {
+            "frequency": ((sizes["modes"],), torch.float64),
+            "nodes": ((sizes["nodes"], 3), torch.float64),
+            "triangles": ((sizes["triangles"], 6), torch.int64),
+            "shapes": ((sizes["nodes"], sizes["modes"], 3), torch.float64),
+        }
+    except (ValueError, TypeError, KeyError) as error:
+        raise SimulationError(f"{path}: its header is damaged ({error!r}): compute the modes again") from error
+    present = {name: (tuple(tensor.shape), tensor.dtype) for name, tensor in tensors.items()}
+    if present != expected:
+        raise SimulationError(
+            f"{path}: expected the tensors {_told(expected)}, found {_told(present)}: compute the modes again"
+        )
+    rows = tensors["triangles"]
+    if len(rows) and (int(rows.min()) < 0 or int(rows.max()) >= sizes["nodes"]):
+        raise SimulationError(f"{path}: a triangle names a node that is not there: compute the modes again")
+    return ElasticModes(tensors["frequency"], tensors["nodes"], rows, tensors["shapes"], material, weight)
+
+
+def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
+    if not path.is_file():
+        raise SimulationError(f"{path}: expected a file of elastic modes, found no such file: check the name")
+    try:
+        with safe_open(path, framework="pt") as file:
+            words = (file.metadata() or {}).get(_KEY)
+            if words is None:
+                raise SimulationError(f"{path}: expected elastic modes, found a safetensors file of something else")
+            # Clones, for what the file maps into memory would change with it.
+            return words, {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise SimulationError(
+            f"{path}: expected elastic modes, found a file that is cut short, damaged or of another kind: compute "
+            "them again"
+        ) from error
+
+
+def _told(tensors: dict[str, tuple[tuple[int, ...], torch.dtype]]) -> str:
+    return ", ".join(f"{name} {list(shape)} {dtype}" for name, (shape, dtype) in sorted(tensors.items()))

@@ -1,0 +1,163 @@
+"""The outer skin of a body, mended and made as coarse or as fine as the elements shall be."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int
+
+from avmsf.capture.surface import Surface
+from avmsf.errors import SimulationError
+from avmsf.simulate.coarsening import coarsen
+
+_CREASE = 0.7
+"""Cosine of the angle by which a triangle may turn when the skin is made coarser: creases stay."""
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """Triangles with an area, no two vertices in one place."""
+
+    points: Float64[np.ndarray, "points 3"]
+    """Object frame, metres; every one belongs to a triangle."""
+    faces: Int[np.ndarray, "faces 3"]
+    """Rows of `points`, counter-clockwise from outside."""
+
+    @property
+    def size(self) -> float:
+        """Diagonal of the box around the skin, metres."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
+    @property
+    def areas(self) -> Float64[np.ndarray, " faces"]:
+        """Square metres."""
+        return 0.5 * np.linalg.norm(_doubled(self.points[self.faces]), axis=1)
+
+    @property
+    def volume(self) -> float:
+        """Cubic metres inside a closed skin."""
+        corners = self.points[self.faces]
+        return float((np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2]).sum() / 6.0)
+
+    @property
+    def open_edges(self) -> int:
+        """Edges that have a triangle on one side only."""
+        ends = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        return int((np.unique(ends, axis=0, return_counts=True)[1] == 1).sum())
+
+    @property
+    def normals(self) -> Float64[np.ndarray, "points 3"]:
+        """Unit normals at the points: the mean of the triangles around each, weighted by their angles there."""
+        corners = self.points[self.faces]
+        sides = unit(np.roll(corners, -1, axis=1) - corners)
+        angles = np.arccos(np.clip(-(sides * np.roll(sides, 1, axis=1)).sum(axis=-1), -1, 1))
+        total = np.zeros_like(self.points)
+        np.add.at(total, self.faces, angles[..., None] * unit(_doubled(corners))[:, None])
+        return unit(total)
+
+    @classmethod
+    def of(cls, surface: Surface) -> "Skin":
+        """Return a surface's triangles with vertices in one place made one, without those that have no area.
+
+        Raises SimulationError for points without triangles, coordinates that are not finite, triangles that name
+        vertices which are not there, and where no triangle has an area.
+        """
+        points, faces = surface.vertices.double().numpy(), surface.faces.numpy()
+        if not len(faces):
+            raise SimulationError(
+                f"expected a mesh, found {len(points)} points and no triangles: mesh the points, for a body has a skin"
+            )
+        if int(faces.min()) < 0 or int(faces.max()) >= len(points):
+            found = int(faces.max()) if int(faces.min()) >= 0 else int(faces.min())
+            raise SimulationError(
+                f"a triangle names vertex {found} (counted from 0) of {len(points)}: the file is cut short or corrupt; "
+                "export the mesh again"
+            )
+        if not np.isfinite(points).all():
+            row = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+            raise SimulationError(f"vertex {row} is {points[row].tolist()}: expected finite coordinates, in metres")
+        places, rows = np.unique(points[faces.ravel()], axis=0, return_inverse=True)
+        welded = rows.reshape(-1, 3)
+        wide = np.linalg.norm(_doubled(places[welded]), axis=1) > 1e-12 * np.linalg.norm(np.ptp(places, axis=0)) ** 2
+        if not wide.any():
+            raise SimulationError(
+                f"none of the {len(faces)} triangles has an area: the mesh is a line or a point; scan the object again"
+            )
+        return cls._compact(places, welded[wide])
+
+    def oriented(self) -> "Skin":
+        """Return the skin without triangles that share an edge with two others or face against their neighbours.
+
+        The widest are kept. Raises SimulationError where more than a twentieth of the area would be lost.
+        """
+        areas = self.areas
+        used: set[tuple[int, int]] = set()
+        kept = np.zeros(len(self.faces), dtype=bool)
+        for row in np.argsort(-areas, kind="stable"):
+            a, b, c = self.faces[row].tolist()
+            sides = ((a, b), (b, c), (c, a))
+            if used.isdisjoint(sides):
+                used.update(sides)
+                kept[row] = True
+        lost = float(areas[~kept].sum() / areas.sum())
+        if lost > 0.05:
+            raise SimulationError(
+                f"{lost:.0%} of the surface faces against its neighbours or meets more than one of them at an edge: "
+                "expected triangles counter-clockwise from outside; make the normals of the mesh consistent"
+            )
+        return self._compact(self.points, self.faces[kept])
+
+    def remeshed(self, length: float) -> "Skin":
+        """Return the skin with edges of about `length` metres, shorter ones only where the skin bends sharply."""
+        return self.coarsened(0.75 * length, turn=_CREASE)._refined(1.5 * length)
+
+    def _refined(self, longest: float) -> "Skin":
+        """Return the skin with all longer edges halved, again and again."""
+        points, faces = self.points, self.faces
+        while True:
+            ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
+            keys, which = np.unique(ends[..., 0] * len(points) + ends[..., 1], return_inverse=True)
+            first, second = keys // len(points), keys % len(points)
+            split = np.linalg.norm(points[first] - points[second], axis=1) > longest
+            if not split.any():
+                return Skin(points, faces)
+            middle = np.where(split, len(points) + np.cumsum(split) - 1, -1)[which.reshape(-1, 3)]
+            points = np.concatenate([points, 0.5 * (points[first[split]] + points[second[split]])])
+            faces = np.concatenate([_split(faces, middle, pattern) for pattern in range(8)])
+
+    def coarsened(self, shortest: float, *, turn: float) -> "Skin":
+        """Return the skin with few edges shorter than `shortest` metres, as `coarsen` takes them out."""
+        faces = coarsen(self.points, self.faces, self.normals, shortest=shortest, turn=turn)
+        return self._compact(self.points, faces)
+
+    @staticmethod
+    def _compact(points: np.ndarray, faces: np.ndarray) -> "Skin":
+        used, rows = np.unique(faces, return_inverse=True)
+        return Skin(points[used], rows.reshape(-1, 3))
+
+
+def _split(faces: np.ndarray, middle: np.ndarray, pattern: int) -> np.ndarray:
+    """Return the parts of those faces whose edges 01, 12 and 20 are split as the bits of `pattern` say."""
+    bits = ((middle >= 0) * np.array([1, 2, 4])).sum(axis=1)
+    chosen = bits == pattern
+    (a, b, c), (ab, bc, ca) = faces[chosen].T, middle[chosen].T
+    parts = {
+        0: [(a, b, c)],
+        1: [(a, ab, c), (ab, b, c)],
+        2: [(b, bc, a), (bc, c, a)],
+        4: [(c, ca, b), (ca, a, b)],
+        3: [(ab, b, bc), (a, ab, c), (ab, bc, c)],
+        6: [(bc, c, ca), (b, bc, a), (bc, ca, a)],
+        5: [(ca, a, ab), (c, ca, b), (ca, ab, b)],
+        7: [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)],
+    }[pattern]
+    return np.concatenate([np.stack(part, axis=1) for part in parts])
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors of length 1 along the last axis; what has no length stays."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1.0)
+
+
+def _doubled(corners: Float64[np.ndarray, "faces 3 3"]) -> np.ndarray:
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -1,0 +1,140 @@
+"""Any mesh or scan as tetrahedra, by pytetwild, which heeds neither holes nor self-intersections.
+
+pytetwild inserts the triangles in an order that it draws afresh each time and that no seed reaches, so that two runs
+differ in their tetrahedra, and the frequencies of the body in their last digits; keep the solid to keep its sounds. It
+runs in a process of its own, for it may crash, and never ends on some meshes.
+"""
+
+import importlib.util
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+
+from avmsf.capture.surface import Surface
+from avmsf.errors import SimulationError
+from avmsf.simulate.closest import Closest, ClosestPoints
+from avmsf.simulate.skin import Skin
+from avmsf.simulate.solid import Solid
+
+WORKER = Path(__file__).with_name("tetrahedra_worker.py")
+_ENVELOPE = 0.04
+"""How far the solid's surface may lie from the mesh, over the length of the tetrahedra's edges."""
+_SHORTEST = 0.1
+"""Length of the edges that are taken out of the mesh beforehand, over that of the tetrahedra's edges."""
+_TURN = 0.7
+"""Cosine of the angle by which triangles may turn then. It makes a scan's filling ten times as quick."""
+_LID = 0.25
+"""Part of the solid's surface that may close holes."""
+_LOST = 0.1
+"""Part of the mesh, or of the volume of its parts, that may be left out."""
+
+
+def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> Solid:
+    """Return what a mesh or scan encloses; holes are closed, and triangles inside and loose small parts left out.
+
+    `detail` is the length of the tetrahedra's edges over the body's size, the diagonal of the box around it, where
+    nothing asks for shorter ones; the solid's surface keeps within a 25th of that length of the mesh. Takes some
+    seconds to a minute. Raises SimulationError where pytetwild is missing, fails or takes more than `timeout`
+    seconds, and for what encloses no body: points, sheets, parts that do not touch and walls too thin for the detail.
+    """
+    if not 0 < detail < 1:
+        raise SimulationError(f"detail = {detail:g}: expected more than 0 and less than 1 of the body's size")
+    skin = Skin.of(surface)
+    coarse = skin.coarsened(_SHORTEST * detail * skin.size, turn=_TURN)
+    points, cells = _tetrahedralise(coarse, detail, timeout)
+    advice = _advice(skin)
+    if not len(cells):
+        raise SimulationError(f"the mesh encloses no volume ({skin.open_edges} of its edges are open): {advice}")
+    solid = _largest(Solid.build(torch.from_numpy(points), torch.from_numpy(cells)))
+    _expect_likeness(solid, skin, tolerance=4.0 * _ENVELOPE * detail * skin.size, advice=advice)
+    return solid
+
+
+def _tetrahedralise(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and cells as pytetwild's process leaves them."""
+    found = importlib.util.find_spec("pytetwild")
+    if found is None or not found.submodule_search_locations:
+        raise SimulationError("solids from meshes need pytetwild: pip install 'avmsf[fem]'")
+    with tempfile.TemporaryDirectory(prefix="avmsf-fill-") as name:
+        job, result = Path(name) / "job.npz", Path(name) / "result.npz"
+        np.savez(
+            job, points=skin.points, faces=skin.faces.astype(np.uint32), edge=detail, envelope=_ENVELOPE * detail,
+            library=found.submodule_search_locations[0],
+        )  # fmt: skip
+        # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
+        command = [sys.executable, "-P", str(WORKER), str(job), str(result)]
+        single = os.environ | {"OMP_NUM_THREADS": "1"}
+        try:
+            ended = subprocess.run(command, capture_output=True, timeout=timeout, env=single, check=False)
+        except subprocess.TimeoutExpired as error:
+            raise SimulationError(
+                f"filling {len(skin.faces)} triangles took more than {timeout:g} s: allow more time, use a larger "
+                "detail or simplify the mesh"
+            ) from error
+        if ended.returncode != 0 or not result.is_file():
+            last = ended.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["it said nothing"]
+            raise SimulationError(
+                f"pytetwild broke off (exit status {ended.returncode}; {last[0][:200]}): simplify the mesh, or use "
+                "another detail"
+            )
+        with np.load(result) as arrays:
+            return arrays["points"], arrays["cells"]
+
+
+def _largest(solid: Solid) -> Solid:
+    """Return the largest part. Raises SimulationError where the others are more than loose bits."""
+    volumes = torch.bincount(solid.parts, weights=solid.volumes)
+    if float(volumes[0]) < (1.0 - _LOST) * float(volumes.sum()):
+        told = ", ".join(f"{volume:.3g}" for volume in volumes[:4].tolist())
+        raise SimulationError(
+            f"the mesh encloses {len(volumes)} parts that do not touch ({told}{', ...' if len(volumes) > 4 else ''} "
+            "m3): one body sounds as one; join them, or give one of them"
+        )
+    return Solid.build(solid.points, solid.cells[solid.parts == 0])
+
+
+def _expect_likeness(solid: Solid, skin: Skin, *, tolerance: float, advice: str) -> None:
+    """Raise SimulationError where much of the mesh is not the solid's surface, or much of that surface is no mesh."""
+    outside = Skin(solid.points.numpy(), solid.boundary.numpy())
+    places = _spread(skin)
+    found = ClosestPoints(outside.points[outside.faces])(places)
+    # Where bodies cross, the mesh runs inside; only what lies outside was lost.
+    lost = float(((found.distances > tolerance) & ~_behind(outside, found, places)).mean())
+    if lost > _LOST:
+        raise SimulationError(
+            f"{lost:.0%} of the mesh encloses nothing ({skin.open_edges} of its edges are open), or walls too thin for "
+            f"the detail, which may be off by {tolerance:.2g} m: use a smaller detail, close the mesh, or {advice}"
+        )
+    lids = float((ClosestPoints(skin.points[skin.faces])(_spread(outside)).distances > tolerance).mean())
+    if lids > _LID:
+        raise SimulationError(
+            f"{lids:.0%} of the surface would be lids over holes ({skin.open_edges} edges of the mesh are open): close "
+            f"the mesh, or {advice}"
+        )
+
+
+def _spread(skin: Skin, samples: int = 2000) -> Float64[np.ndarray, "samples 3"]:
+    """Return places of even density on a skin."""
+    reached = np.cumsum(skin.areas)
+    rows = np.searchsorted(reached, (np.arange(samples) + 0.5) / samples * reached[-1])
+    # In a triangle, places from a sequence that fills the square evenly (Roberts' R2).
+    u, v = (np.arange(1, samples + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532]) % 1.0).T
+    weights = np.stack([1.0 - np.sqrt(u), np.sqrt(u) * (1.0 - v), np.sqrt(u) * v], axis=1)
+    return np.einsum("pc,pcd->pd", weights, skin.points[skin.faces[rows]])
+
+
+def _behind(skin: Skin, found: Closest, places: Float64[np.ndarray, "places 3"]) -> Bool[np.ndarray, " places"]:
+    """Return which places lie behind the triangle that is closest to them."""
+    corners = skin.points[skin.faces[found.rows]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return (normals * (places - np.einsum("pc,pcd->pd", found.weights, corners))).sum(axis=1) < 0
+
+
+def _advice(skin: Skin) -> str:
+    return f"give it a wall with shell(surface, thickness={0.015 * skin.size:.1g})"

@@ -1,0 +1,66 @@
+"""Elastic modes in a file: the same to the last bit, or an error that names the file."""
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from avmsf.errors import SimulationError
+from avmsf.simulate.block import block
+from avmsf.simulate.elastic import ElasticModes, elastic_modes
+from avmsf.simulate.elasticstore import load_modes, save_modes
+from avmsf.simulate.material import GLASS
+
+
+@pytest.fixture(scope="module")
+def modes() -> ElasticModes:
+    return elastic_modes(block((0.07, 0.05, 0.011), (2, 1, 1)), GLASS, count=4)
+
+
+def test_what_is_read_is_what_was_written(modes, tmp_path):
+    save_modes(modes, tmp_path / "new" / "modes.safetensors")
+    back = load_modes(tmp_path / "new" / "modes.safetensors")
+    for name in ("frequency", "nodes", "triangles", "shapes"):
+        assert torch.equal(getattr(back, name), getattr(modes, name))
+    assert (back.material, back.mass) == (modes.material, modes.mass)
+    assert torch.equal(back.at(modes.nodes[:5]), modes.at(modes.nodes[:5]))
+
+
+def test_files_that_hold_no_modes(modes, tmp_path):
+    path = tmp_path / "modes.safetensors"
+    with pytest.raises(SimulationError, match="no such file"):
+        load_modes(path)
+    save_modes(modes, path)
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(SimulationError, match="cut short, damaged or of another kind"):
+        load_modes(path)
+    save_file({"frequency": torch.ones(3)}, path)
+    with pytest.raises(SimulationError, match="a safetensors file of something else"):
+        load_modes(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda record, tensors: record.update(format=9), "expected elastic modes of format 1, found format 9"),
+        (lambda record, tensors: record.pop("mass"), "its header is damaged .*mass"),
+        (lambda record, tensors: tensors.pop("nodes"), r"expected the tensors .*nodes \["),
+        (lambda record, tensors: tensors["triangles"].add_(10_000), "names a node that is not there"),
+    ],
+)
+def test_files_that_were_changed(modes, tmp_path, change, words):
+    path = tmp_path / "modes.safetensors"
+    save_modes(modes, path)
+    tensors = load_file(path)
+    record = json.loads(header_of(path))
+    change(record, tensors)
+    save_file(tensors, path, {"avmsf_elastic": json.dumps(record)})
+    with pytest.raises(SimulationError, match=words):
+        load_modes(path)
+
+
+def header_of(path) -> str:
+    content = path.read_bytes()
+    length = int.from_bytes(content[:8], "little")
+    return json.loads(content[8 : 8 + length])["__metadata__"]["avmsf_elastic"]
