@@ -1,0 +1,168 @@
+"""Vessels with a handle: it and its mirror plane are all that tells one side from the others."""
+
+import math
+
+import numpy as np
+import torch
+
+from avmsf.simulate.shapes.body import Body
+from avmsf.simulate.shapes.maker import Draft, drawn_wall
+from avmsf.simulate.shapes.profile import Profile
+from avmsf.simulate.shapes.rods import Rod, smooth_curve, square_columns
+from avmsf.simulate.shapes.shape import Symmetry
+from avmsf.simulate.shapes.turned import Turned
+
+_CROWD = 0.35
+_HALF = 2
+"""Points on each side of the middle of a handle's patch."""
+_BANDS = 2
+"""Bands of triangles that a handle's patch is high."""
+_HANDLE_LAYERS = 26
+
+
+def mug(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a mug with a handle."""
+    radius, tall = random.uniform(0.036, 0.046), random.uniform(2.0, 2.6)
+    narrow = random.uniform(0.85, 1.0)
+    wall = drawn_wall(random, 0.0035, 0.005, wall)
+    height = tall * radius
+    body = Body()
+    turned = Turned.lay(
+        body,
+        Profile(
+            [
+                (0.0, 0.0, 1.2 * wall),
+                (0.9 * narrow * radius, 0.0, 1.2 * wall),
+                (narrow * radius, 0.03 * height, wall),
+                (radius, 0.45 * height, wall),
+                (radius, height, 0.9 * wall),
+            ]
+        ),
+        points=800,
+        crowd=_CROWD,
+    )
+    reach, low = random.uniform(0.75, 0.95) * radius, random.uniform(0.2, 0.3)
+    _add_handle(body, turned, low * height, random.uniform(0.74, 0.82) * height, reach, random)
+    return Draft(body, wall, _mirrored())
+
+
+def jug(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a jug that leans and pours to the side, a quarter turn or so from its handle: no symmetry."""
+    radius, tall = random.uniform(0.04, 0.055), random.uniform(2.2, 2.8)
+    neck, lip = random.uniform(0.6, 0.75), random.uniform(0.5, 0.65)
+    aside, lean = math.radians(random.uniform(75.0, 130.0)), random.uniform(0.2, 0.3)
+    wall = drawn_wall(random, 0.0035, 0.005, wall)
+    height = tall * radius
+
+    def warp(angles: np.ndarray, along: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        apart = np.angle(np.exp(1j * (angles - aside)))
+        near = np.exp(-((apart / 0.5) ** 2)) - 0.25 * np.exp(-((apart / 1.0) ** 2))
+        part = np.clip((along - 0.7) / 0.3, 0.0, 1.0) ** 2
+        leaning = lean * radius * np.cos(apart) * np.clip((along - 0.3) / 0.7, 0.0, 1.0) ** 2
+        return values[:, 0] * (1.0 + lip * part * near) + leaning, values[:, 1] + 0.12 * radius * part * near
+
+    body = Body()
+    turned = Turned.lay(
+        body,
+        Profile(
+            [
+                (0.0, 0.0, 1.2 * wall),
+                (0.75 * radius, 0.0, 1.2 * wall),
+                (1.2 * radius, 0.3 * height, wall),
+                (neck * radius, 0.75 * height, wall),
+                (1.1 * neck * radius, height, wall),
+            ]
+        ),
+        points=800,
+        crowd=_CROWD,
+        warp=warp,
+    )
+    reach = random.uniform(0.9, 1.1) * radius
+    _add_handle(body, turned, random.uniform(0.38, 0.45) * height, 0.82 * height, reach, random)
+    return Draft(body, wall, Symmetry("none"))
+
+
+def skillet(random: np.random.Generator, wall: float | None) -> Draft:
+    """Make a frying pan with a long handle."""
+    radius, depth = random.uniform(0.07, 0.095), random.uniform(0.3, 0.42)
+    length, rise = random.uniform(1.2, 1.6), random.uniform(0.15, 0.35)
+    wall = drawn_wall(random, 0.003, 0.0045, wall)
+    height = depth * radius
+    body = Body()
+    turned = Turned.lay(
+        body,
+        Profile(
+            [
+                (0.0, 0.0, 1.2 * wall),
+                (0.8 * radius, 0.0, 1.2 * wall),
+                (0.9 * radius, 0.15 * height, wall),
+                (radius, height, wall),
+            ]
+        ),
+        points=760,
+        crowd=_CROWD,
+    )
+    ring = _ring_at(turned, 0.6 * height, _BANDS)
+    patch = turned.side_patch(range(ring, ring + _BANDS + 1), _HALF)
+    start = turned.outside(patch)
+    middle = start.mean(axis=0)
+    far = length * radius
+    curve = smooth_curve(
+        [
+            (middle[0], middle[2]),
+            (middle[0] + 0.15 * far, middle[2] + 0.05 * far * rise),
+            (middle[0] + 0.5 * far, middle[2] + 0.5 * far * rise),
+            (middle[0] + far, middle[2] + 0.9 * far * rise),
+        ],
+        _HANDLE_LAYERS,
+    )
+    part = np.linspace(0.0, 1.0, _HANDLE_LAYERS)
+    rounding = np.sqrt(1.0 - 0.85 * np.clip((part - 0.88) / 0.12, 0.0, 1.0) ** 2)
+    widths = random.uniform(0.018, 0.023) * (0.75 + 0.25 * part) * rounding
+    heights = np.full(_HANDLE_LAYERS, random.uniform(0.009, 0.012)) * (0.4 + 0.6 * rounding)
+    layers = Rod(curve, widths, heights).layers(start, square_columns(_BANDS + 1, _HALF))
+    body.grow(patch.triangles, patch.order, turned.lower[patch.rows], layers)
+    return Draft(body, wall, _mirrored())
+
+
+def _add_handle(body: Body, turned: Turned, low: float, high: float, reach: float, random: np.random.Generator) -> None:
+    """Add an ear at angle 0 between two heights that stands out by `reach`, metres."""
+    above, below = _ring_at(turned, high, _BANDS), _ring_at(turned, low, _BANDS)
+    if (above + below + _BANDS) % 2:
+        # The diagonals of the upper patch, upside down, are the lower one's only every second band.
+        below += 1
+    leaving = turned.side_patch(range(above, above + _BANDS + 1), _HALF)
+    arriving = turned.side_patch(range(below, below + _BANDS + 1), _HALF, falling=True)
+    start, end = turned.outside(leaving), turned.outside(arriving)
+    (x, _, z), (x_end, _, z_end) = start.mean(axis=0), end.mean(axis=0)
+    far = max(x, x_end) + reach
+    curve = smooth_curve(
+        [
+            (x, z),
+            (x + 0.45 * reach, z),
+            (far, z + 0.02 * (z - z_end)),
+            (far + 0.1 * reach, 0.6 * z + 0.4 * z_end),
+            (far - 0.15 * reach, 0.8 * z_end + 0.2 * z),
+            (x_end + 0.4 * reach, z_end),
+            (x_end, z_end),
+        ],
+        _HANDLE_LAYERS,
+    )
+    part = np.linspace(0.0, 1.0, _HANDLE_LAYERS)
+    widths = random.uniform(0.012, 0.015) * (1.0 - 0.15 * np.sin(math.pi * part))
+    heights = np.full(_HANDLE_LAYERS, random.uniform(0.0075, 0.0095))
+    layers = Rod(curve, widths, heights).layers(start, square_columns(_BANDS + 1, _HALF), end)
+    body.grow(
+        leaving.triangles, leaving.order, turned.lower[leaving.rows], layers, end=turned.lower[arriving.rows]
+    )  # fmt: skip
+
+
+def _ring_at(turned: Turned, height: float, bands: int) -> int:
+    """Return the lowest ring of a patch whose middle lies at a height on the wall."""
+    heights = turned.sheet.middle[turned.rings.starts[:-1], 2]
+    # Beyond the bottom, where heights rise.
+    return int(np.argmin(np.abs(heights - height))) - bands // 2
+
+
+def _mirrored() -> Symmetry:
+    return Symmetry("one mirror plane, y = 0", mirrors=torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64))

@@ -1,0 +1,65 @@
+"""An object made by rule, and what is known of it."""
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from avmsf.capture.surface import Surface
+from avmsf.capture.texturedmesh import TexturedMesh
+from avmsf.simulate.solid import Solid
+
+
+def _origin() -> Tensor:
+    return torch.zeros(3, dtype=torch.float64)
+
+
+def _no_planes() -> Tensor:
+    return torch.zeros(0, 3, dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry:
+    """Turns about one axis and mirror planes that carry a shape onto itself; what follows from them is not listed."""
+
+    words: str
+    """For people, such as "one mirror plane"."""
+    axis: Float64[Tensor, " 3"] | None = None
+    """Direction of the axis, a unit vector; None where no turn is a symmetry."""
+    order: int | None = None
+    """Turns by 1/order are symmetries; None with an axis means every angle (of the shape that the triangles
+    approximate), and every plane that contains the axis."""
+    mirrors: Float64[Tensor, "planes 3"] = field(default_factory=_no_planes)
+    """Unit normals of mirror planes, apart from those that contain an axis of every angle."""
+    point: Float64[Tensor, " 3"] = field(default_factory=_origin)
+    """A point of the axis and of all planes, object frame, metres."""
+
+    @property
+    def none(self) -> bool:
+        """Whether nothing but standing still carries the shape onto itself."""
+        return self.axis is None and not len(self.mirrors)
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """One individual of a kind: upright along z, its axis, if any, the z axis."""
+
+    name: str
+    """Kind and seed, such as "mug-3"."""
+    surface: Surface
+    """Closed triangles, counter-clockwise from outside, metres: the solid's skin, its triangles cut finer."""
+    colours: Float[Tensor, "points 3"]
+    """Red, green, blue at each vertex of the surface as displayed (sRGB), 0 to 1."""
+    thickness: float
+    """Nominal thickness of the walls, metres; of a lump without walls its smallest extent."""
+    symmetry: Symmetry
+    """Of the shape; colours need not follow it."""
+    solid: Solid
+    """Tetrahedra, in the surface to rounding."""
+
+
+def textured(shape: Shape) -> TexturedMesh:
+    """Return a shape's surface in its colours, to render it with `avmsf.capture.meshviews.render_views`."""
+    faces = shape.surface.faces
+    return TexturedMesh.build(shape.surface.vertices, faces, colors=shape.colours[faces])

@@ -1,0 +1,120 @@
+"""Walls that are not equally thick everywhere, as no real ones are."""
+
+import numpy as np
+import scipy.sparse
+import torch
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Float64, Int
+from scipy.sparse.linalg import splu
+
+from avmsf.errors import SimulationError
+from avmsf.simulate.imperfections import smooth_field
+from avmsf.simulate.shapes.sheet import mitred_normals
+from avmsf.simulate.solid import Solid
+
+MOST = 0.5
+"""Largest variation."""
+_SQUEEZED = 0.02
+"""Part of its volume below which a tetrahedron is moved as a whole instead."""
+_MENDINGS = 30
+_APART = 1e-4
+"""How far inside of the surface rays start, in object diagonals."""
+
+
+def vary_thickness(solid: Solid, part: float, *, generator: np.random.Generator) -> Solid:
+    """Return a solid whose walls are thicker here and thinner there, smoothly, by chance.
+
+    `part` is the root mean square of the thickness over the surface relative to its mean, which stays as it is; 0
+    returns the solid itself. Thickness varies over lengths from .4 diagonals on. Both sides of a wall move along their
+    normals by half of what it grows, and points inside go along with those around them. No tetrahedron is turned inside
+    out. Raises SimulationError for a part below 0 or above .5, and for tetrahedra so flat that they cannot move.
+    """
+    if not 0.0 <= part <= MOST:
+        raise SimulationError(f"thickness variation {part:g}: expected a part of the thickness from 0 to {MOST:g}")
+    if part == 0.0:
+        return solid
+    rows, inverse = np.unique(solid.boundary.numpy(), return_inverse=True)
+    triangles, places = inverse.reshape(-1, 3), solid.points.numpy()[rows]
+    corners = places[triangles]
+    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    share = np.bincount(triangles.ravel(), weights=np.repeat(np.linalg.norm(doubled, axis=1), 3))
+    field = torch.log(smooth_field(torch.from_numpy(places), 1.0, diagonal=solid.size, generator=generator)).numpy()
+    factor = _spread(field, share, part)
+    # At a rim the walls' thickness, not the rim's distance from what lies below it.
+    walls = np.full(len(places), np.inf)
+    np.minimum.at(walls, triangles, _thickness(places, triangles, solid.size)[:, None])
+    moved = 0.5 * ((factor - 1.0) * walls)[:, None] * mitred_normals(places, triangles)
+    motion = _carried(solid, rows, moved)
+    return Solid.build(solid.points + torch.from_numpy(_mended(solid, motion)), solid.cells)
+
+
+def _spread(
+    field: Float64[np.ndarray, " points"], share: Float64[np.ndarray, " points"], part: float
+) -> Float64[np.ndarray, " points"]:
+    """Return positive factors of mean 1 and this root mean square deviation that rise with a field."""
+    strength = 0.0
+    for _ in range(50):
+        factor = np.exp((strength or part) * (field - field.mean()))
+        factor /= np.average(factor, weights=share)
+        found = float(np.sqrt(np.average((factor - 1.0) ** 2, weights=share)))
+        strength = (strength or part) * part / found
+    return factor
+
+
+def _thickness(
+    places: Float64[np.ndarray, "points 3"], triangles: Int[np.ndarray, "triangles 3"], size: float
+) -> Float64[np.ndarray, " triangles"]:
+    """Return how far the body reaches behind the middle of each triangle, metres."""
+    middle = 0.5 * (places.min(axis=0) + places.max(axis=0))
+    # Embree counts in float32: the body is moved to the origin and given size 1.
+    corners = (places[triangles] - middle) / size
+    scene = EmbreeScene()
+    TriangleMesh(scene, corners.astype(np.float32))
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    origins = corners.mean(axis=1) - _APART * normals
+    found = scene.run(origins.astype(np.float32), -normals.astype(np.float32), output=1)
+    reach = np.where(found["primID"] >= 0, found["tfar"], np.inf).astype(np.float64) + _APART
+    hit = np.isfinite(reach)
+    if not hit.any():
+        raise SimulationError("the surface has no inside: it is not closed; make the tetrahedra again")
+    return size * np.where(hit, reach, np.median(reach[hit]))
+
+
+def _carried(
+    solid: Solid, rows: Int[np.ndarray, " outer"], moved: Float64[np.ndarray, "outer 3"]
+) -> Float64[np.ndarray, "points 3"]:
+    """Return the motion of all points: inner ones move as the mean of those that share an edge with them."""
+    count = len(solid.points)
+    motion = np.zeros((count, 3))
+    motion[rows] = moved
+    inner = np.setdiff1d(np.arange(count), rows)
+    if len(inner):
+        cells = solid.cells.numpy()
+        pairs = np.concatenate([cells[:, [one, other]] for one in range(4) for other in range(4) if one != other])
+        joined = scipy.sparse.csr_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
+        balance = scipy.sparse.diags_array(joined.sum(axis=1)) - joined
+        own, others = balance[inner][:, inner].tocsc(), balance[inner][:, rows]
+        motion[inner] = splu(own).solve(-(others @ moved))
+    return motion
+
+
+def _mended(solid: Solid, motion: Float64[np.ndarray, "points 3"]) -> Float64[np.ndarray, "points 3"]:
+    """Return the motion with the corners of tetrahedra that it would crush moved alike instead."""
+    before, cells = solid.volumes.numpy(), solid.cells.numpy()
+    for _ in range(_MENDINGS):
+        corners = (solid.points.numpy() + motion)[cells]
+        crushed = cells[np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0 < _SQUEEZED * before]
+        if not len(crushed):
+            return motion
+        means = np.repeat(motion[crushed].mean(axis=1), 4, axis=0)
+        touched, which = np.unique(crushed, return_inverse=True)
+        number = np.bincount(which.ravel())
+        motion = motion.copy()
+        for axis in range(3):
+            motion[touched, axis] = np.bincount(which.ravel(), weights=means[:, axis]) / number
+    raise SimulationError(
+        f"{len(crushed)} of {len(cells)} tetrahedra would be crushed by this variation of the thickness: vary it less, "
+        "or make the tetrahedra again with another detail"
+    )
