@@ -1,10 +1,30 @@
-"""What is known of a simulated object and of no recorded one: its modes, and how strongly each blow excited them."""
+"""What is known of a simulated object and of no recorded one: its modes, and how strongly each blow excited them.
 
+A file `truth.safetensors` holds the tensors under the names of their fields, and in its header one JSON:
+{"format": 1, "version": "0.1.0", "names": ["001.wav", ...], "recipe": {...}}
+"""
+
+import json
 from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
-from jaxtyping import Float64
+import torch
+from jaxtyping import Complex128, Float64
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as to_bytes
 from torch import Tensor
+
+from avmsf.errors import SimulationError
+from avmsf.files import write_whole
+
+FORMAT = 1
+"""Number of this format; it grows with every change that older versions could not read."""
+TRUTH = "truth.safetensors"
+"""Its name in a capture folder."""
+_KEY = "avmsf_truth"
+_MODES, _TABLES, _CONTACTS = ("frequency", "damping"), ("gains", "quadrature"), "contacts"
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,3 +47,106 @@ class Truth:
     """The recordings' names, in the order of the rows."""
     recipe: dict[str, Any] = field(default_factory=dict)
     """All settings that the object was made with, as plain values."""
+    contacts: Float64[Tensor, "contacts 3"] | None = None
+    """Where the blows fell, metres, which is not quite where the table of impacts has them; None if that is exact."""
+
+    @property
+    def amplitudes(self) -> Complex128[Tensor, "contacts modes"]:
+        """Amplitudes A: recording i is the real part of the sum of A[i] exp((-d + 2 pi i f) t)."""
+        return torch.complex(self.quadrature, -self.gains)
+
+
+def write_truth(truth: Truth, path: str | Path) -> None:
+    """Write a truth to one file, which `read_truth` reads back to the last bit.
+
+    A file that is there stays whole until the new one is. Raises SimulationError where the file cannot be written, or
+    could not be read back.
+    """
+    path = Path(path)
+    tensors = {name: getattr(truth, name) for name in (*_MODES, *_TABLES, _CONTACTS)}
+    tensors = {name: tensor.clone().contiguous() for name, tensor in tensors.items() if tensor is not None}
+    _expect_tensors(tensors, len(truth.names), path)
+    record = {"format": FORMAT, "version": version("avmsf"), "names": list(truth.names), "recipe": truth.recipe}
+    try:
+        words = json.dumps(record, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise SimulationError(
+            f"{path}: expected a recipe of finite numbers, words, lists and dicts ({error}): take the rest out of it"
+        ) from error
+    content = to_bytes(tensors, {_KEY: words})
+    write_whole(path, lambda place: place.write_bytes(content), raising=SimulationError)
+
+
+def read_truth(path: str | Path) -> Truth:
+    """Read what `write_truth` wrote; `path` is the file, or the capture folder that holds it.
+
+    Raises SimulationError for a file that is missing, cut short, of another kind or of another format, and where its
+    tensors do not fit together.
+    """
+    path = Path(path)
+    path = path / TRUTH if path.is_dir() else path
+    words, tensors = _read(path)
+    record = _understand(words, path)
+    _expect_tensors(tensors, len(record["names"]), path)
+    return Truth(names=tuple(record["names"]), recipe=record["recipe"], **tensors)
+
+
+def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
+    if not path.is_file():
+        raise SimulationError(
+            f"{path}: expected the truth of a simulated object, found no such file: only objects that `avmsf simulate` "
+            "made have one"
+        )
+    try:
+        with safe_open(path, framework="pt") as file:
+            words = (file.metadata() or {}).get(_KEY)
+            # Clones, for what the file maps into memory would change with it.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise SimulationError(
+            f"{path}: expected the truth of a simulated object, found a file of another kind or one cut short "
+            f"({error}): simulate the object again"
+        ) from error
+    if words is None:
+        raise SimulationError(
+            f"{path}: expected the truth of a simulated object, found a safetensors file of something else (its "
+            f"metadata has no entry {_KEY!r}): name a file that `avmsf simulate` wrote"
+        )
+    return words, tensors
+
+
+def _understand(words: str, path: Path) -> dict[str, Any]:
+    """Return the header's record after looking at every entry of it."""
+    try:
+        record = json.loads(words)
+        found, writer, names = record["format"], record["version"], record["names"]
+        listed = isinstance(names, list) and all(isinstance(name, str) for name in names)
+        if found == FORMAT and not (listed and isinstance(record["recipe"], dict)):
+            raise ValueError("names or recipe of another type")
+    except (ValueError, TypeError, KeyError) as error:
+        raise SimulationError(
+            f"{path}: expected the header of a simulated object's truth, found a damaged one ({type(error).__name__}: "
+            f"{error}): simulate the object again"
+        ) from error
+    if found != FORMAT:
+        raise SimulationError(
+            f"{path}: expected a truth of format {FORMAT}, found format {found}, written by avmsf {writer} (this is "
+            f"avmsf {version('avmsf')}): install avmsf {writer} or newer, or simulate the object again"
+        )
+    return record
+
+
+def _expect_tensors(tensors: dict[str, Tensor], contacts: int, path: Path) -> None:
+    modes = len(tensors["frequency"]) if "frequency" in tensors and tensors["frequency"].ndim == 1 else 0
+    expected = dict.fromkeys(_MODES, (modes,)) | dict.fromkeys(_TABLES, (contacts, modes))
+    if _CONTACTS in tensors:
+        expected |= {_CONTACTS: (contacts, 3)}
+    found = {name: tuple(tensor.shape) for name, tensor in tensors.items() if tensor.dtype == torch.float64}
+    if found != expected or tensors.keys() != expected.keys():
+        raise SimulationError(
+            f"{path}: expected the float64 tensors {expected}, found "
+            f"{ {name: tuple(tensor.shape) for name, tensor in tensors.items()} }: simulate the object again"
+        )
+    for name, tensor in tensors.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise SimulationError(f"{path}: expected {name} to be finite numbers, found otherwise: simulate it again")

@@ -1,0 +1,125 @@
+"""`avmsf simulate`: objects whose modes and gains are known, struck, recorded and photographed."""
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from avmsf.cli import INTERRUPTED
+from avmsf.cli.printing import console, say, table
+from avmsf.errors import SimulationError
+from avmsf.simulate.example import EXAMPLE
+from avmsf.simulate.material import MATERIALS
+from avmsf.simulate.recipe import ObjectRecipe
+from avmsf.simulate.shapes import KINDS
+from avmsf.simulate.sim20 import NON_SYMMETRIC, SET, SIM20, sim20_recipe
+from avmsf.simulate.simulationset import SetProgress, simulate_set
+
+
+@dataclass(frozen=True)
+class Options:
+    """Simulate objects: finite elements, a hammer, a microphone and a camera, as capture folders with their truth.
+
+    `avmsf simulate sim-20 --output FOLDER` makes the benchmark set, one folder an object; what is whole is kept, so
+    that an interrupted run goes on with the same command. One object of the set by its name, any other by --kind or
+    --mesh, goes into FOLDER itself. Needs pip install 'avmsf[fem]'.
+    """
+
+    what: tyro.conf.Positional[str | None] = None
+    """sim-20 for the benchmark set, the name of one of its objects, or example for the one that `avmsf demo` is about;
+    nothing for an object of your own."""
+    output: Path | None = None
+    """Folder to make."""
+    list: bool = False
+    """List the set's objects, the shapes and the materials, and make nothing."""
+    cache: Path | None = None
+    """Folder to keep elastic modes in, which take most of the time: other hammers, noises and views then go quickly."""
+    recipe: Annotated[ObjectRecipe, tyro.conf.arg(name="")] = field(default_factory=ObjectRecipe)
+    """The object, and how it is struck, heard and seen; of an object of the set, what shall be different."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return tyro.cli(Options, prog="avmsf simulate", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def run(options: Options) -> int:
+    """Simulate; return 130 where Ctrl-C stopped it."""
+    if options.list:
+        _list()
+        return 0
+    if options.output is None:
+        raise SimulationError("expected --output FOLDER, where to put what is simulated; --list shows what there is")
+    recipes, folder = _chosen(options, options.output)
+    try:
+        with _Bar() as bar:
+            simulate_set(recipes, folder, cache=options.cache, progress=bar.show)
+    except KeyboardInterrupt:
+        say("avmsf simulate: interrupted; the same command goes on from where it was")
+        return INTERRUPTED
+    print(f"wrote {options.output}" if len(recipes) == 1 else f"wrote {len(recipes)} objects to {options.output}")
+    return 0
+
+
+def _chosen(options: Options, output: Path) -> tuple[dict[str, ObjectRecipe], Path]:
+    """Return the recipes by their folders' names, and the folder that holds these."""
+    changes = {
+        each.name: getattr(options.recipe, each.name)
+        for each in fields(ObjectRecipe)
+        if getattr(options.recipe, each.name) != getattr(ObjectRecipe(), each.name)
+    }
+    if options.what == SET:
+        return {name: replace(recipe, **changes) for name, recipe in SIM20.items()}, output
+    place = output.resolve()
+    if options.what is None:
+        return {place.name: options.recipe}, place.parent
+    named = EXAMPLE if options.what == "example" else sim20_recipe(options.what)
+    return {place.name: replace(named, **changes)}, place.parent
+
+
+def _list() -> None:
+    screen = console(errors=False)
+    rows = [
+        (name, recipe.kind, recipe.material, str(recipe.seed), "yes" if name not in NON_SYMMETRIC else "no")
+        for name, recipe in SIM20.items()
+    ]
+    screen.print(table(SET, ("object", "shape", "material", "seed", "symmetric"), rows, words=3))
+    print(f"shapes for --kind: {', '.join(KINDS)}")
+    print(f"materials: {', '.join(MATERIALS)}")
+
+
+class _Bar:
+    """One bar for all objects, with what is being done to the one at hand; in a file or a pipe, a line an object."""
+
+    def __init__(self) -> None:
+        self.live = sys.stderr.isatty()
+        self.begun = time.monotonic()
+        self.bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=Console(file=sys.stderr, markup=False, highlight=False),
+            disable=not self.live,
+        )
+        self.task = self.bar.add_task("", total=None)
+
+    def __enter__(self) -> "_Bar":
+        self.bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.stop()
+
+    def show(self, progress: SetProgress) -> None:
+        """Take note of a stage."""
+        words = f"{progress.name}: {progress.stage}"
+        self.bar.update(self.task, description=words, completed=progress.done, total=progress.total)
+        if not self.live and progress.stage in ("kept", "done"):
+            say(f"{words} ({progress.done} of {progress.total}, {time.monotonic() - self.begun:.0f} s)")

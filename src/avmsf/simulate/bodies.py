@@ -1,0 +1,122 @@
+"""From a recipe to a body: what it looks like, what it is made of, and its elastic modes, kept by content."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from avmsf.capture.surface import Surface
+from avmsf.capture.texturedmesh import TexturedMesh, read_textured_mesh
+from avmsf.errors import SimulationError
+from avmsf.simulate.elastic import ElasticModes, elastic_modes
+from avmsf.simulate.elasticstore import load_modes, save_modes
+from avmsf.simulate.imperfections import smooth_field, stream, support_places, support_springs
+from avmsf.simulate.material import material_named
+from avmsf.simulate.recipe import AXES, ObjectRecipe, key_of
+from avmsf.simulate.shapes import make_shape, textured, vary_thickness
+from avmsf.simulate.shell import shell
+from avmsf.simulate.solid import Solid
+from avmsf.simulate.tetrahedra import fill
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """An object before it is struck."""
+
+    mesh: TexturedMesh
+    """As it looks, with even walls: thickness varies unseen."""
+    elastic: ElasticModes
+    supports: Float64[Tensor, "legs 3"]
+    """Places that it stands on."""
+
+    @property
+    def surface(self) -> Surface:
+        """Its shape alone."""
+        return self.mesh.surface
+
+
+def make_body(recipe: ObjectRecipe, *, cache: Path | None, tell: Tell) -> Body:
+    """Make a recipe's body, its elastic modes read from the folder `cache` where they were computed before.
+
+    A file that is damaged is made again. Raises SimulationError for an unknown shape and a mesh that cannot be made
+    solid, and CaptureError for a mesh that cannot be read.
+    """
+    mesh, make_solid = _shape(recipe)
+    legs = support_places(mesh.surface.vertices.double(), up_of(recipe), generator=stream(recipe.seed, "supports"))
+    kept = None if cache is None else cache / f"modes-{key_of(recipe.elastic_values())}.safetensors"
+    if kept is not None and kept.is_file():
+        try:
+            return Body(mesh, load_modes(kept), legs)
+        except SimulationError as error:
+            tell(f"computing again what cannot be read ({error})")
+    tell("solid")
+    solid = _uneven(recipe, make_solid())
+    tell(f"elastic modes of {len(solid.cells)} tetrahedra")
+    elastic = _elastic(recipe, solid, legs)
+    if kept is not None:
+        save_modes(elastic, kept)
+    return Body(mesh, elastic, legs)
+
+
+def up_of(recipe: ObjectRecipe) -> Float64[Tensor, " 3"]:
+    """Return the unit vector that points to the sky."""
+    return torch.tensor(AXES[recipe.up], dtype=torch.float64)
+
+
+def _shape(recipe: ObjectRecipe) -> tuple[TexturedMesh, Callable[[], Solid]]:
+    """Return what the object looks like, and what makes it solid."""
+    if recipe.mesh is not None:
+        mesh = read_textured_mesh(recipe.mesh)
+        mesh = replace(mesh, vertices=mesh.vertices * _scale(recipe, mesh.vertices))
+        return mesh, lambda: _made_solid(recipe, mesh.surface)
+    shape = make_shape(recipe.kind, seed=recipe.seed, size=recipe.size, wall=recipe.thickness)
+    return textured(shape), lambda: shape.solid
+
+
+def _made_solid(recipe: ObjectRecipe, surface: Surface) -> Solid:
+    """Return what a mesh encloses, or the wall beneath it."""
+    try:
+        if recipe.thickness is None:
+            return fill(surface, detail=recipe.detail)
+        return shell(surface, thickness=recipe.thickness, detail=recipe.detail)
+    except SimulationError as error:
+        advice = " (--thickness gives it walls)" if recipe.thickness is None else ""
+        raise SimulationError(f"{recipe.mesh} cannot be made solid: {error}{advice}") from error
+
+
+def _uneven(recipe: ObjectRecipe, solid: Solid) -> Solid:
+    part = recipe.imperfections.thickness
+    return solid if part == 0.0 else vary_thickness(solid, part, generator=stream(recipe.seed, "thickness"))
+
+
+def _elastic(recipe: ObjectRecipe, solid: Solid, legs: Float64[Tensor, "legs 3"]) -> ElasticModes:
+    material, imperfections = material_named(recipe.material), recipe.imperfections
+    middles = solid.points[solid.cells].mean(dim=1)
+    diagonal = float((solid.points.amax(0) - solid.points.amin(0)).norm())
+    stiffness, density = (
+        smooth_field(middles, spread, diagonal=diagonal, generator=stream(recipe.seed, name))
+        for name, spread in (("stiffness", imperfections.stiffness), ("density", imperfections.density))
+    )
+    mass = material.density * float((solid.volumes * density).sum())
+    strength = support_springs(mass, imperfections)
+    return elastic_modes(
+        solid,
+        material,
+        count=recipe.modes,
+        stiffness_factor=stiffness,
+        density_factor=density,
+        springs=[(leg, strength) for leg in legs] if strength > 0.0 else None,
+    )
+
+
+def _scale(recipe: ObjectRecipe, vertices: Tensor) -> float:
+    """Return what makes the longest side of the bounding box as long as the recipe has it."""
+    longest = float((vertices.amax(0) - vertices.amin(0)).max())
+    if not longest > 0.0:
+        raise SimulationError("the mesh has no extent: all of its vertices lie in one place; export it again")
+    return 1.0 if recipe.size is None else recipe.size / longest

@@ -1,0 +1,133 @@
+"""A hammer's blow: how long its tip stays on the body, how hard it presses, and what that leaves of each mode.
+
+Two pulses of duration tau and impulse 1 newton second, both of which begin at time zero:
+
+    half-sine   pi / (2 tau) sin(pi t / tau), a mass on a linear spring: a tip with a flat face of radius a, for which
+                the spring has 2 a E* and tau = pi sqrt(m / (2 a E*));
+    hertz       N sin(pi t / tau)^(3/2), within 3 % of Hertz's pulse of a round tip of radius a, for which
+                tau = 2.868 (m^2 / (a E*^2 v))^(1/5).
+
+1/E* = (1 - nu_1^2) / E_1 + (1 - nu_2^2) / E_2 joins both materials, m = 1 / (1 / m_hammer + 1 / m_body) both masses as
+if the body were rigid and free, v is the speed, and the tip bounces off as fast as it came: the impulse is 2 m v. A
+vibration that the pulse has left behind is the one of an impulse at time zero times the pulse's Laplace transform at
+the vibration's pole, in size and in phase.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Complex128, Float64
+from scipy.special import loggamma
+from torch import Tensor
+
+from avmsf.errors import SimulationError
+from avmsf.simulate.material import Material
+
+LONGEST = 0.02
+"""Seconds of contact beyond which a blow is a push."""
+_HERTZ_SCALE = 2.868
+_HERTZ_AREA = math.sqrt(math.pi) * math.gamma(1.25) / math.gamma(1.75)
+"""Integral of sin(x)^(3/2) from 0 to pi."""
+
+
+@dataclass(frozen=True)
+class Hammer:
+    """A small steel hammer with a round tip, unless told otherwise."""
+
+    mass: float = 0.02
+    """Of its head, kilograms."""
+    radius: float = 0.003
+    """Of its tip, metres."""
+    young: float = 2e11
+    """Young's modulus of its tip, pascals: 2e11 is steel, 3e9 a hard plastic, 1e7 rubber."""
+    poisson: float = 0.29
+    """Poisson's ratio of its tip."""
+    speed: float = 0.5
+    """With which it meets the body, metres per second."""
+    pulse: Literal["hertz", "half-sine"] = "hertz"
+    """hertz: a round tip; half-sine: a flat one."""
+    contact_time: float = 0.0
+    """Seconds that the tip stays on the body; 0 computes it from the above."""
+
+    def __post_init__(self) -> None:
+        for name, unit in (("mass", "kg"), ("radius", "m"), ("young", "Pa"), ("speed", "m/s")):
+            value = getattr(self, name)
+            if not 0 < value < math.inf:
+                raise SimulationError(f"hammer: {name} = {value:g} {unit}: expected more than 0")
+        if not -1 < self.poisson < 0.5:
+            raise SimulationError(f"hammer: poisson = {self.poisson:g}: expected more than -1 and less than .5")
+        if not 0 <= self.contact_time <= LONGEST:
+            raise SimulationError(
+                f"hammer: contact_time = {self.contact_time:g} s: expected 0 to compute it, or up to {LONGEST:g}"
+            )
+
+
+def moving_mass(hammer: Hammer, mass: float) -> float:
+    """Return what hammer and body weigh against each other, kilograms."""
+    return 1.0 / (1.0 / hammer.mass + 1.0 / mass)
+
+
+def contact_times(
+    hammer: Hammer, material: Material, *, mass: float, speeds: Float64[Tensor, " contacts"]
+) -> Float64[Tensor, " contacts"]:
+    """Return how long the tip stays on a body of this material and mass, kg, for blows of these speeds, m/s; seconds.
+
+    Raises SimulationError where that is longer than `LONGEST`.
+    """
+    if hammer.contact_time > 0.0:
+        return torch.full_like(speeds, hammer.contact_time)
+    joint = 1.0 / ((1.0 - hammer.poisson**2) / hammer.young + (1.0 - material.poisson**2) / material.young)
+    moving = moving_mass(hammer, mass)
+    if hammer.pulse == "half-sine":
+        times = torch.full_like(speeds, math.pi * math.sqrt(moving / (2.0 * hammer.radius * joint)))
+    else:
+        times = _HERTZ_SCALE * (moving**2 / (hammer.radius * joint**2 * speeds)) ** 0.2
+    if float(times.max()) > LONGEST:
+        raise SimulationError(
+            f"the hammer stays on the body for {float(times.max()):.2g} s; a blow takes less than {LONGEST:g}: take a "
+            "lighter hammer, a stiffer tip, or a faster blow"
+        )
+    return times
+
+
+def peak_forces(
+    hammer: Hammer, *, mass: float, speeds: Float64[Tensor, " contacts"], times: Float64[Tensor, " contacts"]
+) -> Float64[Tensor, " contacts"]:
+    """Return the greatest force of each blow on a body of this mass, newtons."""
+    impulses = 2.0 * moving_mass(hammer, mass) * speeds
+    area = 2.0 if hammer.pulse == "half-sine" else _HERTZ_AREA
+    return impulses * math.pi / (area * times)
+
+
+def pulse_spectrum(
+    hammer: Hammer, poles: Complex128[Tensor, " modes"], times: Float64[Tensor, " contacts"]
+) -> Complex128[Tensor, "contacts modes"]:
+    """Return the Laplace transform of each blow's pulse, scaled to a peak of one newton, at the poles; seconds."""
+    turns = times[:, None] * poles[None, :]
+    if hammer.pulse == "half-sine":
+        return times[:, None] * (2.0 / math.pi) * _half_sine(turns)
+    return times[:, None] * (_HERTZ_AREA / math.pi) * _hertz(turns)
+
+
+def _half_sine(turns: Complex128[Tensor, "contacts modes"]) -> Complex128[Tensor, "contacts modes"]:
+    """Return the transform of the pulse of unit area; `turns` is s tau."""
+    below = math.pi**2 + turns.square()
+    # Zero over zero where the pulse lasts half a cycle of an undamped mode.
+    resonant = below.abs() < 1e-9
+    plain = (1.0 + torch.exp(-turns)) / torch.where(resonant, 1.0, below)
+    return 0.5 * math.pi**2 * torch.where(resonant, -torch.exp(-turns) / (2.0 * turns), plain)
+
+
+def _hertz(turns: Complex128[Tensor, "contacts modes"]) -> Complex128[Tensor, "contacts modes"]:
+    """Return the transform of the pulse of unit area.
+
+    The integral of sin(x)^(v - 1) exp(i b x) from 0 to pi is, with v = 5/2 and i b = -s tau / pi,
+    pi exp(i b pi / 2) Gamma(v + 1) / (2^(v - 1) v Gamma((v + b + 1) / 2) Gamma((v - b + 1) / 2)).
+    """
+    b = 1j * turns.numpy() / math.pi
+    logarithm = loggamma((3.5 + b) / 2.0) + loggamma((3.5 - b) / 2.0)
+    scale = math.pi * math.gamma(3.5) / (2.0**1.5 * 2.5 * _HERTZ_AREA)
+    return torch.from_numpy(scale * np.exp(0.5j * math.pi * b - logarithm))

@@ -1,0 +1,135 @@
+"""Where a hammer falls on an object, and what is written down of it."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Bool, Float64, Int
+from torch import Tensor
+
+from avmsf.capture.surface import Surface
+from avmsf.errors import SimulationError
+from avmsf.simulate.closest import ClosestPoints
+from avmsf.simulate.imperfections import Imperfections, stream
+
+STEEPEST = -0.35
+"""Least height of a unit normal where a hammer gets beneath: 20 degrees of overhang above a table."""
+_CANDIDATES = 4
+"""Places drawn evenly from what can be reached, for each contact: more would push the contacts to the rims."""
+
+
+@dataclass(frozen=True, eq=False)
+class Strikes:
+    """Blows as they fell and as they were written down, row for row."""
+
+    places: Float64[Tensor, "contacts 3"]
+    """Where they fell, metres."""
+    directions: Float64[Tensor, "contacts 3"]
+    """Unit vectors along which the hammer moved."""
+    written_places: Float64[Tensor, "contacts 3"]
+    written_directions: Float64[Tensor, "contacts 3"]
+    speeds: Float64[Tensor, " contacts"]
+    """Relative to the hammer's."""
+    force_errors: Float64[Tensor, " contacts"]
+    """What the written peak forces are multiplied by."""
+
+
+def draw_strikes(
+    surface: Surface, count: int, *, up: Float64[Tensor, " 3"], imperfections: Imperfections, seed: int
+) -> Strikes:
+    """Draw blows spread over all of a surface that a hammer reaches from above or from the side, straight into it.
+
+    A place is reached where its outward normal hits nothing of the object and does not point down. Raises
+    SimulationError where there are no such places.
+    """
+    places, normals = _reached(surface, count, up=up, seed=seed)
+    chosen = _spread(places, count, seed=seed)
+    places, normals = places[chosen], normals[chosen]
+    inward = -normals
+    offsets = _across(normals, imperfections.contact, generator=stream(seed, "contact jitter"))
+    tilts = _across(normals, math.radians(imperfections.direction), generator=stream(seed, "direction jitter"))
+    directions = inward + torch.tan(tilts.norm(dim=1, keepdim=True)) * _unit(tilts)
+    speeds = stream(seed, "speeds").standard_normal(count)
+    errors = stream(seed, "force errors").standard_normal(count)
+    return Strikes(
+        places=places,
+        directions=_unit(directions),
+        written_places=nearest_on(surface, places + offsets) if imperfections.contact > 0.0 else places,
+        written_directions=inward,
+        speeds=torch.from_numpy(np.exp(imperfections.speed * speeds)),
+        # Bounded, for a written force is never negative.
+        force_errors=torch.from_numpy(np.exp(imperfections.force * errors)),
+    )
+
+
+def nearest_on(surface: Surface, places: Float64[Tensor, "contacts 3"]) -> Float64[Tensor, "contacts 3"]:
+    """Return the surface's points nearest to the places."""
+    triangles = surface.vertices.double().numpy()[surface.faces.numpy()]
+    triangles = triangles[np.ptp(triangles, axis=1).max(axis=1) > 0]
+    found = ClosestPoints(triangles)(places.numpy())
+    return torch.from_numpy(np.einsum("pc,pca->pa", found.weights, triangles[found.rows]))
+
+
+def _reached(
+    surface: Surface, count: int, *, up: Float64[Tensor, " 3"], seed: int
+) -> tuple[Float64[Tensor, "places 3"], Float64[Tensor, "places 3"]]:
+    """Return `_CANDIDATES` times `count` places that a hammer reaches, drawn evenly by area, and their normals."""
+    mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
+    if not (len(mesh.faces) and math.isfinite(mesh.area) and mesh.area > 0.0):
+        raise SimulationError(f"a surface of {len(mesh.faces)} triangles has no area to strike: give a mesh with faces")
+    generator = stream(seed, "contacts")
+    wanted = _CANDIDATES * count
+    places, normals, drawn = np.zeros((0, 3)), np.zeros((0, 3)), 0
+    while len(places) < wanted and drawn < 200 * wanted:
+        points, rows = trimesh.sample.sample_surface(mesh, 8 * wanted, seed=int(generator.integers(2**31)))
+        outward = np.asarray(mesh.face_normals[rows])
+        reached = (outward @ up.numpy() >= STEEPEST) & _free(mesh, np.asarray(points), outward)
+        places, normals = np.concatenate([places, points[reached]]), np.concatenate([normals, outward[reached]])
+        drawn += 8 * wanted
+    if len(places) < count:
+        raise SimulationError(
+            f"a hammer reaches next to nothing of the surface from above or from the side ({len(places)} of {drawn} "
+            "places): name another axis that points up, or turn the mesh's triangles outward"
+        )
+    return torch.from_numpy(places[:wanted]), torch.from_numpy(normals[:wanted])
+
+
+def _free(
+    mesh: trimesh.Trimesh, places: Float64[np.ndarray, "places 3"], outward: Float64[np.ndarray, "places 3"]
+) -> Bool[np.ndarray, " places"]:
+    """Return where a ray along the normal leaves the object without meeting it again."""
+    low, high = mesh.bounds
+    diagonal = float(np.linalg.norm(high - low))
+    # Embree counts in float32: the object is moved to the origin and made of size 1, and a ray starts off its surface.
+    scene = EmbreeScene()
+    TriangleMesh(scene, ((mesh.vertices - low) / diagonal).astype(np.float32), mesh.faces.astype(np.int32))
+    origins = ((places - low) / diagonal + 1e-4 * outward).astype(np.float32)
+    return scene.run(origins, outward.astype(np.float32)) < 0
+
+
+def _spread(places: Float64[Tensor, "places 3"], count: int, *, seed: int) -> Int[Tensor, " chosen"]:
+    """Return rows of places far apart: a first by chance, then always the farthest from all before."""
+    start = int(stream(seed, "first contact").integers(len(places)))
+    distance = (places - places[start]).norm(dim=1)
+    chosen = [start]
+    while len(chosen) < count:
+        distance[chosen[-1]] = -math.inf
+        chosen.append(int(distance.argmax()))
+        distance = torch.minimum(distance, (places - places[chosen[-1]]).norm(dim=1))
+    return torch.tensor(chosen)
+
+
+def _across(
+    normals: Float64[Tensor, "contacts 3"], spread: float, *, generator: np.random.Generator
+) -> Float64[Tensor, "contacts 3"]:
+    """Return Gaussian vectors across the normals whose lengths have this root mean square."""
+    drawn = torch.from_numpy(generator.standard_normal(tuple(normals.shape)))
+    return spread / math.sqrt(2.0) * (drawn - (drawn * normals).sum(dim=1, keepdim=True) * normals)
+
+
+def _unit(vectors: Float64[Tensor, "contacts 3"]) -> Float64[Tensor, "contacts 3"]:
+    return vectors / vectors.norm(dim=1, keepdim=True).clamp(min=1e-300)
