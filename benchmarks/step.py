@@ -107,7 +107,15 @@ def start(
         generator=torch.Generator().manual_seed(config.seed),
     )
     samples = impacts.sounds.shape[1]
-    run = kind(network, modes, gains=gains, sample_rate=impacts.sample_rate, samples=samples, config=config)
+    run = kind(
+        network,
+        modes,
+        gains=gains,
+        phase=torch.zeros_like(modes.bank.frequency),
+        sample_rate=impacts.sample_rate,
+        samples=samples,
+        config=config,
+    )
     return run, Targets.of(impacts, gains, features.nearest(impacts.contacts), config)
 
 

@@ -65,11 +65,11 @@ def test_a_file_names_its_tensors_and_itself(tmp_path):
     save(field(), tmp_path / "plate.safetensors")
     with safe_open(tmp_path / "plate.safetensors", framework="pt") as file:
         names, record = set(file.keys()), json.loads(file.metadata()["avmsf"])
-    assert {"bank.frequency", "bank.damping", "residual.magnitude"} < names
+    assert {"bank.frequency", "bank.damping", "phase", "residual.magnitude"} < names
     assert {name.removeprefix("gain_field.") for name in names if name.startswith("gain_field.")} == set(
         field().gain_field.state_dict()
     )
-    assert record["format"] == 1
+    assert record["format"] == 2
     assert record["version"] == "0.1.0"
     assert record["sample_rate"] == 8000.0
     assert record["origin"]["capture"] == "a plate"
@@ -261,9 +261,9 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path):
 
 def test_a_newer_format_is_refused_by_name(tmp_path):
     def change(_: dict, record: dict) -> None:
-        record.update(format=2, version="3.1.4", something="new")
+        record.update(format=3, version="3.1.4", something="new")
 
-    with pytest.raises(FieldFileError, match=r"of format 1, found format 2, written by avmsf 3\.1\.4") as caught:
+    with pytest.raises(FieldFileError, match=r"of format 2, found format 3, written by avmsf 3\.1\.4") as caught:
         load(changed(tmp_path, change))
     assert "install avmsf 3.1.4 or newer" in str(caught.value)
 
@@ -349,12 +349,12 @@ def test_nothing_that_a_record_lacks_is_made_up(tmp_path, keys):
         load(changed(tmp_path, change))
 
 
-@pytest.mark.parametrize("words", ["", "[]", "{", '"avmsf"', '{"format": 1}'])
+@pytest.mark.parametrize("words", ["", "[]", "{", '"avmsf"', '{"format": 2}'])
 def test_a_record_that_is_none_is_refused(tmp_path, words):
     path = tmp_path / "plate.safetensors"
     save(field(), path)
     path.write_bytes(to_bytes(from_bytes(path.read_bytes()), {"avmsf": words}))
-    with pytest.raises(FieldFileError, match="expected the header of a sound field of format 1, found another"):
+    with pytest.raises(FieldFileError, match="expected the header of a sound field of format 2, found another"):
         load(path)
 
 

@@ -17,6 +17,7 @@ from avmsf.modal.leastsquares import (
     project,
     refine,
 )
+from avmsf.modal.phase import common_phase
 from avmsf.modal.synthesis import synthesise
 
 RATE = 8000.0
@@ -94,6 +95,25 @@ def test_sine_gains_of_sines_come_back():
     gains, _, _ = draw(BANK)
     sounds = gains @ basis(BANK, 6000)[: len(BANK)]
     torch.testing.assert_close(fit_sine_gains(sounds, BANK, sample_rate=RATE), gains, rtol=0, atol=1e-7)
+
+
+def test_gains_of_sines_that_start_late_come_back_with_their_phases():
+    gains, _, _ = draw(BANK)
+    phase = torch.linspace(-1.5, 1.5, len(BANK), dtype=torch.float64)
+    sines, cosines = basis(BANK, 6000).chunk(2)
+    sounds = gains @ (torch.cos(phase)[:, None] * sines + torch.sin(phase)[:, None] * cosines)
+    found = fit_sine_gains(sounds, BANK, sample_rate=RATE, phase=phase)
+    torch.testing.assert_close(found, gains, rtol=0, atol=1e-7)
+    torch.testing.assert_close(common_phase(*fit_gains(sounds, BANK, sample_rate=RATE)), phase, rtol=0, atol=1e-6)
+
+
+def test_a_common_phase_does_not_heed_signs_and_follows_the_strong():
+    strong = torch.tensor([[3.0], [-2.0], [4.0]], dtype=torch.float64)
+    weak = torch.tensor([[0.1]], dtype=torch.float64)
+    gains = torch.cat([strong * math.cos(0.7), weak * math.cos(2.0)])
+    quadrature = torch.cat([strong * math.sin(0.7), weak * math.sin(2.0)])
+    # A hundredth of a square's 29 can turn the sum's argument, which is twice the phase, by no more than 1 / 2900.
+    assert float(common_phase(gains, quadrature)[0]) == pytest.approx(0.7, abs=1 / 2900)
 
 
 def test_sine_gains_leave_the_least_residual():

@@ -16,10 +16,8 @@ from avmsf.scene.features import FeatureField
 
 def expect_fitting(train: Impacts, modes: Extraction) -> None:
     """Raise `FitError` for recordings and modes that no field can be fitted to."""
-    if len(train) < 2:
-        raise FitError(
-            f"expected at least 2 recordings to fit a field to, found {len(train)}: strike the object in more places"
-        )
+    if len(train) == 0:
+        raise FitError("expected recordings to fit a field to, found none: strike the object in some places")
     for name, sound, contact in zip(train.names, train.sounds, train.contacts, strict=True):
         if not bool(torch.isfinite(sound).all() and torch.isfinite(contact).all()):
             raise FitError(
@@ -49,6 +47,8 @@ def fingerprint(train: Impacts, features: FeatureField, modes: Extraction, confi
     digest = hashlib.sha256(json.dumps(words, sort_keys=True).encode())
     tensors = [train.contacts, train.sounds, features.points, features.features]
     tensors += [modes.bank.frequency, modes.bank.damping, modes.residual.magnitude]
+    # Phases, and without a warm-up how strong the modes are, are those of the extraction.
+    tensors += [modes.gains, modes.quadrature]
     for tensor in tensors if train.directions is None else [*tensors, train.directions]:
         digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())

@@ -68,6 +68,8 @@ class FitConfig:
     """Whether dampings vary with the contact; `validated` tries both and keeps what validation contacts prefer."""
     validation: float = 0.25
     """Part of the training contacts that choices are validated on; with fewer than 6 contacts none are."""
+    phase: Literal["common", "sine"] = "common"
+    """How modes start: each with the phase that the training recordings agree on, or as sines (paper, eq. 3)."""
     residual: bool = True
     """Whether noise is modelled beside the modes."""
     seed: int = 0
@@ -131,6 +133,7 @@ PAPER = FitConfig(
     fft_sizes=(2048, 1024, 512, 256),
     hop=64,
     early_weight=1.0,
+    phase="sine",
 )
 """The paper's settings where it states them (supplement, training setup), the middle of each of its lists: clusters,
 learning rate, steps, resolutions, hop and the beginning's weight. It leaves the network's other sizes, the warm-up and

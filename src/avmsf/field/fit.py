@@ -25,6 +25,7 @@ from avmsf.field.training import Targets, TrainingRun, gain_scale
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction import Extraction
 from avmsf.modal.leastsquares import fit_sine_gains
+from avmsf.modal.phase import common_phase
 from avmsf.modal.residual import Residual
 from avmsf.modal.spectra import envelope
 from avmsf.scene.features import FeatureField
@@ -64,11 +65,11 @@ def fit(
 ) -> SoundField:
     """Fit a sound field to recordings (paper, section 3.5).
 
-    `modes` as extracted from `train`. Choices that the config leaves open are made on a part of the training contacts
-    held out for the purpose, then the field is fitted to all. With `checkpoint`, the state is kept there while the fit
-    runs, on interruption and at the end, and a fit of the same arguments goes on from it to the same result; delete the
-    file once the field is saved. Raises `FitError` for arguments that do not fit together and for a fit that diverges,
-    and `FieldFileError` for a checkpoint that is none of this fit's.
+    `modes` as extracted from `train`, or `uninformed` where there is no warm-up. Choices that the config leaves open
+    are made on a part of the training contacts held out for the purpose, then the field is fitted to all. With
+    `checkpoint`, the state is kept there while the fit runs, on interruption and at the end, and a fit of the same
+    arguments goes on from it to the same result; delete the file once the field is saved. Raises `FitError` for
+    arguments that do not fit together and for a fit that diverges, `FieldFileError` for a checkpoint of another fit.
     """
     config = FitConfig() if config is None else config
     expect_fitting(train, modes)
@@ -85,6 +86,7 @@ def fit(
     return SoundField(
         ModalBank(*(each.detach()[order] for each in (run.bank.frequency, run.bank.damping))),
         run.network.eval().requires_grad_(False),
+        job.phase[order],
         Residual(run.residual.magnitude.detach().clone()),
         train.sample_rate,
         train.sounds.shape[1],
@@ -115,7 +117,13 @@ class _Job:
         self.train, self.features, self.modes, self.config = train, features, modes, config
         self.checkpoint, self.progress = checkpoint, progress
         signs = orientation_signs(train.contacts, train.directions)
-        gains = fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate)
+        # Without a warm-up gains are no aim, they only say how strong the modes are: the extraction's own do.
+        gains = modes.gains.to(train.sounds)
+        self.phase = torch.zeros_like(modes.bank.frequency)
+        if config.phase == "common":
+            self.phase = common_phase(modes.gains, modes.quadrature)
+        if config.warmup_steps:
+            gains = fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate, phase=self.phase)
         self.gains = gains * signs[:, None]
         self.rows = features.nearest(train.contacts)
         self.regions = features.clusters(config.clusters)
@@ -212,6 +220,7 @@ class _Job:
             network,
             self.modes,
             gains=gains,
+            phase=self.phase,
             sample_rate=self.train.sample_rate,
             samples=self.train.sounds.shape[1],
             config=config,

@@ -1,6 +1,6 @@
 """All of a sound field that is no tensor, as the JSON in its file's header.
 
-{"format": 1, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
+{"format": 2, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
  "sizes": {"points": 8192, "dim": 3, "modes": 43, "bins": 1025},
  "gain_field": {"kind": "attention", "encoder": "geometry", "shape": {AttentionShape}},
  "config": {FitConfig}, "origin": {"capture": "bowl", "trained_on": [...], "per_newton": true, "report": {...}}}
@@ -17,7 +17,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.gains import AttentionShape
 from avmsf.field.soundfield import Origin, SoundField
 
-FORMAT = 1
+FORMAT = 2
 """Number of this format; it grows with every change that older versions could not read."""
 _KIND = "attention"
 

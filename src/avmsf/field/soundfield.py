@@ -4,14 +4,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.field.config import FitConfig
 from avmsf.field.gains import AttentionGains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual, shape_noise
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesise_phased
 
 _BATCH = 32
 """Contacts rendered at once, which bounds the memory."""
@@ -41,6 +41,8 @@ class SoundField:
     """Frequencies and dampings, shared by all contacts."""
     gain_field: AttentionGains
     """Gains at contacts, and the factors on the dampings where these vary."""
+    phase: Float64[Tensor, " modes"]
+    """How each mode starts, radians: mode k sounds as exp(-d t) sin(2 pi f t + phase). Zero in the paper."""
     residual: Residual
     """Noise beside the modes."""
     sample_rate: float
@@ -50,7 +52,7 @@ class SoundField:
     origin: Origin
 
     def gains(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts modes"]:
-        """Return the signed gains at the contacts (object frame, metres), in the unit of the training sounds."""
+        """Return the signed amplitudes at the contacts (object frame, metres), in the unit of the training sounds."""
         with torch.no_grad():
             return self.gain_field(contacts)[0]
 
@@ -80,4 +82,6 @@ class SoundField:
     def _modes(self, contacts: Float[Tensor, "contacts 3"], samples: int) -> Float[Tensor, "contacts samples"]:
         gains, factors = self.gain_field(contacts)
         damping = self.bank.damping if factors is None else self.bank.damping * factors
-        return synthesise(gains, self.bank.frequency, damping, samples=samples, sample_rate=self.sample_rate)
+        return synthesise_phased(
+            gains, self.bank.frequency, damping, self.phase, samples=samples, sample_rate=self.sample_rate
+        )

@@ -1,6 +1,6 @@
 """A sound field as one file: safetensors, and one JSON in its header for all that is no tensor.
 
-Tensors are named by the path of their field: `bank.frequency`, `residual.magnitude`, `gain_field.query.weight`. The
+Tensors are named by the path of their field: `bank.frequency`, `phase`, `gain_field.query.weight`. The
 header's metadata holds under the key `avmsf` the record that `avmsf.field.header` describes.
 """
 
@@ -51,6 +51,7 @@ def load(path: str | Path) -> SoundField:
     return SoundField(
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
         _network(header, tensors),
+        tensors["phase"],
         Residual(tensors["residual.magnitude"]),
         header.sample_rate,
         header.samples,
@@ -62,6 +63,7 @@ def _tensors(field: SoundField) -> dict[str, Tensor]:
     named = {
         "bank.frequency": field.bank.frequency,
         "bank.damping": field.bank.damping,
+        "phase": field.phase,
         "residual.magnitude": field.residual.magnitude,
     }
     named |= {_GAIN_FIELD + name: tensor for name, tensor in field.gain_field.state_dict().items()}
@@ -139,7 +141,7 @@ def _skeleton(header: Header) -> dict[str, Tensor]:
         )
         bank = torch.empty(header.modes, dtype=torch.float64)
         residual = torch.empty(header.bins)
-    named = {"bank.frequency": bank, "bank.damping": bank, "residual.magnitude": residual}
+    named = {"bank.frequency": bank, "bank.damping": bank, "phase": bank, "residual.magnitude": residual}
     return named | {_GAIN_FIELD + name: tensor for name, tensor in network.state_dict().items()}
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float64, Int
 from torch import Tensor, nn
 
 from avmsf.capture.impacts import Impacts
@@ -15,7 +15,7 @@ from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction import Extraction
 from avmsf.modal.residual import Residual, shape_noise
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesise_phased
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +60,12 @@ class TrainingRun:
         modes: Extraction,
         *,
         gains: Float[Tensor, "contacts modes"],
+        phase: Float64[Tensor, " modes"],
         sample_rate: float,
         samples: int,
         config: FitConfig,
     ) -> None:
-        self.network, self.config = network, config
+        self.network, self.config, self.phase = network, config, phase
         self.sample_rate, self.samples = sample_rate, samples
         self.start = modes
         self.weight = _mode_weight(modes.bank, gains)
@@ -114,7 +115,9 @@ class TrainingRun:
         gains, factors = self.network.read(rows)
         bank = self.bank
         damping = bank.damping if factors is None else bank.damping * factors
-        sounds = synthesise(gains, bank.frequency, damping, samples=self.samples, sample_rate=self.sample_rate)
+        sounds = synthesise_phased(
+            gains, bank.frequency, damping, self.phase, samples=self.samples, sample_rate=self.sample_rate
+        )
         if not self.config.residual:
             return sounds
         return sounds + shape_noise(

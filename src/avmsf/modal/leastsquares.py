@@ -35,12 +35,21 @@ def fit_gains(
 
 
 def fit_sine_gains(
-    sounds: Float[Tensor, "contacts samples"], bank: ModalBank, *, sample_rate: float
+    sounds: Float[Tensor, "contacts samples"],
+    bank: ModalBank,
+    *,
+    sample_rate: float,
+    phase: Float64[Tensor, " modes"] | None = None,
 ) -> Float[Tensor, "contacts modes"]:
-    """Return the sine amplitudes alone that fit each sound best: what the paper's synthesis (eq. 3) can express."""
+    """Return the signed amplitudes of exp(-d t) sin(2 pi f t + phase) that fit each sound best.
+
+    `phase` in radians, one a mode; None is zero, all that the paper's synthesis (eq. 3) can express.
+    """
     system = NormalEquations.of(sounds, poles_of(bank, sample_rate))
-    modes = len(bank)
-    return _solve(system.gram[:modes, :modes], system.products[:, :modes]).to(sounds.dtype)
+    zero = torch.zeros_like(bank.frequency) if phase is None else phase
+    # Each mode's atom as a mixture of its sine and its cosine.
+    mixture = torch.cat([torch.diag(torch.cos(zero)), torch.diag(torch.sin(zero))])
+    return _solve(mixture.T @ system.gram @ mixture, system.products @ mixture).to(sounds.dtype)
 
 
 def refine(

@@ -46,6 +46,27 @@ def synthesise(
     return sounds.reshape(gains.shape[0], blocks * _BLOCK)[:, :samples]
 
 
+def synthesise_phased(
+    gains: Float[Tensor, "contacts modes"],
+    frequency: Float64[Tensor, " modes"],
+    damping: Float64[Tensor, "*contacts modes"],
+    phase: Float64[Tensor, " modes"],
+    *,
+    samples: int,
+    sample_rate: float,
+) -> Float[Tensor, "contacts samples"]:
+    """Return the sum over modes of gains exp(-d t) sin(2 pi f t + phase), phases in radians; else as `synthesise`."""
+    turned = torch.polar(torch.ones_like(phase), phase)
+    return synthesise(
+        gains * turned.real.to(gains.dtype),
+        frequency,
+        damping,
+        samples=samples,
+        sample_rate=sample_rate,
+        quadrature=gains * turned.imag.to(gains.dtype),
+    )
+
+
 def _decaying_sines(
     frequency: Float64[Tensor, " modes"],
     damping: Float64[Tensor, "*contacts modes"],

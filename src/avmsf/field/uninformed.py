@@ -1,0 +1,52 @@
+"""Where a field starts that is told nothing of the object's modes: the paper's row without initialisation."""
+
+import math
+
+import torch
+
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import FitError
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extract import lowest_frequency
+from avmsf.modal.extraction import Extraction
+from avmsf.modal.residual import Residual
+
+_HIGHEST = 0.9
+"""Highest frequency over half the sample rate."""
+_LEAST_QUALITY = 10.0
+"""Quality factor, pi f / d, of the fastest decay."""
+_NOISE = 0.01
+"""Noise over the sounds' root mean square: 40 dB down."""
+
+
+def uninformed(train: Impacts, *, modes: int, bins: int, generator: torch.Generator) -> Extraction:
+    """Return modes drawn at random in place of extracted ones, with flat noise of `bins` bands.
+
+    Frequencies are spread evenly over their logarithm, from the lowest that the sounds' length allows (17 Hz in 3 s) to
+    nine tenths of half the sample rate; dampings likewise, from a fall by one neper over the whole sound to a quality
+    factor of 10. All gains are equal, and so large that the modes have the energy of the mean sound. Nothing but this
+    energy, the rate and the length are taken from `train`. Raises FitError for fewer than one mode or two bands.
+    """
+    if modes < 1 or bins < 2:
+        raise FitError(
+            f"{modes} modes and {bins} bands of noise were asked for; a field has at least 1 mode and 2 bands"
+        )
+    rate, samples = train.sample_rate, train.sounds.shape[1]
+    lowest, highest = lowest_frequency(samples, rate), _HIGHEST * rate / 2
+    if lowest >= highest:
+        raise FitError(f"sounds of {samples} samples are too short for modes; keep more seconds after the onset")
+    chance = torch.rand(2, modes, dtype=torch.float64, generator=generator)
+    frequency = torch.sort(lowest * (highest / lowest) ** chance[0]).values
+    slowest = rate / samples
+    fastest = torch.clamp(math.pi * frequency / _LEAST_QUALITY, min=slowest)
+    damping = slowest * (fastest / slowest) ** chance[1]
+    power = float(train.sounds.double().square().mean())
+    # A mode of gain one has the energy 1 / (4 d) over time, and so the mean power 1 / (4 d) over the duration.
+    gain = math.sqrt(power * train.duration / float((1 / (4 * damping)).sum()))
+    gains = torch.full((len(train), modes), gain)
+    return Extraction(
+        ModalBank(frequency, damping),
+        gains,
+        Residual(torch.full((bins,), _NOISE * math.sqrt(power))),
+        torch.zeros_like(gains),
+    )
