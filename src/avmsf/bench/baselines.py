@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf.bench.modalbaseline import ModalBaseline
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction import Extraction
 from avmsf.modal.leastsquares import fit_gains, fit_sine_gains
 from avmsf.modal.synthesis import synthesise
 from avmsf.scene.points import nearest_points
@@ -90,40 +90,33 @@ class MeanWaveform:
 
 
 @dataclass(frozen=True, eq=False)
-class MeanGains:
-    """The modes with the mean of the nearest contacts' signed gains, in phase and in quadrature; no residual."""
+class MeanGains(ModalBaseline):
+    """The modes with the mean of the nearest contacts' signed gains, in phase and in quadrature."""
 
-    train: Impacts
-    extraction: Extraction
-    """Modes of the training impacts, and their gains in each of them, row for row."""
     count: int = 3
     """How many contacts' gains are averaged."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _expect_neighbours(self.train, self.count)
-        if len(self.extraction.gains) != len(self.train):
-            raise EvaluationError(
-                f"the extraction has gains of {len(self.extraction.gains)} recordings and there are {len(self.train)} "
-                "training impacts; extract the modes from these impacts"
-            )
 
-    @property
-    def sample_rate(self) -> float:
-        """Samples per second, Hz."""
-        return self.train.sample_rate
+    def amplitudes_at(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts two_modes"]:
+        """Return the mean of the nearest training contacts' gains in phase, then in quadrature."""
+        return self.amplitudes[nearest_points(self.train.contacts, contacts, count=self.count)].mean(dim=1)
+
+
+@dataclass(frozen=True, eq=False)
+class RandomImpact:
+    """One recording of another object, the same at every contact: what a listener makes of any struck thing."""
+
+    sound: Float[Tensor, " samples"]
+    """The other object's recording, in its own unit, as long as the sounds that it is compared with."""
+    sample_rate: float
+    """Samples per second, Hz."""
 
     def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
-        """Return the modes' sound with the mean gains of the nearest training contacts."""
-        rows = nearest_points(self.train.contacts, contacts, count=self.count)
-        bank = self.extraction.bank
-        return synthesise(
-            self.extraction.gains[rows].mean(dim=1),
-            bank.frequency,
-            bank.damping,
-            samples=self.train.sounds.shape[1],
-            sample_rate=self.train.sample_rate,
-            quadrature=self.extraction.quadrature[rows].mean(dim=1),
-        )
+        """Return the recording for every contact."""
+        return self.sound.expand(len(contacts), -1)
 
 
 def floor(test: Impacts, bank: ModalBank) -> Float[Tensor, "contacts samples"]:

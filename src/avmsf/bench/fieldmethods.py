@@ -1,0 +1,72 @@
+"""The sound field as a method: the paper's form, and what is left when a part of it is taken away."""
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from avmsf.bench.task import Look, Task
+from avmsf.capture.impacts import Impacts
+from avmsf.field.config import FitConfig
+from avmsf.field.fit import fit
+from avmsf.field.soundfield import SoundField
+from avmsf.field.uninformed import uninformed
+from avmsf.modal.extraction import Extraction
+from avmsf.scene.features import FeatureField
+
+QUICK = FitConfig()
+"""The quick recipe."""
+
+
+@dataclass(frozen=True)
+class FieldMethod:
+    """A field with the attention network, fitted to extracted modes."""
+
+    name: str
+    """What tables call it."""
+    config: FitConfig = QUICK
+    """Settings of the fit, but for the seed, which is the task's."""
+    look: Look = "visual"
+    """What the network reads of the object's points."""
+
+    def fit(self, task: Task) -> SoundField:
+        """Fit the field. Raises AvmsfError where modes, features or field cannot be made."""
+        return fit_field(task, task.train, task.features(self.look), task.modes(), self.config)
+
+
+@dataclass(frozen=True)
+class UninformedField:
+    """A field without modal initialisation (the paper's row "w/o init"): no extracted modes and no warm-up.
+
+    It starts from `uninformed`, with as many modes and bands of noise as the extraction has, and is trained end to end
+    for as many steps as the recipe takes in all. Corrections have `correction_rate`, for here they are no corrections:
+    frequencies, dampings and noise have to find where they belong.
+    """
+
+    name: str
+    """What tables call it."""
+    config: FitConfig = QUICK
+    """Settings of the recipe whose steps are all taken end to end."""
+    correction_rate: float = 30.0
+    """Part of the learning rate for frequencies (in widths of their modes), dampings and noise (as logarithms)."""
+    look: Look = "visual"
+    """What the network reads of the object's points."""
+
+    def fit(self, task: Task) -> SoundField:
+        """Fit the field. Raises AvmsfError where features or field cannot be made, or no mode can be counted."""
+        counted = task.modes()
+        start = uninformed(
+            task.train,
+            modes=len(counted.bank),
+            bins=len(counted.residual.magnitude),
+            generator=torch.Generator().manual_seed(task.seed),
+        )
+        steps = self.config.warmup_steps + self.config.steps
+        config = replace(self.config, warmup_steps=0, steps=steps, correction_rate=self.correction_rate)
+        return fit_field(task, task.train, task.features(self.look), start, config)
+
+
+def fit_field(task: Task, train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> SoundField:
+    """Fit a field to some of a task's training blows, in whose modes they are rows, with the task's seed."""
+    # An object of few points has no more regions than points.
+    clusters = min(config.clusters, len(torch.unique(features.points, dim=0)))
+    return fit(train, features, modes, replace(config, clusters=clusters, seed=task.seed), capture=task.name)

@@ -1,0 +1,147 @@
+"""All methods by name: what turns an object's training blows into a renderer."""
+
+import difflib
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, RandomImpact, WhiteNoise
+from avmsf.bench.fieldmethods import QUICK, FieldMethod, UninformedField
+from avmsf.bench.gridfield import PAPER_GRID, QUICK_GRID, GridField
+from avmsf.bench.interpolation import SplineGains
+from avmsf.bench.recorded import Recorded
+from avmsf.bench.renderer import Renderer
+from avmsf.bench.spectralmean import MeanSpectra
+from avmsf.bench.task import Method, Task
+from avmsf.errors import EvaluationError
+from avmsf.field.config import PAPER
+from avmsf.field.soundfield import SoundField
+
+NEIGHBOURS = 3
+"""Nearest strikes that are averaged (the paper's KNN), or all where there are fewer."""
+_RECORDED = "recorded:"
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A method that needs no training worth the name."""
+
+    name: str
+    """What tables call it."""
+    make: Callable[[Task], Renderer] = field(repr=False)
+    """Makes the renderer from the task's training blows."""
+
+    def fit(self, task: Task) -> Renderer:
+        """Make the renderer. Raises AvmsfError where it cannot."""
+        return self.make(task)
+
+
+@dataclass(frozen=True)
+class RecordedMethod:
+    """Another system, by the wav files that it made: FOLDER/OBJECT/RECORDING.wav, as `Recorded` reads them."""
+
+    folder: Path
+    """Holds a folder of sounds for every object."""
+
+    @property
+    def name(self) -> str:
+        """`recorded:` and the folder."""
+        return f"{_RECORDED}{self.folder}"
+
+    def fit(self, task: Task) -> Recorded:
+        """Find the object's folder. Raises EvaluationError where there is none."""
+        return Recorded(
+            self.folder / task.name, task.contacts, task.names, task.train.sample_rate, task.train.sounds.shape[1]
+        )
+
+
+def _count(task: Task) -> int:
+    return min(NEIGHBOURS, len(task.train))
+
+
+def _white_noise(task: Task) -> WhiteNoise:
+    return WhiteNoise(task.train, seed=task.seed)
+
+
+def _random_impact(task: Task) -> RandomImpact:
+    return RandomImpact(task.stranger(), task.train.sample_rate)
+
+
+def _nearest(task: Task) -> NearestStrike:
+    return NearestStrike(task.train)
+
+
+def _mean_waveform(task: Task) -> MeanWaveform:
+    return MeanWaveform(task.train, count=_count(task))
+
+
+def _mean_gains(task: Task) -> MeanGains:
+    return MeanGains(task.train, task.modes(), count=_count(task), noise=True, seed=task.seed)
+
+
+def _mean_spectra(task: Task) -> MeanSpectra:
+    return MeanSpectra(task.train, count=_count(task))
+
+
+def _spline_gains(task: Task) -> SplineGains:
+    return SplineGains(task.train, task.modes(), noise=True, seed=task.seed)
+
+
+BASELINES = (
+    Baseline("white-noise", _white_noise),
+    Baseline("random-impact", _random_impact),
+    Baseline("nearest", _nearest),
+    Baseline("knn3", _mean_waveform),
+    Baseline("knn-gains", _mean_gains),
+    Baseline("knn-spectra", _mean_spectra),
+    Baseline("spline-gains", _spline_gains),
+)
+"""The paper's baselines that need nothing but data, then the strong ones that it leaves out. Those that share modes
+have noise beside them, as the field has: without it all is silent between modes, and L1-log is lost."""
+
+FIELDS = (
+    FieldMethod("field"),
+    FieldMethod("field-positions", look="positions"),
+    FieldMethod("field-unaligned", look="unaligned"),
+    # All steps end to end take long enough without two trials of dampings beforehand.
+    UninformedField("field-no-initialisation", replace(QUICK, damping="shared")),
+    FieldMethod("field-no-residual", replace(QUICK, residual=False)),
+    # The warm-up moves no damping, so there is nothing to choose between.
+    FieldMethod("field-warmup", replace(QUICK, steps=0, damping="shared")),
+    FieldMethod("field-paper", PAPER),
+    GridField("field-grid", QUICK_GRID),
+    GridField("field-paper-grid", PAPER_GRID, PAPER),
+)
+"""Fields by the quick recipe unless told otherwise: the paper's form, its ablations, the paper's settings and grids."""
+
+METHODS: dict[str, Method] = {method.name: method for method in (*BASELINES, *FIELDS)}
+"""All methods but `recorded:FOLDER`, in the order of tables."""
+
+
+def method_named(name: str) -> Method:
+    """Return the method of this name. Raises EvaluationError that lists the known ones."""
+    if name in METHODS:
+        return METHODS[name]
+    if name.startswith(_RECORDED):
+        folder = Path(name.removeprefix(_RECORDED)).expanduser()
+        if name == _RECORDED or not folder.is_dir():
+            raise EvaluationError(
+                f"{name}: expected a folder after `{_RECORDED}`, with a folder of wav files for every object, found "
+                "none of this name"
+            )
+        return RecordedMethod(folder)
+    near = difflib.get_close_matches(name, METHODS, n=1)
+    guess = f"; did you mean {near[0]}?" if near else ""
+    raise EvaluationError(f"no method is called {name!r}: there are {', '.join(METHODS)} and recorded:FOLDER{guess}")
+
+
+def report_of(renderer: Renderer) -> dict[str, Any]:
+    """Return what a method chose on its way to a renderer, as plain values; empty where it had no choice."""
+    if isinstance(renderer, SoundField):
+        return renderer.origin.report
+    if isinstance(renderer, SplineGains):
+        return renderer.report
+    if isinstance(renderer, MeanGains | MeanSpectra | MeanWaveform):
+        return {"neighbours": renderer.count}
+    return {}

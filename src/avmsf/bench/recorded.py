@@ -1,0 +1,93 @@
+"""Sounds that someone else's system has made, judged like any other renderer's."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.capture.audio import read_recording
+from avmsf.errors import CaptureError, EvaluationError
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Wav files, one a recording of the object, that are looked up by the contact of that recording.
+
+    FOLDER/RECORDING.wav for the recording called RECORDING or RECORDING.wav, whose name may hold folders. Of several
+    recordings at one contact the first that has a file stands for all. Files are read when they are asked for, so
+    that only those of the contacts to be judged need be there.
+    """
+
+    folder: Path
+    """Holds the object's files."""
+    contacts: Float[Tensor, "contacts 3"]
+    """Contacts of the object's recordings, metres."""
+    names: tuple[str, ...]
+    """The recordings' names, row for row."""
+    sample_rate: float
+    """Samples per second that the files must have, Hz."""
+    samples: int
+    """Samples that each file must have."""
+
+    def __post_init__(self) -> None:
+        if len(self.contacts) != len(self.names):
+            raise EvaluationError(
+                f"{len(self.names)} names of recordings were given for {len(self.contacts)} contacts; give one for each"
+            )
+        if not self.folder.is_dir():
+            raise EvaluationError(
+                f"{self.folder}: expected a folder with this object's sounds, such as "
+                f"{self.path(self.names[0]) if self.names else 'RECORDING.wav'}, found none: render them there, or "
+                "leave the object out"
+            )
+
+    def path(self, name: str) -> Path:
+        """Return where the sound that stands for a recording is expected."""
+        return self.folder / (name if name.lower().endswith(".wav") else f"{name}.wav")
+
+    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+        """Return the files' sounds, as they are.
+
+        Raises EvaluationError for a contact where nothing was recorded, for a file that is missing, and for one that is
+        no sound, has several different channels or another rate or length.
+        """
+        sounds = [self._read(self._find(contact)) for contact in contacts]
+        return torch.stack(sounds) if sounds else torch.zeros(0, self.samples)
+
+    def _find(self, contact: Float[Tensor, "3"]) -> Path:
+        # Contacts that went through float32 are still the same places; a micrometre is far below any two's distance.
+        rows = torch.nonzero((self.contacts.double() - contact.double()).norm(dim=1) < 1e-6).flatten().tolist()
+        if not rows:
+            place = ", ".join(f"{value:g}" for value in contact.tolist())
+            raise EvaluationError(
+                f"{self.folder}: there is no sound for a blow at ({place}) m, for nothing was recorded there: sounds "
+                "from files are known at the recordings' contacts alone"
+            )
+        paths = [self.path(self.names[row]) for row in rows]
+        present = [path for path in paths if path.is_file()]
+        if not present:
+            raise EvaluationError(
+                f"{paths[0]}: expected the sound that stands for the recording {self.names[rows[0]]}, found no such "
+                f"file: render it as a mono wav of {self.samples} samples at {self.sample_rate:g} Hz"
+            )
+        return present[0]
+
+    def _read(self, path: Path) -> Float[Tensor, " samples"]:
+        try:
+            recording = read_recording(path)
+        except CaptureError as error:
+            raise EvaluationError(str(error)) from error
+        if recording.sample_rate != self.sample_rate or recording.frames != self.samples:
+            raise EvaluationError(
+                f"{path}: expected {self.samples} samples at {self.sample_rate:g} Hz, as the recordings have, found "
+                f"{recording.frames} at {recording.sample_rate:g} Hz: render it anew, from the onset on"
+            )
+        first = recording.channels[0]
+        if any(not np.array_equal(channel, first) for channel in recording.channels[1:]):
+            raise EvaluationError(
+                f"{path}: expected one channel, found {len(recording.channels)} different ones: save it as mono"
+            )
+        return torch.from_numpy(first.copy()).float()

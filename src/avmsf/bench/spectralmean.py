@@ -1,0 +1,73 @@
+"""The mean of the nearest sounds as spectra, in which phases do not cancel."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import EvaluationError
+from avmsf.modal.spectra import scaled_fft_size
+from avmsf.scene.points import nearest_points
+
+
+@dataclass(frozen=True, eq=False)
+class MeanSpectra:
+    """The mean magnitudes of the nearest training sounds' short-time spectra, with the phases of the nearest one's.
+
+    The phases of one strike belong to one another, from frame to frame and from bin to bin, so that the sound has
+    nearly the mean magnitudes. Where a bin of the nearest is silent, its phase is zero.
+    """
+
+    train: Impacts
+    count: int = 3
+    """How many sounds are averaged."""
+    fft_size: int = 1024
+    """Samples of the Hann window at 44.1 and 48 kHz; other rates go as `scaled_fft_size`. The hop is a quarter."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count <= len(self.train):
+            raise EvaluationError(
+                f"the mean spectrum of {self.count} nearest impacts was asked of {len(self.train)} training impacts; "
+                f"ask for 1 to {len(self.train)}"
+            )
+        if self.fft_size < 16:
+            raise EvaluationError(f"spectra of {self.fft_size} samples were asked for; ask for 16 or more")
+
+    @property
+    def sample_rate(self) -> float:
+        """Samples per second, Hz."""
+        return self.train.sample_rate
+
+    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+        """Return the sounds whose spectra the means are."""
+        rows = nearest_points(self.train.contacts, contacts, count=self.count)
+        # A contact at a time: the spectra of all together would be many times larger than their sounds.
+        sounds = [self._mean(self.train.sounds[each]) for each in rows]
+        return torch.stack(sounds) if sounds else self.train.sounds[:0]
+
+    def _mean(self, sounds: Float[Tensor, "neighbours samples"]) -> Float[Tensor, " samples"]:
+        spectra = self._transform(sounds)
+        mixed = torch.polar(spectra.abs().mean(dim=0), spectra[0].angle())
+        size = self._size
+        return torch.istft(mixed, size, size // 4, window=self._window(sounds), center=True, length=sounds.shape[1])
+
+    def _transform(self, sounds: Float[Tensor, "neighbours samples"]) -> Complex[Tensor, "neighbours bins frames"]:
+        size = self._size
+        return torch.stft(
+            sounds,
+            size,
+            size // 4,
+            window=self._window(sounds),
+            center=True,
+            pad_mode="constant",
+            return_complex=True,
+        )
+
+    @property
+    def _size(self) -> int:
+        return 4 * max(1, round(scaled_fft_size(self.fft_size, sample_rate=self.sample_rate) / 4))
+
+    def _window(self, sounds: Float[Tensor, "neighbours samples"]) -> Float[Tensor, " size"]:
+        return torch.hann_window(self._size, dtype=sounds.dtype, device=sounds.device)

@@ -1,0 +1,240 @@
+"""The baselines that the paper leaves out: splines over contacts, means of spectra, and blows from both sides."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import RBFInterpolator
+
+from avmsf.bench.baselines import MeanGains, MeanWaveform
+from avmsf.bench.interpolation import SplineGains
+from avmsf.bench.spectralmean import MeanSpectra
+from avmsf.bench.thinplate import SMOOTHINGS, fit_spline
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import EvaluationError
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction import Extraction
+from avmsf.modal.residual import Residual
+from avmsf.simulate.plate import Plate, plate_modes, sample_contacts
+
+ONE = torch.ones(1)
+
+
+def scattered(count: int, seed: int = 0) -> torch.Tensor:
+    box = torch.tensor([0.3, 0.2, 0.1], dtype=torch.float64)
+    drawn = torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) * box
+    return torch.unique(drawn, dim=0)
+
+
+def flattened(places: torch.Tensor, directions: int) -> torch.Tensor:
+    """Return the places in a tilted plane or on a tilted line."""
+    kept = torch.zeros(3, dtype=torch.float64)
+    kept[:directions] = 1.0
+    return places * kept @ turned().T
+
+
+def turned() -> torch.Tensor:
+    return torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5))).Q
+
+
+def bumps(places: torch.Tensor) -> torch.Tensor:
+    waves = torch.sin(places @ torch.tensor([[14.0, 0.0], [0.0, 18.0], [9.0, 5.0]], dtype=torch.float64))
+    return waves[:, :1] + 0.5 * waves[:, 1:]
+
+
+@pytest.mark.parametrize("count", [8, 20])
+@pytest.mark.parametrize("directions", [1, 2, 3])
+def test_a_linear_field_comes_back_exactly(directions, count):
+    slopes = torch.randn(3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    places, elsewhere = (flattened(each, directions) for each in (scattered(count), 3.0 * scattered(30, seed=1)))
+    spline = fit_spline(places, places @ slopes + 2.0, importance=torch.ones(4))
+    assert spline.sites.shape == (count, directions)
+    assert torch.allclose(spline.at(elsewhere), elsewhere @ slopes + 2.0, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("directions", [2, 3])
+def test_splines_are_scipys(directions):
+    places = torch.unique(flattened(scattered(15), directions), dim=0)
+    elsewhere = flattened(scattered(30, seed=1), directions)
+    spline = fit_spline(places, bumps(places), importance=ONE)
+    assert spline.smoothing == 0.0
+    along = (elsewhere - spline.middle) @ spline.axes
+    theirs = RBFInterpolator(spline.sites.numpy(), bumps(places).numpy(), kernel="thin_plate_spline")(along.numpy())
+    assert np.allclose(spline.at(elsewhere).numpy(), theirs, rtol=0, atol=1e-8)
+    assert torch.allclose(spline.at(places), bumps(places), rtol=0, atol=1e-9)
+
+
+def test_smoothing_is_the_least_that_sites_left_out_ask_for():
+    """The rule by brute force, with scipy's splines through all sites but one."""
+    places = scattered(24)
+    noise = 1.0 * torch.randn(24, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    values = bumps(places) + noise
+    spline = fit_spline(places, values, importance=ONE)
+    sites = spline.sites.numpy()
+    errors = np.empty((len(SMOOTHINGS), 24))
+    for trial, smoothing in enumerate(SMOOTHINGS):
+        for left in range(24):
+            kept = np.arange(24) != left
+            others = RBFInterpolator(sites[kept], values.numpy()[kept], kernel="thin_plate_spline", smoothing=smoothing)
+            errors[trial, left] = ((others(sites[left : left + 1]) - values.numpy()[left]) ** 2).sum()
+    assert spline.smoothing > 0.0
+    best = errors[errors.sum(1).argmin()]
+    needed = [(trial - best).sum() <= (trial - best).std(ddof=1) * math.sqrt(24) for trial in errors].index(True)
+    assert spline.smoothing == SMOOTHINGS[needed]
+    ours = spline.at(scattered(40, seed=9))
+    theirs = RBFInterpolator(sites, values.numpy(), kernel="thin_plate_spline", smoothing=spline.smoothing)
+    along = (scattered(40, seed=9) - spline.middle) @ spline.axes
+    assert np.allclose(ours.numpy(), theirs(along.numpy()), rtol=0, atol=1e-8)
+
+
+def test_smoothing_brings_noisy_values_nearer_to_the_truth():
+    places, elsewhere = scattered(40), scattered(60, seed=1)
+    noise = 0.4 * torch.randn(40, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    spline = fit_spline(places, bumps(places) + noise, importance=ONE)
+    rough = RBFInterpolator(spline.sites.numpy(), (bumps(places) + noise).numpy(), kernel="thin_plate_spline")
+    along = (elsewhere - spline.middle) @ spline.axes
+    error = float((spline.at(elsewhere) - bumps(elsewhere)).square().mean())
+    assert error < 0.8 * float(((torch.from_numpy(rough(along.numpy())) - bumps(elsewhere)) ** 2).mean())
+
+
+def test_importance_decides_which_value_asks_for_smoothing():
+    places = scattered(24)
+    noise = torch.randn(24, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    both = torch.cat([bumps(places), noise], dim=1)
+    asked = [fit_spline(places, both, importance=torch.tensor(weights)) for weights in ([1.0, 0.0], [0.0, 1.0])]
+    assert asked[0].smoothing == 0.0
+    assert asked[1].smoothing > 0.0
+
+
+def test_few_sites_make_a_function_that_does_not_run_away():
+    end = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], dtype=torch.float64)
+    values = torch.tensor([[1.0], [3.0]], dtype=torch.float64)
+    spline = fit_spline(end, values, importance=ONE)
+    asked = torch.tensor([[0.025, 0.0, 0.0], [9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]], dtype=torch.float64)
+    # Straight between two sites, level beyond them.
+    assert torch.allclose(spline.at(asked), torch.tensor([[1.5], [3.0], [1.0]], dtype=torch.float64))
+    single = fit_spline(end[:1], values[:1], importance=ONE)
+    assert torch.equal(single.at(asked), torch.ones(3, 1, dtype=torch.float64))
+    for count in (3, 4, 7):
+        few = fit_spline(scattered(count), bumps(scattered(count)), importance=ONE)
+        assert not few.bending
+        assert torch.allclose(few.at(scattered(count)), bumps(scattered(count)), rtol=0, atol=1e-9)
+        far = 1e3 * (scattered(20, seed=1) - scattered(1))
+        assert float(few.at(far).abs().max()) < 20.0
+    assert fit_spline(scattered(8), bumps(scattered(8)), importance=ONE).bending
+    assert fit_spline(flattened(scattered(6), 2), bumps(scattered(6)), importance=ONE).bending
+    with pytest.raises(EvaluationError, match="without any contact"):
+        fit_spline(end[:0], values[:0], importance=ONE)
+
+
+def test_a_spline_belongs_to_the_object_and_not_to_its_frame_or_order():
+    places, elsewhere = scattered(20), scattered(30, seed=1)
+    straight = fit_spline(places, bumps(places), importance=ONE).at(elsewhere)
+    moved = [each @ turned().T + torch.tensor([1.0, -2.0, 0.5]) for each in (places, elsewhere)]
+    assert torch.allclose(fit_spline(moved[0], bumps(places), importance=ONE).at(moved[1]), straight, rtol=0, atol=1e-9)
+    rows = torch.randperm(20, generator=torch.Generator().manual_seed(0))
+    shuffled = fit_spline(places[rows], bumps(places)[rows], importance=ONE).at(elsewhere)
+    assert torch.allclose(shuffled, straight, rtol=0, atol=1e-9)
+
+
+def test_blows_in_one_place_count_as_their_mean():
+    places = scattered(10)
+    values = bumps(places)
+    again = torch.cat([places, places[2:4], places[2:3]])
+    twice = torch.cat([values, values[2:4] + 1.0, values[2:3] + 2.0])
+    mean = values.clone()
+    mean[2] += 1.0
+    mean[3] += 0.5
+    expected = fit_spline(places, mean, importance=ONE).at(scattered(30, seed=1))
+    found = fit_spline(again, twice, importance=ONE).at(scattered(30, seed=1))
+    assert torch.allclose(found, expected, rtol=0, atol=1e-9)
+
+
+def two_sided(count: int = 14) -> tuple[Impacts, Extraction, Extraction]:
+    """Return blows on a plate, a few of them from below, with the gains that these have and those from above."""
+    plate = Plate()
+    contacts = sample_contacts(plate, count, generator=torch.Generator().manual_seed(0))
+    modes = plate_modes(plate, contacts, highest=2500.0)
+    above = modes.gains.float()
+    sides = torch.ones(count, 1)
+    sides[[1, 5, 6]] = -1.0
+    directions = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64) * sides
+    bank = ModalBank(modes.frequency, modes.damping)
+    sounds = torch.zeros(count, 400)
+    impacts = Impacts(contacts, sounds, 8000.0, tuple(map(str, range(count))), directions)
+    still = torch.zeros_like(above)
+    return (
+        impacts,
+        Extraction(bank, above * sides, Residual(torch.zeros(4)), still),
+        Extraction(bank, above, Residual(torch.zeros(4)), still),
+    )
+
+
+@pytest.mark.parametrize("baseline", [MeanGains, SplineGains])
+def test_blows_from_the_other_side_do_not_cancel(baseline):
+    impacts, both_sides, from_above = two_sided()
+    asked = sample_contacts(Plate(), 20, generator=torch.Generator().manual_seed(1))
+    expected = baseline(replace(impacts, directions=None), from_above).gains(asked)
+    assert torch.allclose(baseline(impacts, both_sides).gains(asked), expected, rtol=0, atol=1e-6)
+    # Without directions nothing tells them apart.
+    blind = baseline(replace(impacts, directions=None), both_sides).gains(asked)
+    assert float((blind - expected).abs().max()) > 0.3 * float(expected.abs().max())
+
+
+def test_spline_gains_have_both_phases():
+    impacts, _, modes = two_sided()
+    turned_modes = replace(modes, gains=torch.zeros_like(modes.gains), quadrature=modes.gains)
+    renderer = SplineGains(replace(impacts, directions=None), turned_modes)
+    straight = SplineGains(replace(impacts, directions=None), modes)
+    assert float(renderer.gains(impacts.contacts).abs().max()) == 0.0
+    assert torch.equal(renderer.quadrature(impacts.contacts), straight.gains(impacts.contacts))
+    first = renderer.render(impacts.contacts)[:, 0]
+    # A cosine starts at its gain, and the spline passes through the gains.
+    assert torch.allclose(first, modes.gains.sum(1), rtol=0, atol=1e-4 * float(modes.gains.abs().max()))
+
+
+def test_modes_of_other_recordings_are_refused():
+    impacts, modes, _ = two_sided()
+    with pytest.raises(EvaluationError, match="gains of 14 recordings and there are 4 training impacts"):
+        SplineGains(impacts.take(range(4)), modes)
+
+
+def ringing(gains: list[float], phases: list[float], *, samples: int = 3000) -> Impacts:
+    times = torch.arange(samples, dtype=torch.float64) / 22050.0
+    decay = torch.exp(-20.0 * times)
+    sounds = [
+        gain * decay * torch.sin(2 * math.pi * 1500.0 * times + phase)
+        for gain, phase in zip(gains, phases, strict=True)
+    ]
+    contacts = torch.zeros(len(gains), 3, dtype=torch.float64)
+    contacts[:, 0] = torch.arange(len(gains))
+    return Impacts(contacts, torch.stack(sounds).float(), 22050.0, tuple(map(str, range(len(gains)))))
+
+
+@pytest.mark.parametrize("samples", [3000, 4096, 701])
+def test_the_mean_spectrum_of_equal_sounds_is_the_sound(samples):
+    train = ringing([1.0, 1.0, 1.0], [0.4] * 3, samples=samples)
+    found = MeanSpectra(train).render(train.contacts)
+    assert torch.allclose(found, train.sounds, rtol=0, atol=1e-5)
+    noise = torch.randn(1, samples, generator=torch.Generator().manual_seed(0))
+    alone = replace(train.take([0]), sounds=noise)
+    assert torch.allclose(MeanSpectra(alone, count=1).render(train.contacts), noise.expand(3, -1), rtol=0, atol=1e-4)
+
+
+def test_phases_do_not_cancel_in_spectra():
+    opposed = ringing([1.0, 3.0], [0.0, math.pi])
+    asked = opposed.contacts[:1] + 0.1
+    found = MeanSpectra(opposed, count=2).render(asked)
+    # The magnitudes' mean is two, in the phase of the nearest, whose waveforms' mean would be minus one.
+    assert torch.allclose(found, 2.0 * opposed.sounds[:1], rtol=0, atol=1e-4)
+    assert torch.allclose(MeanWaveform(opposed, count=2).render(asked), -opposed.sounds[:1], rtol=0, atol=1e-5)
+
+
+def test_means_of_too_many_spectra_are_refused():
+    train = ringing([1.0, 1.0], [0.0, 0.0])
+    with pytest.raises(EvaluationError, match="mean spectrum of 3 nearest impacts was asked of 2"):
+        MeanSpectra(train)
+    with pytest.raises(EvaluationError, match="spectra of 8 samples"):
+        MeanSpectra(train, count=2, fft_size=8)

@@ -1,0 +1,401 @@
+"""Every method by its name: what all renderers have in common, and what each is known to give."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from avmsf.bench.evaluation import split
+from avmsf.bench.fieldmethods import FieldMethod, UninformedField
+from avmsf.bench.gridfield import PAPER_GRID, Grid, GridField
+from avmsf.bench.methods import METHODS, RecordedMethod, method_named, report_of
+from avmsf.bench.renderer import Renderer
+from avmsf.bench.task import Method, Task
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import EvaluationError, FitError, SceneError
+from avmsf.field.fit import fit
+from avmsf.field.soundfield import SoundField
+from avmsf.field.uninformed import uninformed
+from avmsf.modal.extraction import Extraction
+from avmsf.modal.synthesis import synthesise
+from avmsf.scene.features import FeatureField
+from plate_field import QUICK, RATE, plate_extraction, plate_features, plate_impacts
+
+TINY = replace(QUICK, hidden=16, layers=1, warmup_steps=6, steps=4, fft_sizes=(256,), early=256)
+COUNT, TRAIN = 20, 9
+SECONDS, SAMPLES = 0.1, 800
+
+
+def struck() -> Impacts:
+    return plate_impacts(COUNT, seconds=SECONDS)
+
+
+def tiny(method: Method) -> Method:
+    """Return a method of the same kind that is fitted in a moment."""
+    if isinstance(method, GridField):
+        return replace(method, base=TINY, grid=Grid((4, 8), (1e-2,), (2,), (1.0,), ("shared",)))
+    if isinstance(method, FieldMethod | UninformedField):
+        kept = {name: getattr(method.config, name) for name in ("residual", "feature_scale", "bands")}
+        return replace(method, config=replace(TINY, **kept, steps=min(4, method.config.steps)))
+    return method
+
+
+def plate_task(train: Impacts, *, impacts: Impacts | None = None, seed: int = 0) -> Task:
+    known = struck() if impacts is None else impacts
+    return Task(
+        name="plate",
+        train=train,
+        contacts=known.contacts,
+        names=known.names,
+        seed=seed,
+        modes=lambda: plate_extraction(train),
+        features=lambda look: plate_features(200),
+        stranger=lambda: torch.linspace(-1, 1, SAMPLES),
+    )
+
+
+@cache
+def parts() -> tuple[Impacts, Impacts]:
+    return split(struck(), count=TRAIN)
+
+
+@cache
+def made(name: str, seed: int = 0) -> Renderer:
+    return tiny(METHODS[name]).fit(plate_task(parts()[0], seed=seed))
+
+
+every_method = pytest.mark.parametrize("name", METHODS)
+
+
+@every_method
+def test_a_sound_depends_on_its_contact_alone(name):
+    _, test = parts()
+    renderer = made(name)
+    assert isinstance(METHODS[name], Method)
+    assert isinstance(renderer, Renderer)
+    assert METHODS[name].name == name
+    assert renderer.sample_rate == RATE
+    together = renderer.render(test.contacts)
+    assert together.shape == (len(test), SAMPLES)
+    assert together.dtype == torch.float32
+    assert bool(torch.isfinite(together).all())
+    for row in (0, 4, len(test) - 1):
+        # Sums run in another order in a product of another size: float32 rounding, a hundred thousandth of the loudest.
+        alone = renderer.render(test.contacts[row : row + 1])[0]
+        assert torch.allclose(alone, together[row], rtol=0, atol=1e-5 * float(together.abs().max()))
+    assert renderer.render(test.contacts[:0]).shape == (0, SAMPLES)
+
+
+@every_method
+def test_a_seed_decides_all_chance(name):
+    train, test = parts()
+    again = tiny(METHODS[name]).fit(plate_task(train)).render(test.contacts)
+    assert torch.equal(again, made(name).render(test.contacts))
+
+
+@every_method
+def test_one_or_two_shots_are_enough(name):
+    impacts = struck()
+    for count in (1, 2):
+        train = impacts.take(range(count))
+        renderer = tiny(METHODS[name]).fit(plate_task(train))
+        sounds = renderer.render(impacts.contacts)
+        assert sounds.shape == (COUNT, SAMPLES)
+        assert bool(torch.isfinite(sounds).all())
+        if name.startswith("knn"):
+            assert report_of(renderer) == {"neighbours": count}
+
+
+@pytest.mark.parametrize("name", ["nearest", "knn3", "knn-gains", "knn-spectra", "spline-gains"])
+def test_the_order_of_training_rows_changes_nothing(name):
+    train, test = parts()
+    rows = torch.randperm(TRAIN, generator=torch.Generator().manual_seed(1)).tolist()
+    shuffled = METHODS[name].fit(plate_task(train.take(rows))).render(test.contacts)
+    straight = made(name).render(test.contacts)
+    assert torch.allclose(shuffled, straight, rtol=0, atol=1e-5 * float(straight.abs().max()))
+
+
+@pytest.mark.parametrize("name", ["nearest", "spline-gains"])
+def test_training_contacts_sound_as_recorded(name):
+    train, _ = parts()
+    difference = made(name).render(train.contacts) - train.sounds
+    # The recordings' noise is 40 dB down, and the spline's own noise comes to as much once more. The plate's true modes
+    # are a little off in its extraction, 20 dB at the end of the sound.
+    limit = 0.0 if name == "nearest" else 0.35
+    assert float(difference.square().mean().sqrt() / train.sounds.square().mean().sqrt()) <= limit
+
+
+@pytest.mark.parametrize("name", ["knn-gains", "spline-gains", "field", "field-no-initialisation"])
+def test_methods_with_modes_give_their_bank_and_gains(name):
+    train, test = parts()
+    renderer = made(name)
+    gains = renderer.gains(test.contacts)
+    assert gains.shape == (len(test), len(renderer.bank))
+    if name != "field-no-initialisation":
+        assert len(renderer.bank) == len(plate_extraction(train).bank)
+    if name.endswith("gains"):
+        sounds = replace(renderer, noise=False).render(test.contacts)
+        made_of = synthesise(gains, renderer.bank.frequency, renderer.bank.damping, samples=SAMPLES, sample_rate=RATE)
+        # The plate's sounds are sines alone, and so are these.
+        assert torch.allclose(sounds, made_of, rtol=0, atol=1e-6 * float(sounds.abs().max()))
+
+
+@pytest.mark.parametrize("name", ["knn-gains", "spline-gains"])
+def test_noise_beside_modes_is_the_residual(name):
+    _, test = parts()
+    noise = made(name).render(test.contacts) - replace(made(name), noise=False).render(test.contacts)
+    assert torch.allclose(noise[0], noise[3], rtol=0, atol=1e-4 * float(noise.abs().max()))
+    magnitude = float(plate_extraction(parts()[0]).residual.magnitude[0])
+    # Flat noise of 800 samples: its root mean square scatters by 2.5 %.
+    assert float(noise[0].square().mean().sqrt()) == pytest.approx(magnitude, rel=0.1)
+    other = made(name, seed=1).render(test.contacts)
+    assert not torch.allclose(other, made(name).render(test.contacts), rtol=0, atol=0.1 * magnitude)
+
+
+def test_a_random_impact_is_the_strangers_everywhere():
+    train, test = parts()
+    sounds = made("random-impact").render(test.contacts)
+    assert torch.equal(sounds, torch.linspace(-1, 1, SAMPLES).expand(len(test), -1))
+    with pytest.raises(EvaluationError, match="no other object"):
+        METHODS["random-impact"].fit(replace(plate_task(train), stranger=no_stranger))
+
+
+def no_stranger():
+    raise EvaluationError("there is no other object")
+
+
+def test_fields_read_what_their_names_say():
+    train, _ = parts()
+    asked = []
+
+    def features(look):
+        asked.append(look)
+        return plate_features(200)
+
+    task = replace(plate_task(train), features=features)
+    for name in ("field", "field-positions", "field-unaligned", "field-no-residual", "field-no-initialisation"):
+        tiny(METHODS[name]).fit(task)
+    assert asked == ["visual", "positions", "unaligned", "visual", "visual"]
+
+    def blind(look):
+        raise SceneError("nothing shows the object's look")
+
+    with pytest.raises(SceneError, match="nothing shows"):
+        tiny(METHODS["field"]).fit(replace(task, features=blind))
+
+
+def test_ablations_leave_out_what_their_names_say():
+    train, _ = parts()
+    assert float(made("field-no-residual").residual.magnitude.abs().max()) == 0.0
+    bank = plate_extraction(train).bank
+    assert torch.equal(made("field-warmup").bank.frequency, bank.frequency)
+    assert not torch.equal(made("field").bank.frequency, bank.frequency)
+    assert made("field-warmup").origin.config.steps == 0
+    free = made("field-no-initialisation")
+    config = free.origin.config
+    assert (config.warmup_steps, config.steps) == (0, 10)
+    assert len(free.bank) == len(bank)
+    assert float((free.bank.frequency - bank.frequency).abs().min()) > 0.01
+    assert made("field", seed=7).origin.config.seed == 7
+
+
+def test_without_initialisation_no_mode_of_the_recordings_leaks_in():
+    """Other recordings of the same energy give the same start; and the fit begins as silent as that start says."""
+    train, _ = parts()
+    chance = torch.Generator().manual_seed(3)
+    start = uninformed(train, modes=12, bins=17, generator=chance)
+    other = replace(train, sounds=train.sounds.flip(1))
+    again = uninformed(other, modes=12, bins=17, generator=torch.Generator().manual_seed(3))
+    for one, two in zip((*bank_of(start), start.gains), (*bank_of(again), again.gains), strict=True):
+        assert torch.allclose(one, two, rtol=1e-6)
+    frequency, damping = bank_of(start)
+    assert bool((frequency.diff() > 0).all())
+    # Fifty periods in .1 s, and nine tenths of 4 kHz; from one neper over the sound to a quality of ten.
+    assert float(frequency.min()) > 50 / SECONDS
+    assert float(frequency.max()) < 3600
+    assert bool((damping >= 1 / SECONDS).all())
+    assert bool((damping <= math.pi * frequency / 10).all())
+    sounds = synthesise(start.gains, frequency, damping, samples=SAMPLES, sample_rate=RATE)
+    # Half of a damped sine's square is lost or won to its phase and its neighbours.
+    assert float(sounds.square().mean() / train.sounds.square().mean()) == pytest.approx(1.0, abs=0.5)
+    untrained = fit(train, plate_features(200), start, replace(TINY, warmup_steps=0, steps=1, learning_rate=1e-9))
+    assert torch.allclose(untrained.gain_field.gain_scale, start.gains[0])
+
+
+def test_frequencies_without_initialisation_are_free_to_move():
+    train, _ = parts()
+    field = tiny(METHODS["field-no-initialisation"]).fit(plate_task(train))
+    count = len(field.bank)
+    start = uninformed(train, modes=count, bins=33, generator=torch.Generator().manual_seed(0))
+    width = (start.bank.damping / (2 * math.pi)).clamp(min=1 / SECONDS)
+    moved = (field.bank.frequency - start.bank.frequency).abs() / width
+    # Ten steps of at most three hundredths of a width each.
+    assert 0.1 < float(moved.max()) < 0.33
+
+
+def bank_of(extraction: Extraction) -> tuple[torch.Tensor, torch.Tensor]:
+    return extraction.bank.frequency, extraction.bank.damping
+
+
+def test_nothing_can_be_started_from_nothing():
+    train, _ = parts()
+    generator = torch.Generator()
+    with pytest.raises(FitError, match="0 modes and 17 bands"):
+        uninformed(train, modes=0, bins=17, generator=generator)
+    with pytest.raises(FitError, match="1 bands"):
+        uninformed(train, modes=3, bins=1, generator=generator)
+    with pytest.raises(FitError, match="100 samples are too short"):
+        uninformed(replace(train, sounds=train.sounds[:, :100]), modes=3, bins=17, generator=generator)
+
+
+def test_the_papers_grid_has_all_its_combinations():
+    candidates = list(PAPER_GRID.candidates(TINY))
+    assert len(candidates) == 162
+    found = {(each.clusters, each.learning_rate, each.steps, each.early_weight, each.damping) for each in candidates}
+    assert len(found) == 162
+    assert {each.warmup_steps for each in candidates} == {TINY.warmup_steps}
+
+
+def test_a_grid_is_chosen_from_by_envelopes_held_out_of_training():
+    train, _ = parts()
+    # A rate at which nothing is learnt beside one at which much is, in a warm-up too short to matter.
+    grid = Grid((8,), (1e-7, 2e-2), (30,), (1.0,), ("shared",))
+    method = GridField("grid", grid, replace(TINY, warmup_steps=1, warmup_rate=1e-7))
+    field = method.fit(plate_task(train))
+    report = report_of(field)["grid"]
+    assert report["chosen"] == {
+        "clusters": 8,
+        "learning_rate": 2e-2,
+        "steps": 30,
+        "early_weight": 1.0,
+        "damping": "shared",
+    }
+    assert report["validation_envelope"][1] < report["validation_envelope"][0]
+    assert field.origin.config.learning_rate == 2e-2
+    # A quarter of nine, and all nine learn in the end.
+    assert len(report["validation_contacts"]) == 2
+    assert set(report["validation_contacts"]) < set(train.names)
+    assert field.origin.trained_on == train.names
+    few = GridField("grid", grid, TINY).fit(plate_task(train.take(range(5))))
+    assert report_of(few)["grid"] == {"validated": False}
+
+
+def test_a_grids_trials_do_not_learn_from_what_they_are_judged_by(monkeypatch):
+    train, _ = parts()
+    seen = []
+
+    def watched(impacts, features, modes, config, **rest):
+        seen.append(impacts.names)
+        assert len(modes.gains) == len(impacts)
+        return fit(impacts, features, modes, config, **rest)
+
+    monkeypatch.setattr("avmsf.bench.fieldmethods.fit", watched)
+    field = GridField("grid", Grid((8,), (1e-2,), (2,), (0.5, 1.0), ("shared",)), TINY).fit(plate_task(train))
+    held = set(report_of(field)["grid"]["validation_contacts"])
+    assert len(seen) == 3
+    for names in seen[:2]:
+        assert set(names) == set(train.names) - held
+    assert seen[2] == train.names
+
+
+def test_a_field_of_few_points_has_no_more_regions():
+    train, _ = parts()
+    points = FeatureField.from_contacts(struck().contacts, count=6)
+    field = tiny(METHODS["field"]).fit(replace(plate_task(train), features=lambda look: points))
+    assert isinstance(field, SoundField)
+    assert field.gain_field.shape.clusters == len(points.points) < 8
+
+
+def test_reports_say_what_was_used():
+    assert report_of(made("white-noise")) == {}
+    assert report_of(made("knn3")) == {"neighbours": 3}
+    assert report_of(made("spline-gains")) == {
+        "kernel": "thin plate",
+        "directions": 2,
+        "sites": TRAIN,
+        "smoothing": 0.0,
+    }
+    assert report_of(made("field-positions"))["damping"] in ("shared", "per-contact")
+
+
+def test_unknown_names_are_refused_with_the_known_ones(tmp_path):
+    assert method_named("knn3") is METHODS["knn3"]
+    with pytest.raises(
+        EvaluationError, match=r"'spline-gain': there are white-noise, .*recorded:FOLDER; did you mean "
+    ):
+        method_named("spline-gain")
+    with pytest.raises(EvaluationError, match=r"no method is called 'diffsound': there are .*field-grid"):
+        method_named("diffsound")
+    for name in ("recorded:", f"recorded:{tmp_path}/none"):
+        with pytest.raises(EvaluationError, match="expected a folder after `recorded:`"):
+            method_named(name)
+    method = method_named(f"recorded:{tmp_path}")
+    assert method == RecordedMethod(tmp_path)
+    assert method.name == f"recorded:{tmp_path}"
+
+
+def test_methods_are_told_apart_by_their_words():
+    """A results folder remembers methods by these, so no address of an object may be in them."""
+    words = [repr(method) for method in METHODS.values()]
+    assert len(set(words)) == len(words)
+    assert not [word for word in words if " at 0x" in word]
+
+
+def write_sounds(folder, impacts: Impacts, *, rate: int = int(RATE), ending: str = ".wav") -> None:
+    for name, sound in zip(impacts.names, impacts.sounds, strict=True):
+        path = folder / "plate" / f"{name}{ending}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        soundfile.write(path, sound.numpy(), rate, subtype="FLOAT")
+
+
+def test_others_sounds_come_back_as_they_were_written(tmp_path):
+    train, test = parts()
+    write_sounds(tmp_path, test)
+    task = plate_task(train)
+    renderer = method_named(f"recorded:{tmp_path}").fit(task)
+    assert isinstance(renderer, Renderer)
+    rows = [5, 0, 7]
+    assert torch.equal(renderer.render(test.contacts[rows]), test.sounds[rows])
+    assert torch.equal(renderer.render(test.contacts.float()), test.sounds)
+    assert renderer.render(test.contacts[:0]).shape == (0, SAMPLES)
+    # Recordings that are called by their files are looked up by them.
+    called = replace(task, names=tuple(f"{name}.wav" for name in task.names))
+    assert torch.equal(method_named(f"recorded:{tmp_path}").fit(called).render(test.contacts), test.sounds)
+    # Two blows in one place: the one that has a sound stands for both.
+    doubled = replace(task, contacts=torch.cat([test.contacts[:1], task.contacts]), names=("elsewhere", *task.names))
+    assert torch.equal(method_named(f"recorded:{tmp_path}").fit(doubled).render(test.contacts), test.sounds)
+
+
+def test_others_sounds_that_do_not_fit_are_refused_by_name(tmp_path):
+    train, test = parts()
+    task = plate_task(train)
+    with pytest.raises(EvaluationError, match=r"plate: expected a folder with this object's sounds, such as .*001.wav"):
+        RecordedMethod(tmp_path).fit(task)
+    write_sounds(tmp_path, test)
+    renderer = RecordedMethod(tmp_path).fit(task)
+    with pytest.raises(EvaluationError, match=rf"{train.names[0]}.wav: expected the sound that stands for"):
+        renderer.render(train.contacts[:1])
+    with pytest.raises(EvaluationError, match=r"no sound for a blow at \(1, 2, 3\) m"):
+        renderer.render(torch.tensor([[1.0, 2.0, 3.0]]))
+    path = tmp_path / "plate" / f"{test.names[0]}.wav"
+    sound = test.sounds[0].numpy()
+    for data, rate in ((sound[:700], 8000), (sound, 16000)):
+        soundfile.write(path, data, rate, subtype="FLOAT")
+        with pytest.raises(
+            EvaluationError, match=rf"{test.names[0]}.wav: expected 800 samples at 8000 Hz.*{len(data)} at {rate} Hz"
+        ):
+            renderer.render(test.contacts[:1])
+    soundfile.write(path, np.stack([sound, 0.5 * sound], axis=1), 8000, subtype="FLOAT")
+    with pytest.raises(EvaluationError, match="expected one channel, found 2 different ones"):
+        renderer.render(test.contacts[:1])
+    soundfile.write(path, np.stack([sound, sound], axis=1), 8000, subtype="FLOAT")
+    assert torch.equal(renderer.render(test.contacts[:1]), test.sounds[:1])
+    path.write_bytes(b"no sound")
+    with pytest.raises(EvaluationError, match="not a sound file that can be read"):
+        renderer.render(test.contacts[:1])
+    with pytest.raises(EvaluationError, match="3 names of recordings were given for 20 contacts"):
+        RecordedMethod(tmp_path).fit(replace(task, names=task.names[:3]))
