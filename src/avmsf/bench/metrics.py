@@ -10,9 +10,11 @@ metric calls `validate` first, which raises EvaluationError with the row that is
 - `spectrogram_distance` (L1), `log_mel_distance` (L1-log) and `envelope_distance` (ENV): the paper's three.
 - `objectfolder_distance`: the ObjectFolder benchmark's spectrogram distance.
 
-A `Convention` in `avmsf.bench.conventions` names the parameters that each is reported with.
+CDPAM is in `avmsf.bench.cdpam`; modes are compared with true ones in `avmsf.bench.physical`, places with true ones in
+`avmsf.bench.localisation`. A `Convention` in `avmsf.bench.conventions` names the parameters that each is reported with.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 
@@ -40,19 +42,25 @@ _BLOCK = 16
 """Sounds compared at a time: bounds the memory that their spectrograms take."""
 
 
-def validate(predicted: Sounds, truth: Sounds, *, names: Sequence[str] | None = None) -> None:
+def validate(
+    predicted: Sounds,
+    truth: Sounds,
+    *,
+    names: Sequence[str] | None = None,
+    sample_rates: tuple[float, float] | None = None,
+) -> None:
     """Raise EvaluationError unless both are [contacts, samples] of one shape, not empty, and finite throughout.
 
-    `names` are what the message calls the rows; they are numbered from 0 without them.
+    `names` are what the message calls the rows; they are numbered from 0 without them. Where both sample rates are
+    known (Hz, predicted and true) they have to be equal.
     """
+    if sample_rates is not None and sample_rates[0] != sample_rates[1]:
+        raise EvaluationError(
+            f"predicted sounds are at {sample_rates[0]:g} Hz and true ones at {sample_rates[1]:g} Hz; resample one of "
+            "them"
+        )
     for what, sounds in (("predicted", predicted), ("true", truth)):
-        if sounds.ndim != 2:
-            raise EvaluationError(
-                f"{what} sounds must be [contacts, samples], got the shape {tuple(sounds.shape)}; "
-                "give a single sound as one row, sound[None]"
-            )
-        if sounds.numel() == 0:
-            raise EvaluationError(f"{what} sounds are empty: {sounds.shape[0]} contacts of {sounds.shape[1]} samples")
+        _expect_rows(sounds, what)
     if len(predicted) != len(truth):
         raise EvaluationError(
             f"{len(predicted)} predicted sounds cannot be compared with {len(truth)} true ones; render one for each "
@@ -64,13 +72,30 @@ def validate(predicted: Sounds, truth: Sounds, *, names: Sequence[str] | None = 
             "are both at one sample rate, and rendered and recorded for the same time?"
         )
     for what, sounds in (("predicted", predicted), ("true", truth)):
-        bad = torch.nonzero(~torch.isfinite(sounds))
-        if len(bad):
-            row, sample = bad[0].tolist()
-            name = names[row] if names is not None else f"row {row}"
-            raise EvaluationError(
-                f"the {what} sound of {name} is {float(sounds[row, sample])} at sample {sample}; all must be finite"
-            )
+        _expect_numbers(sounds, what, names)
+
+
+def validate_sounds(sounds: Sounds, *, what: str = "given") -> None:
+    """Raise EvaluationError unless they are [contacts, samples], not empty, and finite throughout."""
+    _expect_rows(sounds, what)
+    _expect_numbers(sounds, what, None)
+
+
+def resampled(sounds: Float64[Tensor, "contacts samples"], *, sample_rate: float, wanted: float) -> Sounds:
+    """Return sounds at another sample rate (Hz) by a polyphase filter; what the new rate cannot hold is taken away.
+
+    The ratio of the rates is the nearest with a denominator up to 20,000, exact for all rates in use. Raises
+    EvaluationError for a rate that is not a positive number, or less than a thousandth of the wanted one.
+    """
+    if not (math.isfinite(sample_rate) and sample_rate >= 1e-3 * wanted):
+        raise EvaluationError(
+            f"sounds at {sample_rate:g} Hz cannot be compared at {wanted:g} Hz; expected a positive sample rate of "
+            f"{1e-3 * wanted:g} Hz or more"
+        )
+    if sample_rate == wanted:
+        return sounds
+    ratio = (Fraction(wanted) / Fraction(sample_rate)).limit_denominator(20000)
+    return torch.from_numpy(resample_poly(sounds.numpy(), ratio.numerator, ratio.denominator, axis=1))
 
 
 def default_fft_sizes(sample_rate: float) -> tuple[int, ...]:
@@ -156,15 +181,34 @@ def objectfolder_distance(predicted: Sounds, truth: Sounds, *, sample_rate: floa
             f"ObjectFolder's spectrogram reaches 7600 Hz, and sounds at {sample_rate:g} Hz end at {sample_rate / 2:g} "
             "Hz; evaluate them in the convention PAPER"
         )
-    ratio = Fraction(22050) / Fraction(sample_rate).limit_denominator(1000)
     filters = slaney_filters(80, fft_size=1024, sample_rate=22050.0, lowest=125.0, highest=7600.0)
 
     def image(sounds: Float64[Tensor, "contacts samples"]) -> Float64[Tensor, "contacts mels frames"]:
-        resampled = torch.from_numpy(resample_poly(sounds.numpy(), ratio.numerator, ratio.denominator, axis=1))
-        nepers = log_mel(resampled, filters, fft_size=1024, hop=256, floor=1e-5)[:, :, :860]
+        heard = resampled(sounds, sample_rate=sample_rate, wanted=22050.0)
+        nepers = log_mel(heard, filters, fft_size=1024, hop=256, floor=1e-5)[:, :, :860]
         return ((nepers * (20.0 / np.log(10.0)) - 20.0 + 100.0) / 100.0).clamp(0.0, 1.0)
 
     return _blockwise(lambda a, b: (image(a) - image(b)).square().mean(dim=(1, 2)), predicted, truth)
+
+
+def _expect_rows(sounds: Sounds, what: str) -> None:
+    if sounds.ndim != 2:
+        raise EvaluationError(
+            f"{what} sounds must be [contacts, samples], got the shape {tuple(sounds.shape)}; "
+            "give a single sound as one row, sound[None]"
+        )
+    if sounds.numel() == 0:
+        raise EvaluationError(f"{what} sounds are empty: {sounds.shape[0]} contacts of {sounds.shape[1]} samples")
+
+
+def _expect_numbers(sounds: Sounds, what: str, names: Sequence[str] | None) -> None:
+    bad = torch.nonzero(~torch.isfinite(sounds))
+    if len(bad):
+        row, sample = bad[0].tolist()
+        name = names[row] if names is not None else f"row {row}"
+        raise EvaluationError(
+            f"the {what} sound of {name} is {float(sounds[row, sample])} at sample {sample}; all must be finite"
+        )
 
 
 def _stft_sums(predicted: Sounds, truth: Sounds, *, fft_size: int, hop: int) -> tuple[PerContact, PerContact]:

@@ -21,6 +21,9 @@ VERBS = {
     "view-cloud": "Draw Gaussians or features from all sides: colours, features, clusters, symmetries.",
     "render": "Write the sounds of blows anywhere on the object as wav files.",
     "show": "Say what a field file holds, and draw it.",
+    "dataset": "Say what of a dataset is there, and what is missing.",
+    "simulate": "Make sounding objects by finite elements, whose truth is known: one, or the set sim-20.",
+    "evaluate": "Judge methods on the objects of a dataset by a protocol, and report.",
     "demo": "Go all the way on a built-in example: capture, modes, field, sounds, pictures, figures.",
 }
 """Each verb's module in this package, and the first sentence of its help."""

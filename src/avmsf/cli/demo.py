@@ -1,9 +1,9 @@
-"""`avmsf demo`: all the way on a plate whose sounds are known in closed form."""
+"""`avmsf demo`: all the way from pictures and taps of a mug to its sound anywhere, beside what is true of it."""
 
 import shutil
 import uuid
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -12,30 +12,39 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.bench.baselines import MeanWaveform
+from avmsf.bench.clouds import draw_cloud
 from avmsf.bench.evaluation import Scores, split
 from avmsf.bench.pictures import draw_gains, draw_modes, draw_scores, draw_spectrograms, save_picture
-from avmsf.capture import Capture, Impacts, Surface, check, read_capture, write_capture
+from avmsf.capture import CaptureSettings, Impacts, check, read_capture
 from avmsf.cli.modes import mode_table
 from avmsf.cli.modetable import amplitudes, levels, mode_rows
 from avmsf.cli.printing import console, json_text, say
 from avmsf.cli.progress import FitBar
+from avmsf.cli.reconstruct import show_fit
+from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scores import compare, score_markdown, score_table, score_values
+from avmsf.cli.view_cloud import plain_colors
 from avmsf.cli.writing import Level, OutputError, write_sound, write_text
 from avmsf.field.config import FitConfig
-from avmsf.field.fit import fit
 from avmsf.field.soundfield import SoundField
-from avmsf.field.store import load, save
-from avmsf.modal.extract import extract
+from avmsf.field.store import load
+from avmsf.modal.extract import HighResolution
 from avmsf.modal.extraction import Extraction
-from avmsf.scene.features import FeatureField
+from avmsf.pipeline.reconstruct import CACHE, ReconstructConfig, Reconstruction, reconstruct
+from avmsf.pipeline.scene import CLOUD, SceneConfig
+from avmsf.scene.ply import read_splats
 from avmsf.scene.points import farthest_points
-from avmsf.simulate.plate import Plate, plate_surface_points, sample_contacts, strike
+from avmsf.scene.splatconfig import SplatConfig
+from avmsf.simulate.example import EXAMPLE_FOLDER
 
-PLATE = Plate(thickness=0.004)
-CONTACTS, TRAIN = 40, 16
-SECONDS, SAMPLE_RATE, NOISE_DB = 1.0, 44100.0, -40.0
-CONTACT_TIME = 5e-4
-"""How long the hammer's tip stays on the plate, s: a hard rubber one."""
+TRAIN = 12
+"""Blows that the field is fitted to; the others judge it."""
+CONFIG = ReconstructConfig(
+    # A mug's dampings hardly change with place, so that the trials which would find this out can be left out.
+    scene=SceneConfig(splat=SplatConfig(steps=1000)),
+    fit=FitConfig(damping="shared"),
+)
+FIELD = "mug.safetensors"
 MARK = "demo.json"
 """File by which a folder is known to be a demo's own, and may be replaced."""
 _HEARD = 3
@@ -44,10 +53,10 @@ _HEARD = 3
 
 @dataclass(frozen=True)
 class Options:
-    """Go all the way on a built-in example: capture, modes, field, sounds, pictures, figures.
+    """Go all the way on a built-in example: images, Gaussians, features, modes, a field, sounds, pictures, figures.
 
-    A steel plate of 24 x 17 cm is struck with a rubber hammer at 40 places, in closed form and with noise 40 dB down.
-    A field is fitted to 16 of the blows and judged by the others.
+    A ceramic mug, made by `avmsf simulate example`: 48 pictures and 16 blows. Gaussians are fitted to the pictures, a
+    field to 12 of the blows, and the other 4 judge it.
     """
 
     folder: tyro.conf.Positional[Path] = Path("demo")
@@ -83,62 +92,54 @@ def run(options: Options) -> int:
 def _go_all_the_way(folder: Path) -> str:
     """Fill `folder` and return what to say of it."""
     screen = console(errors=False)
-    _record(folder / "capture")
+    shutil.copytree(EXAMPLE_FOLDER, folder / "capture")
     report = check(folder / "capture")
     wrong = sum(bool(each.problems) for each in report.recordings)
     say(f"check: {len(report.recordings)} recordings, {wrong} to look at")
     capture = read_capture(folder / "capture")
     train, test = split(capture.impacts, count=TRAIN)
-    say(f"modes: from {len(train)} recordings of {train.duration:.3g} s")
-    modes = extract(train)
+    made = _reconstruct(folder / "capture", train)
+    shutil.copyfile(made.field, folder / FIELD)
+    field, modes = load(folder / FIELD), made.modes
     level = levels(amplitudes(modes))
-    screen.print(mode_table(f"{len(level)} modes of {capture.name}", mode_rows(modes.bank, level)))
-    field = _fit(capture, train, modes)
-    save(field, folder / "plate.safetensors")
-    field = load(folder / "plate.safetensors")
+    screen.print(mode_table(f"{len(level)} modes of the mug", mode_rows(modes.bank, level)))
     scores = compare(field, train, test, modes)
     title = f"{len(test)} contacts not trained on, {len(train)} trained on; lower is better"
     screen.print(score_table(title, scores))
-    heard = test.take(farthest_points(test.contacts, _HEARD).tolist())
+    heard = test.take(farthest_points(test.contacts, min(_HEARD, len(test))).tolist())
     _write_sounds(folder / "sounds", field, train, heard)
-    _draw(folder / "pictures", field, modes, train, heard, scores)
+    shutil.move(folder / "capture" / CACHE / CLOUD, folder / "mug.ply")
+    _draw(folder, field, modes, train, heard, scores)
+    shutil.rmtree(folder / "capture" / CACHE)
     write_text(folder / "scores.md", f"{title}\n\n{score_markdown(scores)}")
-    facts = {"contacts": CONTACTS, "train": list(train.names), "test": list(test.names), "plate": asdict(PLATE)}
+    facts = {
+        "train": list(train.names),
+        "test": list(test.names),
+        "features": made.features,
+        "stages": {each.stage: each.seconds for each in made.stages},
+    }
     write_text(folder / MARK, json_text(facts | {"scores": score_values(scores)}) + "\n")
-    write_text(folder / "LISTEN.txt", _guide("", len(heard)))
-    return _guide(f"{folder}/", len(heard))
+    write_text(folder / "LISTEN.txt", _guide("", field, len(heard)))
+    return _guide(f"{folder}/", field, len(heard))
 
 
-def _record(folder: Path) -> None:
-    """Write the plate's blows as an ordinary capture folder, with its rectangle as the surface."""
-    generator = torch.Generator().manual_seed(0)
-    contacts = sample_contacts(PLATE, CONTACTS, generator=generator)
-    impacts = strike(
-        PLATE,
-        contacts,
-        sample_rate=SAMPLE_RATE,
-        seconds=SECONDS,
-        generator=generator,
-        noise_db=NOISE_DB,
-        contact_time=CONTACT_TIME,
-    )
-    a, b = PLATE.length, PLATE.width
-    corners = torch.tensor([[0.0, 0.0, 0.0], [a, 0.0, 0.0], [a, b, 0.0], [0.0, b, 0.0]])
-    surface = Surface(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]))
-    write_capture(Capture("plate", impacts, surface), folder)
-
-
-def _fit(capture: Capture, train: Impacts, modes: Extraction) -> SoundField:
-    assert capture.surface is not None
-    features = FeatureField.from_mesh(capture.surface, generator=torch.Generator().manual_seed(0))
-    # A plate's dampings are the same everywhere, so that the trials which would find this out can be left out.
-    config = FitConfig(damping="shared")
-    with FitBar() as bar:
-        return fit(train, features, modes, config, capture=capture.name, progress=bar.show)
+def _reconstruct(folder: Path, train: Impacts) -> Reconstruction:
+    with SceneBar() as scene_bar, FitBar() as fit_bar:
+        return reconstruct(
+            folder,
+            read_capture(folder),
+            train,
+            CONFIG,
+            method=HighResolution(),
+            cache=folder / CACHE,
+            settings=CaptureSettings.read(folder / "capture.toml"),
+            listener=scene_bar.listener,
+            fitting=lambda progress: show_fit(progress, scene_bar, fit_bar),
+        )
 
 
 def _write_sounds(folder: Path, field: SoundField, train: Impacts, heard: Impacts) -> None:
-    """Write recorded, rendered and averaged sounds on one scale, and a walk across the plate."""
+    """Write recorded, rendered and averaged sounds on one scale, and a walk around the mug."""
     rendered = field.render(heard.contacts)
     averaged = MeanWaveform(train).render(heard.contacts)
     factor = Level("peak", -1.0).factor(torch.cat([heard.sounds, rendered, averaged]))
@@ -146,16 +147,18 @@ def _write_sounds(folder: Path, field: SoundField, train: Impacts, heard: Impact
         for kind, sounds in (("1-recorded", heard.sounds), ("2-field", rendered), ("3-mean-of-nearest", averaged)):
             path = folder / f"contact-{row + 1}-{kind}.wav"
             write_sound(path, factor * sounds[row], sample_rate=field.sample_rate, coding="float32")
-    walk = _walk(field)
+    walk = _walk(field, train)
     walk = walk * Level("peak", -1.0).factor(walk[None])
     write_sound(folder / "walk.wav", walk, sample_rate=field.sample_rate, coding="float32")
 
 
-def _walk(field: SoundField, *, steps: int = 24, every: float = 0.22) -> Float[Tensor, " samples"]:
-    """Return blows along the diagonal from near a corner to the middle and on, each let ring."""
-    part = torch.linspace(0.06, 0.94, steps, dtype=torch.float64)[:, None]
-    places = part * torch.tensor([[PLATE.length, PLATE.width, 0.0]], dtype=torch.float64)
-    sounds = field.render(places)
+def _walk(field: SoundField, train: Impacts, *, steps: int = 24, every: float = 0.22) -> Float[Tensor, " samples"]:
+    """Return blows around the mug at half its height, each let ring."""
+    low, high = train.contacts.amin(0), train.contacts.amax(0)
+    angle = 2 * torch.pi * torch.arange(steps, dtype=torch.float64) / steps
+    around = torch.stack([torch.cos(angle), torch.sin(angle), torch.zeros_like(angle)], dim=1)
+    # The field takes the point of the object that is nearest to each of these.
+    sounds = field.render((low + high) / 2 + around * (high - low) / 2)
     hop = round(every * field.sample_rate)
     walk = torch.zeros(hop * (steps - 1) + sounds.shape[1])
     for step, sound in enumerate(sounds):
@@ -171,9 +174,13 @@ def _draw(
     heard: Impacts,
     scores: dict[str, Scores],
 ) -> None:
-    points = plate_surface_points(PLATE, 3000)
+    cloud = read_splats(folder / "mug.ply")
+    points = field.gain_field.points
     pictures = {
-        "modes": draw_modes(modes.bank, levels(amplitudes(modes)), title=f"{len(modes.bank)} modes of the plate"),
+        "cloud": draw_cloud(
+            cloud.centers, {"colour": plain_colors(cloud)}, title=f"{len(cloud)} Gaussians", up=(0.0, 0.0, 1.0)
+        ),
+        "modes": draw_modes(modes.bank, levels(amplitudes(modes)), title=f"{len(modes.bank)} modes of the mug"),
         "gains": draw_gains(
             points,
             field.gains(points),
@@ -191,21 +198,23 @@ def _draw(
         "scores": draw_scores(scores, title="how far rendered sounds are from recorded ones"),
     }
     for stem, picture in pictures.items():
-        save_picture(picture, folder / f"{stem}.png")
+        save_picture(picture, folder / "pictures" / f"{stem}.png")
 
 
-def _guide(prefix: str, heard: int) -> str:
+def _guide(prefix: str, field: SoundField, heard: int) -> str:
     """Say what to listen to; `prefix` goes before the files' names."""
+    x, y, z = field.gain_field.points[0].tolist()
     return f"""
-Listen to {prefix}sounds/walk.wav: blows along the plate's diagonal, at places that were never struck.
+Listen to {prefix}sounds/walk.wav: blows around the mug at half its height, most at places that were never struck.
 Then, for each of {heard} contacts that the field has never heard, in this order:
   contact-1-1-recorded.wav         what was recorded there
   contact-1-2-field.wav            what the field makes of it
   contact-1-3-mean-of-nearest.wav  the mean of the three nearest recordings
 
-Look at {prefix}pictures: scores.png, spectrograms.png, gains.png, modes.png.
+Look at {prefix}pictures: cloud.png, scores.png, spectrograms.png, gains.png, modes.png.
+{prefix}mug.ply is the mug as Gaussians, for any 3DGS viewer.
 {prefix}scores.md and {prefix}{MARK} hold the figures.
-{prefix}capture is a folder as one fills it by hand, {prefix}plate.safetensors the field that was fitted to it.
-Strike the plate yourself, anywhere from 0 0 0 to {PLATE.length:.3g} {PLATE.width:.3g} 0 metres:
-  avmsf render {prefix}plate.safetensors --at 0.1 0.05 0 --output mine.wav
+{prefix}capture is a folder as one fills it by hand, {prefix}{FIELD} the field that was fitted to it.
+Strike the mug yourself, anywhere on it, in metres:
+  avmsf render {prefix}{FIELD} --at {x:.3f} {y:.3f} {z:.3f} --output mine.wav
 """

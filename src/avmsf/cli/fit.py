@@ -21,7 +21,7 @@ from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
-from avmsf.pipeline.keptmodes import extract_once
+from avmsf.modal.keptmodes import extract_once
 from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features

@@ -101,7 +101,7 @@ def run(options: Options) -> int:
                 cache=options.kept,
                 settings=settings,
                 listener=scene_bar.listener,
-                fitting=lambda progress: _show_fit(progress, scene_bar, fit_bar),
+                fitting=lambda progress: show_fit(progress, scene_bar, fit_bar),
             )
     except KeyboardInterrupt:
         say("avmsf reconstruct: interrupted; the same command goes on from where it was")
@@ -143,7 +143,7 @@ def run(options: Options) -> int:
     return 0
 
 
-def _show_fit(progress: Progress, scene_bar: SceneBar, fit_bar: FitBar) -> None:
+def show_fit(progress: Progress, scene_bar: SceneBar, fit_bar: FitBar) -> None:
     """Show the fit on a screen that holds one bar at a time."""
     scene_bar.stop()
     fit_bar.show(progress)

@@ -22,8 +22,8 @@ from avmsf.field.store import save
 from avmsf.files import write_whole
 from avmsf.modal.extract import ModeFinder
 from avmsf.modal.extraction import Extraction
+from avmsf.modal.keptmodes import extract_once
 from avmsf.pipeline.choice import choose_features
-from avmsf.pipeline.keptmodes import extract_once
 from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField

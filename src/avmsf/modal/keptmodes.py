@@ -1,37 +1,40 @@
-"""The modes of an unfinished fit, kept beside its checkpoint.
+"""Modes that are found once and kept in a file.
 
 Linear algebra rounds differently from one run to the next, so modes that are found again differ in their last digits;
-a fit that goes on from a checkpoint needs the very ones it began with.
+work that goes on after an interruption needs the very ones it began with.
 """
 
 import hashlib
 import json
+from importlib.metadata import version
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-import avmsf
 from avmsf.capture import Impacts
 from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extract import ModeFinder, extract
+from avmsf.modal.extract import ModeFinder, extract, extract_sounds
 from avmsf.modal.extraction import Extraction
 from avmsf.modal.residual import Residual
 
 _KEY = "avmsf-modes"
 
 
-def extract_once(train: Impacts, method: ModeFinder, path: Path) -> Extraction:
+def extract_once(train: Impacts, method: ModeFinder, path: Path, *, lone: bool = False) -> Extraction:
     """Return the modes that `path` keeps of these recordings and this method; find and keep them where it has none.
 
-    Raises as `extract` and `write_whole`.
+    With `lone`, one recording is enough. Raises as `extract` and `write_whole`.
     """
     digest = _digest(train, method)
     kept = _read(path, digest)
     if kept is not None:
         return kept
-    found = extract(train, method)
+    if lone and len(train) == 1:
+        found = extract_sounds(train.sounds, sample_rate=train.sample_rate, method=method)
+    else:
+        found = extract(train, method)
     tensors = {
         "frequency": found.bank.frequency,
         "damping": found.bank.damping,
@@ -59,7 +62,7 @@ def _read(path: Path, digest: str) -> Extraction | None:
 
 
 def _digest(train: Impacts, method: ModeFinder) -> str:
-    words = [avmsf.__version__, repr(method), train.names, train.sample_rate]
+    words = [version("avmsf"), repr(method), train.names, train.sample_rate]
     digest = hashlib.sha256(json.dumps(words).encode())
     digest.update(train.sounds.contiguous().numpy().tobytes())
     return digest.hexdigest()

@@ -1,0 +1,137 @@
+"""One case of one object: every method learns from the same blows and is judged by the same others."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.bench.cases import Case
+from avmsf.bench.judging import spread
+from avmsf.bench.knowntruth import truth_at
+from avmsf.bench.listening import keep_sound, listening_gain
+from avmsf.bench.methods import report_of
+from avmsf.bench.otherobjects import draw_stranger
+from avmsf.bench.plan import Evaluation
+from avmsf.bench.results import CaseRecord, Outcome, one_line
+from avmsf.bench.task import Look, Method, Task
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import AvmsfError
+from avmsf.modal.extraction import Extraction
+from avmsf.modal.keptmodes import extract_once
+from avmsf.scene.features import FeatureField
+from avmsf.simulate.truth import Truth
+
+LISTENED = 3
+"""Test contacts of an experiment whose sounds are kept to be listened to."""
+_RECORDED = "recorded"
+"""What the recordings' own files are called beside the methods'."""
+
+
+class CaseRun:
+    """Runs methods in one case, with modes that are found once and kept in a file."""
+
+    def __init__(
+        self,
+        evaluation: Evaluation,
+        identifier: str,
+        case: Case,
+        impacts: Impacts,
+        truth: Truth | None,
+        *,
+        folder: Path,
+        place: str,
+        look: Callable[[Look], FeatureField],
+        listened: bool,
+    ) -> None:
+        """Prepare a case of an object; `place` is its own path beneath the results' folder."""
+        self.evaluation, self.identifier, self.case, self.impacts = evaluation, identifier, case, impacts
+        self.train, self.test = impacts.take(case.train), impacts.take(case.test)
+        self.truth = None if truth is None else truth_at(truth, self.test.names)
+        self.folder, self.place, self.look = folder, place, look
+        self.listened = spread(len(case.test), LISTENED) if listened else []
+        self.shared = 0.0
+        self.found: Extraction | None = None
+
+    def outcome(self, method: Method) -> Outcome:
+        """Return what a method comes to; whatever it raises, but for an interruption, is its failure."""
+        begun, shared = time.perf_counter(), self.shared
+        try:
+            renderer = method.fit(self._task())
+            fit_seconds = time.perf_counter() - begun - (self.shared - shared)
+            begun = time.perf_counter()
+            with torch.no_grad():
+                sounds = renderer.render(self.test.contacts)
+            render_seconds = time.perf_counter() - begun
+            judgement = self.evaluation.judging.judge(renderer, sounds, self.test, self.truth)
+        except AvmsfError as error:
+            return Outcome(self.case.key, method.name, failure=one_line(error))
+        except Exception as error:  # A fault in one method must not cost the others their hours.
+            return Outcome(self.case.key, method.name, failure=f"{type(error).__name__}: {one_line(error)}")
+        return Outcome(
+            self.case.key,
+            method.name,
+            judgement.values,
+            judgement.figures,
+            round(fit_seconds, 4),
+            round(render_seconds, 4),
+            self._keep_sounds(method.name, sounds),
+            report_of(renderer),
+        )
+
+    def described(self, known: CaseRecord) -> CaseRecord:
+        """Return the case's record with the recordings' files, and with what modes and features have taken so far."""
+        sounds = known.sounds or self._keep_sounds(_RECORDED, self.test.sounds)
+        seconds, self.shared = known.shared_seconds + self.shared, 0.0
+        return replace(known, sounds=sounds, shared_seconds=round(seconds, 4))
+
+    def _task(self) -> Task:
+        return Task(
+            name=self.identifier,
+            train=self.train,
+            contacts=self.impacts.contacts,
+            names=self.impacts.names,
+            seed=self.evaluation.seed,
+            modes=self._modes,
+            features=self._features,
+            stranger=self._stranger,
+        )
+
+    def _modes(self) -> Extraction:
+        with self._sharing():
+            if self.found is None:
+                path = self.folder / "modes" / f"{self.place}.safetensors"
+                self.found = extract_once(self.train, self.evaluation.finder, path, lone=True)
+            return self.found
+
+    def _features(self, look: Look) -> FeatureField:
+        with self._sharing():
+            return self.look(look)
+
+    def _stranger(self) -> Float[Tensor, " samples"]:
+        return draw_stranger(self.evaluation.dataset, self.identifier, self.train, seed=self.evaluation.seed)
+
+    @contextmanager
+    def _sharing(self) -> Iterator[None]:
+        """Count the time to no method: whichever asks first would seem the slowest."""
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.shared += time.perf_counter() - begun
+
+    def _keep_sounds(self, name: str, sounds: Float[Tensor, "contacts samples"]) -> dict[str, str]:
+        """Write the sounds to listen to, and return their files by the names of their recordings."""
+        kept = {}
+        # Methods that read a folder have its path in their name.
+        word = "".join(mark if mark.isalnum() or mark in "-_" else "-" for mark in name)
+        for row in self.listened:
+            file = f"sounds/{self.place}/{row:03d} {word}.flac"
+            gain = listening_gain(self.test.sounds[row])
+            keep_sound(self.folder / file, sounds[row], sample_rate=self.test.sample_rate, gain=gain)
+            kept[self.test.names[row]] = file
+        return kept

@@ -1,0 +1,101 @@
+"""All that is measured of one method's sounds: the convention's metrics, CDPAM, and modes against the truth."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.bench.conventions import PAPER, Convention
+from avmsf.bench.evaluation import score
+from avmsf.bench.physical import ModalRenderer, judge_modes
+from avmsf.bench.renderer import Renderer
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import EvaluationError
+from avmsf.simulate.truth import Truth
+
+if TYPE_CHECKING:
+    from avmsf.bench.cdpam import Cdpam
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What one method's sounds of the test contacts are worth."""
+
+    values: dict[str, tuple[float | None, ...]]
+    """Each metric's figure for every test contact; None where it was not taken."""
+    figures: dict[str, float | None]
+    """Figures that are of all test contacts at once."""
+
+
+@dataclass(frozen=True)
+class Judging:
+    """What is measured."""
+
+    convention: Convention = PAPER
+    cdpam: bool = True
+    """Whether CDPAM is among the metrics; it takes the longest of them."""
+    cdpam_contacts: int = 8
+    """Test contacts of a case, spread evenly over them, that CDPAM is taken of; 0 for all."""
+
+    def __post_init__(self) -> None:
+        if self.cdpam_contacts < 0:
+            raise EvaluationError(f"cdpam_contacts = {self.cdpam_contacts}: expected 0, for all, or more")
+
+    def prepare(self) -> None:
+        """Raise EvaluationError where something that is needed is not installed: before work of hours, not after."""
+        if self.cdpam:
+            _cdpam()
+
+    def judge(
+        self,
+        renderer: Renderer,
+        sounds: Float[Tensor, "..."],
+        test: Impacts,
+        truth: Truth | None,
+    ) -> Judgement:
+        """Measure what `renderer` made of the test contacts; `truth`, where known, has the rows of `test`.
+
+        Raises as `score`, and EvaluationError for sounds of another sample rate.
+        """
+        if renderer.sample_rate != test.sample_rate:
+            raise EvaluationError(
+                f"the method's sounds are at {renderer.sample_rate:g} Hz and the recordings at {test.sample_rate:g} Hz"
+            )
+        scores = score(sounds, test, convention=self.convention)
+        values: dict[str, tuple[float | None, ...]] = {
+            metric: tuple(figures.tolist()) for metric, figures in scores.values.items()
+        }
+        if self.cdpam:
+            values["cdpam"] = self._cdpam_values(sounds, test)
+        return Judgement(values, {} if truth is None else _modal_figures(renderer, test, truth))
+
+    def _cdpam_values(self, sounds: Float[Tensor, "contacts samples"], test: Impacts) -> tuple[float | None, ...]:
+        rows = spread(len(test), self.cdpam_contacts or len(test))
+        taken = _cdpam().distance(sounds[rows], test.sounds[rows], sample_rate=test.sample_rate)
+        found = dict(zip(rows, taken.tolist(), strict=True))
+        return tuple(found.get(row) for row in range(len(test)))
+
+
+def spread(count: int, wanted: int) -> list[int]:
+    """Return at most `wanted` of the rows 0 to `count` - 1, evenly spread, in ascending order."""
+    if wanted >= count:
+        return list(range(count))
+    return [(2 * place + 1) * count // (2 * wanted) for place in range(wanted)]
+
+
+def _modal_figures(renderer: Renderer, test: Impacts, truth: Truth) -> dict[str, float | None]:
+    """Return how near a method's modes and gains are to the truth; nothing of methods that have no modes."""
+    if not isinstance(renderer, ModalRenderer):
+        return {}
+    figures = judge_modes(renderer, test.contacts, truth).figures()
+    # Gains at a single contact agree with any others.
+    return {name: value for name, value in figures.items() if name != "mac" or len(test) > 1}
+
+
+@lru_cache(maxsize=1)
+def _cdpam() -> "Cdpam":
+    from avmsf.bench.cdpam import Cdpam
+
+    return Cdpam.load(scalings=("benchmark",))

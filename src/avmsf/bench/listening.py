@@ -1,0 +1,124 @@
+"""Sounds that are kept to be listened to, and pictures of them."""
+
+import base64
+import io
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import soundfile
+import torch
+from jaxtyping import Float, Float64, UInt8
+from matplotlib import colormaps
+from PIL import Image
+from scipy.signal import resample_poly
+from torch import Tensor
+
+from avmsf.errors import EvaluationError
+from avmsf.files import write_whole
+from avmsf.modal.spectra import magnitude_stft, scaled_fft_size
+
+_PEAK = 0.25
+"""What recordings peak at, of full scale: louder sounds of a method have room above."""
+_LEAST_RATE = 8000.0
+"""Hz below which browsers do not play."""
+_FULL = 1 - 2**-15
+_RANGE_DB = 80.0
+_LOWEST = 60.0
+"""Hz at the lower edge of pictures, which are logarithmic in frequency above it."""
+
+
+def listening_gain(recorded: Float[Tensor, " samples"]) -> float:
+    """Return what a recording, and all that is heard beside it, is multiplied by."""
+    peak = float(recorded.abs().max())
+    return _PEAK / peak if peak > 0 else 1.0
+
+
+def keep_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: float, gain: float) -> None:
+    """Write a sound times `gain` as a FLAC file of 16 bits; what would clip is turned down to full scale.
+
+    Sounds at rates that browsers do not play are resampled by a whole factor. Raises EvaluationError.
+    """
+    samples = sound.double().numpy() * gain
+    factor = max(1, int(np.ceil(_LEAST_RATE / sample_rate)))
+    if factor > 1:
+        samples = resample_poly(samples, factor, 1)
+    peak = float(np.abs(samples).max(initial=0.0))
+    if peak > _FULL:
+        samples = samples * (_FULL / peak)
+    memory = io.BytesIO()
+    soundfile.write(memory, samples, round(sample_rate * factor), subtype="PCM_16", format="FLAC")
+    write_whole(path, lambda place: place.write_bytes(memory.getvalue()), raising=EvaluationError)
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """A kept sound, read back."""
+
+    content: bytes
+    """The file as it lies on the disk."""
+    samples: Float64[Tensor, " samples"]
+    sample_rate: float
+
+    @classmethod
+    def read(cls, path: Path) -> "Heard":
+        """Read a file that `keep_sound` wrote. Raises EvaluationError where it is gone or damaged."""
+        try:
+            content = path.read_bytes()
+            samples, rate = soundfile.read(io.BytesIO(content), dtype="float64")
+        except (OSError, soundfile.LibsndfileError) as error:
+            raise EvaluationError(
+                f"{path}: cannot be read as a kept sound ({error}); delete the object's file to have it made again"
+            ) from error
+        return cls(content, torch.from_numpy(samples), float(rate))
+
+    @property
+    def address(self) -> str:
+        """The file as an address that a page plays without any network."""
+        return f"data:audio/flac;base64,{base64.b64encode(self.content).decode()}"
+
+
+def draw_spectrogram(heard: Heard, *, loudest: float | None, width: int = 240, height: int = 120) -> str:
+    """Return the address of a picture of a sound: time to the right, frequency upwards on a logarithmic scale.
+
+    Colours span 80 dB below `loudest`, the largest magnitude of the recording it is compared with; None is its own.
+    """
+    levels = _levels(heard, width, height)
+    top = float(levels.max()) if loudest is None else loudest
+    shown = ((levels - top) / _RANGE_DB + 1).clamp(0, 1).flip(0)
+    return _png((shown * 255).round().to(torch.uint8).numpy())
+
+
+def loudest_of(heard: Heard, *, width: int = 240, height: int = 120) -> float:
+    """Return the level, dB, of the brightest point in a sound's picture."""
+    return float(_levels(heard, width, height).max())
+
+
+def picture_span(heard: Heard) -> tuple[float, float, float]:
+    """Return a picture's seconds, and its lowest and highest frequency, Hz."""
+    highest = heard.sample_rate / 2
+    return len(heard.samples) / heard.sample_rate, min(_LOWEST, highest / 50), highest
+
+
+def _levels(heard: Heard, width: int, height: int) -> Float64[Tensor, "height width"]:
+    """Return magnitudes in dB: the largest bin within each pixel, so that no line falls between two."""
+    fft_size = scaled_fft_size(2048, sample_rate=heard.sample_rate)
+    hop = max(1, len(heard.samples) // width)
+    spectrum = magnitude_stft(heard.samples[None], fft_size=fft_size, hop=hop)[0, :, :width]
+    _, lowest, highest = picture_span(heard)
+    edges = np.geomspace(lowest, highest, height + 1) * fft_size / heard.sample_rate
+    rows = []
+    for low, high in pairwise(edges.tolist()):
+        first = min(round(low), spectrum.shape[0] - 1)
+        rows.append(spectrum[first : max(first + 1, round(high))].amax(0))
+    return 20 * torch.log10(torch.stack(rows).clamp(min=1e-9))
+
+
+def _png(shades: UInt8[np.ndarray, "height width"]) -> str:
+    picture = Image.fromarray(shades).convert("P")
+    colours = (colormaps["magma"](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
+    picture.putpalette(colours.tobytes())
+    memory = io.BytesIO()
+    picture.save(memory, format="PNG", optimize=True)
+    return f"data:image/png;base64,{base64.b64encode(memory.getvalue()).decode()}"

@@ -1,0 +1,60 @@
+"""All that decides an evaluation's figures, in one value that travels to other processes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+import avmsf
+from avmsf.bench.judging import Judging
+from avmsf.bench.protocols import EvaluationProtocol
+from avmsf.bench.results import ResultsFolder
+from avmsf.bench.task import Look, Method
+from avmsf.capture.datasets.dataset import Dataset
+from avmsf.modal.extract import HighResolution, ModeFinder
+from avmsf.scene.features import FeatureField
+
+
+@runtime_checkable
+class FeatureMaker(Protocol):
+    """Makes what fields read of an object's points."""
+
+    def __call__(self, identifier: str, look: Look, views: int | None = None) -> FeatureField:
+        """Return an object's features, from at most `views` views. Raises SceneError where nothing shows its look."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What is evaluated, on what, and how."""
+
+    dataset: Dataset
+    title: str
+    """What reports call the dataset; results of another are not mixed with its own."""
+    protocol: EvaluationProtocol
+    methods: tuple[Method, ...]
+    features: FeatureMaker
+    seed: int = 0
+    """Start of all chance in the methods."""
+    judging: Judging = field(default_factory=Judging)
+    finder: ModeFinder = field(default_factory=HighResolution)
+    """How modes are found, once a case."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Plain values that decide the features."""
+
+    def begin(self, results: ResultsFolder) -> None:
+        """Take a folder for this evaluation's results.
+
+        Raises EvaluationError where the folder holds other ones, and where a metric's package is not installed.
+        """
+        self.judging.prepare()
+        identity = {
+            "version": avmsf.__version__,
+            "protocol": self.protocol.name,
+            "choosing": repr(self.protocol.choosing),
+            "dataset": self.title,
+            "seed": self.seed,
+            "metrics": repr(self.judging),
+            "modes": repr(self.finder),
+            "settings": dict(self.settings),
+        }
+        results.begin(identity, {method.name: repr(method) for method in self.methods})

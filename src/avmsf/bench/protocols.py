@@ -1,0 +1,104 @@
+"""The experiments of the paper, as data: what is learnt from, what is judged by, and which methods take part."""
+
+import difflib
+from dataclasses import dataclass
+
+from avmsf.bench.cases import Choosing, Closest, Farthest, FewerViews, LeaveOneOut, Shots
+from avmsf.errors import EvaluationError
+
+BASELINE = "knn3"
+"""The method that all others are compared with."""
+PAPER_METRICS = ("l1", "l1_log", "envelope", "cdpam")
+"""The columns of the paper's tables."""
+OWN_METRICS = ("relative_stft", "mac", "gain_error")
+"""What is shown besides: the last two where the truth is known."""
+_TABLE = (
+    "white-noise",
+    "random-impact",
+    "nearest",
+    BASELINE,
+    "knn-gains",
+    "knn-spectra",
+    "spline-gains",
+    "field",
+)
+_ABLATED = ("field-positions", "field-no-initialisation", "field-unaligned", "field-no-residual")
+
+
+@dataclass(frozen=True)
+class EvaluationProtocol:
+    """One experiment."""
+
+    name: str
+    """What the command line calls it."""
+    summary: str
+    """What it does, in a sentence."""
+    choosing: Choosing
+    """How each object's contacts are parted."""
+    methods: tuple[str, ...] = _TABLE
+    """Names of the methods that take part unless others are asked for; the baseline is among them."""
+    subset: str | None = None
+    """Name of the objects that take part unless others are asked for; None for all."""
+    required: bool = False
+    """Whether the subset is what the experiment is about: without it, datasets that have no such objects take part with
+    all of theirs."""
+    metrics: tuple[str, ...] = (*PAPER_METRICS, *OWN_METRICS)
+    """Columns of the tables, by the metrics' names."""
+
+
+PROTOCOLS = {
+    each.name: each
+    for each in (
+        EvaluationProtocol(
+            "farthest", "Train on 20 % of the contacts, spread as far apart as they go; test on the others.", Farthest()
+        ),
+        EvaluationProtocol("leave-one-out", "Test on every contact once, after training on all others.", LeaveOneOut()),
+        EvaluationProtocol(
+            "closest", "Train on 20 % of the contacts in one region, test on the others.", Closest(), subset="ablation"
+        ),
+        EvaluationProtocol(
+            "shots",
+            "Train on 16, 8, 4, 2 and 1 contacts, each choice within the one before; test on the same others.",
+            Shots(),
+            subset="ablation",
+        ),
+        EvaluationProtocol(
+            "views",
+            "Draw looks from all views and from 12; train and test as `farthest` does.",
+            FewerViews(),
+            (BASELINE, "field"),
+            subset="ablation",
+        ),
+        EvaluationProtocol(
+            "ablation",
+            "Leave out one part of the field at a time: looks, initialisation, alignment, residual.",
+            Farthest(),
+            (BASELINE, "field", *_ABLATED),
+            subset="ablation",
+        ),
+        EvaluationProtocol(
+            "non-symmetric",
+            "As `farthest`, on objects without symmetry, where near contacts tell least.",
+            Farthest(),
+            subset="non-symmetric",
+            required=True,
+        ),
+        EvaluationProtocol(
+            "grid",
+            "Choose the field's settings from the paper's grids on validation contacts; test as `farthest` does.",
+            Farthest(),
+            (BASELINE, "field", "field-grid"),
+            subset="ablation",
+        ),
+    )
+}
+"""All experiments by name."""
+
+
+def protocol_named(name: str) -> EvaluationProtocol:
+    """Return the protocol of this name. Raises EvaluationError that lists the known ones."""
+    if name in PROTOCOLS:
+        return PROTOCOLS[name]
+    near = difflib.get_close_matches(name, PROTOCOLS, n=1)
+    guess = f"; did you mean {near[0]}?" if near else ""
+    raise EvaluationError(f"no protocol is called {name!r}: there are {', '.join(PROTOCOLS)}{guess}")

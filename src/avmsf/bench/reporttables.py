@@ -1,0 +1,310 @@
+"""What a report says, as titles, words and tables that Markdown and HTML draw alike."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from avmsf.bench.protocols import BASELINE, PROTOCOLS
+from avmsf.bench.published import published, published_ratios
+from avmsf.bench.results import ObjectRecord
+from avmsf.bench.summary import (
+    RISING,
+    Mean,
+    Table,
+    differences,
+    failures_of,
+    figures_of,
+    labels_of,
+    means,
+    ratios,
+    times_of,
+)
+
+HEADINGS = {
+    "l1": "L1",
+    "l1_log": "L1-log",
+    "envelope": "ENV",
+    "cdpam": "CDPAM",
+    "relative_stft": "relative STFT",
+    "mac": "MAC",
+    "gain_error": "gain error",
+}
+"""Metrics as columns call them; others go by their own names."""
+WARNING = (
+    "The paper describes its metrics in words only. The convention that these figures are taken in is inferred from "
+    "its rows for white noise, so absolute figures must not be compared with the paper's: compare ratios to KNN."
+)
+_DASH = "–"
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table of words; the first column names the rows."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    best: frozenset[tuple[int, int]] = frozenset()
+    """Rows and columns of the cells that are the best of their column."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of a report."""
+
+    title: str
+    words: tuple[str, ...] = ()
+    """Paragraphs before the table."""
+    grid: Grid | None = None
+    remarks: tuple[str, ...] = ()
+    """Paragraphs after it."""
+
+
+def sections(
+    records: Sequence[ObjectRecord], identity: Mapping[str, Any], *, subsets: Mapping[str, frozenset[str]]
+) -> list[Section]:
+    """Return all parts of the report on these results."""
+    protocol, dataset = str(identity["protocol"]), str(identity["dataset"])
+    order = list(identity["methods"])
+    labels = labels_of(records)
+    tables = {label: _ordered(figures_of(records, label), order) for label in labels}
+    main = tables[labels[0]] if labels else {}
+    shown = _metrics(main, protocol)
+    parts = [_opening(records, identity, labels)]
+    if main:
+        parts.append(_main_table(main, shown, protocol, dataset, labels))
+        parts.append(_ratio_table(main, shown, protocol, dataset))
+        parts.append(_difference_table(main, shown))
+        for name, members in subsets.items():
+            chosen = {each: main[each] for each in main if each in members}
+            if chosen and len(chosen) < len(main):
+                parts.append(_subset_table(name, chosen, shown))
+        if len(labels) > 1:
+            parts += [_case_table(metric, tables, protocol, dataset) for metric in shown]
+        parts += _mode_table(main, shown) + _object_tables(main, shown)
+    parts.append(_times(records, order))
+    parts.append(_failures(records))
+    return parts
+
+
+def figure(value: float | None, digits: int = 3) -> str:
+    """Return a number with so many significant digits; a dash for what is not known."""
+    if value is None or not math.isfinite(value):
+        return _DASH
+    if value == 0 or not 1e-3 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}" if value else "0"
+    return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
+
+
+def _opening(records: Sequence[ObjectRecord], identity: Mapping[str, Any], labels: Sequence[str]) -> Section:
+    protocol = PROTOCOLS.get(str(identity["protocol"]))
+    about = f"{protocol.summary} " if protocol else ""
+    tested = sum(sum(len(case.test) for case in record.cases if case.label in labels[:1]) for record in records)
+    return Section(
+        f"{identity['protocol']} on {identity['dataset']}",
+        (
+            f"{about}{len(records)} objects, {tested} test contacts in the main case"
+            f"{f' ({labels[0]})' if len(labels) > 1 else ''}; avmsf {identity['version']}, seed {identity['seed']}.",
+            "Figures are means over an object's test contacts, then over objects, ± the standard error over objects. "
+            "Lower is better; of MAC, and of modes found, more is. L1, L1-log and ENV are in the convention `paper` of "
+            "docs/conventions.md; relative STFT is free of unit and level.",
+            WARNING,
+            f"What decides the figures: metrics {identity['metrics']}; modes {identity['modes']}.",
+        ),
+    )
+
+
+def _main_table(main: Table, shown: Sequence[str], protocol: str, dataset: str, labels: Sequence[str]) -> Section:
+    found = means(main)
+    rows = [
+        (method, *(_mean(figures.get(metric)) for metric in shown), _count(figures))
+        for method, figures in found.items()
+    ]
+    best = _best(found, shown)
+    paper = published(protocol, dataset)
+    if paper is not None:
+        rows += [
+            (f"paper: {row.title}", *(figure(row.figures.get(metric)) for metric in shown), _DASH)
+            for row in paper.rows
+            if row.label in (None, labels[0])
+        ]
+    remark = (
+        f"Rows that begin with “paper:” are its own figures on {paper.dataset}. {WARNING}"
+        if paper is not None
+        else f"The paper has no figures of this experiment on {dataset}."
+    )
+    grid = Grid(("method", *_headings(shown), "objects"), tuple(rows), best)
+    return Section("All methods" + (f": {labels[0]}" if len(labels) > 1 else ""), (), grid, (remark,))
+
+
+def _ratio_table(main: Table, shown: Sequence[str], protocol: str, dataset: str) -> Section:
+    found = ratios(main)
+    falling = [metric for metric in shown if any(metric in figures for figures in found.values())]
+    rows = [(method, *(figure(found[method].get(metric)) for metric in falling)) for method in found]
+    for source, methods in published_ratios(protocol).items():
+        if published(protocol, dataset) is not None and not dataset.startswith(source):
+            continue
+        rows += [
+            (f"paper, {source}: {method}", *(figure(figures.get(metric)) for metric in falling))
+            for method, figures in methods.items()
+            if method in found
+        ]
+    return Section(
+        f"Ratio to {BASELINE}",
+        (
+            "Below 1 is better than the mean of the three nearest recordings. Ours are geometric means over objects of "
+            "each object's ratio; the paper's are ratios of its means, which is all that its tables allow.",
+        ),
+        Grid(("method", *_headings(falling)), tuple(rows)),
+    )
+
+
+def _difference_table(main: Table, shown: Sequence[str]) -> Section:
+    found = differences(main)
+    shown = [metric for metric in shown if any(metric in figures for figures in found.values())]
+    rows = tuple(
+        (method, *(_mean(found[method].get(metric), signed=True) for metric in shown))
+        for method in found
+        if method != BASELINE
+    )
+    return Section(
+        f"Paired difference to {BASELINE}",
+        ("Object by object, method less baseline; a difference of less than two standard errors may be chance.",),
+        Grid(("method", *_headings(shown)), rows),
+    )
+
+
+def _subset_table(name: str, chosen: Table, shown: Sequence[str]) -> Section:
+    found = means(chosen)
+    rows = tuple((method, *(_mean(found[method].get(metric)) for metric in shown)) for method in found)
+    words = f"{len(chosen)} objects: {', '.join(chosen)}."
+    return Section(f"Objects: {name}", (words,), Grid(("method", *_headings(shown)), rows, _best(found, shown)))
+
+
+def _case_table(metric: str, tables: Mapping[str, Table], protocol: str, dataset: str) -> Section:
+    found = {label: means(table) for label, table in tables.items()}
+    methods = list(dict.fromkeys(method for each in found.values() for method in each))
+    rows = [(method, *(_mean(found[label].get(method, {}).get(metric)) for label in tables)) for method in methods]
+    paper = published(protocol, dataset)
+    for title in dict.fromkeys(row.title for row in paper.rows) if paper is not None else ():
+        own = {row.label: row.figures.get(metric) for row in paper.rows if row.title == title} if paper else {}
+        if any(own.get(label) is not None for label in tables):
+            rows.append((f"paper: {title}", *(figure(own.get(label)) for label in tables)))
+    return Section(f"{HEADINGS.get(metric, metric)} case by case", (), Grid(("method", *tables), tuple(rows)))
+
+
+def _mode_table(main: Table, shown: Sequence[str]) -> list[Section]:
+    others = [metric for metric in _found(main) if metric not in shown]
+    if not others:
+        return []
+    found = means(main)
+    rows = tuple(
+        (method, *(_mean(figures.get(metric)) for metric in others))
+        for method, figures in found.items()
+        if any(metric in figures for metric in others)
+    )
+    words = (
+        "Of methods that have modes: the part of the true energy whose modes were found, errors of frequency "
+        "(relative) and damping (natural logarithm) of those, modes that are not there, and their energy over the "
+        "true one's."
+    )
+    return [Section("Modes beside the truth", (words,), Grid(("method", *_headings(others)), rows))]
+
+
+def _object_tables(main: Table, shown: Sequence[str]) -> list[Section]:
+    methods = list(dict.fromkeys(method for figures in main.values() for method in figures))
+    return [
+        Section(
+            f"{HEADINGS.get(metric, metric)} object by object",
+            (),
+            Grid(
+                ("object", *methods),
+                tuple(
+                    (identifier, *(figure(figures.get(method, {}).get(metric)) for method in methods))
+                    for identifier, figures in main.items()
+                ),
+            ),
+        )
+        for metric in shown
+    ]
+
+
+def _times(records: Sequence[ObjectRecord], order: Sequence[str]) -> Section:
+    times = times_of(records)
+    fits = {
+        method: [times[each]["methods"][method] for each in times if method in times[each]["methods"]]
+        for method in order
+    }
+    rows = [
+        (
+            method,
+            figure(sum(each["fit"] for each in found) / len(found)),
+            figure(sum(each["render"] for each in found) / len(found)),
+        )
+        for method, found in fits.items()
+        if found
+    ]
+    shared = [each["shared"] for each in times.values()]
+    if shared:
+        rows.append(("shared: modes and features", figure(sum(shared) / len(shared)), _DASH))
+    return Section(
+        "Time an object",
+        ("Seconds on one thread, mean over objects, all of a protocol's cases together; judging is not counted.",),
+        Grid(("method", "to fit", "to render the test contacts"), tuple(rows)),
+    )
+
+
+def _failures(records: Sequence[ObjectRecord]) -> Section:
+    failures = failures_of(records)
+    if not failures:
+        return Section("Failures", ("None.",))
+    rows = tuple(
+        (str(each["object"]), each["case"] or "all", each["method"] or "all", str(each["failure"])) for each in failures
+    )
+    return Section("Failures", (), Grid(("object", "case", "method", "why"), rows))
+
+
+def _ordered(table: Table, order: Sequence[str]) -> Table:
+    """Return the table with its methods in the order in which they were asked for."""
+    return {
+        identifier: {method: figures[method] for method in order if method in figures}
+        for identifier, figures in table.items()
+    }
+
+
+def _metrics(table: Table, protocol: str) -> tuple[str, ...]:
+    """Return the protocol's columns that have figures."""
+    columns = PROTOCOLS[protocol].metrics if protocol in PROTOCOLS else tuple(HEADINGS)
+    return tuple(metric for metric in columns if metric in _found(table))
+
+
+def _found(table: Table) -> dict[str, None]:
+    return dict.fromkeys(metric for figures in table.values() for values in figures.values() for metric in values)
+
+
+def _headings(metrics: Sequence[str]) -> tuple[str, ...]:
+    return tuple(HEADINGS.get(metric, metric.replace("_", " ")) for metric in metrics)
+
+
+def _mean(mean: Mean | None, *, signed: bool = False) -> str:
+    if mean is None:
+        return _DASH
+    words = figure(mean.mean)
+    if signed and mean.mean > 0:
+        words = f"+{words}"
+    return words if mean.standard_error is None else f"{words} ± {figure(mean.standard_error, 2)}"
+
+
+def _count(figures: Mapping[str, Mean]) -> str:
+    return str(max((each.objects for each in figures.values()), default=0))
+
+
+def _best(found: Mapping[str, Mapping[str, Mean]], shown: Sequence[str]) -> frozenset[tuple[int, int]]:
+    best = set()
+    methods = list(found)
+    for column, metric in enumerate(shown, 1):
+        values = {row: found[method][metric].mean for row, method in enumerate(methods) if metric in found[method]}
+        if values:
+            pick = max if metric in RISING else min
+            best.add((pick(values, key=lambda row: values[row]), column))
+    return frozenset(best)

@@ -1,0 +1,197 @@
+"""A folder of results: a file an object, written whole after every method, so that a kill loses one method at most."""
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from avmsf.errors import EvaluationError
+from avmsf.files import write_whole
+
+IDENTITY, OBJECTS = "protocol.json", "objects"
+"""The file that says what the folder's figures are, and the folder of the objects' files."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one method came to in one case of an object."""
+
+    case: str
+    """The case's key."""
+    method: str
+    values: Mapping[str, tuple[float | None, ...]] = field(default_factory=dict)
+    """Each metric's figure for every test contact, in the case's order; None where it was not taken."""
+    figures: Mapping[str, float | None] = field(default_factory=dict)
+    """Figures that are of all test contacts at once."""
+    fit_seconds: float = 0.0
+    """Without what methods share: modes and features."""
+    render_seconds: float = 0.0
+    """For all test contacts."""
+    sounds: Mapping[str, str] = field(default_factory=dict)
+    """Files of sounds to listen to, relative to the folder, by the names of their recordings."""
+    report: Mapping[str, Any] = field(default_factory=dict)
+    """What the method chose on its way."""
+    failure: str | None = None
+    """Why there is no figure, in one line."""
+
+
+@dataclass(frozen=True)
+class CaseRecord:
+    """One case of an object, with names in place of rows."""
+
+    key: str
+    label: str
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    sounds: Mapping[str, str] = field(default_factory=dict)
+    """Files of the recordings that methods can be listened to beside."""
+    shared_seconds: float = 0.0
+    """What modes and features took, which all methods share."""
+
+
+@dataclass(frozen=True)
+class ObjectRecord:
+    """All that is known of one object's evaluation."""
+
+    identifier: str
+    name: str = ""
+    material: str | None = None
+    inferred: bool = False
+    """Whether name and material are concluded rather than read."""
+    digest: str = ""
+    """Of the recordings, and of the truth where it is known."""
+    contacts: int = 0
+    sample_rate: float = 0.0
+    duration: float = 0.0
+    """Seconds of every sound."""
+    cases: tuple[CaseRecord, ...] = ()
+    outcomes: tuple[Outcome, ...] = ()
+    failure: str | None = None
+    """Why the object could not be evaluated at all."""
+
+    def done(self, case: str, method: str) -> bool:
+        """Whether this method has figures in this case; failures are tried again."""
+        return any(each.case == case and each.method == method and each.failure is None for each in self.outcomes)
+
+    def adding(self, outcome: Outcome) -> "ObjectRecord":
+        """Return the record with this outcome in place of an earlier one of its case and method."""
+        others = (each for each in self.outcomes if (each.case, each.method) != (outcome.case, outcome.method))
+        return replace(self, outcomes=(*others, outcome))
+
+
+@dataclass(frozen=True)
+class ResultsFolder:
+    """Where an evaluation keeps what it has found."""
+
+    path: Path
+
+    def begin(self, identity: Mapping[str, Any], methods: Mapping[str, str]) -> None:
+        """Take the folder for figures of this identity, or go on with what is there of it.
+
+        `identity` holds plain values that decide the figures; `methods` says of each method what it is. Methods may be
+        added later. Raises EvaluationError where the folder's figures are of another identity, or a method has changed.
+        """
+        wanted = json.loads(json.dumps(dict(identity)))
+        place = self.path / IDENTITY
+        known = self.identity() if place.exists() else {**wanted, "methods": {}}
+        if not place.exists() and self.path.is_dir() and any(self.path.iterdir()):
+            raise EvaluationError(f"{self.path}: is not empty and holds no {IDENTITY}; choose a new --output")
+        kept = known.pop("methods")
+        for key in dict.fromkeys((*wanted, *known)):
+            if wanted.get(key) != known.get(key):
+                raise EvaluationError(
+                    f"{self.path}: holds results of another evaluation: {key} is {_brief(known.get(key))} there and "
+                    f"{_brief(wanted.get(key))} here; results are not mixed, choose another --output"
+                )
+        for name in methods:
+            if name in kept and kept[name] != methods[name]:
+                raise EvaluationError(
+                    f"{self.path}: holds results of another method {name}: {_brief(kept[name])} there and "
+                    f"{_brief(methods[name])} here; results are not mixed, choose another --output"
+                )
+        write_json(place, {**wanted, "methods": {**kept, **methods}})
+
+    def identity(self) -> dict[str, Any]:
+        """Return what the folder's figures are, methods among it. Raises EvaluationError where there is none."""
+        return self._read(self.path / IDENTITY)
+
+    def read(self, identifier: str) -> ObjectRecord | None:
+        """Return an object's record, or None where there is none yet."""
+        place = self._place(identifier)
+        return self._record(place) if place.exists() else None
+
+    def write(self, record: ObjectRecord) -> None:
+        """Keep an object's record in place of an earlier one."""
+        write_json(self._place(record.identifier), asdict(record))
+
+    def records(self) -> tuple[ObjectRecord, ...]:
+        """Return all objects' records, in natural order."""
+        places = sorted((self.path / OBJECTS).glob("[!.]*.json"), key=lambda place: natural(place.stem))
+        return tuple(self._record(place) for place in places)
+
+    def _place(self, identifier: str) -> Path:
+        return self.path / OBJECTS / f"{identifier}.json"
+
+    def _record(self, place: Path) -> ObjectRecord:
+        read = self._read(place)
+        try:
+            cases = tuple(
+                CaseRecord(**{**each, "train": tuple(each["train"]), "test": tuple(each["test"])})
+                for each in read.pop("cases")
+            )
+            outcomes = tuple(
+                Outcome(**{**each, "values": {name: tuple(values) for name, values in each["values"].items()}})
+                for each in read.pop("outcomes")
+            )
+            return ObjectRecord(**read, cases=cases, outcomes=outcomes)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise self._damaged(place, error) from error
+
+    def _read(self, place: Path) -> dict[str, Any]:
+        try:
+            read = json.loads(place.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise self._damaged(place, error) from error
+        if not isinstance(read, dict):
+            raise self._damaged(place, "no JSON object")
+        return read
+
+    def _damaged(self, place: Path, error: object) -> EvaluationError:
+        return EvaluationError(
+            f"{place}: cannot be read as results of this version ({error}); delete the file to compute them again, or "
+            "choose another --output"
+        )
+
+
+def write_json(place: Path, values: Mapping[str, Any]) -> None:
+    """Write plain values whole. Raises EvaluationError where that cannot be."""
+    words = json.dumps(_finite(values), indent=1, ensure_ascii=False, allow_nan=False)
+    write_whole(place, lambda path: path.write_text(words + "\n", encoding="utf-8"), raising=EvaluationError)
+
+
+def one_line(error: Exception) -> str:
+    """Return an error's message as one line."""
+    return " ".join(str(error).split())
+
+
+def natural(words: str) -> tuple[tuple[int, int, str], ...]:
+    """Return a key that sorts numbers within names by value."""
+    parts = re.findall(r"\d+|\D+", words)
+    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)
+
+
+def _finite(value: Any) -> Any:
+    """Return the values with null for what JSON cannot hold."""
+    if isinstance(value, Mapping):
+        return {str(key): _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _brief(value: object) -> str:
+    words = json.dumps(value, ensure_ascii=False) if not isinstance(value, str) else value
+    return words if len(words) <= 160 else f"{words[:157]}..."

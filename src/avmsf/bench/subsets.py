@@ -1,0 +1,50 @@
+"""Groups of objects within a dataset: those of the paper's smaller studies, and simulated ones known by their truth."""
+
+from collections.abc import Mapping, Sequence
+
+from avmsf.bench.knowntruth import without_symmetry
+from avmsf.bench.protocols import EvaluationProtocol
+from avmsf.capture.datasets import CaptureCollection
+from avmsf.capture.datasets.dataset import Dataset
+from avmsf.capture.datasets.subsets import ABLATION, NON_SYMMETRIC
+from avmsf.errors import EvaluationError
+
+ABLATED, NOT_SYMMETRIC = "ablation", "non-symmetric"
+"""The groups' names."""
+_NUMBERS: Mapping[str, Sequence[str]] = {ABLATED: ABLATION, NOT_SYMMETRIC: NON_SYMMETRIC}
+
+
+def members(dataset: Dataset) -> dict[str, frozenset[str]]:
+    """Return the groups that a dataset has objects of, by name.
+
+    The numbers of ObjectFolder Real are RealImpact's too, before the first underscore of an object's name. Of captures
+    only those are known that were simulated.
+    """
+    objects = dataset.objects()
+    if isinstance(dataset, CaptureCollection):
+        found = {NOT_SYMMETRIC: frozenset(each for each in objects if without_symmetry(dataset, each))}
+    else:
+        found = {
+            name: frozenset(each for each in objects if each.partition("_")[0] in numbers)
+            for name, numbers in _NUMBERS.items()
+        }
+    return {name: each for name, each in found.items() if each}
+
+
+def choose_objects(dataset: Dataset, protocol: EvaluationProtocol, asked: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the objects that take part: those asked for, else the protocol's group, else all.
+
+    Raises DatasetError for unknown ones, and EvaluationError where the protocol is about a group that the dataset does
+    not have.
+    """
+    if asked:
+        return tuple(dict.fromkeys(dataset.facts(identifier).identifier for identifier in asked))
+    if protocol.subset is not None:
+        group = members(dataset).get(protocol.subset, frozenset())
+        if group:
+            return tuple(each for each in dataset.objects() if each in group)
+        if protocol.required:
+            raise EvaluationError(
+                f"no object of this dataset is known to be {protocol.subset}; name some of its objects with --objects"
+            )
+    return dataset.objects()

@@ -1,0 +1,182 @@
+"""`avmsf evaluate`: how good methods are on a dataset, as tables and as a page."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from avmsf.bench.judging import Judging
+from avmsf.bench.methods import method_named
+from avmsf.bench.parallel import RunProgress, Workers, run_objects
+from avmsf.bench.plan import Evaluation
+from avmsf.bench.protocols import protocol_named
+from avmsf.bench.report import PAGE, SUMMARY, TABLES, write_page, write_summary
+from avmsf.bench.reporttables import Section
+from avmsf.bench.results import ResultsFolder
+from avmsf.bench.subsets import choose_objects, members
+from avmsf.capture.datasets import CaptureCollection, open_dataset
+from avmsf.capture.datasets.dataset import Dataset
+from avmsf.cli import INTERRUPTED
+from avmsf.cli.printing import console, print_json, say, table
+from avmsf.errors import EvaluationError
+from avmsf.modal.extract import HighResolution
+from avmsf.pipeline.objectlooks import ObjectLooks
+from avmsf.pipeline.scene import SceneConfig
+from avmsf.pipeline.sources import ViewsConfig
+
+
+@dataclass(frozen=True)
+class Options:
+    """Judge methods by contacts that they were not trained on, on all objects of a dataset.
+
+    Every figure is kept as it comes: after an interruption the same command goes on, and methods or objects may be
+    added later. The folder of results holds summary.json, report.md and report.html, which shows and plays sounds.
+    """
+
+    protocol: tyro.conf.Positional[str]
+    """The experiment: farthest, leave-one-out, closest, shots, views, ablation, non-symmetric or grid."""
+    data: tyro.conf.Positional[Path]
+    """Folder of a dataset, of capture folders, or of one capture."""
+    methods: tuple[str, ...] = ()
+    """Methods, apart from each other by commas or blanks; the protocol's own where none is named."""
+    objects: tuple[str, ...] = ()
+    """Objects, likewise; the protocol's own where none is named."""
+    output: Path | None = None
+    """Folder of results; evaluation/DATASET/PROTOCOL in the current folder where it is not given."""
+    features: Path | None = None
+    """Folder that keeps what objects look like, which several evaluations of one dataset may share; features in the
+    folder of results where it is not given."""
+    look: Literal["best", "mesh"] = "best"
+    """What looks are lifted from: the best of what shows an object, photographs before a mesh, which takes Gaussians;
+    or its mesh, onto whose own surface they go."""
+    workers: int = 1
+    """Objects at a time, each on one thread; more than one needs the extra `scale`."""
+    ray: str | None = None
+    """Address of a ray cluster to compute on, or auto; its computers must see data and results under the same paths."""
+    seed: int = 0
+    """Start of all chance in the methods."""
+    cdpam: bool = True
+    """Whether CDPAM is taken, which needs the extra `eval`."""
+    cdpam_contacts: int = 8
+    """Test contacts of a case that CDPAM is taken of, spread evenly; 0 for all."""
+    modes: int = 128
+    """Most modes that are sought in the training recordings."""
+    contacts: Path | None = None
+    """Where ObjectFolder Real's contacts are, for its raw form."""
+    table: Path | None = None
+    """The published table of ObjectFolder Real's names and materials."""
+    json: bool = False
+    """Print the summary as one JSON object on the standard output, all else on the standard error."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return tyro.cli(Options, prog="avmsf evaluate", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def run(options: Options) -> int:
+    """Evaluate, and say what came of it; return 130 where Ctrl-C stopped it."""
+    protocol = protocol_named(options.protocol)
+    methods = tuple(method_named(name) for name in _words(options.methods) or protocol.methods)
+    workers = Workers(options.workers, options.ray)
+    dataset = open_dataset(options.data.resolve(), contacts=options.contacts, table=options.table)
+    title = title_of(dataset, options.data)
+    objects = choose_objects(dataset, protocol, _words(options.objects))
+    # Workers run in folders of their own.
+    folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
+    scene = SceneConfig(views=ViewsConfig(source=options.look))
+    evaluation = Evaluation(
+        dataset,
+        title,
+        protocol,
+        methods,
+        ObjectLooks(dataset, (options.features or folder / "features").resolve(), scene),
+        options.seed,
+        Judging(cdpam=options.cdpam, cdpam_contacts=options.cdpam_contacts),
+        HighResolution(modes=options.modes),
+        {"scene": asdict(scene)},
+    )
+    results, groups = ResultsFolder(folder), members(dataset)
+    say(f"{protocol.name} on {title}: {len(objects)} objects, {len(methods)} methods, results in {folder}")
+    try:
+        with EvaluationBar() as bar:
+
+            def show(progress: RunProgress) -> None:
+                if progress.done > bar.done:
+                    write_summary(results, subsets=groups)
+                bar.show(progress)
+
+            run_objects(evaluation, objects, results, workers=workers, progress=show)
+        summary = write_summary(results, subsets=groups)
+        parts = write_page(results, subsets=groups)
+    except KeyboardInterrupt:
+        say(f"avmsf evaluate: interrupted; the same command goes on from what {folder} holds")
+        return INTERRUPTED
+    if not summary["methods"]:
+        first = summary["failures"][0]["failure"] if summary["failures"] else "there is no object"
+        raise EvaluationError(f"no method has a figure: {first}")
+    screen = console(errors=options.json)
+    for part in parts[1:3]:
+        _print(part, screen)
+    failures = len(summary["failures"])
+    if failures:
+        screen.print(f"{failures} failures, listed in {TABLES}; the same command tries them again", soft_wrap=True)
+    screen.print(f"wrote {SUMMARY}, {TABLES} and {PAGE} in {folder}", soft_wrap=True)
+    if options.json:
+        print_json({**summary, "results": str(folder)})
+    return 0
+
+
+def title_of(dataset: Dataset, folder: Path) -> str:
+    """Return what reports call a dataset: captures by their folder, which tells them from other captures."""
+    return folder.resolve().name if isinstance(dataset, CaptureCollection) else dataset.name
+
+
+class EvaluationBar:
+    """One bar over all objects; in a file or a pipe, a line an object."""
+
+    def __init__(self) -> None:
+        self.live = sys.stderr.isatty()
+        self.bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=Console(file=sys.stderr, markup=False, highlight=False),
+            disable=not self.live,
+        )
+        self.task = self.bar.add_task("", total=None)
+        self.done = 0
+
+    def __enter__(self) -> "EvaluationBar":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.bar.stop()
+
+    def show(self, progress: RunProgress) -> None:
+        """Take note of what has begun or ended."""
+        self.bar.start()
+        self.bar.update(self.task, description=progress.words, completed=progress.done, total=progress.total)
+        if not self.live and progress.done > self.done:
+            say(f"{progress.words}, {progress.done} of {progress.total} objects")
+        self.done = progress.done
+
+
+def _words(given: Sequence[str]) -> tuple[str, ...]:
+    return tuple(word for each in given for word in each.split(",") if word)
+
+
+def _print(part: Section, screen: Console) -> None:
+    if part.grid is not None:
+        # Standard errors, which are in the reports, would fold every cell of a narrow screen.
+        rows = [[cell.partition(" ±")[0] for cell in row] for row in part.grid.rows]
+        screen.print(table(part.title, part.grid.columns, rows))

@@ -1,0 +1,95 @@
+"""`avmsf evaluate`: from a folder of captures to tables, and what can be got wrong on the way."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from avmsf.cli.evaluate import parse, run
+from avmsf.errors import AvmsfError
+from plate_set import fill_plates
+
+Streams = pytest.CaptureFixture[str]
+CHEAP = ("--methods", "knn3,nearest", "white-noise", "--no-cdpam")
+
+
+@pytest.fixture(scope="module")
+def plates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fill_plates(tmp_path_factory.mktemp("place") / "plates", ("a", "b"))
+
+
+def test_a_dataset_becomes_tables_and_a_page(plates: Path, tmp_path: Path, capsys: Streams) -> None:
+    words = [str(plates), *CHEAP, "--output", str(tmp_path / "results")]
+    assert run(parse(["farthest", *words, "--json"])) == 0
+    out, err = capsys.readouterr()
+    printed = json.loads(out)
+    kept = json.loads((tmp_path / "results" / "summary.json").read_text())
+    assert {key: printed[key] for key in kept} == kept
+    assert list(kept["methods"]) == ["knn3", "nearest", "white-noise"]
+    assert set(kept["methods"]["knn3"]) == {"l1", "l1_log", "envelope", "relative_stft"}
+    assert kept["ratio_to_knn3"]["knn3"]["l1"] == 1.0
+    assert (kept["dataset"], kept["objects"], kept["test_contacts"]) == ("plates", 2, 16)
+    assert "b: done, 2 of 2 objects" in err
+    assert "L1-log" in err
+    assert "# farthest on plates" in (tmp_path / "results" / "report.md").read_text()
+    before = (tmp_path / "results" / "objects" / "a.json").read_bytes()
+    assert run(parse(["farthest", *words])) == 0
+    assert (tmp_path / "results" / "objects" / "a.json").read_bytes() == before
+    with pytest.raises(AvmsfError, match="protocol is farthest there and closest here"):
+        run(parse(["closest", *words]))
+
+
+def test_one_capture_and_one_object_will_do(plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(parse(["shots", str(plates / "a"), *CHEAP])) == 0
+    summary = json.loads((tmp_path / "evaluation" / "a" / "shots" / "summary.json").read_text())
+    assert list(summary["cases"]) == ["8 shots", "4 shots", "2 shots", "1 shot"]
+    assert run(parse(["farthest", str(plates), "--objects", "b", *CHEAP])) == 0
+    summary = json.loads((tmp_path / "evaluation" / "plates" / "farthest" / "summary.json").read_text())
+    assert summary["objects"] == 1
+
+
+WRONG = {
+    "farhest plates": "no protocol is called 'farhest': there are farthest, leave-one-out",
+    "farthest plates --methods knn3,fild": "no method is called 'fild': there are white-noise",
+    "farthest plates --objects c": "'c'",
+    "farthest nowhere": "nowhere",
+    "farthest plates --workers 0": "workers = 0: expected 1 or more",
+    "farthest plates --cdpam-contacts -1": "cdpam_contacts = -1: expected 0",
+    "non-symmetric plates": "no object of this dataset is known to be non-symmetric; name some of its objects",
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_what_is_wrong_is_said_before_anything_is_written(
+    words: str, plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(plates.parent)
+    before = sorted(path.name for path in plates.parent.iterdir())
+    with pytest.raises(AvmsfError) as raised:
+        run(parse(words.split()))
+    assert WRONG[words] in str(raised.value)
+    assert sorted(path.name for path in plates.parent.iterdir()) == before
+
+
+def test_no_figure_at_all_is_an_error(plates: Path, tmp_path: Path) -> None:
+    with pytest.raises(AvmsfError, match=r"no method has a figure: .*neither a mesh nor pictures"):
+        run(parse(["farthest", str(plates), "--methods", "field", "--no-cdpam", "--output", str(tmp_path / "r")]))
+
+
+def test_ctrl_c_keeps_what_is_there(
+    plates: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from avmsf.bench.baselines import NearestStrike
+
+    def stop(self: NearestStrike, contacts: object) -> None:
+        raise KeyboardInterrupt
+
+    words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results")]
+    with monkeypatch.context() as patched:
+        patched.setattr(NearestStrike, "render", stop)
+        assert run(parse(words)) == 130
+    assert capsys.readouterr().err.splitlines()[-1].startswith("avmsf evaluate: interrupted; the same command goes on")
+    kept = json.loads((tmp_path / "results" / "objects" / "a.json").read_text())
+    assert [each["method"] for each in kept["outcomes"]] == ["knn3"]
+    assert run(parse(words)) == 0
