@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint install clean
+.PHONY: demo example test lint install clean
 
 install: .venv/installed
 
@@ -13,6 +13,11 @@ install: .venv/installed
 
 demo: .venv/installed
 	$(BIN)/avmsf demo demo
+
+# Makes anew what `make demo` starts from, the same to the last bit where numpy and scipy are the same.
+example: .venv/installed
+	rm -rf src/avmsf/example
+	$(BIN)/avmsf simulate example --output src/avmsf/example
 
 test: .venv/installed
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto
