@@ -1,4 +1,4 @@
-"""`python -m benchmarks field`, `extract`, `speed`, `scene` or `settings`."""
+"""`python -m benchmarks field`, `extract`, `speed`, `scene`, `proof` or `settings`."""
 
 import argparse
 import sys
@@ -8,7 +8,7 @@ from types import ModuleType
 
 from avmsf.capture import CaptureWarning
 from avmsf.errors import AvmsfError
-from benchmarks import extract, field, scene, settings, speed
+from benchmarks import extract, field, proof, scene, settings, speed
 from benchmarks.material import MissingDataError
 from benchmarks.report import Options, show
 
@@ -17,6 +17,7 @@ BENCHMARKS: dict[str, ModuleType] = {
     "extract": extract,
     "speed": speed,
     "scene": scene,
+    "proof": proof,
     "settings": settings,
 }
 

@@ -21,10 +21,10 @@ VERBS = {
     "view-cloud": "Draw Gaussians or features from all sides: colours, features, clusters, symmetries.",
     "render": "Write the sounds of blows anywhere on the object as wav files.",
     "show": "Say what a field file holds, and draw it.",
-    "dataset": "Say what of a dataset is there, and what is missing.",
-    "simulate": "Make sounding objects by finite elements, whose truth is known: one, or the set sim-20.",
-    "evaluate": "Judge methods on the objects of a dataset by a protocol, and report.",
-    "demo": "Go all the way on a built-in example: capture, modes, field, sounds, pictures, figures.",
+    "dataset": "Say what of a dataset is there, object by object, and what is missing.",
+    "simulate": "Simulate objects, how they sound and how they look, as capture folders with their truth.",
+    "evaluate": "Judge methods by contacts that they were not trained on, on all objects of a dataset.",
+    "demo": "Go all the way on a built-in example: images, Gaussians, features, a field, sounds, pictures.",
 }
 """Each verb's module in this package, and the first sentence of its help."""
 INTERRUPTED = 130

@@ -53,7 +53,7 @@ _HEARD = 3
 
 @dataclass(frozen=True)
 class Options:
-    """Go all the way on a built-in example: images, Gaussians, features, modes, a field, sounds, pictures, figures.
+    """Go all the way on a built-in example: images, Gaussians, features, a field, sounds, pictures.
 
     A ceramic mug, made by `avmsf simulate example`: 48 pictures and 16 blows. Gaussians are fitted to the pictures, a
     field to 12 of the blows, and the other 4 judge it.

@@ -24,7 +24,7 @@ from avmsf.simulate.simulationset import SetProgress, simulate_set
 
 @dataclass(frozen=True)
 class Options:
-    """Simulate objects: finite elements, a hammer, a microphone and a camera, as capture folders with their truth.
+    """Simulate objects, how they sound and how they look, as capture folders with their truth.
 
     `avmsf simulate sim-20 --output FOLDER` makes the benchmark set, one folder an object; what is whole is kept, so
     that an interrupted run goes on with the same command. One object of the set by its name, any other by --kind or

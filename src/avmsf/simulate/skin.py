@@ -108,7 +108,8 @@ class Skin:
 
     def remeshed(self, length: float) -> "Skin":
         """Return the skin with edges of about `length` metres, shorter ones only where the skin bends sharply."""
-        return self.coarsened(0.75 * length, turn=_CREASE)._refined(1.5 * length)
+        # In this order, for what is coarsened next to long edges would keep them.
+        return self._refined(1.5 * length).coarsened(0.75 * length, turn=_CREASE)
 
     def _refined(self, longest: float) -> "Skin":
         """Return the skin with all longer edges halved, again and again."""
