@@ -9,7 +9,7 @@ from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.simulate.coarsening import coarsen
 
-_CREASE = 0.7
+_CREASE = 0.9
 """Cosine of the angle by which a triangle may turn when the skin is made coarser: creases stay."""
 
 
