@@ -1,13 +1,17 @@
-# `make demo` and `make test` set everything up by themselves; everything they install lies in .venv.
+# Every target sets up what it needs by itself, in .venv: the demo the package alone, the others its tools and extras.
 PYTHON ?= python3
 BIN := .venv/bin
 
 .PHONY: demo example test lint install clean
 
-install: .venv/installed
+install: .venv/developed
 
 .venv/installed: pyproject.toml
 	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --editable .
+	touch $@
+
+.venv/developed: .venv/installed
 	$(BIN)/pip install --quiet --editable '.[dev]'
 	touch $@
 
@@ -15,14 +19,14 @@ demo: .venv/installed
 	$(BIN)/avmsf demo demo
 
 # Makes anew what `make demo` starts from, the same to the last bit where numpy and scipy are the same.
-example: .venv/installed
+example: .venv/developed
 	rm -rf src/avmsf/example
 	$(BIN)/avmsf simulate example --output src/avmsf/example
 
-test: .venv/installed
+test: .venv/developed
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto
 
-lint: .venv/installed
+lint: .venv/developed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

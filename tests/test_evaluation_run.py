@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -279,7 +280,7 @@ def test_cdpam_is_taken_of_a_few_contacts(plates: Path, tmp_path: Path, monkeypa
             return (predicted - truth).abs().sum(1).double()
 
     monkeypatch.setattr("avmsf.bench.judging._cdpam", Ear)
-    evaluation = replace(planned(plates, "nearest"), judging=Judging(cdpam_contacts=3))
+    evaluation = replace(planned(plates, "nearest"), judging=Judging(level="raw", cdpam_contacts=3))
     run_objects(evaluation, ("a",), ResultsFolder(tmp_path))
     (record,) = ResultsFolder(tmp_path).records()
     train, test = split(read_capture(plates / "a").impacts)
@@ -287,6 +288,19 @@ def test_cdpam_is_taken_of_a_few_contacts(plates: Path, tmp_path: Path, monkeypa
     values = record.outcomes[0].values["cdpam"]
     assert [row for row, value in enumerate(values) if value is not None] == [1, 4, 6]
     assert [values[row] for row in (1, 4, 6)] == pytest.approx(expected[[1, 4, 6]].tolist(), rel=1e-6)
+
+
+def test_at_full_scale_the_recordings_unit_does_not_matter(plates: Path, tmp_path: Path) -> None:
+    impacts = read_capture(plates / "a").impacts
+    train, test = split(impacts)
+    sounds, loudest = NearestStrike(train).render(test.contacts), float(impacts.sounds.abs().max())
+    judge = partial(Judging(cdpam=False).judge, NearestStrike(train), truth=None)
+    one = judge(sounds, test, loudest=loudest)
+    other = judge(1e-3 * sounds, replace(test, sounds=1e-3 * test.sounds), loudest=1e-3 * loudest)
+    raw = Judging(level="raw", cdpam=False).judge(NearestStrike(train), sounds, test, None, loudest=loudest)
+    for metric in ("l1", "envelope"):
+        assert other.values[metric] == pytest.approx(one.values[metric], rel=1e-4)
+        assert raw.values[metric] == pytest.approx([loudest * each for each in one.values[metric]], rel=1e-4)
 
 
 KILLED = """

@@ -67,7 +67,9 @@ class CaseRun:
             with torch.no_grad():
                 sounds = renderer.render(self.test.contacts)
             render_seconds = time.perf_counter() - begun
-            judgement = self.evaluation.judging.judge(renderer, sounds, self.test, self.truth)
+            judgement = self.evaluation.judging.judge(
+                renderer, sounds, self.test, self.truth, loudest=float(self.impacts.sounds.abs().max())
+            )
         except AvmsfError as error:
             return Outcome(self.case.key, method.name, failure=one_line(error))
         except Exception as error:  # A fault in one method must not cost the others their hours.

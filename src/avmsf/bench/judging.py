@@ -1,8 +1,8 @@
 """All that is measured of one method's sounds: the convention's metrics, CDPAM, and modes against the truth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from jaxtyping import Float
 from torch import Tensor
@@ -34,6 +34,10 @@ class Judging:
     """What is measured."""
 
     convention: Convention = PAPER
+    level: Literal["full-scale", "raw"] = "full-scale"
+    """full-scale: all sounds of an object by one factor, so that its loudest recording peaks at one, the scale on which
+    L1, ENV and CDPAM of different objects can be averaged. raw: in the unit of the recordings, such as pascals per
+    newton."""
     cdpam: bool = True
     """Whether CDPAM is among the metrics; it takes the longest of them."""
     cdpam_contacts: int = 8
@@ -54,15 +58,19 @@ class Judging:
         sounds: Float[Tensor, "..."],
         test: Impacts,
         truth: Truth | None,
+        *,
+        loudest: float,
     ) -> Judgement:
         """Measure what `renderer` made of the test contacts; `truth`, where known, has the rows of `test`.
 
-        Raises as `score`, and EvaluationError for sounds of another sample rate.
+        `loudest` is the peak of the object's loudest recording, in the unit of the recordings. Raises as `score`, and EvaluationError for sounds of another sample rate.
         """
         if renderer.sample_rate != test.sample_rate:
             raise EvaluationError(
                 f"the method's sounds are at {renderer.sample_rate:g} Hz and the recordings at {test.sample_rate:g} Hz"
             )
+        if self.level == "full-scale" and loudest > 0:
+            sounds, test = sounds / loudest, replace(test, sounds=test.sounds / loudest)
         scores = score(sounds, test, convention=self.convention)
         values: dict[str, tuple[float | None, ...]] = {
             metric: tuple(figures.tolist()) for metric, figures in scores.values.items()

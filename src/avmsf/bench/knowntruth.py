@@ -16,7 +16,7 @@ def truth_of(dataset: Dataset, identifier: str) -> Truth | None:
 
 
 def without_symmetry(dataset: Dataset, identifier: str) -> bool:
-    """Whether an object was simulated, and is one of the benchmark set's that have no symmetry."""
+    """Whether an object was simulated, and is one of the benchmark set's that no turn carries onto themselves."""
     return identifier in NON_SYMMETRIC and _path(dataset, identifier) is not None
 
 

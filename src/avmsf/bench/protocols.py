@@ -78,14 +78,15 @@ PROTOCOLS = {
         ),
         EvaluationProtocol(
             "non-symmetric",
-            "As `farthest`, on objects without symmetry, where near contacts tell least.",
+            "As `farthest`, on objects that no turn carries onto themselves, where near contacts tell least.",
             Farthest(),
             subset="non-symmetric",
             required=True,
         ),
         EvaluationProtocol(
             "grid",
-            "Choose the field's settings from the paper's grids on validation contacts; test as `farthest` does.",
+            "Choose the field's settings from a small grid on validation contacts (`field-paper-grid`: the paper's own); "
+            "test as `farthest` does.",
             Farthest(),
             (BASELINE, "field", "field-grid"),
             subset="ablation",

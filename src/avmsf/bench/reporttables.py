@@ -105,9 +105,11 @@ def _opening(records: Sequence[ObjectRecord], identity: Mapping[str, Any], label
         (
             f"{about}{len(records)} objects, {tested} test contacts in the main case"
             f"{f' ({labels[0]})' if len(labels) > 1 else ''}; avmsf {identity['version']}, seed {identity['seed']}.",
-            "Figures are means over an object's test contacts, then over objects, ± the standard error over objects. "
+            "Figures are means over an object's test contacts (CDPAM's over a few of them, `cdpam_contacts` below, 0 "
+            "for all), then over objects, ± the standard error over objects. "
             "Lower is better; of MAC, and of modes found, more is. L1, L1-log and ENV are in the convention `paper` of "
-            "docs/conventions.md; relative STFT is free of unit and level.",
+            "docs/conventions.md; relative STFT is free of unit and level. With level='full-scale' an "
+            "object's sounds are multiplied by one factor that brings its loudest recording to a peak of one.",
             WARNING,
             f"What decides the figures: metrics {identity['metrics']}; modes {identity['modes']}.",
         ),
@@ -153,7 +155,8 @@ def _ratio_table(main: Table, shown: Sequence[str], protocol: str, dataset: str)
         f"Ratio to {BASELINE}",
         (
             "Below 1 is better than the mean of the three nearest recordings. Ours are geometric means over objects of "
-            "each object's ratio; the paper's are ratios of its means, which is all that its tables allow.",
+            "each object's ratio; the paper's are ratios of its means, which is all that its tables allow, from its main "
+            "tables where its table of this experiment has no KNN.",
         ),
         Grid(("method", *_headings(falling)), tuple(rows)),
     )

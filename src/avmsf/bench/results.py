@@ -97,7 +97,8 @@ class ResultsFolder:
         wanted = json.loads(json.dumps(dict(identity)))
         place = self.path / IDENTITY
         known = self.identity() if place.exists() else {**wanted, "methods": {}}
-        if not place.exists() and self.path.is_dir() and any(self.path.iterdir()):
+        # A kill may leave a hidden part of the file behind.
+        if not place.exists() and self.path.is_dir() and any(self.path.glob("[!.]*")):
             raise EvaluationError(f"{self.path}: is not empty and holds no {IDENTITY}; choose a new --output")
         kept = known.pop("methods")
         for key in dict.fromkeys((*wanted, *known)):

@@ -61,6 +61,9 @@ class Options:
     """Address of a ray cluster to compute on, or auto; its computers must see data and results under the same paths."""
     seed: int = 0
     """Start of all chance in the methods."""
+    level: Literal["full-scale", "raw"] = "full-scale"
+    """full-scale: an object's sounds by one factor that brings its loudest recording to a peak of one, so that figures
+    of different objects can be averaged; raw: in the recordings' unit."""
     cdpam: bool = True
     """Whether CDPAM is taken, which needs the extra `eval`."""
     cdpam_contacts: int = 8
@@ -85,10 +88,11 @@ def run(options: Options) -> int:
     protocol = protocol_named(options.protocol)
     methods = tuple(method_named(name) for name in _words(options.methods) or protocol.methods)
     workers = Workers(options.workers, options.ray)
-    dataset = open_dataset(options.data.resolve(), contacts=options.contacts, table=options.table)
+    # All paths are made absolute: workers may run in folders of their own.
+    contacts, table_of_names = (None if path is None else path.resolve() for path in (options.contacts, options.table))
+    dataset = open_dataset(options.data.resolve(), contacts=contacts, table=table_of_names)
     title = title_of(dataset, options.data)
     objects = choose_objects(dataset, protocol, _words(options.objects))
-    # Workers run in folders of their own.
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
     scene = SceneConfig(views=ViewsConfig(source=options.look))
     evaluation = Evaluation(
@@ -98,7 +102,7 @@ def run(options: Options) -> int:
         methods,
         ObjectLooks(dataset, (options.features or folder / "features").resolve(), scene),
         options.seed,
-        Judging(cdpam=options.cdpam, cdpam_contacts=options.cdpam_contacts),
+        Judging(level=options.level, cdpam=options.cdpam, cdpam_contacts=options.cdpam_contacts),
         HighResolution(modes=options.modes),
         {"scene": asdict(scene)},
     )

@@ -46,7 +46,10 @@ class Options:
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf simulate", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+    options = _parsed(words, ObjectRecipe())
+    # A second time from the named object's recipe: what is asked for may be a default, and not that object's.
+    recipe = None if options.list else _recipe_of(options.what)
+    return options if recipe is None else _parsed(words, recipe)
 
 
 def run(options: Options) -> int:
@@ -67,20 +70,31 @@ def run(options: Options) -> int:
     return 0
 
 
+def _parsed(words: Sequence[str], recipe: ObjectRecipe) -> Options:
+    default = Options(recipe=recipe)
+    return tyro.cli(
+        Options, prog="avmsf simulate", args=words, default=default, config=(tyro.conf.FlagCreatePairsOff,)
+    )
+
+
+def _recipe_of(what: str | None) -> ObjectRecipe | None:
+    """Return the named object's recipe; None for the whole set and for an object of the user's own."""
+    if what in (None, SET):
+        return None
+    return EXAMPLE if what == "example" else sim20_recipe(what)
+
+
 def _chosen(options: Options, output: Path) -> tuple[dict[str, ObjectRecipe], Path]:
     """Return the recipes by their folders' names, and the folder that holds these."""
-    changes = {
-        each.name: getattr(options.recipe, each.name)
-        for each in fields(ObjectRecipe)
-        if getattr(options.recipe, each.name) != getattr(ObjectRecipe(), each.name)
-    }
     if options.what == SET:
+        changes = {
+            each.name: getattr(options.recipe, each.name)
+            for each in fields(ObjectRecipe)
+            if getattr(options.recipe, each.name) != getattr(ObjectRecipe(), each.name)
+        }
         return {name: replace(recipe, **changes) for name, recipe in SIM20.items()}, output
     place = output.resolve()
-    if options.what is None:
-        return {place.name: options.recipe}, place.parent
-    named = EXAMPLE if options.what == "example" else sim20_recipe(options.what)
-    return {place.name: replace(named, **changes)}, place.parent
+    return {place.name: options.recipe}, place.parent
 
 
 def _list() -> None:
@@ -89,7 +103,7 @@ def _list() -> None:
         (name, recipe.kind, recipe.material, str(recipe.seed), "yes" if name not in NON_SYMMETRIC else "no")
         for name, recipe in SIM20.items()
     ]
-    screen.print(table(SET, ("object", "shape", "material", "seed", "symmetric"), rows, words=3))
+    screen.print(table(SET, ("object", "shape", "material", "seed", "symmetric by turns"), rows, words=3))
     print(f"shapes for --kind: {', '.join(KINDS)}")
     print(f"materials: {', '.join(MATERIALS)}")
 

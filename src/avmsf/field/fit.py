@@ -117,13 +117,15 @@ class _Job:
         self.train, self.features, self.modes, self.config = train, features, modes, config
         self.checkpoint, self.progress = checkpoint, progress
         signs = orientation_signs(train.contacts, train.directions)
-        # Without a warm-up gains are no aim, they only say how strong the modes are: the extraction's own do.
-        gains = modes.gains.to(train.sounds)
         self.phase = torch.zeros_like(modes.bank.frequency)
         if config.phase == "common":
             self.phase = common_phase(modes.gains, modes.quadrature)
         if config.warmup_steps:
             gains = fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate, phase=self.phase)
+        else:
+            # No aim then, they only say how strong the modes are: what of the extraction's own has the phase does.
+            turned = modes.gains * torch.cos(self.phase) + modes.quadrature * torch.sin(self.phase)
+            gains = turned.to(train.sounds)
         self.gains = gains * signs[:, None]
         self.rows = features.nearest(train.contacts)
         self.regions = features.clusters(config.clusters)

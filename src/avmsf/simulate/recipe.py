@@ -1,4 +1,4 @@
-"""All that decides a simulated object, as plain values: the same recipe gives the same bytes."""
+"""All that decides a simulated object, as plain values: the same recipe of a shape gives the same bytes."""
 
 import hashlib
 import json
