@@ -63,7 +63,8 @@ class Judging:
     ) -> Judgement:
         """Measure what `renderer` made of the test contacts; `truth`, where known, has the rows of `test`.
 
-        `loudest` is the peak of the object's loudest recording, in the unit of the recordings. Raises as `score`, and EvaluationError for sounds of another sample rate.
+        `loudest` is the peak of the object's loudest recording, in the unit of the recordings. Raises as `score`, and
+        EvaluationError for sounds of another sample rate.
         """
         if renderer.sample_rate != test.sample_rate:
             raise EvaluationError(

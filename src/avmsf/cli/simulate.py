@@ -72,9 +72,7 @@ def run(options: Options) -> int:
 
 def _parsed(words: Sequence[str], recipe: ObjectRecipe) -> Options:
     default = Options(recipe=recipe)
-    return tyro.cli(
-        Options, prog="avmsf simulate", args=words, default=default, config=(tyro.conf.FlagCreatePairsOff,)
-    )
+    return tyro.cli(Options, prog="avmsf simulate", args=words, default=default, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def _recipe_of(what: str | None) -> ObjectRecipe | None:
