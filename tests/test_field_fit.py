@@ -252,6 +252,14 @@ def test_warm_up_aims_at_the_gains_that_sines_can_express():
     assert torch.equal(field.residual.magnitude, modes.residual.magnitude)
 
 
+def test_without_a_warm_up_modes_are_as_strong_as_they_were_found_whatever_their_phase():
+    modes = plate_extraction(plate_impacts())
+    late = replace(modes, gains=0 * modes.gains, quadrature=modes.gains)
+    sines, cosines = (fitted(replace(SHORT, warmup_steps=0), modes=each).gain_field for each in (modes, late))
+    assert float(sines.gain_scale.min()) > 0
+    assert torch.allclose(cosines.gain_scale, sines.gain_scale)
+
+
 def test_forces_make_a_field_per_newton():
     assert fitted(SHORT, train=plate_impacts(forces=True)).origin.per_newton is True
     assert short_fit().origin.per_newton is False

@@ -19,6 +19,7 @@ from avmsf.cli import simulate
 from avmsf.errors import SimulationError
 from avmsf.simulate.imperfections import Imperfections
 from avmsf.simulate.recipe import ObjectRecipe, key_of
+from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import Simulation, simulate_object
 from avmsf.simulate.simulationfolder import is_written, write_simulation, write_textured
 from avmsf.simulate.simulationset import simulate_set
@@ -373,3 +374,11 @@ def test_the_command_lists_and_knows_what_it_does_not_know(capsys: pytest.Captur
         simulate.run(simulate.parse(["mug-ceramics", "--output", "nowhere"]))
     with pytest.raises(SimulationError, match="expected --output FOLDER"):
         simulate.run(simulate.parse(["sim-20"]))
+
+
+def test_what_is_asked_of_a_named_object_holds_though_it_is_the_usual() -> None:
+    # The example has 16 contacts at 44,100 Hz where a recipe usually has 40 at 48,000.
+    recipe = simulate.parse(["example", "--contacts", "40"]).recipe
+    assert (recipe.contacts, recipe.sample_rate, recipe.kind) == (40, 44100, "mug")
+    recipe = simulate.parse(["mug-plastic", "--material", "ceramic"]).recipe
+    assert recipe == replace(sim20_recipe("mug-plastic"), material="ceramic")

@@ -15,7 +15,6 @@ from avmsf.bench.judging import spread
 from avmsf.bench.knowntruth import truth_at
 from avmsf.bench.listening import keep_sound, listening_gain
 from avmsf.bench.methods import report_of
-from avmsf.bench.otherobjects import draw_stranger
 from avmsf.bench.plan import Evaluation
 from avmsf.bench.results import CaseRecord, Outcome, one_line
 from avmsf.bench.task import Look, Method, Task
@@ -46,13 +45,14 @@ class CaseRun:
         folder: Path,
         place: str,
         look: Callable[[Look], FeatureField],
+        stranger: Callable[[], Float[Tensor, " samples"]],
         listened: bool,
     ) -> None:
         """Prepare a case of an object; `place` is its own path beneath the results' folder."""
         self.evaluation, self.identifier, self.case, self.impacts = evaluation, identifier, case, impacts
         self.train, self.test = impacts.take(case.train), impacts.take(case.test)
         self.truth = None if truth is None else truth_at(truth, self.test.names)
-        self.folder, self.place, self.look = folder, place, look
+        self.folder, self.place, self.look, self.stranger = folder, place, look, stranger
         self.listened = spread(len(case.test), LISTENED) if listened else []
         self.shared = 0.0
         self.found: Extraction | None = None
@@ -115,7 +115,8 @@ class CaseRun:
             return self.look(look)
 
     def _stranger(self) -> Float[Tensor, " samples"]:
-        return draw_stranger(self.evaluation.dataset, self.identifier, self.train, seed=self.evaluation.seed)
+        with self._sharing():
+            return self.stranger()
 
     @contextmanager
     def _sharing(self) -> Iterator[None]:

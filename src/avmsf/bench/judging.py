@@ -36,8 +36,8 @@ class Judging:
     convention: Convention = PAPER
     level: Literal["full-scale", "raw"] = "full-scale"
     """full-scale: all sounds of an object by one factor, so that its loudest recording peaks at one, the scale on which
-    L1, ENV and CDPAM of different objects can be averaged. raw: in the unit of the recordings, such as pascals per
-    newton."""
+    L1, ENV and CDPAM of different objects can be averaged. A choice of unit that no
+    method sees. raw: in the unit of the recordings, such as pascals per newton."""
     cdpam: bool = True
     """Whether CDPAM is among the metrics; it takes the longest of them."""
     cdpam_contacts: int = 8

@@ -1,11 +1,11 @@
 """The truth of simulated objects, for those metrics that need one."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
-from avmsf.simulate.sim20 import NON_SYMMETRIC
 from avmsf.simulate.truth import TRUTH, Truth, read_truth
 
 
@@ -15,9 +15,9 @@ def truth_of(dataset: Dataset, identifier: str) -> Truth | None:
     return None if path is None else read_truth(path)
 
 
-def without_symmetry(dataset: Dataset, identifier: str) -> bool:
-    """Whether an object was simulated, and is one of the benchmark set's that no turn carries onto themselves."""
-    return identifier in NON_SYMMETRIC and _path(dataset, identifier) is not None
+def simulated(dataset: Dataset, names: Sequence[str]) -> frozenset[str]:
+    """Return which of the named objects the dataset has and were simulated."""
+    return frozenset(each for each in dataset.objects() if each in names and _path(dataset, each) is not None)
 
 
 def truth_at(truth: Truth, names: tuple[str, ...]) -> Truth:

@@ -85,7 +85,7 @@ PROTOCOLS = {
         ),
         EvaluationProtocol(
             "grid",
-            "Choose the field's settings from a small grid on validation contacts (`field-paper-grid`: the paper's own); "
+            "Choose the field's settings from a small grid on validation contacts (the paper's: `field-paper-grid`); "
             "test as `farthest` does.",
             Farthest(),
             (BASELINE, "field", "field-grid"),

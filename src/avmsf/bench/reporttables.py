@@ -155,8 +155,8 @@ def _ratio_table(main: Table, shown: Sequence[str], protocol: str, dataset: str)
         f"Ratio to {BASELINE}",
         (
             "Below 1 is better than the mean of the three nearest recordings. Ours are geometric means over objects of "
-            "each object's ratio; the paper's are ratios of its means, which is all that its tables allow, from its main "
-            "tables where its table of this experiment has no KNN.",
+            "each object's ratio; the paper's are ratios of its means, which is all that its tables allow, from its "
+            "main tables where its table of this experiment has no KNN.",
         ),
         Grid(("method", *_headings(falling)), tuple(rows)),
     )

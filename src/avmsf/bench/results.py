@@ -117,7 +117,11 @@ class ResultsFolder:
 
     def identity(self) -> dict[str, Any]:
         """Return what the folder's figures are, methods among it. Raises EvaluationError where there is none."""
-        return self._read(self.path / IDENTITY)
+        place = self.path / IDENTITY
+        read = self._read(place)
+        if not isinstance(read.get("methods"), dict):
+            raise self._damaged(place, "it names no methods")
+        return read
 
     def read(self, identifier: str) -> ObjectRecord | None:
         """Return an object's record, or None where there is none yet."""

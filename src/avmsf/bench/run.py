@@ -5,13 +5,17 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 
 import numba
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from avmsf.bench.caserun import CaseRun
 from avmsf.bench.cases import Case
 from avmsf.bench.knowntruth import truth_of
+from avmsf.bench.otherobjects import draw_stranger
 from avmsf.bench.plan import Evaluation
 from avmsf.bench.results import CaseRecord, ObjectRecord, ResultsFolder, one_line
 from avmsf.bench.task import Look
@@ -39,6 +43,9 @@ def run_object(
         except AvmsfError as error:
             results.write(replace(record, failure=one_line(error)))
             return
+        except (OSError, ValueError) as error:  # A damaged object must not cost the others their hours.
+            results.write(replace(record, failure=f"{type(error).__name__}: {one_line(error)}"))
+            return
         digest = digest_of(impacts, truth)
         if record.digest not in ("", digest):
             raise EvaluationError(
@@ -60,6 +67,11 @@ def run_object(
         )
         results.write(record)
         looks = _Looks(evaluation, identifier)
+
+        @cache
+        def stranger() -> Float[Tensor, " samples"]:
+            return draw_stranger(evaluation.dataset, identifier, impacts, seed=evaluation.seed)
+
         firsts = {case.label: case.key for case in reversed(cases)}
         for number, case in enumerate(cases, 1):
             record = _run_case(
@@ -72,6 +84,7 @@ def run_object(
                     folder=results.path,
                     place=f"{identifier}/{number:02d}",
                     look=looks.of(case.views),
+                    stranger=stranger,
                     listened=firsts[case.label] == case.key,
                 ),
                 record,

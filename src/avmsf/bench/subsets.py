@@ -2,16 +2,19 @@
 
 from collections.abc import Mapping, Sequence
 
-from avmsf.bench.knowntruth import without_symmetry
+from avmsf.bench.knowntruth import simulated
 from avmsf.bench.protocols import EvaluationProtocol
 from avmsf.capture.datasets import CaptureCollection
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.capture.datasets.subsets import ABLATION, NON_SYMMETRIC
 from avmsf.errors import EvaluationError
+from avmsf.simulate import sim20
 
 ABLATED, NOT_SYMMETRIC = "ablation", "non-symmetric"
 """The groups' names."""
 _NUMBERS: Mapping[str, Sequence[str]] = {ABLATED: ABLATION, NOT_SYMMETRIC: NON_SYMMETRIC}
+
+_SIMULATED: Mapping[str, Sequence[str]] = {ABLATED: sim20.ABLATED, NOT_SYMMETRIC: sim20.NON_SYMMETRIC}
 
 
 def members(dataset: Dataset) -> dict[str, frozenset[str]]:
@@ -20,10 +23,10 @@ def members(dataset: Dataset) -> dict[str, frozenset[str]]:
     The numbers of ObjectFolder Real are RealImpact's too, before the first underscore of an object's name. Of captures
     only those are known that were simulated.
     """
-    objects = dataset.objects()
     if isinstance(dataset, CaptureCollection):
-        found = {NOT_SYMMETRIC: frozenset(each for each in objects if without_symmetry(dataset, each))}
+        found = {name: simulated(dataset, names) for name, names in _SIMULATED.items()}
     else:
+        objects = dataset.objects()
         found = {
             name: frozenset(each for each in objects if each.partition("_")[0] in numbers)
             for name, numbers in _NUMBERS.items()

@@ -85,6 +85,9 @@ def _recipe_of(what: str | None) -> ObjectRecipe | None:
 def _chosen(options: Options, output: Path) -> tuple[dict[str, ObjectRecipe], Path]:
     """Return the recipes by their folders' names, and the folder that holds these."""
     if options.what == SET:
+        for name in ("kind", "mesh", "material", "seed"):
+            if getattr(options.recipe, name) != getattr(ObjectRecipe(), name):
+                raise SimulationError(f"--{name} was given with {SET}, whose objects have their own: leave it out")
         changes = {
             each.name: getattr(options.recipe, each.name)
             for each in fields(ObjectRecipe)

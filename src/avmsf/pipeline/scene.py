@@ -81,8 +81,9 @@ class SceneStages:
         """Prepare the stages; `name` is what the features' file is called, for several may share their Gaussians."""
         self.folder, self.stages, self.config, self.settings, self.name = folder, stages, config, settings, name
         self.listener = Listener() if listener is None else listener
-        self.splats = find_splats(folder)
         found = find_source(folder, settings, prefer=config.views.source)
+        preferred = config.views.source == "mesh" and found is not None and found.kind == "mesh"
+        self.splats = None if preferred else find_splats(folder)
         self.source: Source | None = None if self.splats and found and found.kind == "mesh" else found
 
     def __bool__(self) -> bool:

@@ -50,6 +50,9 @@ NON_SYMMETRIC = tuple(
 )
 """Objects whose shape no turn carries onto itself; of mug, skillet and spoon a mirror does."""
 
+ABLATED = ("mug-ceramic", "bowl-glass", "bracket-steel", "pot-steel", "dish-ceramic", "spoon-wood")
+"""Objects of the smaller studies: with and without symmetry, ringing and dull, thick and thin."""
+
 
 def sim20_recipe(name: str) -> ObjectRecipe:
     """Return the recipe of one of the set's objects. Raises SimulationError with the names there are."""
