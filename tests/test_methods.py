@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -399,3 +400,13 @@ def test_others_sounds_that_do_not_fit_are_refused_by_name(tmp_path):
         renderer.render(test.contacts[:1])
     with pytest.raises(EvaluationError, match="3 names of recordings were given for 20 contacts"):
         RecordedMethod(tmp_path).fit(replace(task, names=task.names[:3]))
+
+
+def test_a_recorded_method_is_known_by_what_is_in_its_files(tmp_path: Path) -> None:
+    path = tmp_path / "bowl" / "001.wav"
+    path.parent.mkdir()
+    path.write_bytes(b"one")
+    before = repr(RecordedMethod(tmp_path))
+    assert repr(RecordedMethod(tmp_path)) == before
+    path.write_bytes(b"two")
+    assert repr(RecordedMethod(tmp_path)) != before

@@ -1,6 +1,7 @@
 """All methods by name: what turns an object's training blows into a renderer."""
 
 import difflib
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -48,6 +49,15 @@ class RecordedMethod:
     def name(self) -> str:
         """`recorded:` and the folder."""
         return f"{_RECORDED}{self.folder}"
+
+    def __repr__(self) -> str:
+        # What is in the files decides the figures, and a results folder must not keep those of other files.
+        digest = hashlib.sha256()
+        for path in sorted(self.folder.rglob("*")):
+            if path.suffix.lower() == ".wav" and path.is_file():
+                digest.update(f"{path.relative_to(self.folder).as_posix()}\0{path.stat().st_size}\0".encode())
+                digest.update(path.read_bytes())
+        return f"RecordedMethod({str(self.folder)!r}, wavs {digest.hexdigest()[:16]})"
 
     def fit(self, task: Task) -> Recorded:
         """Find the object's folder. Raises EvaluationError where there is none."""

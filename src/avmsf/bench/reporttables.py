@@ -73,8 +73,9 @@ def sections(
     parts = [_opening(records, identity, labels)]
     if main:
         parts.append(_main_table(main, shown, protocol, dataset, labels))
-        parts.append(_ratio_table(main, shown, protocol, dataset))
-        parts.append(_difference_table(main, shown))
+        if any(BASELINE in methods for methods in main.values()):
+            parts.append(_ratio_table(main, shown, protocol, dataset))
+            parts.append(_difference_table(main, shown))
         for name, members in subsets.items():
             chosen = {each: main[each] for each in main if each in members}
             if chosen and len(chosen) < len(main):
@@ -99,11 +100,13 @@ def figure(value: float | None, digits: int = 3) -> str:
 def _opening(records: Sequence[ObjectRecord], identity: Mapping[str, Any], labels: Sequence[str]) -> Section:
     protocol = PROTOCOLS.get(str(identity["protocol"]))
     about = f"{protocol.summary} " if protocol else ""
+    trained = [len(case.train) for record in records for case in record.cases if case.label in labels[:1]]
     tested = sum(sum(len(case.test) for case in record.cases if case.label in labels[:1]) for record in records)
     return Section(
         f"{identity['protocol']} on {identity['dataset']}",
         (
-            f"{about}{len(records)} objects, {tested} test contacts in the main case"
+            f"{about}Objects: {len(records)}; training contacts of each: {_span(trained)}; "
+            f"test contacts in all: {tested}"
             f"{f' ({labels[0]})' if len(labels) > 1 else ''}; avmsf {identity['version']}, seed {identity['seed']}.",
             "Figures are means over an object's test contacts (CDPAM's over a few of them, `cdpam_contacts` below, 0 "
             "for all), then over objects, ± the standard error over objects. "
@@ -114,6 +117,12 @@ def _opening(records: Sequence[ObjectRecord], identity: Mapping[str, Any], label
             f"What decides the figures: metrics {identity['metrics']}; modes {identity['modes']}.",
         ),
     )
+
+
+def _span(counts: Sequence[int]) -> str:
+    """Return a number, or the least and the largest of several."""
+    least, most = min(counts, default=0), max(counts, default=0)
+    return f"{least}" if least == most else f"{least} to {most}"
 
 
 def _main_table(main: Table, shown: Sequence[str], protocol: str, dataset: str, labels: Sequence[str]) -> Section:

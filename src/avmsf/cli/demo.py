@@ -211,6 +211,9 @@ Then, for each of {heard} contacts that the field has never heard, in this order
   contact-1-2-field.wav            what the field makes of it
   contact-1-3-mean-of-nearest.wav  the mean of the three nearest recordings
 
+Twelve taps are few for a mug whose modes reach 12 kHz: {prefix}scores.md says how far its field is from what was
+recorded at the other four places, and that the mean of the nearest blows is nearer.
+
 Look at {prefix}pictures: cloud.png, scores.png, spectrograms.png, gains.png, modes.png.
 {prefix}mug.ply is the mug as Gaussians, for any 3DGS viewer.
 {prefix}scores.md and {prefix}{MARK} hold the figures.

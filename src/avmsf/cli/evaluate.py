@@ -30,6 +30,9 @@ from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig
 
+_SHOWN = 5
+"""Failures that are printed; the report lists all."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -130,7 +133,9 @@ def run(options: Options) -> int:
         _print(part, screen)
     failures = len(summary["failures"])
     if failures:
-        screen.print(f"{failures} failures, listed in {TABLES}; the same command tries them again", soft_wrap=True)
+        for each in summary["failures"][:_SHOWN]:
+            screen.print(f"failed: {each['object']}, {each['method'] or 'all'}: {each['failure']}", soft_wrap=True)
+        screen.print(f"failures: {failures}, listed in {TABLES}; asked for again, they are tried again", soft_wrap=True)
     screen.print(f"wrote {SUMMARY}, {TABLES} and {PAGE} in {folder}", soft_wrap=True)
     if options.json:
         print_json({**summary, "results": str(folder)})

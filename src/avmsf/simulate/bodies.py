@@ -24,6 +24,10 @@ from avmsf.simulate.tetrahedra import fill
 Tell = Callable[[str], None]
 
 
+_LARGEST = 10.0
+"""Metres along its longest side beyond which a mesh is likelier to count millimetres."""
+
+
 @dataclass(frozen=True, eq=False)
 class Body:
     """An object before it is struck."""
@@ -119,4 +123,9 @@ def _scale(recipe: ObjectRecipe, vertices: Tensor) -> float:
     longest = float((vertices.amax(0) - vertices.amin(0)).max())
     if not longest > 0.0:
         raise SimulationError("the mesh has no extent: all of its vertices lie in one place; export it again")
+    if recipe.size is None and longest > _LARGEST:
+        raise SimulationError(
+            f"the mesh is {longest:g} m long, and expected are metres, at most {_LARGEST:g} of them: if it counts "
+            f"millimetres, give --size {longest / 1000:g}; else say how long it is by --size"
+        )
     return 1.0 if recipe.size is None else recipe.size / longest

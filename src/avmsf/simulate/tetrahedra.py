@@ -71,7 +71,8 @@ def _tetrahedralise(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarr
         command = [sys.executable, "-P", str(WORKER), str(job), str(result)]
         single = os.environ | {"OMP_NUM_THREADS": "1"}
         try:
-            ended = subprocess.run(command, capture_output=True, timeout=timeout, env=single, check=False)
+            # fTetWild leaves a file of its own where it runs.
+            ended = subprocess.run(command, capture_output=True, timeout=timeout, env=single, cwd=name, check=False)
         except subprocess.TimeoutExpired as error:
             raise SimulationError(
                 f"filling {len(skin.faces)} triangles took more than {timeout:g} s: allow more time, use a larger "
