@@ -17,6 +17,7 @@ _CHILD = """
 import json, resource, sys, time, warnings
 from avmsf.capture import CaptureWarning
 from avmsf.capture.datasets import open_dataset
+from benchmarks.step import peak_gigabytes
 
 warnings.simplefilter("ignore", CaptureWarning)
 
@@ -28,8 +29,7 @@ before = resident()
 begun, begun_cpu = time.perf_counter(), time.process_time()
 capture = open_dataset(sys.argv[1]).capture(sys.argv[2])
 seconds, cpu = time.perf_counter() - begun, time.process_time() - begun_cpu
-# Kilobytes, on Linux.
-peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+peak = peak_gigabytes() * 1e9 / 2**20
 found = {"seconds": seconds, "cpu": cpu, "megabytes": peak - before, "peak": peak, "blows": len(capture.impacts)}
 print(json.dumps(found))
 """
@@ -52,7 +52,7 @@ def measure_realimpact(options: Options) -> Report:
     convention = (
         f"realimpact: one object of {size / 1e9:.2f} GB (sparse: the sounds of far microphones are holes) with a "
         "textured mesh, in a fresh process. open_seconds: from the folder's name to the Capture, after imports; "
-        "cpu_seconds: what of it the process worked. megabytes: the process's peak resident memory (getrusage) less "
+        "cpu_seconds: what of it the process worked. megabytes: the process's peak resident memory (VmHWM) less "
         "what was resident before, in units of 2^20; pages of the mapped file that were looked at count."
     )
     rows = [*figures.items(), ("peak of the process, megabytes", found["peak"])]

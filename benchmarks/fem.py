@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import resource
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ from avmsf.simulate.elements import SecondOrder
 from avmsf.simulate.material import CERAMIC, STEEL, Material
 from avmsf.simulate.solid import Solid
 from benchmarks.report import Options, Report, Table, tell
+from benchmarks.step import peak_gigabytes
 
 _LEISSA = np.array([13.489, 19.789, 24.432, 35.024, 35.024, 61.526])
 """Angular frequencies of a free square plate times side^2 sqrt(mass a square metre / rigidity), Poisson's ratio .3."""
@@ -120,12 +120,12 @@ def _measure_bowl(sides: int) -> dict[str, Any]:
     solid = bowl(sides)
     # Warm up what is loaded at first use.
     elastic_modes(bowl(3), CERAMIC, count=4)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = peak_gigabytes()
     begun = time.perf_counter()
     modes = elastic_modes(solid, CERAMIC, count=64)
     return {
         "seconds": time.perf_counter() - begun,
-        "megabytes": (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024,
+        "megabytes": 1e3 * (peak_gigabytes() - before),
         "freedoms": 3 * len(SecondOrder.of(solid).nodes),
         "frequency": modes.frequency.tolist(),
     }
