@@ -46,9 +46,12 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
     if not 0 < detail < 1:
         raise SimulationError(f"detail = {detail:g}: expected more than 0 and less than 1 of the body's size")
     skin = Skin.of(surface)
+    advice = _advice(skin)
+    # Of a sheet fTetWild makes a sliver as thin as its envelope, or nothing, as chance has it.
+    if skin.open_edges and _flatness(skin) < 2.0 * _ENVELOPE * detail * skin.size:
+        raise SimulationError(f"the mesh encloses no volume, it is a flat sheet: {advice}")
     coarse = skin.coarsened(_SHORTEST * detail * skin.size, turn=_TURN)
     points, cells = _tetrahedralise(coarse, detail, timeout)
-    advice = _advice(skin)
     if not len(cells):
         raise SimulationError(f"the mesh encloses no volume ({skin.open_edges} of its edges are open): {advice}")
     solid = _largest(Solid.build(torch.from_numpy(points), torch.from_numpy(cells)))
@@ -135,6 +138,14 @@ def _behind(skin: Skin, found: Closest, places: Float64[np.ndarray, "places 3"])
     corners = skin.points[skin.faces[found.rows]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return (normals * (places - np.einsum("pc,pcd->pd", found.weights, corners))).sum(axis=1) < 0
+
+
+def _flatness(skin: Skin) -> float:
+    """Return the extent of the skin's corners along the axis that they spread least along, metres."""
+    places = skin.points[skin.faces].reshape(-1, 3)
+    places = places - places.mean(axis=0)
+    _, axes = np.linalg.eigh(places.T @ places)
+    return float(np.ptp(places @ axes[:, 0]))
 
 
 def _advice(skin: Skin) -> str:
