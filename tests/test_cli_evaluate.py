@@ -29,7 +29,7 @@ def test_a_dataset_becomes_tables_and_a_page(plates: Path, tmp_path: Path, capsy
     assert set(kept["methods"]["knn3"]) == {"l1", "l1_log", "envelope", "relative_stft"}
     assert kept["ratio_to_knn3"]["knn3"]["l1"] == 1.0
     assert (kept["dataset"], kept["objects"], kept["test_contacts"]) == ("plates", 2, 16)
-    assert "b: done, 2 of 2 objects" in err
+    assert "b: done (2 of 2, " in err
     assert "L1-log" in err
     assert "# farthest on plates" in (tmp_path / "results" / "report.md").read_text()
     before = (tmp_path / "results" / "objects" / "a.json").read_bytes()

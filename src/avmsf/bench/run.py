@@ -1,7 +1,6 @@
 """Running an evaluation: object by object, case by case, method by method, keeping each figure as it comes."""
 
 import hashlib
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -108,10 +107,9 @@ def one_thread() -> Iterator[None]:
 
 def digest_of(impacts: Impacts, truth: Truth | None) -> str:
     """Return a digest of all that figures depend on of an object's recordings and truth."""
-    digest = hashlib.sha256(json.dumps([impacts.names, impacts.sample_rate]).encode())
-    known = () if truth is None else (truth.frequency, truth.damping, truth.gains, truth.quadrature)
-    for tensor in (impacts.contacts, impacts.sounds, impacts.directions, impacts.forces, *known):
-        digest.update(b"none" if tensor is None else tensor.contiguous().numpy().tobytes())
+    digest = hashlib.sha256(impacts.digest().encode())
+    for tensor in () if truth is None else (truth.frequency, truth.damping, truth.gains, truth.quadrature):
+        digest.update(tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()
 
 

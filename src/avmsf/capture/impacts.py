@@ -1,5 +1,7 @@
 """The recordings of one object: where it was struck, and what was heard."""
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -32,6 +34,13 @@ class Impacts:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def digest(self) -> str:
+        """Return a digest of all that can be learnt from the recordings."""
+        digest = hashlib.sha256(json.dumps([self.names, self.sample_rate]).encode())
+        for tensor in (self.contacts, self.sounds, self.directions, self.forces):
+            digest.update(b"none" if tensor is None else tensor.contiguous().numpy().tobytes())
+        return digest.hexdigest()
 
     def take(self, rows: Sequence[int]) -> "Impacts":
         """Return the given rows alone, in the given order."""

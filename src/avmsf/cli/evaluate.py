@@ -1,15 +1,12 @@
 """`avmsf evaluate`: how good methods are on a dataset, as tables and as a page."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from avmsf.bench.judging import Judging
 from avmsf.bench.methods import method_named
@@ -23,6 +20,7 @@ from avmsf.bench.subsets import choose_objects, members
 from avmsf.capture.datasets import CaptureCollection, open_dataset
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.cli import INTERRUPTED
+from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.printing import console, print_json, say, table
 from avmsf.errors import EvaluationError
 from avmsf.modal.extract import HighResolution
@@ -112,12 +110,12 @@ def run(options: Options) -> int:
     results, groups = ResultsFolder(folder), members(dataset)
     say(f"{protocol.name} on {title}: {len(objects)} objects, {len(methods)} methods, results in {folder}")
     try:
-        with EvaluationBar() as bar:
+        with ObjectBar() as bar:
 
             def show(progress: RunProgress) -> None:
                 if progress.done > bar.done:
                     write_summary(results, subsets=groups)
-                bar.show(progress)
+                bar.show(progress.words, done=progress.done, total=progress.total)
 
             run_objects(evaluation, objects, results, workers=workers, progress=show)
         summary = write_summary(results, subsets=groups)
@@ -145,39 +143,6 @@ def run(options: Options) -> int:
 def title_of(dataset: Dataset, folder: Path) -> str:
     """Return what reports call a dataset: captures by their folder, which tells them from other captures."""
     return folder.resolve().name if isinstance(dataset, CaptureCollection) else dataset.name
-
-
-class EvaluationBar:
-    """One bar over all objects; in a file or a pipe, a line an object."""
-
-    def __init__(self) -> None:
-        self.live = sys.stderr.isatty()
-        self.bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            console=Console(file=sys.stderr, markup=False, highlight=False),
-            disable=not self.live,
-        )
-        self.task = self.bar.add_task("", total=None)
-        self.done = 0
-
-    def __enter__(self) -> "EvaluationBar":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.bar.stop()
-
-    def show(self, progress: RunProgress) -> None:
-        """Take note of what has begun or ended."""
-        self.bar.start()
-        self.bar.update(self.task, description=progress.words, completed=progress.done, total=progress.total)
-        if not self.live and progress.done > self.done:
-            say(f"{progress.words}, {progress.done} of {progress.total} objects")
-        self.done = progress.done
 
 
 def _words(given: Sequence[str]) -> tuple[str, ...]:

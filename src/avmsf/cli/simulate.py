@@ -1,17 +1,14 @@
 """`avmsf simulate`: objects whose modes and gains are known, struck, recorded and photographed."""
 
-import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from avmsf.cli import INTERRUPTED
+from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.printing import console, say, table
 from avmsf.errors import SimulationError
 from avmsf.simulate.example import EXAMPLE
@@ -61,8 +58,12 @@ def run(options: Options) -> int:
         raise SimulationError("expected --output FOLDER, where to put what is simulated; --list shows what there is")
     recipes, folder = _chosen(options, options.output)
     try:
-        with _Bar() as bar:
-            simulate_set(recipes, folder, cache=options.cache, progress=bar.show)
+        with ObjectBar() as bar:
+
+            def show(progress: SetProgress) -> None:
+                bar.show(f"{progress.name}: {progress.stage}", done=progress.done, total=progress.total)
+
+            simulate_set(recipes, folder, cache=options.cache, progress=show)
     except KeyboardInterrupt:
         say("avmsf simulate: interrupted; the same command goes on from where it was")
         return INTERRUPTED
@@ -107,34 +108,3 @@ def _list() -> None:
     screen.print(table(SET, ("object", "shape", "material", "seed", "symmetric by turns"), rows, words=3))
     print(f"shapes for --kind: {', '.join(KINDS)}")
     print(f"materials: {', '.join(MATERIALS)}")
-
-
-class _Bar:
-    """One bar for all objects, with what is being done to the one at hand; in a file or a pipe, a line an object."""
-
-    def __init__(self) -> None:
-        self.live = sys.stderr.isatty()
-        self.begun = time.monotonic()
-        self.bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            console=Console(file=sys.stderr, markup=False, highlight=False),
-            disable=not self.live,
-        )
-        self.task = self.bar.add_task("", total=None)
-
-    def __enter__(self) -> "_Bar":
-        self.bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.bar.stop()
-
-    def show(self, progress: SetProgress) -> None:
-        """Take note of a stage."""
-        words = f"{progress.name}: {progress.stage}"
-        self.bar.update(self.task, description=words, completed=progress.done, total=progress.total)
-        if not self.live and progress.stage in ("kept", "done"):
-            say(f"{words} ({progress.done} of {progress.total}, {time.monotonic() - self.begun:.0f} s)")

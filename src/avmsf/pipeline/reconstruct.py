@@ -94,7 +94,7 @@ def reconstruct(
     stages = StageFolder(cache)
     shape = _shape(folder, capture, config, stages, settings=settings, listener=listener)
     expect_on_object(capture.impacts, shape.points, strict=shape.found_frame)
-    heard = {"impacts": digest_of_impacts(train), "method": repr(method)}
+    heard = {"impacts": train.digest(), "method": repr(method)}
     listener.tell(f"modes: of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path))
     modes = extract_once(train, method, found.path)
@@ -195,12 +195,3 @@ def expect_on_object(impacts: Impacts, points: Float[Tensor, "points 3"], *, str
         raise CaptureError(words)
     if words:
         warnings.warn(words, CaptureWarning, stacklevel=2)
-
-
-def digest_of_impacts(impacts: Impacts) -> str:
-    """Return a digest of all that a fit reads of recordings."""
-    words = [impacts.names, impacts.sample_rate]
-    digest = hashlib.sha256(json.dumps(words).encode())
-    for tensor in (impacts.contacts, impacts.sounds, impacts.directions, impacts.forces):
-        digest.update(b"none" if tensor is None else tensor.contiguous().numpy().tobytes())
-    return digest.hexdigest()
