@@ -18,7 +18,7 @@ from torch import Tensor
 
 from avmsf.capture import Impacts
 from avmsf.field.config import PAPER, FitConfig
-from avmsf.field.gains import AttentionGains
+from avmsf.field.attention import AttentionGains
 from avmsf.field.losses import SpectralTarget
 from avmsf.field.training import Targets, TrainingRun, gain_scale
 from avmsf.modal.bank import ModalBank

@@ -11,7 +11,7 @@ from scipy.interpolate import RBFInterpolator
 from avmsf.bench.baselines import MeanGains, MeanWaveform
 from avmsf.bench.interpolation import SplineGains
 from avmsf.bench.spectralmean import MeanSpectra
-from avmsf.bench.thinplate import SMOOTHINGS, fit_spline
+from avmsf.field.thinplate import SMOOTHINGS, fit_spline
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
 from avmsf.modal.bank import ModalBank
@@ -50,7 +50,7 @@ def test_a_linear_field_comes_back_exactly(directions, count):
     slopes = torch.randn(3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     places, elsewhere = (flattened(each, directions) for each in (scattered(count), 3.0 * scattered(30, seed=1)))
     spline = fit_spline(places, places @ slopes + 2.0, importance=torch.ones(4))
-    assert spline.sites.shape == (count, directions)
+    assert spline.sites.sites.shape == (count, directions)
     assert torch.allclose(spline.at(elsewhere), elsewhere @ slopes + 2.0, rtol=0, atol=1e-9)
 
 
@@ -59,9 +59,11 @@ def test_splines_are_scipys(directions):
     places = torch.unique(flattened(scattered(15), directions), dim=0)
     elsewhere = flattened(scattered(30, seed=1), directions)
     spline = fit_spline(places, bumps(places), importance=ONE)
-    assert spline.smoothing == 0.0
+    assert spline.sites.smoothing == 0.0
     along = (elsewhere - spline.middle) @ spline.axes
-    theirs = RBFInterpolator(spline.sites.numpy(), bumps(places).numpy(), kernel="thin_plate_spline")(along.numpy())
+    theirs = RBFInterpolator(spline.sites.sites.numpy(), bumps(places).numpy(), kernel="thin_plate_spline")(
+        along.numpy()
+    )
     assert np.allclose(spline.at(elsewhere).numpy(), theirs, rtol=0, atol=1e-8)
     assert torch.allclose(spline.at(places), bumps(places), rtol=0, atol=1e-9)
 
@@ -72,19 +74,19 @@ def test_smoothing_is_the_least_that_sites_left_out_ask_for():
     noise = 1.0 * torch.randn(24, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
     values = bumps(places) + noise
     spline = fit_spline(places, values, importance=ONE)
-    sites = spline.sites.numpy()
+    sites = spline.sites.sites.numpy()
     errors = np.empty((len(SMOOTHINGS), 24))
     for trial, smoothing in enumerate(SMOOTHINGS):
         for left in range(24):
             kept = np.arange(24) != left
             others = RBFInterpolator(sites[kept], values.numpy()[kept], kernel="thin_plate_spline", smoothing=smoothing)
             errors[trial, left] = ((others(sites[left : left + 1]) - values.numpy()[left]) ** 2).sum()
-    assert spline.smoothing > 0.0
+    assert spline.sites.smoothing > 0.0
     best = errors[errors.sum(1).argmin()]
     needed = [(trial - best).sum() <= (trial - best).std(ddof=1) * math.sqrt(24) for trial in errors].index(True)
-    assert spline.smoothing == SMOOTHINGS[needed]
+    assert spline.sites.smoothing == SMOOTHINGS[needed]
     ours = spline.at(scattered(40, seed=9))
-    theirs = RBFInterpolator(sites, values.numpy(), kernel="thin_plate_spline", smoothing=spline.smoothing)
+    theirs = RBFInterpolator(sites, values.numpy(), kernel="thin_plate_spline", smoothing=spline.sites.smoothing)
     along = (scattered(40, seed=9) - spline.middle) @ spline.axes
     assert np.allclose(ours.numpy(), theirs(along.numpy()), rtol=0, atol=1e-8)
 
@@ -93,7 +95,7 @@ def test_smoothing_brings_noisy_values_nearer_to_the_truth():
     places, elsewhere = scattered(40), scattered(60, seed=1)
     noise = 0.4 * torch.randn(40, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
     spline = fit_spline(places, bumps(places) + noise, importance=ONE)
-    rough = RBFInterpolator(spline.sites.numpy(), (bumps(places) + noise).numpy(), kernel="thin_plate_spline")
+    rough = RBFInterpolator(spline.sites.sites.numpy(), (bumps(places) + noise).numpy(), kernel="thin_plate_spline")
     along = (elsewhere - spline.middle) @ spline.axes
     error = float((spline.at(elsewhere) - bumps(elsewhere)).square().mean())
     assert error < 0.8 * float(((torch.from_numpy(rough(along.numpy())) - bumps(elsewhere)) ** 2).mean())
@@ -119,7 +121,7 @@ def test_few_sites_make_a_function_that_does_not_run_away():
     assert torch.equal(single.at(asked), torch.ones(3, 1, dtype=torch.float64))
     for count in (3, 4, 7):
         few = fit_spline(scattered(count), bumps(scattered(count)), importance=ONE)
-        assert not few.bending
+        assert not few.sites.bending
         assert torch.allclose(few.at(scattered(count)), bumps(scattered(count)), rtol=0, atol=1e-9)
         far = 1e3 * (scattered(20, seed=1) - scattered(1))
         assert float(few.at(far).abs().max()) < 20.0

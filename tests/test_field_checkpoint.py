@@ -13,6 +13,7 @@ from avmsf.errors import FieldFileError
 from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import Progress, fit
+from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.training import TrainingRun
 from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
@@ -29,7 +30,7 @@ def fitted(
 ) -> SoundField:
     impacts = plate_impacts(6, seconds=0.1)
     modes = plate_extraction(impacts)
-    return fit(impacts, plate_features(60), modes, config, checkpoint=checkpoint, progress=progress)
+    return fit(impacts, plate_features(60), modes, config, gains=Attention(), checkpoint=checkpoint, progress=progress)
 
 
 @cache
@@ -167,8 +168,8 @@ def test_a_path_may_be_a_word(tmp_path):
     keys, impacts = Interruption((STAGES[0], 3)), plate_impacts(6, seconds=0.1)
     arguments = (impacts, plate_features(60), plate_extraction(impacts), CONFIG)
     with pytest.raises(KeyboardInterrupt):
-        fit(*arguments, checkpoint=str(tmp_path / "state"), progress=keys)
-    expect_same(fit(*arguments, checkpoint=str(tmp_path / "state")), uninterrupted())
+        fit(*arguments, gains=Attention(), checkpoint=str(tmp_path / "state"), progress=keys)
+    expect_same(fit(*arguments, gains=Attention(), checkpoint=str(tmp_path / "state")), uninterrupted())
     assert [path.name for path in tmp_path.iterdir()] == ["state"]
 
 
@@ -221,7 +222,7 @@ def test_a_checkpoint_of_other_arguments_is_refused_and_kept(tmp_path, other):
         fitted(checkpoint, Interruption((STAGES[0], 1)))
     before = checkpoint.read_bytes()
     with pytest.raises(FieldFileError, match=r"fit\.checkpoint: this checkpoint belongs to a fit of other recordings"):
-        fit(*other(impacts, plate_features(60), plate_extraction(impacts)), checkpoint=checkpoint)
+        fit(*other(impacts, plate_features(60), plate_extraction(impacts)), gains=Attention(), checkpoint=checkpoint)
     assert checkpoint.read_bytes() == before
 
 

@@ -11,6 +11,7 @@ from avmsf.bench.metrics import relative_stft_error
 from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import Progress, fit
+from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.bank import ModalBank
@@ -21,7 +22,7 @@ from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import plate_modes
 from plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
 
-LONG = replace(QUICK, width=32, hidden=128, warmup_steps=300, steps=60, correction_rate=3.0)
+LONG = replace(QUICK, width=32, hidden=128, warmup_steps=300, steps=60, correction_rate=3e-3)
 SHORT = replace(QUICK, warmup_steps=4, steps=4)
 VALIDATED = replace(SHORT, damping="validated")
 
@@ -30,7 +31,8 @@ def fitted(config: FitConfig, **changes) -> SoundField:
     """Fit to the plate, with other arguments where `changes` names them."""
     impacts = changes.pop("train", plate_impacts())
     modes = changes.pop("modes", None) or plate_extraction(plate_impacts(len(impacts)))
-    return fit(impacts, changes.pop("features", plate_features()), modes, config, **changes)
+    gains = changes.pop("gains", Attention())
+    return fit(impacts, changes.pop("features", plate_features()), modes, config, gains=gains, **changes)
 
 
 @cache

@@ -9,6 +9,7 @@ import torch
 
 from avmsf.bench.renderer import Renderer
 from avmsf.field.fit import fit
+from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.simulate.plate import sample_contacts
 from plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
@@ -20,7 +21,7 @@ CONTACTS = sample_contacts(PLATE, 40, generator=torch.Generator().manual_seed(5)
 def field(damping: str = "per-contact") -> SoundField:
     impacts = plate_impacts(forces=True)
     config = replace(QUICK, damping=damping, warmup_steps=20, steps=4, learning_rate=0.05)
-    return fit(impacts, plate_features(), plate_extraction(impacts), config)
+    return fit(impacts, plate_features(), plate_extraction(impacts), config, gains=Attention())
 
 
 def by_hand(sound_field: SoundField, row: int) -> torch.Tensor:

@@ -24,6 +24,7 @@ from safetensors.torch import save as to_bytes
 
 from avmsf.errors import FieldFileError
 from avmsf.field.fit import fit
+from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.simulate.plate import sample_contacts
@@ -37,7 +38,7 @@ CONFIG = replace(QUICK, warmup_steps=4, steps=2)
 def field(damping: str = "shared") -> SoundField:
     impacts = plate_impacts(forces=True)
     config = replace(CONFIG, damping=damping, learning_rate=0.05)
-    return fit(impacts, plate_features(), plate_extraction(impacts), config, capture="a plate")
+    return fit(impacts, plate_features(), plate_extraction(impacts), config, gains=Attention(), capture="a plate")
 
 
 def other_field() -> SoundField:

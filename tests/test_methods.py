@@ -19,6 +19,7 @@ from avmsf.bench.task import Method, Task
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, FitError, SceneError
 from avmsf.field.fit import fit
+from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uninformed import uninformed
 from avmsf.modal.extraction import Extraction
@@ -223,7 +224,9 @@ def test_without_initialisation_no_mode_of_the_recordings_leaks_in():
     sounds = synthesise(start.gains, frequency, damping, samples=SAMPLES, sample_rate=RATE)
     # Half of a damped sine's square is lost or won to its phase and its neighbours.
     assert float(sounds.square().mean() / train.sounds.square().mean()) == pytest.approx(1.0, abs=0.5)
-    untrained = fit(train, plate_features(200), start, replace(TINY, warmup_steps=0, steps=1, learning_rate=1e-9))
+    untrained = fit(
+        train, plate_features(200), start, replace(TINY, warmup_steps=0, steps=1, learning_rate=1e-9), gains=Attention()
+    )
     assert torch.allclose(untrained.gain_field.gain_scale, start.gains[0])
 
 

@@ -37,7 +37,9 @@ class WhiteNoise:
         """Samples per second, Hz."""
         return self.train.sample_rate
 
-    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+    def render(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts samples"]:
         """Return noise that depends on the seed and on where the contact is, and on nothing else."""
         loudness = self.train.sounds.square().mean(dim=1).sqrt().mean()
         sounds = [self._noise(contact) for contact in contacts]
@@ -63,7 +65,9 @@ class NearestStrike:
         """Samples per second, Hz."""
         return self.train.sample_rate
 
-    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+    def render(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts samples"]:
         """Return the nearest training contact's sound."""
         return self.train.sounds[nearest_points(self.train.contacts, contacts)[:, 0]]
 
@@ -84,7 +88,9 @@ class MeanWaveform:
         """Samples per second, Hz."""
         return self.train.sample_rate
 
-    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+    def render(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts samples"]:
         """Return the mean of the nearest training contacts' sounds."""
         return self.train.sounds[nearest_points(self.train.contacts, contacts, count=self.count)].mean(dim=1)
 
@@ -114,7 +120,9 @@ class RandomImpact:
     sample_rate: float
     """Samples per second, Hz."""
 
-    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+    def render(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts samples"]:
         """Return the recording for every contact."""
         return self.sound.expand(len(contacts), -1)
 

@@ -65,7 +65,7 @@ class CaseRun:
             fit_seconds = time.perf_counter() - begun - (self.shared - shared)
             begun = time.perf_counter()
             with torch.no_grad():
-                sounds = renderer.render(self.test.contacts)
+                sounds = renderer.render(self.test.contacts, directions=self.test.directions)
             render_seconds = time.perf_counter() - begun
             judgement = self.evaluation.judging.judge(
                 renderer, sounds, self.test, self.truth, loudest=float(self.impacts.sounds.abs().max())

@@ -84,7 +84,7 @@ def evaluate(
             "resample one of them, or train on a capture of this rate"
         )
     with torch.no_grad():
-        sounds = renderer.render(impacts.contacts)
+        sounds = renderer.render(impacts.contacts, directions=impacts.directions)
     return score(sounds, impacts, convention=convention, fft_sizes=fft_sizes)
 
 

@@ -6,8 +6,10 @@ import torch
 
 from avmsf.bench.task import Look, Task
 from avmsf.capture.impacts import Impacts
+from avmsf.field.automatic import Automatic
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
+from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uninformed import uninformed
 from avmsf.modal.extraction import Extraction
@@ -46,8 +48,8 @@ class UninformedField:
     """What tables call it."""
     config: FitConfig = QUICK
     """Settings of the recipe whose steps are all taken end to end."""
-    correction_rate: float = 30.0
-    """Part of the learning rate for frequencies (in widths of their modes), dampings and noise (as logarithms)."""
+    correction_rate: float = 0.03
+    """Adam's step for frequencies (in widths of their modes) and for the logarithms of dampings."""
     look: Look = "visual"
     """What the network reads of the object's points."""
 
@@ -65,8 +67,18 @@ class UninformedField:
         return fit_field(task, task.train, task.features(self.look), start, config)
 
 
-def fit_field(task: Task, train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> SoundField:
-    """Fit a field to some of a task's training blows, in whose modes they are rows, with the task's seed."""
+def fit_field(
+    task: Task,
+    train: Impacts,
+    features: FeatureField,
+    modes: Extraction,
+    config: FitConfig,
+    *,
+    gains: GainRecipe | Automatic | None = None,
+) -> SoundField:
+    """Fit a field to some of a task's blows, in whose modes they are rows, by the network unless told otherwise."""
     # An object of few points has no more regions than points.
     clusters = min(config.clusters, len(torch.unique(features.points, dim=0)))
-    return fit(train, features, modes, replace(config, clusters=clusters, seed=task.seed), capture=task.name)
+    recipe = Attention() if gains is None else gains
+    config = replace(config, clusters=clusters, seed=task.seed)
+    return fit(train, features, modes, config, gains=recipe, capture=task.name)

@@ -95,7 +95,7 @@ def _take(modes: Extraction, rows: list[int]) -> Extraction:
 
 
 def _held_out_error(field: SoundField, held: Impacts) -> float:
-    difference = envelope(field.render(held.contacts)) - envelope(held.sounds.float())
+    difference = envelope(field.render(held.contacts, directions=held.directions)) - envelope(held.sounds.float())
     return float(difference.square().mean(dim=1).sqrt().mean())
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.bench.modalbaseline import ModalBaseline
-from avmsf.bench.thinplate import Spline, fit_spline
+from avmsf.field.thinplate import Spline, fit_spline
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +33,10 @@ class SplineGains(ModalBaseline):
     @property
     def report(self) -> dict[str, Any]:
         """What the spline is, as plain values: its kernel, directions, distinct contacts and smoothing."""
-        spline = self.spline
+        sites = self.spline.sites
         return {
-            "kernel": "thin plate" if spline.bending else "distance",
-            "directions": spline.sites.shape[1],
-            "sites": spline.sites.shape[0],
-            "smoothing": spline.smoothing,
+            "kernel": "thin plate" if sites.bending else "distance",
+            "directions": sites.sites.shape[1],
+            "sites": sites.sites.shape[0],
+            "smoothing": sites.smoothing,
         }

@@ -67,7 +67,9 @@ class ModalBaseline(ABC):
         """Return the signed gains in quadrature (of the cosines) at the contacts."""
         return self.amplitudes_at(contacts)[:, len(self.bank) :]
 
-    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+    def render(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts samples"]:
         """Return the modes' sound at each contact, and the noise beside it where there is any."""
         gains, quadrature = self.amplitudes_at(contacts).chunk(2, dim=1)
         samples = self.train.sounds.shape[1]

@@ -48,7 +48,9 @@ class Recorded:
         """Return where the sound that stands for a recording is expected."""
         return self.folder / (name if name.lower().endswith(".wav") else f"{name}.wav")
 
-    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+    def render(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts samples"]:
         """Return the files' sounds, as they are.
 
         Raises EvaluationError for a contact where nothing was recorded, for a file that is missing, and for one that is

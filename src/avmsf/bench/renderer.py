@@ -18,6 +18,11 @@ class Renderer(Protocol):
         """Samples per second of the rendered sounds, Hz."""
         ...
 
-    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
-        """Return the sound of a blow at each contact (object frame, metres), in the unit of the training sounds."""
+    def render(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return the sound of a blow at each contact (object frame, metres), in the unit of the training sounds.
+
+        `directions`, unit vectors along which the hammer moves, are for those to heed who know of directions.
+        """
         ...

@@ -40,7 +40,9 @@ class MeanSpectra:
         """Samples per second, Hz."""
         return self.train.sample_rate
 
-    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+    def render(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts samples"]:
         """Return the sounds whose spectra the means are."""
         rows = nearest_points(self.train.contacts, contacts, count=self.count)
         # A contact at a time: the spectra of all together would be many times larger than their sounds.

@@ -140,7 +140,7 @@ def _reconstruct(folder: Path, train: Impacts) -> Reconstruction:
 
 def _write_sounds(folder: Path, field: SoundField, train: Impacts, heard: Impacts) -> None:
     """Write recorded, rendered and averaged sounds on one scale, and a walk around the mug."""
-    rendered = field.render(heard.contacts)
+    rendered = field.render(heard.contacts, directions=heard.directions)
     averaged = MeanWaveform(train).render(heard.contacts)
     factor = Level("peak", -1.0).factor(torch.cat([heard.sounds, rendered, averaged]))
     for row in range(len(heard)):
@@ -190,7 +190,7 @@ def _draw(
         ),
         "spectrograms": draw_spectrograms(
             heard.sounds,
-            field.render(heard.contacts),
+            field.render(heard.contacts, directions=heard.directions),
             sample_rate=field.sample_rate,
             names=[f"contact {row + 1}" for row in range(len(heard))],
             title="contacts that the field has never heard",

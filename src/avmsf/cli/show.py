@@ -85,9 +85,11 @@ class Fitted:
         """Samples per second, Hz."""
         return self.field.sample_rate
 
-    def render(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts samples"]:
+    def render(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts samples"]:
         """Return the field's sounds."""
-        return self.field.render(contacts, samples=self.samples)
+        return self.field.render(contacts, directions=directions, samples=self.samples)
 
 
 def describe(field: SoundField) -> dict[str, Any]:
@@ -101,7 +103,7 @@ def describe(field: SoundField) -> dict[str, Any]:
         "mode_count": len(field.bank),
         "points": len(points),
         "extent_metres": (points.amax(0) - points.amin(0)).tolist(),
-        "encoder": field.gain_field.encoder,
+        "gain_field": {"kind": field.gain_field.kind, **field.gain_field.record()},
         "residual_rms": noise,
         "per_newton": field.origin.per_newton,
         "trained_on": list(field.origin.trained_on),
@@ -134,7 +136,7 @@ def draw_field(
         chosen = heard.take(farthest_points(heard.contacts, min(_DRAWN_CONTACTS, len(heard))).tolist())
         pictures["spectrograms"] = draw_spectrograms(
             chosen.sounds,
-            field.render(chosen.contacts, samples=chosen.sounds.shape[1]),
+            field.render(chosen.contacts, directions=chosen.directions, samples=chosen.sounds.shape[1]),
             sample_rate=field.sample_rate,
             names=chosen.names,
             title=f"{name}: recorded and rendered",

@@ -9,9 +9,8 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError
-from avmsf.field.config import FitConfig
+from avmsf.field.recipes import GainCase, GainRecipe
 from avmsf.modal.extraction import Extraction
-from avmsf.scene.features import FeatureField
 
 
 def expect_fitting(train: Impacts, modes: Extraction) -> None:
@@ -41,15 +40,15 @@ def expect_fitting(train: Impacts, modes: Extraction) -> None:
         )
 
 
-def fingerprint(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> str:
+def fingerprint(case: GainCase, recipe: GainRecipe) -> str:
     """Return a digest of all that decides a fit's result, this package's version among it."""
-    words = [version("avmsf"), asdict(config), train.names, train.sample_rate, features.encoder]
+    train, modes = case.train, case.modes
+    words = [version("avmsf"), asdict(case.config), recipe.name, recipe.digest()]
+    words += [train.digest(), case.features.digest()]
     digest = hashlib.sha256(json.dumps(words, sort_keys=True).encode())
-    tensors = [train.contacts, train.sounds, features.points, features.features]
-    tensors += [modes.bank.frequency, modes.bank.damping, modes.residual.magnitude]
+    tensors = [modes.bank.frequency, modes.bank.damping, modes.residual.magnitude]
     # Phases, and without a warm-up how strong the modes are, are those of the extraction.
-    tensors += [modes.gains, modes.quadrature]
-    for tensor in tensors if train.directions is None else [*tensors, train.directions]:
+    for tensor in (*tensors, modes.gains, modes.quadrature):
         digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from avmsf.errors import FitError
-from avmsf.field.gains import AttentionShape
+from avmsf.field.attention import AttentionShape
 from avmsf.modal.spectra import scaled_fft_size
 
 _LEAST = {
@@ -15,6 +15,7 @@ _LEAST = {
     "hidden": 1,
     "layers": 0,
     "correction_rate": 0,
+    "noise_rate": 0,
     "weight_decay": 0,
     "warmup_steps": 0,
     "steps": 0,
@@ -46,8 +47,10 @@ class FitConfig:
     """Adam's step at the start of the warm-up; it falls on a cosine to a tenth."""
     learning_rate: float = 1e-3
     """Adam's step at the start of the end-to-end stage, likewise (paper: 1e-2, 5e-3 or 1e-3)."""
-    correction_rate: float = 0.1
-    """Part of that step for frequencies, dampings and noise, which start close to where they end."""
+    correction_rate: float = 1e-2
+    """Likewise for frequencies, in widths of their modes, and for the logarithms of dampings."""
+    noise_rate: float = 0.1
+    """Likewise for the logarithms of the noise's magnitudes: what lies between modes is taken for noise at first."""
     weight_decay: float = 1.0
     """Decoupled weight decay on the network's matrices."""
     warmup_steps: int = 1000
@@ -126,7 +129,8 @@ PAPER = FitConfig(
     feature_scale=1.0,
     warmup_rate=5e-3,
     learning_rate=5e-3,
-    correction_rate=1.0,
+    correction_rate=5e-3,
+    noise_rate=5e-3,
     weight_decay=0.0,
     warmup_steps=1000,
     steps=10000,

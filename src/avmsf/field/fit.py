@@ -15,13 +15,13 @@ from torch import Tensor
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FieldFileError, FitError
 from avmsf.field.arguments import expect_fitting, fingerprint
+from avmsf.field.automatic import Automatic
 from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
 from avmsf.field.config import FitConfig
-from avmsf.field.gains import AttentionGains
 from avmsf.field.losses import spectral_loss
-from avmsf.field.orientation import orientation_signs
+from avmsf.field.recipes import GainCase, GainRecipe
 from avmsf.field.soundfield import Origin, SoundField
-from avmsf.field.training import Targets, TrainingRun, gain_scale
+from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction import Extraction
 from avmsf.modal.leastsquares import fit_sine_gains
@@ -59,14 +59,17 @@ def fit(
     modes: Extraction,
     config: FitConfig | None = None,
     *,
+    gains: GainRecipe | Automatic | None = None,
     capture: str = "",
     checkpoint: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> SoundField:
     """Fit a sound field to recordings (paper, section 3.5).
 
-    `modes` as extracted from `train`, or `uninformed` where there is no warm-up. Choices that the config leaves open
-    are made on a part of the training contacts held out for the purpose, then the field is fitted to all. With
+    `modes` as extracted from `train`, or `uninformed` where there is no warm-up. `gains` is how the gain field is made,
+    or `Automatic`, which chooses among several ways and is the default: between the paper's network and splines, for of
+    the object's shape nothing is known here. What the config leaves open is chosen on a part of the training contacts
+    held out for the purpose, then the field is fitted to all. With
     `checkpoint`, the state is kept there while the fit runs, on interruption and at the end, and a fit of the same
     arguments goes on from it to the same result; delete the file once the field is saved. Raises `FitError` for
     arguments that do not fit together and for a fit that diverges, `FieldFileError` for a checkpoint of another fit.
@@ -76,17 +79,22 @@ def fit(
     # Amplitudes are float32 from here on, so that a field is the same whichever its recordings came in.
     train = replace(train, sounds=train.sounds.float())
     modes = replace(modes, residual=Residual(modes.residual.magnitude.float()))
-    place = None if checkpoint is None else Path(checkpoint)
-    job = _Job(train, features, modes, config, place, progress)
+    case = gain_case(train, features, modes, config)
+    recipe = Automatic() if gains is None else gains
+    told: dict[str, Any] = {}
+    if isinstance(recipe, Automatic):
+        choice = recipe.choose(case)
+        recipe, told = choice.recipe, choice.report
+    job = _Job(case, recipe, None if checkpoint is None else Path(checkpoint), progress)
     chosen, report = job.choose()
     run = job.run("fit", list(range(len(train))), chosen)
     # Close modes may have passed one another on the way.
     order = torch.argsort(run.bank.frequency.detach())
-    run.network.reorder(order)
+    report = {"gains": recipe.name, **told, **run.network.report, **report}
     return SoundField(
         ModalBank(*(each.detach()[order] for each in (run.bank.frequency, run.bank.damping))),
-        run.network.eval().requires_grad_(False),
-        job.phase[order],
+        run.network.finished(order),
+        case.phase[order],
         Residual(run.residual.magnitude.detach().clone()),
         train.sample_rate,
         train.sounds.shape[1],
@@ -94,11 +102,25 @@ def fit(
     )
 
 
+def gain_case(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> GainCase:
+    """Return what gain fields are made from: the recordings, with how their modes start and how strong they are."""
+    phase = torch.zeros_like(modes.bank.frequency)
+    if config.phase == "common":
+        phase = common_phase(modes.gains, modes.quadrature)
+    if config.warmup_steps:
+        gains = fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate, phase=phase)
+    else:
+        # No aim then, they only say how strong the modes are: what of the extraction's own has the phase does.
+        turned = modes.gains * torch.cos(phase) + modes.quadrature * torch.sin(phase)
+        gains = turned.to(train.sounds)
+    return GainCase(train, features, modes, phase, gains, config)
+
+
 @dataclass(frozen=True)
 class _Plan:
     """A run's free choices."""
 
-    spatial_damping: bool
+    damping: str
     steps: int
 
 
@@ -107,29 +129,20 @@ class _Job:
 
     def __init__(
         self,
-        train: Impacts,
-        features: FeatureField,
-        modes: Extraction,
-        config: FitConfig,
+        case: GainCase,
+        recipe: GainRecipe,
         checkpoint: Path | None,
         progress: Callable[[Progress], None] | None,
     ) -> None:
-        self.train, self.features, self.modes, self.config = train, features, modes, config
-        self.checkpoint, self.progress = checkpoint, progress
-        signs = orientation_signs(train.contacts, train.directions)
-        self.phase = torch.zeros_like(modes.bank.frequency)
-        if config.phase == "common":
-            self.phase = common_phase(modes.gains, modes.quadrature)
-        if config.warmup_steps:
-            gains = fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate, phase=self.phase)
-        else:
-            # No aim then, they only say how strong the modes are: what of the extraction's own has the phase does.
-            turned = modes.gains * torch.cos(self.phase) + modes.quadrature * torch.sin(self.phase)
-            gains = turned.to(train.sounds)
-        self.gains = gains * signs[:, None]
-        self.rows = features.nearest(train.contacts)
-        self.regions = features.clusters(config.clusters)
-        self.fingerprint = fingerprint(train, features, modes, config)
+        self.case, self.recipe, self.checkpoint, self.progress = case, recipe, checkpoint, progress
+        self.train = case.train
+        # Where nothing has to be learnt first, the run starts end to end.
+        warmup = case.config.warmup_steps if recipe.warms_up else 0
+        self.config = case.config if warmup else replace(case.config, warmup_steps=0, steps=max(1, case.config.steps))
+        self.steps = case.config.steps
+        self.gains = case.gains * case.signs[:, None]
+        self.rows = recipe.rows(case)
+        self.fingerprint = fingerprint(case, recipe)
         saved = read_checkpoint(checkpoint, fingerprint=self.fingerprint) if checkpoint is not None else None
         self.trials: dict[str, Any] = {} if saved is None else saved["trials"]
         self.running: dict[str, Any] | None = None if saved is None else saved["running"]
@@ -137,27 +150,27 @@ class _Job:
 
     def choose(self) -> tuple[_Plan, dict[str, Any]]:
         """Return what the config leaves open, decided on validation contacts, and how it was decided."""
-        default = _Plan(self.config.damping == "per-contact", self.config.steps)
+        dampings = self.recipe.dampings(self.config)
+        default = _Plan(dampings[0], self.steps)
         count = round(self.config.validation * len(self.train))
-        undecided = self.config.damping == "validated"
-        if len(self.train) < _FEWEST_TO_VALIDATE or count < 1 or not (undecided or self.config.patience):
-            return default, {"damping": _named(default.spatial_damping), "validated": False}
+        undecided = len(dampings) > 1 or (self.config.patience > 0 and self.recipe.warms_up)
+        if len(self.train) < _FEWEST_TO_VALIDATE or count < 1 or not undecided:
+            return default, {"damping": default.damping, "validated": False}
         held = farthest_points(self.train.contacts, len(self.train)).tolist()[-count:]
         learnt = [row for row in range(len(self.train)) if row not in held]
-        variants = [False, True] if undecided else [default.spatial_damping]
-        for spatial in variants:
-            name = f"trial with {_named(spatial)} damping"
+        for damping in dampings:
+            name = f"trial with {damping} damping"
             if name not in self.trials:
-                self.run(name, learnt, _Plan(spatial, self.config.steps), held=held)
-        outcomes = {spatial: self.trials[f"trial with {_named(spatial)} damping"] for spatial in variants}
-        best = min(outcomes, key=lambda spatial: outcomes[spatial]["envelope"])
-        steps = outcomes[best]["steps"] if self.config.patience else self.config.steps
+                self.run(name, learnt, _Plan(damping, self.steps), held=held)
+        outcomes = {damping: self.trials[f"trial with {damping} damping"] for damping in dampings}
+        best = min(outcomes, key=lambda damping: outcomes[damping]["envelope"])
+        steps = outcomes[best]["steps"] if self.config.patience else self.steps
         report = {
-            "damping": _named(best),
+            "damping": best,
             "validated": True,
             "validation_contacts": [self.train.names[row] for row in held],
-            "validation_envelope": {_named(spatial): each["envelope"] for spatial, each in outcomes.items()},
-            "validation_spectral": {_named(spatial): each["spectral"] for spatial, each in outcomes.items()},
+            "validation_envelope": {damping: each["envelope"] for damping, each in outcomes.items()},
+            "validation_spectral": {damping: each["spectral"] for damping, each in outcomes.items()},
             "steps": steps,
         }
         return _Plan(best, steps), report
@@ -208,21 +221,14 @@ class _Job:
         return run
 
     def _start(self, learnt: list[int], plan: _Plan) -> TrainingRun:
-        gains = self.gains[learnt]
-        network = AttentionGains(
-            self.features,
-            gain_scale=gain_scale(gains),
-            shape=replace(self.config.shape, spatial_damping=plan.spatial_damping),
-            generator=torch.Generator().manual_seed(self.config.seed),
-            regions=self.regions,
-        )
+        case = self.case.take(learnt)
         # The cosine runs out where the plan ends, for a run that is meant to end early as well.
         config = replace(self.config, steps=max(1, plan.steps))
         return TrainingRun(
-            network,
-            self.modes,
-            gains=gains,
-            phase=self.phase,
+            self.recipe.start(case, plan.damping),
+            case.modes,
+            gains=self.gains[learnt],
+            phase=case.phase,
             sample_rate=self.train.sample_rate,
             samples=self.train.sounds.shape[1],
             config=config,
@@ -271,10 +277,6 @@ class _Look:
         run.generator.set_state(state)
         if not self.keep_best or spectral < self.best["spectral"]:
             self.best = {"spectral": spectral, "envelope": distance, "at": run.step}
-
-
-def _named(spatial_damping: bool) -> str:
-    return "per-contact" if spatial_damping else "shared"
 
 
 def _expect_finite_loss(loss: float, name: str, step: int) -> None:

@@ -8,7 +8,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.field.config import FitConfig
-from avmsf.field.gains import AttentionGains
+from avmsf.field.gainfield import GainField, Gains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual, shape_noise
 from avmsf.modal.synthesis import synthesise_phased
@@ -39,7 +39,7 @@ class SoundField:
 
     bank: ModalBank
     """Frequencies and dampings, shared by all contacts."""
-    gain_field: AttentionGains
+    gain_field: GainField
     """Gains at contacts, and the factors on the dampings where these vary."""
     phase: Float64[Tensor, " modes"]
     """How each mode starts, radians: mode k sounds as exp(-d t) sin(2 pi f t + phase). Zero in the paper."""
@@ -51,37 +51,59 @@ class SoundField:
     """Length of rendered sounds."""
     origin: Origin
 
-    def gains(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts modes"]:
-        """Return the signed amplitudes at the contacts (object frame, metres), in the unit of the training sounds."""
+    def gains(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts modes"]:
+        """Return the signed amplitudes at the contacts (object frame, metres), in the unit of the training sounds.
+
+        `directions`, unit vectors, are those of the blows; without them they go straight into the surface.
+        """
+        return self.known(contacts, directions=directions).mean
+
+    def known(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
+        """Return all that the gain field knows at the contacts: both parts of the gains, and their doubt."""
         with torch.no_grad():
-            return self.gain_field(contacts)[0]
+            return self.gain_field.at(contacts, directions)
 
     def dampings(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts modes"]:
         """Return the dampings at the contacts, 1/s: the bank's where they are shared."""
-        with torch.no_grad():
-            factors = self.gain_field(contacts)[1]
+        factors = self.known(contacts).damping
         shared = self.bank.damping.expand(len(contacts), -1)
         return shared if factors is None else shared * factors
 
     def render(
-        self, contacts: Float[Tensor, "contacts 3"], *, force: float = 1.0, samples: int | None = None
+        self,
+        contacts: Float[Tensor, "contacts 3"],
+        *,
+        directions: Float[Tensor, "contacts 3"] | None = None,
+        force: float = 1.0,
+        samples: int | None = None,
     ) -> Float[Tensor, "contacts samples"]:
-        """Return the sound of a blow at each contact, times `force`.
+        """Return the sound of a blow at each contact, along `directions` as in `gains`, times `force`.
 
         `force` in newtons where the recordings were divided by theirs, else relative to an average one of them. Of
         `samples` samples, or as long as the training sounds. The noise is one draw, the same at every contact and in
         every call, so that a contact's sound depends on nothing else.
         """
         length = self.samples if samples is None else samples
-        with torch.no_grad():
-            generator = torch.Generator().manual_seed(self.origin.config.seed)
-            noise = shape_noise(self.residual.magnitude, contacts=1, samples=length, generator=generator)
-            parts = [self._modes(part, length) for part in torch.split(contacts, _BATCH)]
-            return force * (torch.cat(parts) + noise)
+        generator = torch.Generator().manual_seed(self.origin.config.seed)
+        noise = shape_noise(self.residual.magnitude, contacts=1, samples=length, generator=generator)
+        parts = []
+        for rows in torch.split(torch.arange(len(contacts)), _BATCH):
+            known = self.known(contacts[rows], directions=None if directions is None else directions[rows])
+            parts.append(self._modes(known, length))
+        return force * (torch.cat(parts) + noise)
 
-    def _modes(self, contacts: Float[Tensor, "contacts 3"], samples: int) -> Float[Tensor, "contacts samples"]:
-        gains, factors = self.gain_field(contacts)
-        damping = self.bank.damping if factors is None else self.bank.damping * factors
+    def _modes(self, known: Gains, samples: int) -> Float[Tensor, "contacts samples"]:
+        damping = self.bank.damping if known.damping is None else self.bank.damping * known.damping
         return synthesise_phased(
-            gains, self.bank.frequency, damping, self.phase, samples=samples, sample_rate=self.sample_rate
+            known.mean,
+            self.bank.frequency,
+            damping,
+            self.phase,
+            samples=samples,
+            sample_rate=self.sample_rate,
+            quadrature=known.quadrature,
         )

@@ -1,7 +1,7 @@
 """A sound field as one file: safetensors, and one JSON in its header for all that is no tensor.
 
-Tensors are named by the path of their field: `bank.frequency`, `phase`, `gain_field.query.weight`. The
-header's metadata holds under the key `avmsf` the record that `avmsf.field.header` describes.
+Tensors are named by the path of their field: `bank.frequency`, `phase`, `gain_field.points`. The header's metadata
+holds under the key `avmsf` the record that `avmsf.field.header` describes.
 """
 
 from pathlib import Path
@@ -12,17 +12,21 @@ from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from avmsf.errors import FieldFileError
-from avmsf.field.gains import AttentionGains
-from avmsf.field.header import FORMAT, Header, read_header
+from avmsf.field.attention import AttentionGains
+from avmsf.field.gainfield import GainField
+from avmsf.field.header import FORMAT, Header, broken, read_header
+from avmsf.field.modalbasis import ModalBasis
 from avmsf.field.soundfield import SoundField
+from avmsf.field.thinplategains import ThinPlateGains
 from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
-from avmsf.scene.features import FeatureField, Regions
 
 _KEY = "avmsf"
 _GAIN_FIELD = "gain_field."
 _POSITIVE = ("bank.frequency", "bank.damping")
+_KINDS: dict[str, type[GainField]] = {each.kind: each for each in (AttentionGains, ThinPlateGains, ModalBasis)}
+"""The gain fields that a file may hold, by what it calls them."""
 
 
 def save(field: SoundField, path: str | Path) -> None:
@@ -50,7 +54,7 @@ def load(path: str | Path) -> SoundField:
     _expect_tensors(tensors, header, path)
     return SoundField(
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
-        _network(header, tensors),
+        _KINDS[header.kind].restore(header.gain_field, _of_gain_field(tensors)),
         tensors["phase"],
         Residual(tensors["residual.magnitude"]),
         header.sample_rate,
@@ -66,7 +70,7 @@ def _tensors(field: SoundField) -> dict[str, Tensor]:
         "phase": field.phase,
         "residual.magnitude": field.residual.magnitude,
     }
-    named |= {_GAIN_FIELD + name: tensor for name, tensor in field.gain_field.state_dict().items()}
+    named |= {_GAIN_FIELD + name: tensor for name, tensor in field.gain_field.tensors().items()}
     # Safetensors refuses tensors that share memory, as a field's points may with its features.
     return {name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in named.items()}
 
@@ -106,7 +110,7 @@ def _guess(path: Path) -> str:
 
 def _expect_tensors(tensors: dict[str, Tensor], header: Header, path: Path) -> None:
     """Compare names, shapes and dtypes with what the header's sizes ask for, and the values with what they mean."""
-    expected = _skeleton(header)
+    expected = _skeleton(header, path)
     missing, unexpected = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
     if missing or unexpected:
         raise FieldFileError(
@@ -127,35 +131,22 @@ def _expect_tensors(tensors: dict[str, Tensor], header: Header, path: Path) -> N
             raise FieldFileError(f"{path}: expected {name} to be {wanted} throughout, found otherwise: fit it again")
 
 
-def _skeleton(header: Header) -> dict[str, Tensor]:
+def _skeleton(header: Header, path: Path) -> dict[str, Tensor]:
     """Return tensors of the names, shapes and dtypes of a field with these sizes, which take no memory."""
-    with torch.device("meta"):
-        features = FeatureField(torch.empty(header.points, 3), torch.empty(header.points, header.dim), header.encoder)
-        regions = Regions(torch.empty(header.shape.clusters, 3), torch.empty(header.shape.clusters, header.dim))
-        network = AttentionGains(
-            features,
-            gain_scale=torch.empty(header.modes),
-            shape=header.shape,
-            generator=torch.Generator(device="cpu"),
-            regions=regions,
-        )
-        bank = torch.empty(header.modes, dtype=torch.float64)
-        residual = torch.empty(header.bins)
-    named = {"bank.frequency": bank, "bank.damping": bank, "phase": bank, "residual.magnitude": residual}
-    return named | {_GAIN_FIELD + name: tensor for name, tensor in network.state_dict().items()}
+    if header.kind not in _KINDS:
+        raise broken(path, ValueError(f"gain_field.kind is {header.kind!r}, not {', '.join(_KINDS)}"))
+    try:
+        gains = _KINDS[header.kind].skeleton(header.gain_field)
+    except (ValueError, TypeError, KeyError) as error:
+        raise broken(path, error) from error
+    bank = torch.empty(header.modes, dtype=torch.float64, device="meta")
+    named = {"bank.frequency": bank, "bank.damping": bank, "phase": bank}
+    named["residual.magnitude"] = torch.empty(header.bins, device="meta")
+    return named | {_GAIN_FIELD + name: tensor for name, tensor in gains.items()}
 
 
-def _network(header: Header, tensors: dict[str, Tensor]) -> AttentionGains:
-    state = {name.removeprefix(_GAIN_FIELD): each for name, each in tensors.items() if name.startswith(_GAIN_FIELD)}
-    network = AttentionGains(
-        FeatureField(state["points"], state["features"], header.encoder),
-        gain_scale=state["gain_scale"],
-        shape=header.shape,
-        generator=torch.Generator(),
-        regions=Regions(state["centers"], state["descriptors"]),
-    )
-    network.load_state_dict(state)
-    return network.eval().requires_grad_(False)
+def _of_gain_field(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(_GAIN_FIELD): each for name, each in tensors.items() if name.startswith(_GAIN_FIELD)}
 
 
 def _named(tensor: Tensor) -> str:

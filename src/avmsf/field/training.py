@@ -1,8 +1,9 @@
 """One training run: warm-up on extracted gains, then all parameters end to end (paper, section 3.5)."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Float64, Int
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 
 from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
-from avmsf.field.gains import AttentionGains
+from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction import Extraction
@@ -23,7 +24,7 @@ class Targets:
     """Recordings as the losses compare them: their gains, and their spectra, whole and at the beginning."""
 
     rows: Int[Tensor, " contacts"]
-    """Points of the gain field that are nearest to the contacts."""
+    """What the gain field reads for the contacts: rows of its points, or of what it was fitted to."""
     gains: Float[Tensor, "contacts modes"]
     """Extracted gains, the warm-up's aim."""
     whole: SpectralTarget
@@ -47,8 +48,42 @@ class Targets:
         )
 
 
+@runtime_checkable
+class TrainableGains(Protocol):
+    """A gain field on its way; a torch module, whose parameters the training moves."""
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What it chose before the training, as plain values."""
+        ...
+
+    def parameters(self) -> Iterator[nn.Parameter]:
+        """Yield what the training moves; matrices decay towards zero as the config asks for, the others do not."""
+        ...
+
+    def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
+        """Return the gains at the contacts that `Targets.rows` stands for, differentiable in the parameters."""
+        ...
+
+    def penalty(self) -> Float[Tensor, ""]:
+        """Return what speaks against the parameters beforehand, in the unit of the spectral loss."""
+        ...
+
+    def finished(self, order: Int[Tensor, " modes"]) -> GainField:
+        """Return the gain field as it stands, with its modes in the given order."""
+        ...
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return all that changes."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> object:
+        """Go back to what `state_dict` returned."""
+        ...
+
+
 class TrainingRun:
-    """Parameters on their way: a gain network, small corrections to the bank and residual, and their optimisers.
+    """Parameters on their way: a gain field, small corrections to the bank and residual, and their optimisers.
 
     The corrections are measured in what the recordings resolve: frequencies in their modes' widths, dampings and noise
     magnitudes as logarithms. So one learning rate serves all, and dampings and magnitudes stay positive.
@@ -56,7 +91,7 @@ class TrainingRun:
 
     def __init__(
         self,
-        network: AttentionGains,
+        network: TrainableGains,
         modes: Extraction,
         *,
         gains: Float[Tensor, "contacts modes"],
@@ -75,9 +110,8 @@ class TrainingRun:
         self.decay = nn.Parameter(torch.zeros(count, dtype=torch.float64))
         self.noise = nn.Parameter(torch.zeros(bins))
         self.generator = torch.Generator().manual_seed(config.seed)
-        matrices = [parameter for parameter in network.parameters() if parameter.ndim > 1]
-        vectors = [parameter for parameter in network.parameters() if parameter.ndim == 1]
-        corrections = [self.shift, self.decay] + ([self.noise] if config.residual else [])
+        matrices = [parameter for parameter in network.parameters() if parameter.ndim == 2]
+        vectors = [parameter for parameter in network.parameters() if parameter.ndim != 2]
 
         def groups() -> list[dict[str, Any]]:
             return [
@@ -86,10 +120,12 @@ class TrainingRun:
             ]
 
         self.warmup = torch.optim.AdamW(groups(), lr=config.warmup_rate)
-        self.joint = torch.optim.AdamW(
-            [*groups(), {"params": corrections, "weight_decay": 0.0, "share": config.correction_rate}],
-            lr=config.learning_rate,
-        )
+        corrections: list[dict[str, Any]] = [
+            {"params": [self.shift, self.decay], "weight_decay": 0.0, "rate": config.correction_rate}
+        ]
+        if config.residual:
+            corrections.append({"params": [self.noise], "weight_decay": 0.0, "rate": config.noise_rate})
+        self.joint = torch.optim.AdamW([*groups(), *corrections], lr=config.learning_rate)
         self.step = 0
         self.whole = True
         """False while parameters are being moved: an interruption then leaves a state that nothing can go on from."""
@@ -112,11 +148,15 @@ class TrainingRun:
 
     def sounds(self, rows: Int[Tensor, " contacts"]) -> Float[Tensor, "contacts samples"]:
         """Return the sounds at points of the gain field, with a fresh draw of noise (paper, eq. 12)."""
-        gains, factors = self.network.read(rows)
-        bank = self.bank
-        damping = bank.damping if factors is None else bank.damping * factors
+        gains, bank = self.network.read(rows), self.bank
         sounds = synthesise_phased(
-            gains, bank.frequency, damping, self.phase, samples=self.samples, sample_rate=self.sample_rate
+            gains.mean,
+            bank.frequency,
+            bank.damping if gains.damping is None else bank.damping * gains.damping,
+            self.phase,
+            samples=self.samples,
+            sample_rate=self.sample_rate,
+            quadrature=gains.quadrature,
         )
         if not self.config.residual:
             return sounds
@@ -134,7 +174,7 @@ class TrainingRun:
             optimiser, done = self.joint, (self.step - self.config.warmup_steps) / self.config.steps
             rate = self.config.learning_rate
         for group in optimiser.param_groups:
-            group["lr"] = rate * group.get("share", 1.0) * (0.55 + 0.45 * math.cos(math.pi * done))
+            group["lr"] = group.get("rate", rate) * (0.55 + 0.45 * math.cos(math.pi * done))
         optimiser.zero_grad()
         torch.autograd.backward(loss)
         self.whole = False
@@ -145,17 +185,17 @@ class TrainingRun:
         return float(loss.detach())
 
     def spectral_loss(self, targets: Targets) -> Float[Tensor, ""]:
-        """Return the loss on whole sounds and on their beginnings (paper, eq. 14)."""
+        """Return the loss on whole sounds and on their beginnings (paper, eq. 14), and the gain field's penalty."""
         sounds = self.sounds(targets.rows)
         early = spectral_loss(sounds, targets.early)
-        return spectral_loss(sounds, targets.whole) + self.config.early_weight * early
+        return spectral_loss(sounds, targets.whole) + self.config.early_weight * early + self.network.penalty()
 
     def _warmup_loss(self, targets: Targets) -> Float[Tensor, ""]:
         """Return the squared error of the gains (paper, eq. 13), over their mean square.
 
         Each mode weighs as its energy over time does, gain^2 / (4 d): a gain counts by the sound that it makes.
         """
-        gains, _ = self.network.read(targets.rows)
+        gains = self.network.read(targets.rows).mean
         return ((gains - targets.gains).square() * self.weight).sum(1).mean()
 
     def state(self) -> dict[str, Any]:

@@ -54,17 +54,18 @@ def synthesise_phased(
     *,
     samples: int,
     sample_rate: float,
+    quadrature: Float[Tensor, "contacts modes"] | None = None,
 ) -> Float[Tensor, "contacts samples"]:
-    """Return the sum over modes of gains exp(-d t) sin(2 pi f t + phase), phases in radians; else as `synthesise`."""
+    """Return the sum over modes of gains exp(-d t) sin(2 pi f t + phase), phases in radians; else as `synthesise`.
+
+    The quadrature's cosines, too, are ahead by the phase.
+    """
     turned = torch.polar(torch.ones_like(phase), phase)
-    return synthesise(
-        gains * turned.real.to(gains.dtype),
-        frequency,
-        damping,
-        samples=samples,
-        sample_rate=sample_rate,
-        quadrature=gains * turned.imag.to(gains.dtype),
-    )
+    along, ahead = turned.real.to(gains.dtype), turned.imag.to(gains.dtype)
+    sine, cosine = gains * along, gains * ahead
+    if quadrature is not None:
+        sine, cosine = sine - quadrature * ahead, cosine + quadrature * along
+    return synthesise(sine, frequency, damping, samples=samples, sample_rate=sample_rate, quadrature=cosine)
 
 
 def _decaying_sines(

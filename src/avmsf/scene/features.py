@@ -1,5 +1,6 @@
 """What is known of every point of an object's surface, for the gain field to read."""
 
+import hashlib
 import math
 from dataclasses import dataclass
 
@@ -78,6 +79,14 @@ class FeatureField:
     def half_diagonal(self) -> float:
         """Half the diagonal of the points' bounding box, metres: the object's size in formulas."""
         return _half_diagonal(self.points)
+
+    def digest(self) -> str:
+        """Return a digest of the points, their features and who made them."""
+        digest = hashlib.sha256(self.encoder.encode())
+        for tensor in (self.points, self.features):
+            digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
+            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
 
     def nearest(self, contacts: Float[Tensor, "contacts 3"]) -> Int[Tensor, " contacts"]:
         """Return the row of the point nearest to each contact (paper: i*, section 3.5)."""

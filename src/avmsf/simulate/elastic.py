@@ -53,6 +53,13 @@ class ElasticModes:
             total += weights[:, node, None, None] * self.shapes[rows[:, node]]
         return total
 
+    def normals(self, places: Float[Tensor, "contacts 3"]) -> Float64[Tensor, "contacts 3"]:
+        """Return the unit normals, out of the body, of the triangles nearest to each place."""
+        found = self._closest(places.double().numpy())
+        corners = self.nodes[self.triangles[torch.from_numpy(found.rows), :3]]
+        normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return normals / normals.norm(dim=1, keepdim=True)
+
     def gains(
         self, places: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"]
     ) -> Float64[Tensor, "contacts modes"]:

@@ -1,13 +1,17 @@
 """How strongly a blow at a place excites each mode: the paper's attention network (section 3.5)."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from itertools import pairwise
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from avmsf.field.gainfield import Gains
+from avmsf.field.records import count_of, like, record_of
 from avmsf.scene.features import FeatureField, Regions
 
 
@@ -31,12 +35,16 @@ class AttentionShape:
     """Whether damping, too, depends on the contact."""
 
 
+_EXAMPLE = AttentionShape(clusters=1, bands=0, width=1, hidden=1, layers=0, feature_scale=1.0)
+
+
 class AttentionGains(nn.Module):
     """Gains from a contact's own feature and from attention over the object's regions (paper, eqs. 7-11).
 
     Holds the points it looks contacts up in, so that a saved network needs nothing else.
     """
 
+    kind: ClassVar[str] = "attention"
     points: Float[Tensor, "points 3"]
     features: Float[Tensor, "points dim"]
     centers: Float[Tensor, "clusters 3"]
@@ -95,6 +103,11 @@ class AttentionGains(nn.Module):
             nn.init.zeros_(self.to_dampings.weight)
 
     @property
+    def report(self) -> dict[str, Any]:
+        """Return nothing: the network chose nothing beforehand."""
+        return {}
+
+    @property
     def feature_field(self) -> FeatureField:
         """The points and features that the network reads."""
         return FeatureField(self.points, self.features, self.encoder)
@@ -108,16 +121,12 @@ class AttentionGains(nn.Module):
                     layer.weight.copy_(layer.weight[modes])
                     layer.bias.copy_(layer.bias[modes])
 
-    def forward(
-        self, contacts: Float[Tensor, "contacts 3"]
-    ) -> tuple[Float[Tensor, "contacts modes"], Float[Tensor, "contacts modes"] | None]:
-        """Return the gains at the contacts, and the factors on the global dampings where these vary with place."""
+    def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
+        """Return the gains at the contacts, whichever way they are struck, and the factors where dampings vary."""
         return self.read(self.feature_field.nearest(contacts))
 
-    def read(
-        self, rows: Int[Tensor, " contacts"]
-    ) -> tuple[Float[Tensor, "contacts modes"], Float[Tensor, "contacts modes"] | None]:
-        """Return what `forward` does for the points of the given rows."""
+    def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
+        """Return what `at` does for the points of the given rows; differentiable in the network's parameters."""
         feature = self.features[rows] * self.shape.feature_scale
         offsets = (self.points[rows][:, None, :] - self.centers) / self.feature_field.half_diagonal
         query = self.query(torch.cat([encode(offsets, self.shape.bands).flatten(1), feature], dim=1))
@@ -125,10 +134,68 @@ class AttentionGains(nn.Module):
         key, value = self.key(descriptors), self.value(descriptors)
         attention = torch.softmax(query @ key.T / math.sqrt(self.shape.width), dim=1)
         hidden = self.head(torch.cat([attention @ value, feature], dim=1))
-        gains = self.to_gains(hidden) * self.gain_scale
-        if self.to_dampings is None:
-            return gains, None
-        return gains, torch.exp(self.to_dampings(hidden))
+        factors = None if self.to_dampings is None else torch.exp(self.to_dampings(hidden))
+        return Gains(self.to_gains(hidden) * self.gain_scale, damping=factors)
+
+    def deviation(
+        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts modes 2"] | None:
+        """Return None: a network knows no doubt."""
+        return None
+
+    def penalty(self) -> Float[Tensor, ""]:
+        """Return zero: what is known of the network beforehand is in its optimiser's weight decay."""
+        return self.gain_scale.new_zeros(())
+
+    def finished(self, order: Int[Tensor, " modes"]) -> "AttentionGains":
+        """Return the network with its modes in the given order, ready for use."""
+        self.reorder(order)
+        return self.eval().requires_grad_(False)
+
+    def record(self) -> dict[str, Any]:
+        """Return the sizes and who made the features."""
+        return {
+            "points": self.points.shape[0],
+            "dim": self.features.shape[1],
+            "modes": self.gain_scale.shape[0],
+            "encoder": self.encoder,
+            "shape": asdict(self.shape),
+        }
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the points, the features and the weights."""
+        return dict(self.state_dict())
+
+    @classmethod
+    def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return tensors like those of a network of these sizes, which take no memory."""
+        points, dim, modes = (count_of(record[name], name) for name in ("points", "dim", "modes"))
+        shape = record_of(_EXAMPLE, record["shape"], "gain_field.shape")
+        with torch.device("meta"):
+            features = FeatureField(torch.empty(points, 3), torch.empty(points, dim), "")
+            regions = Regions(torch.empty(shape.clusters, 3), torch.empty(shape.clusters, dim))
+            network = cls(
+                features,
+                gain_scale=torch.empty(modes),
+                shape=shape,
+                generator=torch.Generator(device="cpu"),
+                regions=regions,
+            )
+        like(record["encoder"], "", "gain_field.encoder")
+        return dict(network.state_dict())
+
+    @classmethod
+    def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "AttentionGains":
+        """Return the network, ready for use."""
+        network = cls(
+            FeatureField(tensors["points"], tensors["features"], record["encoder"]),
+            gain_scale=tensors["gain_scale"],
+            shape=record_of(_EXAMPLE, record["shape"], "gain_field.shape"),
+            generator=torch.Generator(),
+            regions=Regions(tensors["centers"], tensors["descriptors"]),
+        )
+        network.load_state_dict(dict(tensors))
+        return network.eval().requires_grad_(False)
 
 
 def encode(offsets: Float[Tensor, "*shape 3"], bands: int) -> Float[Tensor, "*shape encoded"]:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from avmsf.errors import FitError
-from avmsf.field.gains import AttentionGains, AttentionShape, encode
+from avmsf.field.attention import AttentionGains, AttentionShape, encode
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import cluster
 

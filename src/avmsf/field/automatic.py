@@ -1,0 +1,120 @@
+"""Which way of spreading gains suits an object, decided on its training contacts alone."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.errors import AvmsfError
+from avmsf.field.losses import spectral_loss, spectral_target
+from avmsf.field.recipes import SHARED, Attention, GainCase, GainRecipe, ThinPlate
+from avmsf.field.training import Targets, TrainingRun
+from avmsf.modal.synthesis import synthesise_phased
+from avmsf.scene.points import farthest_points
+
+FEWEST = 3
+"""Training contacts below which there is nothing to decide on."""
+FOLDS = 8
+"""Most parts that the training contacts are left out in; up to as many contacts each is left out alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """One of several recipes, and how it came to be chosen."""
+
+    recipe: GainRecipe
+    report: dict[str, Any]
+    """Under `choice`: each recipe's error at contacts left out in turn, and why those without one have none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Automatic:
+    """Leaves training contacts out in turn and takes the recipe that foretells them best."""
+
+    candidates: tuple[GainRecipe, ...] = (Attention(), ThinPlate())
+    """Recipes to choose from, the first where there are too few contacts to choose by."""
+    unavailable: Mapping[str, str] = field(default_factory=dict)
+    """Recipes that could not be had, and why: for the report."""
+    tell: Callable[[str], None] | None = None
+    """Told, in words, what is tried."""
+
+    def choose(self, case: GainCase) -> Choice:
+        """Return the recipe of the least relative STFT error, mean over contacts left out.
+
+        The modes are those of all training recordings; dampings are shared, and nothing is trained end to end, for this
+        changes little in what a place tells of its gains. A recipe that cannot be had says why in the report, and takes
+        no part. Raises what the first candidate raises where none can be had.
+        """
+        missing = dict(self.unavailable)
+        if len(case.train) < FEWEST or len(self.candidates) == 1:
+            for recipe in self.candidates:
+                try:
+                    recipe.start(case, SHARED)
+                except AvmsfError as error:
+                    missing[recipe.name] = str(error)
+                    continue
+                return Choice(recipe, {"choice": {"errors": {}, "missing": missing}})
+            return Choice(self.candidates[0], {"choice": {"errors": {}, "missing": missing}})
+        errors = {}
+        for recipe in self.candidates:
+            try:
+                errors[recipe.name] = self._error(recipe, case)
+            except AvmsfError as error:
+                missing[recipe.name] = str(error)
+        report = {"choice": {"errors": errors, "missing": missing}}
+        if not errors:
+            return Choice(self.candidates[0], report)
+        best = min(self.candidates, key=lambda each: errors.get(each.name, float("inf")))
+        return Choice(best, report)
+
+    def _error(self, recipe: GainRecipe, case: GainCase) -> float:
+        """Return a recipe's mean error at contacts left out in turn."""
+        order = farthest_points(case.train.contacts, len(case.train)).tolist()
+        parts = [order[first::FOLDS] for first in range(min(FOLDS, len(order)))]
+        total = 0.0
+        for number, held in enumerate(parts, start=1):
+            if self.tell is not None:
+                self.tell(f"choice: {recipe.name}, {number} of {len(parts)}")
+            learnt = [row for row in range(len(order)) if row not in held]
+            total += float(_errors(recipe, case, learnt, held).sum())
+        return total / len(order)
+
+
+def _errors(recipe: GainRecipe, case: GainCase, learnt: list[int], held: list[int]) -> Float[Tensor, " contacts"]:
+    """Return the relative STFT errors at the contacts held out."""
+    part, config = case.take(learnt), case.config
+    gains = recipe.start(part, SHARED)
+    if recipe.warms_up and config.warmup_steps:
+        run = TrainingRun(
+            gains,
+            part.modes,
+            gains=part.gains * part.signs[:, None],
+            phase=case.phase,
+            sample_rate=case.train.sample_rate,
+            samples=case.train.sounds.shape[1],
+            config=replace(config, steps=max(1, config.steps)),
+        )
+        targets = Targets.of(part.train, part.gains * part.signs[:, None], recipe.rows(part), config)
+        for _ in range(config.warmup_steps):
+            run.advance(targets)
+    bank, others = case.modes.bank, case.train.take(held)
+    with torch.no_grad():
+        known = gains.finished(torch.arange(len(bank))).at(others.contacts, others.directions)
+        sounds = synthesise_phased(
+            known.mean.float(),
+            bank.frequency,
+            bank.damping,
+            case.phase,
+            samples=others.sounds.shape[1],
+            sample_rate=others.sample_rate,
+            quadrature=known.quadrature,
+        )
+        sizes, hops, _ = config.resolutions(others.sample_rate)
+        errors = []
+        for sound, heard in zip(sounds[:, None], others.sounds[:, None], strict=True):
+            target = spectral_target(heard, fft_sizes=sizes, hops=hops)
+            errors.append(spectral_loss(sound, target) / len(sizes))
+    return torch.stack(errors)

@@ -1,0 +1,71 @@
+"""What every gain field is to the rest of the house: gains at contacts, how sure they are, and nothing about time."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """How strongly blows at some contacts excite each mode."""
+
+    mean: Float[Tensor, "contacts modes"]
+    """Signed amplitudes of what starts with each mode's phase, in the unit of the training sounds."""
+    quadrature: Float[Tensor, "contacts modes"] | None = None
+    """Signed amplitudes of what is a quarter of a period ahead of that; None where there is nothing of it."""
+    damping: Float[Tensor, "contacts modes"] | None = None
+    """Factors on the modes' dampings; None where these are the same everywhere."""
+
+
+@runtime_checkable
+class GainField(Protocol):
+    """Gains at every contact with one object. One contract test holds for all that implement it."""
+
+    kind: ClassVar[str]
+    """What a file calls it."""
+
+    @property
+    def points(self) -> Float[Tensor, "points 3"]:
+        """Points of the object's surface, object frame, metres: where pictures and searches look."""
+        ...
+
+    def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
+        """Return the gains of blows at contacts (object frame, metres).
+
+        `directions`, the unit vectors along which the hammer moves, are heeded by fields that know of directions; these
+        take a blow straight into the surface where none are given.
+        """
+        ...
+
+    def deviation(
+        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts modes 2"] | None:
+        """Return the standard deviation of what is believed of the gains and of the quadrature at contacts.
+
+        Of the gains themselves, without the scatter of blows. None where the field knows no doubt.
+        """
+        ...
+
+    def record(self) -> dict[str, Any]:
+        """Return what a file holds beside the tensors, as plain values, sizes included."""
+        ...
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return what a file holds, by name."""
+        ...
+
+    @classmethod
+    def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return tensors on the device `meta`, of the names, shapes and dtypes that belong to a record.
+
+        Raises ValueError, TypeError or KeyError for a record that belongs to no such field.
+        """
+        ...
+
+    @classmethod
+    def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "GainField":
+        """Return the field of a record and the tensors that belong to it."""
+        ...

@@ -1,0 +1,137 @@
+"""The recipe that knows the object's shape: elastic modes of the likeliest body, and gains by evidence."""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64, Int
+from torch import Tensor
+
+from avmsf.errors import FitError
+from avmsf.field.bodychoice import MeasuredGains, likely_bodies
+from avmsf.field.config import FitConfig
+from avmsf.field.recipes import SHARED, GainCase
+from avmsf.field.refinement import RefinedGains
+from avmsf.field.suspects import agreeing, doubted, find_suspects
+from avmsf.simulate.nominal import NominalBodies, NominalBody
+
+FEWEST = 3
+"""Strikes below which evidence says nothing."""
+_SPREAD = 0.02
+"""Diagonal of the contacts' box over the object's, below which all were struck in one place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Physics:
+    """Gains from elastic mode shapes, `ModalBasis`."""
+
+    bodies: NominalBodies
+    """What may lie behind the object's surface."""
+    refine: Callable[[NominalBody], NominalBody] | None = None
+    """Makes the chosen body's elements finer, where there were several to choose from."""
+
+    @property
+    def name(self) -> str:
+        """`physics`."""
+        return "physics"
+
+    @property
+    def warms_up(self) -> bool:
+        """The regression is solved for."""
+        return False
+
+    def digest(self) -> str:
+        """Return a digest of the bodies."""
+        digest = hashlib.sha256()
+        for body in self.bodies.bodies:
+            digest.update(body.name.encode())
+            for tensor in (body.elastic.frequency, body.elastic.nodes, body.elastic.shapes):
+                digest.update(tensor.contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
+    def dampings(self, config: FitConfig) -> tuple[str, ...]:
+        """Return shared dampings alone: a mode decays as fast wherever it was struck."""
+        return (SHARED,)
+
+    def start(self, case: GainCase, damping: str) -> RefinedGains:
+        """Return the field of the likeliest body.
+
+        Raises FitError for fewer than three strikes, all strikes in one place, and directions of length zero.
+        """
+        _expect_strikes(case)
+        heard, points, bodies = measured_gains(case), case.features.points, self.bodies.bodies
+        likely = likely_bodies(bodies, points, heard)
+        suspects = find_suspects(likely, heard)
+        measured = doubted(heard, suspects)
+        likely = likely_bodies(bodies, points, measured) if suspects else likely
+        body = agreeing(likely, measured)
+        if self.refine is not None:
+            finer = self.refine(next(each for each in bodies if each.name == body.name))
+            body = agreeing(likely_bodies([finer], points, measured), measured)
+        report = {
+            "body": body.name,
+            "factor": body.factor,
+            "bodies": [{"body": each.name, "factor": each.factor, "lag": each.lag} for each in likely],
+            "bodies_refused": dict(self.bodies.refused),
+            "suspects": {case.train.names[each.row]: each.describe(case.train.names) for each in suspects},
+        }
+        return RefinedGains(replace(body.fit(measured), report=report), case.modes.bank)
+
+    def rows(self, case: GainCase) -> Int[Tensor, " contacts"]:
+        """Return the contacts themselves."""
+        return torch.arange(len(case.train))
+
+
+def measured_gains(case: GainCase) -> MeasuredGains:
+    """Return a case's gains as the regression takes them, with the standard errors that noise gives them."""
+    bank, values = case.modes.bank, case.parts
+    size = values.square().mean((0, 2))
+    return MeasuredGains(
+        case.train.contacts,
+        case.train.directions,
+        values,
+        bank.frequency,
+        bank.damping,
+        (gain_variance(case) / size.clamp_min(torch.finfo(torch.float64).tiny)).expand(len(case.train), -1),
+        torch.ones(len(case.train), dtype=torch.float64),
+    )
+
+
+def gain_variance(case: GainCase) -> Float64[Tensor, " modes"]:
+    """Return the variance that the background noise gives each gain by least squares.
+
+    White noise of variance v on samples at a rate r leaves a damped sine's amplitude with 2 v / r over the energy
+    (1 - exp(-2 d T)) / (4 d), twice that of the sine squared alone, for each of its two parts; around the mode's
+    frequency the residual is as good as white.
+    """
+    bank, magnitude = case.modes.bank, case.modes.residual.magnitude.double()
+    place = bank.frequency / (case.train.sample_rate / 2) * (len(magnitude) - 1)
+    noise = magnitude[place.round().long().clamp(0, len(magnitude) - 1)].square()
+    lasting = -torch.expm1(-2.0 * bank.damping * case.train.duration)
+    return 4.0 * bank.damping * noise / (case.train.sample_rate * lasting)
+
+
+def _expect_strikes(case: GainCase) -> None:
+    train = case.train
+    if len(train) < FEWEST:
+        raise FitError(
+            f"physics needs {FEWEST} strikes or more to tell how much of each shape a mode has, found {len(train)}: "
+            "strike more places, or take gains='spline'"
+        )
+    extent = float((train.contacts.amax(0) - train.contacts.amin(0)).norm())
+    size = 2.0 * case.features.half_diagonal
+    if extent < _SPREAD * size:
+        raise FitError(
+            f"all {len(train)} strikes lie within {extent:.2g} m on an object of {size:.2g} m: strike it in several "
+            "places"
+        )
+    if train.directions is not None:
+        lengths = train.directions.norm(dim=1)
+        wrong = torch.nonzero(~(lengths > 0)).flatten()
+        if len(wrong):
+            row = int(wrong[0])
+            raise FitError(
+                f"{train.names[row]}: its direction is a vector of length zero: give the way the hammer moved, or "
+                "leave nx, ny, nz out for all strikes"
+            )

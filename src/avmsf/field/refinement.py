@@ -1,0 +1,93 @@
+"""Gain fields that are linear in the gains they were made from, refined end to end: the posterior is the prior."""
+
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Float32, Float64, Int
+from torch import Tensor, nn
+
+from avmsf.field.gainfield import GainField, Gains
+from avmsf.modal.bank import ModalBank
+
+_STEP = 200.0
+"""Standard errors that a parameter of one stands for: so a learning rate made for networks moves gains in time."""
+_STRENGTH = 0.1
+"""Spectral loss that gains are worth which are off by one standard error each: about what it measures of them."""
+
+
+@runtime_checkable
+class LinearGains(GainField, Protocol):
+    """A gain field whose mean gains are weighted sums of the gains at the contacts that it was fitted to."""
+
+    @property
+    def values(self) -> Float64[Tensor, "contacts modes 2"]:
+        """Return the gains at the contacts in two parts."""
+        ...
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What it chose, as plain values."""
+        ...
+
+    @property
+    def noise(self) -> Float64[Tensor, "contacts modes 2"]:
+        """Standard error of each of the two parts of the gains at the contacts."""
+        ...
+
+    def smoother(self) -> Float64[Tensor, "modes 2 contacts contacts"]:
+        """Return what each contact's gain counts for at each contact, for each part of each mode."""
+        ...
+
+    def with_values(self, values: Float64[Tensor, "contacts modes 2"]) -> "LinearGains":
+        """Return the field made of other gains at the same contacts."""
+        ...
+
+    def take(self, modes: Int[Tensor, " modes"]) -> "LinearGains":
+        """Return the field of the given modes, in the given order."""
+        ...
+
+
+class RefinedGains(nn.Module):
+    """A linear gain field whose measured gains may move, as far as their standard errors allow."""
+
+    smoother: Float32[Tensor, "modes 2 contacts contacts"]
+    start: Float32[Tensor, "contacts modes 2"]
+    noise: Float32[Tensor, "contacts modes 2"]
+    share: Float32[Tensor, " modes"]
+
+    def __init__(self, field: LinearGains, bank: ModalBank) -> None:
+        """Start from a field of the modes of `bank`, whose energies say how much a gain matters."""
+        super().__init__()
+        self.field = field
+        smoother = field.smoother()
+        self.register_buffer("smoother", smoother.float())
+        self.register_buffer("start", _applied(smoother, field.values).float())
+        self.register_buffer("noise", field.noise.float())
+        energy = field.values.square().sum((0, 2)) / bank.damping
+        self.register_buffer("share", (energy / energy.sum().clamp_min(torch.finfo(torch.float64).tiny)).float())
+        self.shift = nn.Parameter(torch.zeros_like(self.start))
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What the field chose."""
+        return self.field.report
+
+    def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
+        """Return the gains at the contacts of these rows."""
+        parts = (self.start + _applied(self.smoother, _STEP * self.noise * self.shift))[rows]
+        return Gains(parts[..., 0], parts[..., 1])
+
+    def penalty(self) -> Float[Tensor, ""]:
+        """Return the squared shifts over the squared standard errors, each mode by its part of the energy."""
+        squares = (_STEP * self.shift).square().mean((0, 2))
+        return 0.5 * _STRENGTH * (squares * self.share).sum()
+
+    def finished(self, order: Int[Tensor, " modes"]) -> LinearGains:
+        """Return the field of the gains as they stand, with its modes in the given order."""
+        moved = self.field.values + (_STEP * self.noise * self.shift).detach().double()
+        return self.field.with_values(moved).take(order)
+
+
+def _applied(smoother: Tensor, values: Tensor) -> Tensor:
+    """Return the smoothed values, part by part and mode by mode; both values are [contacts, modes, 2]."""
+    return (smoother @ values.permute(1, 2, 0)[..., None]).squeeze(-1).permute(2, 0, 1)

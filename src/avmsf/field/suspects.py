@@ -1,0 +1,178 @@
+"""Strikes that disagree with all others: a wrong row in the table of contacts, or a direction turned round."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from avmsf.field.bodychoice import ChosenBody, MeasuredGains
+from avmsf.field.evidence import NOISES, REMAINDERS, WIDTHS
+from avmsf.scene.points import farthest_points
+
+_DOUBT = 1e6
+"""Factor on the noise of a strike that counts for nothing."""
+_HYPOTHESIS = (WIDTHS.index(0.2), REMAINDERS.index(0.1), NOISES.index(0.1))
+"""What strikes are compared by: not what the gains make likeliest, for wrong ones make noise likeliest."""
+_COST = 0.8
+"""Squared misfit over that of silence, summed over all strikes, that taking one out has to save.
+
+On the aircraft, of 15 strikes with right labels none saves so much; three that have changed places save 1 to 4 each.
+"""
+_ENOUGH = 1.5
+"""Misfit beyond which a strike could not be more wrong."""
+_MOST = 0.25
+"""Part of the strikes that may be suspect: more than that, and it is the model that is wrong."""
+_FEWEST = 6
+"""Strikes below which none can be told from the others."""
+_BODIES = 6
+"""Most of the likeliest bodies that are asked."""
+_LAG = 12.0
+"""Nats of evidence that a body may lack of the likeliest."""
+_NATS = 10.0
+"""Log likelihood of frequencies that counts as much as one strike that is foretold no better than by silence."""
+_PLACES = 500
+"""Places at which a suspect is looked for."""
+_FLOOR = 1e-3
+"""Least scatter of a mode's gains, over their mean square."""
+_NOWHERE = 0.55
+"""Misfit beyond which a place does not explain a strike."""
+_BETTER = 0.35
+"""Misfit at the best place over that at the label, below which the label is wrong: few strikes tell little of one."""
+_SURELY = 2.0
+"""Misfit from which on a strike is wrong even if no place explains it; else it may be one that nobody else tells of."""
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A strike whose gains do not belong where its label says."""
+
+    row: int
+    """Among the training contacts."""
+    misfit: float
+    """Squared misfit at its label over that of silence."""
+    distance: float
+    """Metres from its label to the place of the surface that its gains fit best."""
+    reversed: bool
+    """Whether they fit best with the blow's direction turned round."""
+    best: float
+    """Squared misfit there, over that of silence."""
+
+    def describe(self, names: Sequence[str]) -> str:
+        """Say what is wrong with it."""
+        turned = " with its direction reversed" if self.reversed else ""
+        if self.best > _NOWHERE:
+            found = "fits nowhere on the object"
+        elif self.distance < 1e-9:
+            found = f"fits best{turned}" if turned else "fits its place badly"
+        else:
+            found = f"fits best {self.distance:.2g} m away{turned}"
+        return f"{names[self.row]} {found} (misfit {self.misfit:.2g} where it is said to be, {self.best:.2g} there)"
+
+
+def agreeing(bodies: Sequence[ChosenBody], measured: MeasuredGains) -> ChosenBody:
+    """Return the one of the likely bodies with which strikes that are left out in turn are foretold best.
+
+    Few strikes' evidence is won by single modes; being left out, all strikes have a say. Bodies whose evidence lags far
+    behind are not asked, and how well the frequencies are met counts as well.
+    """
+    strong = measured.strongest()
+    silent = frozenset(torch.nonzero(measured.doubt > 1.0).flatten().tolist())
+    asked = [body for body in bodies if body.lag <= _LAG][:_BODIES]
+    return min(asked, key=lambda body: _Judge(body, strong).cost(silent) - body.suits / _NATS)
+
+
+def find_suspects(bodies: Sequence[ChosenBody], measured: MeasuredGains) -> tuple[Suspect, ...]:
+    """Return the strikes without which all others foretell one another best, worst first.
+
+    A strike is foretold by all others that speak. Taking one out has to save a sum of misfits, its own and what it does
+    to the others'; strikes are taken out, put back and exchanged as long as that helps, a quarter of them at most.
+    Judged by the strongest modes, and by the body among `bodies` with which strikes agree best in the end: wrong ones
+    mislead the choice of the body.
+    """
+    strong = measured.strongest()
+    if len(strong.contacts) < _FEWEST:
+        return ()
+    outcomes = []
+    for body in [each for each in bodies if each.lag <= _LAG][:_BODIES]:
+        judge = _Judge(body, strong)
+        outcomes.append((*_quietest(judge), judge))
+    _, silent, judge = min(outcomes, key=lambda each: each[0])
+    found = [judge.located(row, silent) for row in sorted(silent)]
+    wrong = [each for each in found if each.best < _BETTER * each.misfit or each.misfit > _SURELY]
+    return tuple(sorted(wrong, key=lambda each: -each.misfit))
+
+
+def doubted(measured: MeasuredGains, suspects: Sequence[Suspect]) -> MeasuredGains:
+    """Return the gains with suspects counting for nothing."""
+    doubt = measured.doubt.clone()
+    doubt[[each.row for each in suspects]] = _DOUBT
+    return replace(measured, doubt=doubt)
+
+
+def _quietest(judge: "_Judge") -> tuple[float, frozenset[int]]:
+    """Return the least cost that is found, and those that are silent then."""
+    count = len(judge.power)
+    silent: frozenset[int] = frozenset()
+    cost = judge.cost(silent)
+    while True:
+        near = [silent ^ {row} for row in range(count)]
+        near += [silent - {out} | {row} for out in silent for row in range(count) if row not in silent]
+        allowed = [each for each in near if len(each) <= int(_MOST * count)]
+        costs = [judge.cost(each) for each in allowed]
+        best = min(range(len(allowed)), key=costs.__getitem__)
+        if costs[best] >= cost:
+            return cost, silent
+        silent, cost = allowed[best], costs[best]
+
+
+class _Judge:
+    """Foretells strikes from others, by one hypothesis for all modes."""
+
+    def __init__(self, body: ChosenBody, measured: MeasuredGains) -> None:
+        self.body, self.measured = body, measured
+        self.field = body.fit(measured)
+        self.covariance = self.field.regression.covariance_of(*_HYPOTHESIS)
+        self.values = measured.values.transpose(0, 1)
+        self.power = measured.values.square().sum(2)
+
+    def cost(self, silent: frozenset[int]) -> float:
+        """Return the sum of the misfits of those that speak, and of the price for those that do not."""
+        speaking = [row for row in range(len(self.power)) if row not in silent]
+        inverse = torch.linalg.inv(self.covariance[:, speaking][:, :, speaking])
+        solved = inverse @ self.values[:, speaking]
+        errors = (solved / torch.diagonal(inverse, dim1=1, dim2=2)[..., None]).square().sum(2).T
+        misfits = self._relative(errors, self.power[speaking], self._scatter(errors, speaking))
+        return float(misfits.clamp_max(_ENOUGH).sum()) + _COST * len(silent)
+
+    def located(self, row: int, silent: frozenset[int]) -> Suspect:
+        """Return where on the surface, and which way round, a strike fits best, foretold by those that speak."""
+        speaking = [each for each in range(len(self.power)) if each not in silent]
+        inverse = torch.linalg.inv(self.covariance[:, speaking][:, :, speaking])
+        solved = inverse @ self.values[:, speaking]
+        errors = (solved / torch.diagonal(inverse, dim1=1, dim2=2)[..., None]).square().sum(2).T
+        scatter = self._scatter(errors, speaking)
+        surface = self.body.surface
+        rows = farthest_points(surface.points, min(_PLACES, len(surface.points)))
+        places = torch.cat([self.measured.contacts[row : row + 1].double(), surface.points[rows].double()])
+        directions = torch.cat([self.field.directions[row : row + 1], surface.inward[rows].double()])
+        cross = self.field.covariance_with(places, directions, *_HYPOTHESIS)[:, :, speaking]
+        there = (cross @ solved).transpose(0, 1)
+        both = torch.stack([there, -there])
+        squares = (self.measured.values[row] - both).square().sum(3)
+        misfits = self._relative(squares, self.power[row], scatter)
+        turned, place = divmod(int(misfits.argmin()), len(places))
+        distance = float((places[place] - places[0]).norm())
+        return Suspect(row, float(misfits[0, 0]), distance, bool(turned), float(misfits[turned, place]))
+
+    def _scatter(self, errors: Float64[Tensor, "speaking modes"], speaking: list[int]) -> Float64[Tensor, " modes"]:
+        least = _FLOOR * self.power.mean(0)
+        return (errors.median(0).values + least).clamp_min(torch.finfo(torch.float64).tiny)
+
+    def _relative(
+        self, squares: Float64[Tensor, "*contacts modes"], power: Float64[Tensor, "*speaking modes"], scatter: Tensor
+    ) -> Float64[Tensor, "*contacts"]:
+        """Return squared misfits over what silence would have, every mode by how well it is foretold."""
+        silence = (power / scatter).sum(-1).clamp_min(torch.finfo(torch.float64).tiny)
+        return (squares / scatter).sum(-1) / silence

@@ -1,0 +1,170 @@
+"""Functions of place through scattered values: thin-plate splines, smoothed only as far as the values ask for it.
+
+The least bent of all functions that pass the given values at given distances: a linear function of place plus, for
+every site, a weight times r^2 log r, where the weights are orthogonal to all linear functions. The smoothing is a
+number on the diagonal of its equations: zero passes through all values, infinity leaves the linear function. The error
+at a site that is left out needs no second solution: it is the site's weight over the diagonal of the inverse.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from avmsf.errors import FitError
+
+SMOOTHINGS = (0.0, *(10.0 ** (0.5 * step) for step in range(-10, 5)))
+"""What is tried, for sites within a unit of length."""
+_FLAT = 1e-3
+"""Extent relative to the longest below which a direction is one of measuring errors alone."""
+_ENOUGH = 2
+"""How many times the sites that determine a linear function it takes for one to be fitted."""
+_FEWEST_TO_SMOOTH = 16
+"""Sites from which on leaving them out tells of noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class SplineSites:
+    """Places that values may be known at, and how values there spread; linear in the values, whatever they are."""
+
+    contacts: Float64[Tensor, "contacts 3"]
+    """Metres; those in one place count as one, with their values' mean."""
+    smoothing: float
+    """What the diagonal of the equations is given."""
+
+    @cached_property
+    def _places(self) -> tuple[Float64[Tensor, "sites 3"], Float64[Tensor, "sites contacts"]]:
+        """Distinct contacts, and the matrix that takes the mean of the values at each."""
+        places, owner = torch.unique(self.contacts, dim=0, return_inverse=True)
+        mean = (owner[None, :] == torch.arange(len(places))[:, None]).double()
+        return places, mean / mean.sum(1, keepdim=True)
+
+    @cached_property
+    def middle(self) -> Float64[Tensor, " 3"]:
+        """Middle of the sites, metres."""
+        return self._places[0].mean(0)
+
+    @cached_property
+    def axes(self) -> Float64[Tensor, "3 dim"]:
+        """Principal axes of the sites along which they differ, over their longest extent."""
+        centred = self._places[0] - self.middle
+        _, _, rows = torch.linalg.svd(centred, full_matrices=False)
+        along = centred @ rows.T
+        extent = along.amax(0) - along.amin(0)
+        longest = float(extent.max())
+        return rows[extent > _FLAT * longest].T / (longest or 1.0)
+
+    @cached_property
+    def sites(self) -> Float64[Tensor, "sites dim"]:
+        """Distinct places that values are known at, along the axes."""
+        return (self._places[0] - self.middle) @ self.axes
+
+    @property
+    def bending(self) -> bool:
+        """Whether the sites' functions are r^2 log r, beside a linear function; else they are r, beside a constant."""
+        return len(self.sites) >= _ENOUGH * (self.sites.shape[1] + 1)
+
+    @cached_property
+    def inverse(self) -> Float64[Tensor, "terms terms"]:
+        """Of the spline's equations: the sites' functions with the smoothing, bordered by the drift."""
+        drift = _drift(self.sites, self.bending)
+        terms = drift.shape[1]
+        kernel = _kernel(self.sites, self.sites, self.bending)
+        kernel = kernel + self.smoothing * torch.eye(len(self.sites), dtype=torch.float64)
+        border = torch.cat([drift.T, drift.new_zeros(terms, terms)], dim=1)
+        return torch.linalg.inv(torch.cat([torch.cat([kernel, drift], dim=1), border]))
+
+    def weights(self, places: Float[Tensor, "places 3"]) -> Float64[Tensor, "places contacts"]:
+        """Return what each contact's value counts for at places in metres."""
+        return self._terms(places) @ self.inverse[:, : len(self.sites)] @ self._places[1]
+
+    def spread(self, places: Float[Tensor, "places 3"]) -> Float64[Tensor, " places"]:
+        """Return the variance of a value at each place, given all sites', over that of the sites' functions' weights.
+
+        A spline is the mean of a random field whose covariance is known but for a linear function (kriging).
+        """
+        terms = self._terms(places)
+        quadratic = -((terms @ self.inverse) * terms).sum(1)
+        return (quadratic if self.bending else -quadratic).clamp_min(0.0)
+
+    def left_out(self, values: Float[Tensor, "contacts values"]) -> Float64[Tensor, "sites values"]:
+        """Return the errors at sites whose values are left out in turn."""
+        return self._coefficients(values)[: len(self.sites)] / self._diagonal[:, None]
+
+    def field_variance(self, values: Float[Tensor, "contacts values"]) -> Float64[Tensor, " values"]:
+        """Return the variance that `spread` is relative to, told by the errors at sites left out in turn."""
+        weights = self._coefficients(values)[: len(self.sites)]
+        return (weights.square() / self._diagonal.abs()[:, None]).mean(0)
+
+    @property
+    def _diagonal(self) -> Float64[Tensor, " sites"]:
+        return torch.diagonal(self.inverse)[: len(self.sites)]
+
+    def _coefficients(self, values: Float[Tensor, "contacts values"]) -> Float64[Tensor, "terms values"]:
+        return self.inverse[:, : len(self.sites)] @ (self._places[1] @ values.double())
+
+    def _terms(self, places: Float[Tensor, "places 3"]) -> Float64[Tensor, "places terms"]:
+        along = (places.double() - self.middle) @ self.axes
+        return torch.cat([_kernel(along, self.sites, self.bending), _drift(along, self.bending)], dim=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Spline:
+    """A function of place with one value or many."""
+
+    sites: SplineSites
+    values: Float64[Tensor, "contacts values"]
+    """Values at the sites' contacts."""
+
+    def at(self, contacts: Float[Tensor, "contacts 3"]) -> Float64[Tensor, "contacts values"]:
+        """Return the values at places in metres."""
+        return self.sites.weights(contacts) @ self.values
+
+
+def fit_spline(
+    contacts: Float[Tensor, "contacts 3"],
+    values: Float[Tensor, "contacts values"],
+    *,
+    importance: Float[Tensor, " values"],
+) -> Spline:
+    """Return the function through values at contacts in metres.
+
+    Contacts in one place count as one with their mean values; directions in which they do not differ have no part.
+
+    With fewer sites than twice what determines a linear function (eight in space, six in a plane) that function would
+    run away beyond them: then the function is the biharmonic one, a constant and multiples of r, which does not. From
+    16 sites on the values are smoothed: by the least of `SMOOTHINGS` whose error at sites left out in turn, summed over
+    values by `importance`, is not larger than the best one's by more than that difference's standard error. Fewer sites
+    tell by being left out how far apart they are rather than how noisy, and their values are taken as they are.
+
+    Raises FitError where there is no contact.
+    """
+    if len(contacts) == 0:
+        raise FitError("a spline was asked for without any contact; give at least one")
+    places = contacts.double()
+    few = len(torch.unique(places, dim=0)) < _FEWEST_TO_SMOOTH
+    trials = [SplineSites(places, smoothing) for smoothing in (SMOOTHINGS[:1] if few else SMOOTHINGS)]
+    errors = torch.stack([(trial.left_out(values).square() * importance.double()).sum(1) for trial in trials])
+    return Spline(trials[0 if few else _least_needed(errors)], values.double())
+
+
+def _least_needed(errors: Float64[Tensor, "trials sites"]) -> int:
+    """Return the first trial that no other is better than by more than the difference's standard error."""
+    excess = errors - errors[errors.sum(1).argmin()]
+    scatter = excess.std(1) * len(errors[0]) ** 0.5
+    return int(torch.nonzero(excess.sum(1) <= scatter)[0, 0])
+
+
+def _kernel(
+    places: Float64[Tensor, "contacts dim"], sites: Float64[Tensor, "sites dim"], bending: bool
+) -> Float64[Tensor, "contacts sites"]:
+    # Not cdist, whose shortcut through products loses half the digits of short distances.
+    distance = (places[:, None, :] - sites).square().sum(2).sqrt()
+    return torch.special.xlogy(distance.square(), distance) if bending else distance
+
+
+def _drift(places: Float64[Tensor, "contacts dim"], bending: bool) -> Float64[Tensor, "contacts terms"]:
+    constant = torch.ones(len(places), 1, dtype=torch.float64)
+    return torch.cat([constant, places], dim=1) if bending else constant

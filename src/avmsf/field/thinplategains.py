@@ -1,0 +1,122 @@
+"""Gains as thin-plate splines over the training contacts: the field that reads positions alone."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float, Float32, Float64, Int
+from torch import Tensor
+
+from avmsf.field.gainfield import Gains
+from avmsf.field.records import count_of, like
+from avmsf.field.thinplate import SplineSites, fit_spline
+
+_ASTRAY = 0.02
+"""Standard error of measured gains over their root mean square, at least: hammers do not hit twice alike."""
+
+
+@dataclass(frozen=True, eq=False)
+class ThinPlateGains:
+    """Splines through the gains of all modes, smoothed alike."""
+
+    points: Float32[Tensor, "points 3"]
+    """Points of the object's surface, object frame, metres."""
+    contacts: Float64[Tensor, "contacts 3"]
+    """Where the gains are known, metres."""
+    values: Float64[Tensor, "contacts modes 2"]
+    """Gains there along each mode's phase and a quarter of a period ahead, as if all blows came from one side."""
+    smoothing: float
+    """Of the splines, see `SplineSites`."""
+
+    kind: ClassVar[str] = "spline"
+
+    @cached_property
+    def sites(self) -> SplineSites:
+        """How values at the contacts spread."""
+        return SplineSites(self.contacts, self.smoothing)
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What the splines are, as plain values."""
+        return {"kernel": "thin plate" if self.sites.bending else "distance", "smoothing": self.smoothing}
+
+    def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
+        """Return the splines' gains, whichever way the contacts are struck."""
+        modes = self.values.shape[1]
+        parts = (self.sites.weights(contacts) @ self.values.flatten(1)).reshape(-1, modes, 2).float()
+        return Gains(parts[..., 0], parts[..., 1])
+
+    def deviation(
+        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts modes 2"]:
+        """Return the deviation of a random field whose mean the splines are (kriging), scaled by leaving sites out."""
+        variance = self.sites.field_variance(self.values.flatten(1)).reshape(-1, 2)
+        return (self.sites.spread(contacts)[:, None, None] * variance).sqrt().float()
+
+    def smoother(self) -> Float64[Tensor, "modes 2 contacts contacts"]:
+        """Return what each contact's value counts for at each contact, the same for all modes."""
+        return self.sites.weights(self.contacts).expand(self.values.shape[1], 2, -1, -1)
+
+    @property
+    def noise(self) -> Float64[Tensor, "contacts modes 2"]:
+        """Standard error of the gains at the contacts: what the splines leave of them, and a little at least."""
+        values = self.values.flatten(1)
+        left = (values - self.sites.weights(self.contacts) @ values).reshape(self.values.shape)
+        size = self.values.square().mean((0, 2)).sqrt()
+        noise = torch.maximum(left.square().mean(0).sqrt(), _ASTRAY * size[:, None])
+        return noise.expand(len(self.contacts), -1, -1)
+
+    def with_values(self, values: Float64[Tensor, "contacts modes 2"]) -> "ThinPlateGains":
+        """Return the same splines through other gains."""
+        return replace(self, values=values)
+
+    def take(self, modes: Int[Tensor, " modes"]) -> "ThinPlateGains":
+        """Return the field of the given modes, in the given order."""
+        return replace(self, values=self.values[:, modes])
+
+    def record(self) -> dict[str, Any]:
+        """Return the sizes and the smoothing."""
+        return {
+            "points": len(self.points),
+            "contacts": len(self.contacts),
+            "modes": self.values.shape[1],
+            "smoothing": self.smoothing,
+        }
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the points, the contacts and the gains there."""
+        return {"points": self.points, "contacts": self.contacts, "values": self.values}
+
+    @classmethod
+    def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return tensors like those of a field of these sizes."""
+        points, contacts, modes = (count_of(record[name], name) for name in ("points", "contacts", "modes"))
+        if like(record["smoothing"], 0.0, "smoothing") < 0:
+            raise ValueError(f"smoothing is {record['smoothing']}")
+        return {
+            "points": torch.empty(points, 3, device="meta"),
+            "contacts": torch.empty(contacts, 3, dtype=torch.float64, device="meta"),
+            "values": torch.empty(contacts, modes, 2, dtype=torch.float64, device="meta"),
+        }
+
+    @classmethod
+    def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "ThinPlateGains":
+        """Return the field."""
+        return cls(tensors["points"], tensors["contacts"], tensors["values"], float(record["smoothing"]))
+
+
+def thin_plate_gains(
+    contacts: Float[Tensor, "contacts 3"],
+    values: Float64[Tensor, "contacts modes 2"],
+    *,
+    importance: Float[Tensor, " modes"],
+    points: Float[Tensor, "points 3"],
+) -> ThinPlateGains:
+    """Return splines through gains at contacts in metres, smoothed as `fit_spline` does, each mode by its importance.
+
+    Raises FitError where there is no contact.
+    """
+    spline = fit_spline(contacts, values.flatten(1), importance=importance.double().repeat_interleave(2))
+    return ThinPlateGains(points.float(), contacts.double(), values, spline.sites.smoothing)

@@ -1,0 +1,243 @@
+"""Guesses at what lies behind an object's surface, each with the shapes in which such a body would vibrate."""
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from avmsf.capture.surface import Surface
+from avmsf.errors import SimulationError
+from avmsf.simulate.elastic import ElasticModes, elastic_modes
+from avmsf.simulate.elasticstore import load_modes, save_modes
+from avmsf.simulate.material import Material
+from avmsf.simulate.nominalcheck import CheckedSurface, checked
+from avmsf.simulate.nominalsolid import FEWEST, expect_memory, filled_solid, freedoms_of, wall_solids
+from avmsf.simulate.recipe import key_of
+from avmsf.simulate.solid import Solid
+
+NOMINAL = Material("nominal", 2700.0, 7e10, 0.3, 0.0, 0.0)
+"""What bodies are taken to be made of: near aluminium. Frequencies are to be scaled by one common factor, and shapes
+depend on Poisson's ratio alone, weakly."""
+WALLS = tuple(float(part) for part in np.geomspace(0.003, 0.05, 6))
+"""Thickness of walls that are tried, over the diagonal of the box around the surface."""
+TRIAL = 12_000
+"""Degrees of freedom at most of each of several bodies."""
+_FORMAT = 1
+"""Number of the way in which bodies are made; kept files of another are not read."""
+
+
+@dataclass(frozen=True, eq=False)
+class NominalBody:
+    """One guess at what lies behind an object's surface, and how it would vibrate."""
+
+    wall: float | None
+    """Thickness of its wall, metres; None for a filled body."""
+    elastic: ElasticModes
+    """Free boundary, nominal material."""
+    fine: bool = True
+    """Whether its elements are as many as were asked for; `refined` makes those finer that were made to be compared."""
+
+    @property
+    def name(self) -> str:
+        """What it is, for people."""
+        return _name(self.wall)
+
+
+@dataclass(frozen=True, eq=False)
+class NominalBodies:
+    """All guesses from which modes could be computed."""
+
+    bodies: tuple[NominalBody, ...]
+    """At least one: the filled body first, then walls from thin to thick, or as the user states them."""
+    refused: Mapping[str, str]
+    """Reasons why others could not be had, by the others' names."""
+
+
+def nominal_bodies(
+    surface: Surface,
+    *,
+    walls: Sequence[float | None] | None = None,
+    count: int = 60,
+    freedoms: int = 40_000,
+    cache: Path | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> NominalBodies:
+    """Return the bodies that may lie behind a surface, with the lowest `count` modes of each.
+
+    `walls` states what to try: thicknesses in metres, None for what the surface encloses. By itself it tries that,
+    and walls of `WALLS` times the surface's size where the surface is a sheet or holds much more than the wall would.
+    Where one body is left, it has about `freedoms` degrees of freedom, at most a fifth more; of several each has at
+    most `TRIAL`, enough to choose by, and `refined` makes the chosen one fine. Noisy and inverted surfaces are mended,
+    and `tell` hears of it. Modes are kept by content in the folder `cache`, for filling by tetrahedra comes out a
+    little different each time; a damaged file is made again.
+
+    Raises SimulationError for a surface of points, for what does not fit into memory, and where no body can be had,
+    with the reason for each.
+    """
+    told = tell or (lambda words: None)
+    maker = _Maker(surface, count, cache, told)
+    _expect_settings(count, freedoms, walls)
+    expect_memory(freedoms)
+    guessed = walls is None
+    wanted: list[float | None] = list(_guesses(maker.checked)) if walls is None else list(dict.fromkeys(walls))
+    refused: dict[str, str] = {}
+    likely: list[float | None] = []
+    for wall in wanted:
+        try:
+            _expect_likely(maker.checked, wall, guessed=guessed)
+            likely.append(wall)
+        except SimulationError as error:
+            refused[_name(wall)] = str(error)
+    fine = len(likely) == 1
+    bodies = []
+    for wall in likely:
+        try:
+            bodies.append(maker.body(wall, freedoms, fine=fine))
+        except SimulationError as error:
+            refused[_name(wall)] = str(error)
+    reasons = _grouped(refused)
+    for reason in reasons:
+        told(f"not {reason}")
+    if not bodies:
+        raise SimulationError(
+            f"no body can be made of this surface ({'; '.join(reasons)}): mend the mesh, or state its wall in metres "
+            "if it has one"
+        )
+    if len(bodies) == 1 and not bodies[0].fine:
+        bodies = [refined(surface, bodies[0], freedoms=freedoms, cache=cache, tell=tell)]
+    return NominalBodies(tuple(bodies), MappingProxyType(refused))
+
+
+def refined(
+    surface: Surface,
+    body: NominalBody,
+    *,
+    freedoms: int = 40_000,
+    cache: Path | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> NominalBody:
+    """Return a body of `nominal_bodies` computed with about `freedoms` degrees of freedom; a fine one as it is.
+
+    Raises SimulationError as `nominal_bodies` does; the coarser one remains good then.
+    """
+    if body.fine:
+        return body
+    _expect_settings(len(body.elastic), freedoms, [body.wall])
+    expect_memory(freedoms)
+    maker = _Maker(surface, len(body.elastic), cache, tell or (lambda words: None))
+    return maker.body(body.wall, freedoms, fine=True)
+
+
+class _Maker:
+    """Makes the bodies of one surface, and does once what all of them need."""
+
+    def __init__(self, surface: Surface, count: int, cache: Path | None, tell: Callable[[str], None]) -> None:
+        self._surface, self._count, self._cache, self._tell = surface, count, cache, tell
+        self._walls: dict[int, Callable[[float], Solid]] = {}
+
+    @cached_property
+    def checked(self) -> CheckedSurface:
+        """The surface, mended."""
+        return checked(self._surface, tell=self._tell)
+
+    def body(self, wall: float | None, freedoms: int, *, fine: bool) -> NominalBody:
+        """Return one body with so many degrees of freedom, or with at most `TRIAL` where it need not be fine."""
+        if not fine and freedoms > TRIAL:
+            try:
+                return NominalBody(wall, self._modes(wall, TRIAL), fine=False)
+            except SimulationError as error:
+                # Thin walls are lost in few tetrahedra.
+                self._tell(f"again with more tetrahedra ({error})")
+        return NominalBody(wall, self._modes(wall, freedoms))
+
+    def _modes(self, wall: float | None, freedoms: int) -> ElasticModes:
+        """Return the modes of one body, read from where they are kept."""
+        kept = self._kept(wall, freedoms)
+        if kept is not None and kept.is_file():
+            try:
+                return load_modes(kept)
+            except SimulationError as error:
+                self._tell(f"computing again what cannot be read ({error})")
+        self._tell(f"tetrahedra of the body, {_name(wall)}")
+        solid = self._solid(wall, freedoms)
+        size = freedoms_of(solid)
+        self._tell(f"{self._count} elastic modes of {size} degrees of freedom")
+        elastic = elastic_modes(solid, NOMINAL, count=self._count)
+        if kept is not None:
+            save_modes(elastic, kept)
+        return elastic
+
+    def _solid(self, wall: float | None, freedoms: int) -> Solid:
+        if wall is None:
+            return filled_solid(self.checked, freedoms)
+        if freedoms not in self._walls:
+            self._walls[freedoms] = wall_solids(self.checked, freedoms)
+        return self._walls[freedoms](wall)
+
+    def _kept(self, wall: float | None, freedoms: int) -> Path | None:
+        if self._cache is None:
+            return None
+        values = {
+            "format": _FORMAT,
+            "version": version("avmsf"),
+            "surface": self._digest,
+            "wall": wall,
+            "count": self._count,
+            "freedoms": freedoms,
+        }
+        return self._cache / f"nominal-{key_of(values)}.safetensors"
+
+    @cached_property
+    def _digest(self) -> str:
+        """Digest of the surface's vertices and triangles."""
+        vertices, faces = self._surface.vertices.double().cpu().numpy(), self._surface.faces.long().cpu().numpy()
+        content = hashlib.sha256(f"{vertices.shape} {faces.shape}".encode())
+        content.update(vertices.tobytes())
+        content.update(faces.tobytes())
+        return content.hexdigest()
+
+
+def _guesses(checked: CheckedSurface) -> list[float | None]:
+    return [None, *(part * checked.skin.size for part in WALLS)]
+
+
+def _expect_likely(checked: CheckedSurface, wall: float | None, *, guessed: bool) -> None:
+    """Raise SimulationError where a body is out of the question before tetrahedra are made."""
+    if wall is None:
+        checked.expect_filling()
+    elif wall >= checked.width:
+        raise SimulationError(
+            f"a wall of {1000 * wall:.3g} mm is thicker than the object, which is {1000 * checked.width:.3g} mm wide: "
+            "state the wall's thickness in metres"
+        )
+    elif guessed:
+        checked.expect_hollow(wall)
+
+
+def _expect_settings(count: int, freedoms: int, walls: Sequence[float | None] | None) -> None:
+    if count < 1:
+        raise SimulationError(f"count = {count}: expected 1 mode or more")
+    if freedoms < FEWEST:
+        raise SimulationError(f"freedoms = {freedoms}: expected {FEWEST} degrees of freedom or more")
+    if walls is not None and not len(walls):
+        raise SimulationError("walls is empty: expected thicknesses in metres, None among them for a filled body")
+    for wall in walls or ():
+        if wall is not None and not 0 < wall < float("inf"):
+            raise SimulationError(f"wall = {wall:g} m: expected more than 0, or None for a filled body")
+
+
+def _grouped(refused: Mapping[str, str]) -> list[str]:
+    """Return each reason once, after the names of all that it holds for."""
+    names: dict[str, list[str]] = {}
+    for name, reason in refused.items():
+        names.setdefault(reason, []).append(name)
+    return [f"{', '.join(each)}: {reason}" for reason, each in names.items()]
+
+
+def _name(wall: float | None) -> str:
+    return "filled" if wall is None else f"wall of {1000 * wall:.2g} mm"

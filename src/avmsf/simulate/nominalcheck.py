@@ -1,0 +1,164 @@
+"""A surface as people have them made fit for walls and tetrahedra, or the reason why it is not."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float64, Int
+
+from avmsf.capture.surface import Surface
+from avmsf.errors import SimulationError
+from avmsf.simulate.nominalsmooth import denoised, roughness
+from avmsf.simulate.skin import Skin
+
+_LIDS = 0.25
+"""Part of the closed surface that lids over holes may make up, as `fill` has it."""
+_LOOSE = 0.1
+"""Part of the area that may lie in loose bits, which a wall leaves out."""
+_HOLLOW = 1.0 / 6.0
+"""Thickness of a wall over the mean thickness of what a closed surface holds, beyond which no wall is guessed."""
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedSurface:
+    """A surface that has triangles, faces outwards and is smooth."""
+
+    skin: Skin
+
+    @cached_property
+    def parts(self) -> Int[np.ndarray, " faces"]:
+        """Number of the part that each triangle belongs to, the largest first; those of a part share vertices."""
+        return _parts(self.skin)
+
+    @cached_property
+    def width(self) -> float:
+        """Extent along the second of the axes that the vertices spread along, metres: of a sheet, its narrower side."""
+        places = self.skin.points - self.skin.points.mean(axis=0)
+        _, axes = np.linalg.eigh(places.T @ places)
+        return float(np.sort(np.ptp(places @ axes, axis=0))[1])
+
+    @cached_property
+    def lids(self) -> float:
+        """Part of the closed surface that lids straight over the holes would make up, 0 to 1."""
+        lids = _lids(self.skin)
+        area = 0.5 * float(np.linalg.norm(np.cross(lids[:, 1] - lids[:, 0], lids[:, 2] - lids[:, 0]), axis=1).sum())
+        return area / (area + float(self.skin.areas.sum()))
+
+    @cached_property
+    def mean_thickness(self) -> float | None:
+        """Twice the volume over the area, metres: of a thin wall, its thickness; None for a sheet, which holds none."""
+        if self.lids > _LIDS:
+            return None
+        lids = _lids(self.skin)
+        volume = self.skin.volume + float((np.cross(lids[:, 0], lids[:, 1]) * lids[:, 2]).sum() / 6.0)
+        return 2.0 * abs(volume) / float(self.skin.areas.sum())
+
+    def expect_filling(self) -> None:
+        """Raise SimulationError where the surface is too open to be filled."""
+        if self.lids > _LIDS:
+            raise SimulationError(
+                f"{self.skin.open_edges} of the mesh's edges are open, and lids over its holes would be "
+                f"{self.lids:.0%} of the surface: it is a sheet; give it a wall, or close the mesh"
+            )
+
+    def expect_hollow(self, wall: float) -> None:
+        """Raise SimulationError where the surface holds too little to be the outside of such a wall."""
+        held = self.mean_thickness
+        if held is not None and wall > _HOLLOW * held:
+            raise SimulationError(
+                f"the surface holds {1000 * held:.2g} mm on the mean, as if both sides of a wall were there already: "
+                f"not guessed above {1000 * _HOLLOW * held:.2g} mm; state the wall if it has one"
+            )
+
+    def sheet(self) -> Skin:
+        """Return what a wall can follow: the largest part, neighbours facing alike.
+
+        Raises SimulationError where other parts are more than loose bits, and as `Skin.oriented` does.
+        """
+        areas = np.bincount(self.parts, weights=self.skin.areas)
+        if areas[0] < (1.0 - _LOOSE) * areas.sum():
+            told = ", ".join(f"{10000 * area:.3g}" for area in areas[:4])
+            raise SimulationError(
+                f"the mesh has {len(areas)} parts that share no vertex ({told}{', ...' if len(areas) > 4 else ''} "
+                "cm2), and a wall follows one: join them, or give one of them"
+            )
+        return part_of(self.skin, self.parts == 0).oriented()
+
+
+def checked(surface: Surface, *, tell: Callable[[str], None]) -> CheckedSurface:
+    """Return a surface with inverted parts turned and noise taken out, and tell what was done and what is missing.
+
+    Raises SimulationError for points without triangles, damaged triangles and a mesh without area.
+    """
+    skin, turned = _turned(Skin.of(surface))
+    if turned:
+        tell(f"the mesh faced inwards: {turned} of its {len(skin.faces)} triangles were turned")
+    before = roughness(skin)
+    skin, moved = denoised(skin)
+    if moved:
+        tell(
+            f"the mesh is noisy, its triangles differ by {before:.0f} degrees from one to the next: smoothed, its "
+            f"vertices {1000 * moved:.2g} mm away from where they were"
+        )
+    result = CheckedSurface(skin)
+    if skin.open_edges:
+        helps = "closing them by lids is tried" if result.lids <= _LIDS else "a wall turns it into a body"
+        tell(f"{skin.open_edges} of the mesh's edges are open: {helps}")
+    return result
+
+
+def part_of(skin: Skin, chosen: np.ndarray) -> Skin:
+    """Return a skin with the chosen triangles alone."""
+    used, rows = np.unique(skin.faces[chosen], return_inverse=True)
+    return Skin(skin.points[used], rows.reshape(-1, 3))
+
+
+def _turned(skin: Skin) -> tuple[Skin, int]:
+    """Return a skin whose closed parts face outwards, but for the walls of voids, and how many triangles it turned.
+
+    A part inside the box around another may be a void, which faces inwards; it goes with the part around it.
+    """
+    number = _parts(skin)
+    parts = [part_of(skin, number == part) for part in range(int(number.max()) + 1)]
+    lowest, highest = (np.array([edge(part.points, axis=0) for part in parts]) for edge in (np.min, np.max))
+    turns = np.zeros(len(parts), dtype=bool)
+    for part, each in enumerate(parts):
+        around = (lowest[:part] <= lowest[part]).all(axis=1) & (highest[:part] >= highest[part]).all(axis=1)
+        inside = np.flatnonzero(around)
+        turns[part] = turns[inside[0]] if len(inside) else not each.open_edges and each.volume < 0.0
+    turned = turns[number]
+    faces = np.where(turned[:, None], skin.faces[:, ::-1], skin.faces)
+    return Skin(skin.points, faces), int(turned.sum())
+
+
+def _parts(skin: Skin) -> Int[np.ndarray, " faces"]:
+    """Return the number of the part that each triangle belongs to, the widest first."""
+    count = len(skin.points)
+    ends = skin.faces[:, [[0, 1], [1, 2]]].reshape(-1, 2)
+    joined = scipy.sparse.csr_array((np.ones(len(ends)), ends.T), shape=(count, count))
+    found, label = scipy.sparse.csgraph.connected_components(joined, directed=False)
+    label = label[skin.faces[:, 0]]
+    area = np.bincount(label, weights=skin.areas, minlength=found)
+    rank = np.empty(found, dtype=np.int64)
+    rank[np.argsort(-area, kind="stable")] = np.arange(found)
+    return rank[label]
+
+
+def _lids(skin: Skin) -> Float64[np.ndarray, "lids 3 3"]:
+    """Return triangles from the open edges to the middle of the rim that they are of, facing as the skin does."""
+    sides = skin.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, which, count = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    rim = sides[count[which.ravel()] == 1]
+    if not len(rim):
+        return np.zeros((0, 3, 3))
+    used, ends = np.unique(rim, return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    joined = scipy.sparse.csr_array((np.ones(len(ends)), ends.T), shape=(len(used), len(used)))
+    label = scipy.sparse.csgraph.connected_components(joined, directed=False)[1]
+    middles = np.stack(
+        [np.bincount(label, weights=skin.points[used, axis]) / np.bincount(label) for axis in range(3)], axis=1
+    )
+    start, end = skin.points[used[ends[:, 0]]], skin.points[used[ends[:, 1]]]
+    return np.stack([end, start, middles[label[ends[:, 0]]]], axis=1)

@@ -1,0 +1,168 @@
+"""A checked surface as tetrahedra of a wanted number: what it encloses, or its wall."""
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from avmsf.capture.surface import Surface
+from avmsf.errors import SimulationError
+from avmsf.simulate.elements import SecondOrder
+from avmsf.simulate.nominalcheck import CheckedSurface
+from avmsf.simulate.shell import shell
+from avmsf.simulate.skin import Skin
+from avmsf.simulate.solid import Solid
+from avmsf.simulate.tetrahedra import fill
+
+FEWEST = 1000
+"""Degrees of freedom below which no body has 20 modes worth the name."""
+_OVER, _UNDER = 1.2, 0.65
+"""Degrees of freedom over those wanted, from `_UNDER` to `_OVER`, that end the search."""
+_TRIES = 4
+_FINER = 0.6
+"""Factor on a detail that is too coarse for a body."""
+_DETAILS = (0.002, 0.4)
+"""Least and most length of a tetrahedron's edges over the body's size."""
+_PREPARED = 0.7
+"""Shortest edges that fill gets, over those of the tetrahedra: fTetWild's time goes with the triangles it is given."""
+_TURN = 0.9
+"""Cosine of the angle by which triangles may turn then."""
+_SHELL = 36.0
+"""Degrees of freedom of a wall over the vertices of the skin that it follows."""
+_PEAK = 377e6, 40_000, 1.1
+"""Bytes that modes take at their peak, of how many degrees of freedom, and the power they grow by (benchmarks/fem)."""
+_CAUTION = 2.0
+"""Factor on that, for lumps take more than the walls it was measured on."""
+
+
+def expect_memory(freedoms: int) -> None:
+    """Raise SimulationError where the modes of a mesh with so many degrees of freedom do not fit into memory."""
+    free = _free_memory()
+    peak, measured, power = _PEAK
+    needed = _CAUTION * peak * (freedoms / measured) ** power
+    if free is not None and needed > free:
+        fitting = int(measured * (free / (_CAUTION * peak)) ** (1.0 / power)) // 1000 * 1000
+        raise SimulationError(
+            f"{freedoms} degrees of freedom take about {needed / 1e9:.2g} GB, and {free / 1e9:.2g} GB of memory are "
+            f"free: a coarser mesh of freedoms={max(fitting, FEWEST)} fits; or end other programs"
+        )
+
+
+def freedoms_of(solid: Solid) -> int:
+    """Return the number of displacements at the nodes of second-order elements."""
+    return 3 * len(SecondOrder.of(solid).nodes)
+
+
+def filled_solid(checked: CheckedSurface, freedoms: int) -> Solid:
+    """Return what a surface encloses as tetrahedra with about so many degrees of freedom.
+
+    Raises SimulationError as `fill` does, for sheets, and where no detail comes near enough.
+    """
+    checked.expect_filling()
+    skin = checked.skin
+
+    def filled(detail: float) -> Solid:
+        prepared = skin.coarsened(_PREPARED * detail * skin.size, turn=_TURN)
+        return fill(_surface(prepared), detail=detail)
+
+    return _near(filled, freedoms, first=_filling_detail(checked, freedoms))
+
+
+def wall_solids(checked: CheckedSurface, freedoms: int) -> Callable[[float], Solid]:
+    """Return what makes a wall of a thickness, metres, with about so many degrees of freedom inwards of a surface.
+
+    The skin is remeshed once for all thicknesses. Raises SimulationError for several parts and for triangles that
+    face different ways; what it returns does as `shell` does.
+    """
+    sheet = checked.sheet()
+    length = 1.2 * math.sqrt(_SHELL * float(sheet.areas.sum()) / freedoms)
+    skin = sheet
+    for _ in range(_TRIES):
+        skin = sheet.remeshed(length)
+        part = _SHELL * len(skin.points) / freedoms
+        if _UNDER <= part <= 1.0:
+            break
+        length *= math.sqrt(part / 0.85)
+    surface = _surface(skin)
+
+    def walled(thickness: float) -> Solid:
+        def made(detail: float) -> Solid:
+            return shell(surface, thickness=thickness, detail=detail)
+
+        return _near(made, freedoms, first=length / skin.size)
+
+    return walled
+
+
+def _near(make: Callable[[float], Solid], freedoms: int, *, first: float) -> Solid:
+    """Return the solid of the detail, `first` at first, whose degrees of freedom come nearest to those wanted.
+
+    Raises SimulationError where all of them are over by more than `_OVER`, and what `make` raises of the last detail
+    where none was made.
+    """
+    tried: dict[float, int] = {}
+    best: tuple[int, Solid] | None = None
+    for detail in _details(tried, freedoms, first):
+        try:
+            solid = make(detail)
+        except SimulationError:
+            # Walls too thin for one detail may be thick enough for a finer one.
+            if tried:
+                break
+            detail *= _FINER
+            solid = make(detail)
+        tried[detail] = freedoms_of(solid)
+        if tried[detail] <= _OVER * freedoms and (best is None or tried[detail] > best[0]):
+            best = tried[detail], solid
+    if best is None:
+        least = min(tried.values())
+        raise SimulationError(
+            f"expected {freedoms} degrees of freedom, and the coarsest mesh that was made has {least}: allow "
+            f"freedoms={least}, or simplify the mesh"
+        )
+    return best[1]
+
+
+def _details(tried: dict[float, int], freedoms: int, first: float) -> Iterator[float]:
+    """Yield details until one of those tried is near the wanted number, each by the power that the last two show."""
+    detail, power = min(max(first, _DETAILS[0]), _DETAILS[1]), 1.5
+    for _ in range(_TRIES):
+        yield detail
+        last, found = list(tried.items())[-1]
+        if _UNDER * freedoms <= found <= _OVER * freedoms:
+            return
+        if len(tried) > 1:
+            before, other = list(tried.items())[-2]
+            if other != found:
+                power = min(max(-math.log(found / other) / math.log(last / before), 0.8), 3.0)
+        detail = min(max(last * (found / (0.95 * freedoms)) ** (1.0 / power), _DETAILS[0]), _DETAILS[1])
+        if detail in tried:
+            return
+
+
+def _filling_detail(checked: CheckedSurface, freedoms: int) -> float:
+    """Return a first guess of the detail that fills a surface with so many degrees of freedom."""
+    skin = checked.skin
+    held = checked.mean_thickness or 0.0
+    area = float(skin.areas.sum())
+    volume = 0.5 * held * area
+    # Found by filling mugs, bowls, spoons and lumps: thin walls make tetrahedra smaller than asked for.
+    lengths = np.geomspace(_DETAILS[0], _DETAILS[1], 200) * skin.size
+    relative = np.maximum(held / lengths, 1e-3)
+    needed = area / lengths**2 * 16.4 * relative**-0.68 + volume / lengths**3 * 38.0 * np.minimum(1.0, relative / 3.0)
+    return float(lengths[np.argmax(needed <= freedoms)] / skin.size) if (needed <= freedoms).any() else _DETAILS[1]
+
+
+def _surface(skin: Skin) -> Surface:
+    return Surface(torch.from_numpy(skin.points).float(), torch.from_numpy(skin.faces))
+
+
+def _free_memory() -> float | None:
+    """Return the bytes of memory that programs can still have, or None where the system does not say."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return next(1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration):
+        return None

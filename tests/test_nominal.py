@@ -1,0 +1,184 @@
+"""Geometry to elastic shapes: which bodies a surface may hide, and what is said of surfaces that hide none."""
+
+import importlib.util
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from avmsf.capture.surface import Surface, read_surface
+from avmsf.errors import SimulationError
+from avmsf.simulate import nominal, nominalsolid
+from avmsf.simulate.block import block
+from avmsf.simulate.elastic import elastic_modes
+from avmsf.simulate.nominal import NOMINAL, nominal_bodies, refined
+
+needs_pytetwild = pytest.mark.skipif(
+    importlib.util.find_spec("pytetwild") is None, reason="needs pytetwild: pip install 'avmsf[fem]'"
+)
+
+
+def surface_of(mesh: trimesh.Trimesh) -> Surface:
+    return Surface(torch.from_numpy(np.array(mesh.vertices)).float(), torch.from_numpy(np.array(mesh.faces)))
+
+
+def sheet(sides: tuple[int, int] = (12, 9), size: tuple[float, float] = (0.24, 0.17)) -> Surface:
+    """Return a flat rectangle whose normals point up."""
+    x, y = np.meshgrid(np.linspace(0, size[0], sides[0] + 1), np.linspace(0, size[1], sides[1] + 1), indexing="ij")
+    rows = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    return Surface(torch.from_numpy(points).float(), torch.from_numpy(faces))
+
+
+def ball(radius: float = 0.05) -> Surface:
+    return surface_of(trimesh.creation.icosphere(subdivisions=3, radius=radius))
+
+
+def test_a_sheet_with_a_wall_vibrates_as_the_plate_it_is():
+    bodies = nominal_bodies(sheet(), walls=[0.004], count=12, freedoms=6000).bodies
+    assert [body.name for body in bodies] == ["wall of 4 mm"]
+    assert bodies[0].fine
+    found, plate = bodies[0].elastic, elastic_modes(block((0.24, 0.17, 0.004), (12, 9, 1)), NOMINAL, count=12)
+    assert float((found.frequency / plate.frequency - 1).abs().max()) < 0.02
+    places = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.24, 0.17, 0.0])
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(200, 3)
+    own, other = found.gains(places, up), plate.gains(places, up)
+    alike = (own * other).sum(0) ** 2 / ((own**2).sum(0) * (other**2).sum(0))
+    assert float(alike[:6].min()) > 0.99
+
+
+def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkeypatch: pytest.MonkeyPatch):
+    told: list[str] = []
+    monkeypatch.setattr(nominal, "TRIAL", 1500)
+    found = nominal_bodies(sheet(), count=6, freedoms=4000, tell=told.append)
+    assert [body.wall for body in found.bodies] == pytest.approx(
+        [part * math.hypot(0.24, 0.17) for part in nominal.WALLS]
+    )
+    assert not any(body.fine for body in found.bodies)
+    assert any("42 of the mesh's edges are open" in words for words in told)
+    assert "42 of the mesh's edges are open" in found.refused["filled"]
+    body = found.bodies[1]
+    fine = refined(sheet(), body, freedoms=4000)
+    assert fine.fine
+    assert fine.wall == body.wall
+    assert refined(sheet(), fine) is fine
+    assert len(fine.elastic.nodes) > 2 * len(body.elastic.nodes)
+    assert float((fine.elastic.frequency / body.elastic.frequency - 1).abs()[:2].max()) < 0.05
+
+
+@needs_pytetwild
+def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path: Path):
+    told: list[str] = []
+    inwards = Surface(ball().vertices, ball().faces.flip(1))
+    found = nominal_bodies(inwards, walls=[None], count=20, freedoms=5000, cache=tmp_path, tell=told.append).bodies[0]
+    assert any(f"{len(inwards.faces)} of its {len(inwards.faces)} triangles were turned" in words for words in told)
+    # Lamb: the torsional oscillation of degree 2, whose wave number times radius is 2.501, belongs to five modes.
+    shear = math.sqrt(NOMINAL.young / (2 * (1 + NOMINAL.poisson)) / NOMINAL.density)
+    assert found.elastic.frequency[:5].numpy() == pytest.approx(2.501 * shear / (2 * math.pi * 0.05), rel=0.04)
+    kept = sorted(tmp_path.iterdir())
+    again = nominal_bodies(inwards, walls=[None], count=20, freedoms=5000, cache=tmp_path).bodies[0]
+    assert torch.equal(again.elastic.shapes, found.elastic.shapes)
+    assert sorted(tmp_path.iterdir()) == kept
+    moved = Surface(inwards.vertices + 0.001, inwards.faces)
+    nominal_bodies(moved, walls=[None], count=20, freedoms=5000, cache=tmp_path)
+    assert len(sorted(tmp_path.iterdir())) == 2
+
+
+def test_a_damaged_kept_file_is_made_again(tmp_path: Path):
+    def made(told: list[str]) -> torch.Tensor:
+        bodies = nominal_bodies(sheet(), walls=[0.004], count=4, freedoms=2000, cache=tmp_path, tell=told.append)
+        return bodies.bodies[0].elastic.shapes
+
+    first = made([])
+    (kept,) = tmp_path.iterdir()
+    whole = kept.read_bytes()
+    kept.write_bytes(whole[: len(whole) // 2])
+    told: list[str] = []
+    assert torch.equal(made(told), first)
+    assert any("computing again what cannot be read" in words for words in told)
+    assert kept.read_bytes() == whole
+
+
+@needs_pytetwild
+def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
+    outer, inner = trimesh.creation.icosphere(3, radius=0.06), trimesh.creation.icosphere(3, radius=0.054)
+    inner.invert()
+    found = nominal_bodies(surface_of(trimesh.util.concatenate([outer, inner])), count=8, freedoms=8000)
+    assert [body.wall for body in found.bodies] == [None]
+    # A hollow ball, not a massive one.
+    mass = NOMINAL.density * 4 / 3 * math.pi * (0.06**3 - 0.054**3)
+    assert found.bodies[0].elastic.mass == pytest.approx(mass, rel=0.06)
+    reasons = [reason for name, reason in found.refused.items() if name != "filled"]
+    assert len(reasons) == 6
+    assert all("both sides of a wall" in reason or "2 parts" in reason for reason in reasons)
+
+
+@needs_pytetwild
+def test_boxes_that_overlap_are_one_body():
+    one, other = trimesh.creation.box((0.3, 0.05, 0.02)), trimesh.creation.box((0.05, 0.2, 0.015))
+    found = nominal_bodies(
+        surface_of(trimesh.util.concatenate([one, other])), walls=[None, 0.001], count=6, freedoms=6000
+    )
+    assert [body.name for body in found.bodies] == ["filled"]
+    volume = 0.3 * 0.05 * 0.02 + (0.2 - 0.05) * 0.05 * 0.015
+    assert found.bodies[0].elastic.mass == pytest.approx(NOMINAL.density * volume, rel=0.05)
+    assert "2 parts that share no vertex" in found.refused["wall of 1 mm"]
+
+
+@needs_pytetwild
+def test_the_aircraft_is_filled(shared: Path):
+    surface = read_surface(shared / "aircraft_response/surface.obj")
+    found = nominal_bodies(surface, count=6, freedoms=12_000)
+    assert [body.name for body in found.bodies] == ["filled"]
+    # Its wings bend first, far below all else: as metal plates of 8 mm over 1.5 m do.
+    assert 10 < float(found.bodies[0].elastic.frequency[0]) < 20
+
+
+@needs_pytetwild
+def test_parts_that_do_not_touch_are_refused_with_all_reasons():
+    one, other = trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.1, 0.1, 0.1))
+    other.apply_translation((0.3, 0.0, 0.0))
+    apart = surface_of(trimesh.util.concatenate([one, other]))
+    with pytest.raises(SimulationError, match=r"filled: .*2 parts that do not touch.*wall of 1 mm: .*2 parts.*mend"):
+        nominal_bodies(apart, walls=[None, 0.001], count=6, freedoms=3000)
+
+
+def test_a_wall_thicker_than_the_object_is_refused():
+    with pytest.raises(SimulationError, match="a wall of 200 mm is thicker than the object, which is 170 mm wide"):
+        nominal_bodies(sheet(), walls=[0.2])
+    with pytest.raises(SimulationError, match=r"wall of 40 mm: .* more than the closed surface holds"):
+        nominal_bodies(ball(), walls=[0.04])
+
+
+def test_points_alone_have_no_body():
+    cloud = Surface(ball().vertices, torch.zeros((0, 3), dtype=torch.int64))
+    with pytest.raises(SimulationError, match="expected a mesh, found 642 points and no triangles"):
+        nominal_bodies(cloud)
+
+
+def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 2 * 377e6)
+    with pytest.raises(SimulationError, match=r"80000 degrees of freedom take about 1\.6 GB.*freedoms=40000 fits"):
+        nominal_bodies(sheet(), walls=[0.004], freedoms=80_000)
+    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: None)
+    assert nominal_bodies(sheet(), walls=[0.004], count=4, freedoms=2000).bodies
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"count": 0}, "count = 0: expected 1"),
+        ({"freedoms": 10}, "freedoms = 10: expected 1000"),
+        ({"walls": []}, "walls is empty"),
+        ({"walls": [-0.001]}, "wall = -0.001 m: expected more than 0"),
+        ({"walls": [math.nan]}, "wall = nan m"),
+    ],
+)
+def test_settings_that_make_no_sense_are_named(settings: dict, words: str):
+    with pytest.raises(SimulationError, match=words):
+        nominal_bodies(sheet(), **settings)
