@@ -20,6 +20,7 @@ from avmsf.bench.results import CaseRecord, Outcome, one_line
 from avmsf.bench.task import Look, Method, Task
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError
+from avmsf.field.physics import Physics
 from avmsf.modal.extraction import Extraction
 from avmsf.modal.keptmodes import extract_once
 from avmsf.scene.features import FeatureField
@@ -45,6 +46,7 @@ class CaseRun:
         folder: Path,
         place: str,
         look: Callable[[Look], FeatureField],
+        physics: Callable[[], Physics | AvmsfError],
         stranger: Callable[[], Float[Tensor, " samples"]],
         listened: bool,
     ) -> None:
@@ -53,6 +55,7 @@ class CaseRun:
         self.train, self.test = impacts.take(case.train), impacts.take(case.test)
         self.truth = None if truth is None else truth_at(truth, self.test.names)
         self.folder, self.place, self.look, self.stranger = folder, place, look, stranger
+        self.physics = physics
         self.listened = spread(len(case.test), LISTENED) if listened else []
         self.shared = 0.0
         self.found: Extraction | None = None
@@ -100,6 +103,7 @@ class CaseRun:
             seed=self.evaluation.seed,
             modes=self._modes,
             features=self._features,
+            physics=self._physics,
             stranger=self._stranger,
         )
 
@@ -113,6 +117,13 @@ class CaseRun:
     def _features(self, look: Look) -> FeatureField:
         with self._sharing():
             return self.look(look)
+
+    def _physics(self) -> Physics:
+        with self._sharing():
+            found = self.physics()
+        if isinstance(found, AvmsfError):
+            raise found
+        return found
 
     def _stranger(self) -> Float[Tensor, " samples"]:
         with self._sharing():

@@ -6,10 +6,11 @@ import torch
 
 from avmsf.bench.task import Look, Task
 from avmsf.capture.impacts import Impacts
+from avmsf.errors import AvmsfError
 from avmsf.field.automatic import Automatic
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.recipes import Attention, GainRecipe
+from avmsf.field.recipes import Attention, GainRecipe, ThinPlate
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uninformed import uninformed
 from avmsf.modal.extraction import Extraction
@@ -33,6 +34,61 @@ class FieldMethod:
     def fit(self, task: Task) -> SoundField:
         """Fit the field. Raises AvmsfError where modes, features or field cannot be made."""
         return fit_field(task, task.train, task.features(self.look), task.modes(), self.config)
+
+
+@dataclass(frozen=True)
+class SplineField:
+    """A field whose gains are thin-plate splines, trained end to end."""
+
+    name: str
+    """What tables call it."""
+    config: FitConfig = QUICK
+    """Settings of the fit, but for the seed, which is the task's."""
+
+    def fit(self, task: Task) -> SoundField:
+        """Fit the field. Raises AvmsfError where modes or field cannot be made."""
+        return fit_field(task, task.train, task.features("positions"), task.modes(), self.config, gains=ThinPlate())
+
+
+@dataclass(frozen=True)
+class PhysicsField:
+    """A field whose gains are made of the object's elastic mode shapes."""
+
+    name: str
+    """What tables call it."""
+    config: FitConfig = QUICK
+    """Settings of the fit, but for the seed, which is the task's."""
+
+    def fit(self, task: Task) -> SoundField:
+        """Fit the field. Raises AvmsfError where the object's shape, modes or field cannot be had."""
+        return fit_field(task, task.train, task.features("positions"), task.modes(), self.config, gains=task.physics())
+
+
+@dataclass(frozen=True)
+class AutomaticField:
+    """A field whose gains are made in the way that foretells training contacts best which are left out in turn."""
+
+    name: str
+    """What tables call it."""
+    config: FitConfig = QUICK
+    """Settings of the fit, but for the seed, which is the task's."""
+
+    def fit(self, task: Task) -> SoundField:
+        """Fit the field. Raises AvmsfError where modes or field cannot be made."""
+        positions = task.features("positions")
+        missing: dict[str, str] = {}
+        candidates: list[GainRecipe] = []
+        try:
+            candidates.append(task.physics())
+        except AvmsfError as error:
+            missing["physics"] = str(error)
+        candidates.append(ThinPlate())
+        try:
+            candidates.append(Attention(task.features("visual")))
+        except AvmsfError:
+            candidates.append(Attention())
+        gains = Automatic(tuple(candidates), missing)
+        return fit_field(task, task.train, positions, task.modes(), self.config, gains=gains)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, RandomImpact, WhiteNoise
-from avmsf.bench.fieldmethods import QUICK, FieldMethod, UninformedField
+from avmsf.bench.fieldmethods import QUICK, AutomaticField, FieldMethod, PhysicsField, SplineField, UninformedField
 from avmsf.bench.gridfield import PAPER_GRID, QUICK_GRID, GridField
 from avmsf.bench.interpolation import SplineGains
 from avmsf.bench.recorded import Recorded
@@ -112,6 +112,9 @@ have noise beside them, as the field has: without it all is silent between modes
 
 FIELDS = (
     FieldMethod("field"),
+    SplineField("field-spline"),
+    PhysicsField("field-physics"),
+    AutomaticField("field-auto"),
     FieldMethod("field-positions", look="positions"),
     FieldMethod("field-unaligned", look="unaligned"),
     # All steps end to end take long enough without two trials of dampings beforehand.
@@ -123,7 +126,8 @@ FIELDS = (
     GridField("field-grid", QUICK_GRID),
     GridField("field-paper-grid", PAPER_GRID, PAPER),
 )
-"""Fields by the quick recipe unless told otherwise: the paper's form, its ablations, the paper's settings and grids."""
+"""Fields by the quick recipe unless told otherwise: the paper's form, other gains, ablations, the paper's settings and
+grids."""
 
 METHODS: dict[str, Method] = {method.name: method for method in (*BASELINES, *FIELDS)}
 """All methods but `recorded:FOLDER`, in the order of tables."""

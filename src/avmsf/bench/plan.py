@@ -10,6 +10,7 @@ from avmsf.bench.protocols import EvaluationProtocol
 from avmsf.bench.results import ResultsFolder
 from avmsf.bench.task import Look, Method
 from avmsf.capture.datasets.dataset import Dataset
+from avmsf.field.physics import Physics
 from avmsf.modal.extract import HighResolution, ModeFinder
 from avmsf.scene.features import FeatureField
 
@@ -23,6 +24,15 @@ class FeatureMaker(Protocol):
         ...
 
 
+@runtime_checkable
+class BodyMaker(Protocol):
+    """Makes what fields know of an object's shape."""
+
+    def __call__(self, identifier: str) -> Physics:
+        """Return an object's recipe. Raises AvmsfError where its shape is unknown or unfit."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """What is evaluated, on what, and how."""
@@ -33,6 +43,7 @@ class Evaluation:
     protocol: EvaluationProtocol
     methods: tuple[Method, ...]
     features: FeatureMaker
+    bodies: BodyMaker
     seed: int = 0
     """Start of all chance in the methods."""
     judging: Judging = field(default_factory=Judging)

@@ -21,6 +21,8 @@ _TABLE = (
     "knn-spectra",
     "spline-gains",
     "field",
+    "field-physics",
+    "field-auto",
 )
 _ABLATED = ("field-positions", "field-no-initialisation", "field-unaligned", "field-no-residual")
 

@@ -20,6 +20,7 @@ from avmsf.bench.results import CaseRecord, ObjectRecord, ResultsFolder, one_lin
 from avmsf.bench.task import Look
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.field.physics import Physics
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.truth import Truth
 
@@ -71,6 +72,13 @@ def run_object(
         def stranger() -> Float[Tensor, " samples"]:
             return draw_stranger(evaluation.dataset, identifier, impacts, seed=evaluation.seed)
 
+        @cache
+        def physics() -> Physics | AvmsfError:
+            try:
+                return evaluation.bodies(identifier)
+            except AvmsfError as error:
+                return error
+
         firsts = {case.label: case.key for case in reversed(cases)}
         for number, case in enumerate(cases, 1):
             record = _run_case(
@@ -83,6 +91,7 @@ def run_object(
                     folder=results.path,
                     place=f"{identifier}/{number:02d}",
                     look=looks.of(case.views),
+                    physics=physics,
                     stranger=stranger,
                     listened=firsts[case.label] == case.key,
                 ),

@@ -24,6 +24,7 @@ from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.printing import console, print_json, say, table
 from avmsf.errors import EvaluationError
 from avmsf.modal.extract import HighResolution
+from avmsf.pipeline.objectbodies import Geometry, ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig
@@ -62,6 +63,9 @@ class Options:
     """Address of a ray cluster to compute on, or auto; its computers must see data and results under the same paths."""
     seed: int = 0
     """Start of all chance in the methods."""
+    geometry: Geometry = "mesh"
+    """What physics knows of an object's shape: its mesh; the surface of Gaussians fitted to its views; noisy, its mesh
+    with vertices displaced by 2 % of its size."""
     level: Literal["full-scale", "raw"] = "full-scale"
     """full-scale: an object's sounds by one factor that brings its loudest recording to a peak of one, so that figures
     of different objects can be averaged; raw: in the recordings' unit."""
@@ -96,16 +100,18 @@ def run(options: Options) -> int:
     objects = choose_objects(dataset, protocol, _words(options.objects))
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
     scene = SceneConfig(views=ViewsConfig(source=options.look))
+    kept = (options.features or folder / "features").resolve()
     evaluation = Evaluation(
         dataset,
         title,
         protocol,
         methods,
-        ObjectLooks(dataset, (options.features or folder / "features").resolve(), scene),
+        ObjectLooks(dataset, kept, scene),
+        ObjectBodies(dataset, kept, options.geometry, scene=scene),
         options.seed,
         Judging(level=options.level, cdpam=options.cdpam, cdpam_contacts=options.cdpam_contacts),
         HighResolution(modes=options.modes),
-        {"scene": asdict(scene)},
+        {"scene": asdict(scene), "geometry": options.geometry},
     )
     results, groups = ResultsFolder(folder), members(dataset)
     say(f"{protocol.name} on {title}: {len(objects)} objects, {len(methods)} methods, results in {folder}")

@@ -1,0 +1,57 @@
+"""What the objects of a dataset may be behind their surfaces: made once an object, and kept."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from avmsf.capture.datasets.dataset import Dataset
+from avmsf.capture.surface import Surface
+from avmsf.errors import SceneError
+from avmsf.field.physics import Physics
+from avmsf.pipeline.physics import BodyConfig, physics_of, roughened
+from avmsf.pipeline.scene import SceneConfig, SceneStages
+from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.stages import StageFolder
+from avmsf.scene.gaussiansurface import gaussian_surface
+from avmsf.scene.ply import read_splats
+
+Geometry = Literal["mesh", "gaussians", "noisy"]
+"""What an object's shape is known by: its mesh; Gaussians fitted to its views; its mesh as a bad scan has it."""
+NOISE = 0.02
+"""Displacement of a noisy mesh's vertices over the object's size."""
+
+
+@dataclass(frozen=True)
+class ObjectBodies:
+    """Makes the physics of a dataset's objects, each in a folder of its own beneath `cache`."""
+
+    dataset: Dataset
+    cache: Path
+    geometry: Geometry = "mesh"
+    config: BodyConfig = field(default_factory=BodyConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    """How Gaussians are made, where the geometry asks for them."""
+    seed: int = 0
+    """Start of the chance in the noise."""
+
+    def __call__(self, identifier: str) -> Physics:
+        """Return an object's recipe. Raises SceneError where its shape is unknown, SimulationError for an unfit one."""
+        return physics_of(self._surface(identifier), self.config, cache=self.cache / identifier / "bodies")
+
+    def _surface(self, identifier: str) -> Surface:
+        if self.geometry == "gaussians":
+            return self._gaussian_surface(identifier)
+        surface = self.dataset.capture(identifier).surface
+        if surface is None or not len(surface.faces):
+            raise SceneError(f"{identifier}: the dataset holds no mesh of it; geometry from Gaussians needs none")
+        return surface if self.geometry == "mesh" else roughened(surface, NOISE, seed=self.seed)
+
+    def _gaussian_surface(self, identifier: str) -> Surface:
+        seen = self.dataset.look(identifier)
+        if seen is None:
+            raise SceneError(f"{identifier}: the dataset holds neither a mesh nor pictures of it, so it has no shape")
+        scene = replace(self.scene, views=replace(self.scene.views, source=ViewsConfig().source))
+        stages = SceneStages(
+            seen.folder, StageFolder(self.cache / identifier / "all views"), scene, settings=seen.settings
+        )
+        return gaussian_surface(read_splats(stages.cloud.path))

@@ -1,0 +1,65 @@
+"""From what is known of an object's shape to the recipe of fields that know how it vibrates."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from avmsf.capture.surface import Surface
+from avmsf.errors import SimulationError
+from avmsf.field.physics import Physics
+from avmsf.simulate.nominal import NominalBody, nominal_bodies, refined
+
+
+@dataclass(frozen=True)
+class BodyConfig:
+    """How an object's shape becomes bodies that vibrate."""
+
+    wall: float | None = None
+    """Thickness of the object's wall, metres, where it is known; 0 for a body that its surface encloses whole. By
+    itself it tries several, and the recordings choose."""
+    shapes: int = 60
+    """Lowest elastic mode shapes that gains are made of."""
+    freedoms: int = 40_000
+    """Degrees of freedom of the finite elements, about."""
+
+    def __post_init__(self) -> None:
+        if self.wall is not None and not 0 <= self.wall < float("inf"):
+            raise SimulationError(f"wall = {self.wall}: expected metres, or 0 for a body without a cavity")
+        if self.shapes < 1:
+            raise SimulationError(f"shapes = {self.shapes}: expected 1 or more")
+
+
+def physics_of(
+    surface: Surface, config: BodyConfig, *, cache: Path | None, tell: Callable[[str], None] | None = None
+) -> Physics:
+    """Return the recipe for an object with this surface; elastic modes are kept by content in `cache`.
+
+    Raises SimulationError where no body can be had.
+    """
+    walls = None if config.wall is None else [config.wall or None]
+    bodies = nominal_bodies(surface, walls=walls, count=config.shapes, freedoms=config.freedoms, cache=cache, tell=tell)
+
+    def refine(body: NominalBody) -> NominalBody:
+        try:
+            return refined(surface, body, freedoms=config.freedoms, cache=cache, tell=tell)
+        except SimulationError as error:
+            # What was good enough to choose by is better than nothing.
+            if tell is not None:
+                tell(f"{body.name} stays coarse: {error}")
+            return body
+
+    return Physics(bodies, None if len(bodies.bodies) == 1 else refine)
+
+
+def roughened(surface: Surface, part: float, *, seed: int) -> Surface:
+    """Return a surface whose vertices are displaced at random, by `part` of its size (standard deviation, each axis).
+
+    The size is the diagonal of the box around it: what a bad scan does to a shape.
+    """
+    generator = np.random.default_rng(seed)
+    size = float((surface.vertices.amax(0) - surface.vertices.amin(0)).norm())
+    moved = surface.vertices.double().numpy() + part * size * generator.standard_normal(surface.vertices.shape)
+    return Surface(torch.from_numpy(moved).to(surface.vertices.dtype), surface.faces)
