@@ -11,6 +11,7 @@ from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture import Impacts
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
+from avmsf.field.recipes import Attention
 from avmsf.modal.extract import extract
 from avmsf.modal.extraction import Extraction
 from avmsf.scene.features import FeatureField
@@ -94,5 +95,5 @@ def _cases(options: Options) -> list[Case]:
 
 def _error(case: Case, config: FitConfig) -> float:
     train, test, modes, features = case
-    fields = [fit(train, features, modes, replace(config, seed=seed)) for seed in SEEDS]
+    fields = [fit(train, features, modes, replace(config, seed=seed), gains=Attention()) for seed in SEEDS]
     return sum(evaluate(field, test).mean()["relative_stft"] for field in fields) / len(fields)

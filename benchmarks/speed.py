@@ -88,7 +88,7 @@ def _quick(options: Options) -> Report:
     train, test = split(STRUCK.strikes(count, seconds=seconds), fraction=0.2)
     features = STRUCK.features()
     modes, extracting = _timed(lambda: extract(train))
-    quick, fitting = _timed(lambda: fit(train, features, modes, config))
+    quick, fitting = _timed(lambda: fit(train, features, modes, config, gains=Attention()))
     quick_error = evaluate(quick, test).mean()["relative_stft"]
     tell(f"quick: {extracting:.1f} s to extract, {fitting:.1f} s to fit, error {quick_error:.4f}")
     task = Task(train, features, modes)
@@ -129,7 +129,7 @@ def _render(options: Options) -> Report:
     seconds, repeats = (0.25, 3) if options.quick_look else (3.0, 20)
     impacts, features, modes = full_setting(seconds)
     # Time does not depend on how well a field was trained.
-    field = fit(impacts, features, modes, FitConfig(warmup_steps=1, steps=0, damping="shared"))
+    field = fit(impacts, features, modes, FitConfig(warmup_steps=1, steps=0, damping="shared"), gains=Attention())
     field.render(impacts.contacts[:1])
     taken = median(_timed(lambda: field.render(impacts.contacts[:1]))[1] for _ in range(repeats))
     figures = {"render_seconds": taken}
@@ -168,14 +168,14 @@ def _run_paper(task: Task, spatial: bool, steps: int, config: FitConfig) -> Soun
             tell(f"paper: step {progress.step} of {progress.steps}, loss {progress.loss:.4f}")
 
     recipe = replace(config, steps=steps, damping=damping)
-    return fit(task.train, task.features, task.modes, recipe, progress=say)
+    return fit(task.train, task.features, task.modes, recipe, gains=Attention(), progress=say)
 
 
 def _quick_of_eight(options: Options) -> float:
     seconds, config = (0.5, QUICK_LOOK) if options.quick_look else (3.0, FitConfig())
     train = IMPULSE.strikes(8, seconds=seconds, sample_rate=48000.0, highest=20000.0)
     features = IMPULSE.features()
-    _, taken = _timed(lambda: fit(train, features, extract(train), config))
+    _, taken = _timed(lambda: fit(train, features, extract(train), config, gains=Attention()))
     return taken
 
 

@@ -17,8 +17,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avmsf.capture import Impacts
-from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.attention import AttentionGains
+from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.losses import SpectralTarget
 from avmsf.field.training import Targets, TrainingRun, gain_scale
 from avmsf.modal.bank import ModalBank
@@ -42,7 +42,7 @@ class PlainRun(TrainingRun):
 
     def sounds(self, rows: Int[Tensor, " contacts"]) -> Float[Tensor, "contacts samples"]:
         """Return what a `TrainingRun` does, within float32's error of the phase."""
-        gains, _ = self.network.read(rows)
+        gains = self.network.read(rows).mean
         times = torch.arange(self.samples, dtype=torch.float32) / self.sample_rate
         frequency, damping = self.bank.frequency.float(), self.bank.damping.float()
         atoms = torch.exp(-damping[:, None] * times) * torch.sin(2 * math.pi * frequency[:, None] * times)

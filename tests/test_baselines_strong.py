@@ -11,9 +11,9 @@ from scipy.interpolate import RBFInterpolator
 from avmsf.bench.baselines import MeanGains, MeanWaveform
 from avmsf.bench.interpolation import SplineGains
 from avmsf.bench.spectralmean import MeanSpectra
-from avmsf.field.thinplate import SMOOTHINGS, fit_spline
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError
+from avmsf.errors import EvaluationError, FitError
+from avmsf.field.thinplate import SMOOTHINGS, fit_spline
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction import Extraction
 from avmsf.modal.residual import Residual
@@ -60,7 +60,7 @@ def test_splines_are_scipys(directions):
     elsewhere = flattened(scattered(30, seed=1), directions)
     spline = fit_spline(places, bumps(places), importance=ONE)
     assert spline.sites.smoothing == 0.0
-    along = (elsewhere - spline.middle) @ spline.axes
+    along = (elsewhere - spline.sites.middle) @ spline.sites.axes
     theirs = RBFInterpolator(spline.sites.sites.numpy(), bumps(places).numpy(), kernel="thin_plate_spline")(
         along.numpy()
     )
@@ -87,7 +87,7 @@ def test_smoothing_is_the_least_that_sites_left_out_ask_for():
     assert spline.sites.smoothing == SMOOTHINGS[needed]
     ours = spline.at(scattered(40, seed=9))
     theirs = RBFInterpolator(sites, values.numpy(), kernel="thin_plate_spline", smoothing=spline.sites.smoothing)
-    along = (scattered(40, seed=9) - spline.middle) @ spline.axes
+    along = (scattered(40, seed=9) - spline.sites.middle) @ spline.sites.axes
     assert np.allclose(ours.numpy(), theirs(along.numpy()), rtol=0, atol=1e-8)
 
 
@@ -96,7 +96,7 @@ def test_smoothing_brings_noisy_values_nearer_to_the_truth():
     noise = 0.4 * torch.randn(40, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
     spline = fit_spline(places, bumps(places) + noise, importance=ONE)
     rough = RBFInterpolator(spline.sites.sites.numpy(), (bumps(places) + noise).numpy(), kernel="thin_plate_spline")
-    along = (elsewhere - spline.middle) @ spline.axes
+    along = (elsewhere - spline.sites.middle) @ spline.sites.axes
     error = float((spline.at(elsewhere) - bumps(elsewhere)).square().mean())
     assert error < 0.8 * float(((torch.from_numpy(rough(along.numpy())) - bumps(elsewhere)) ** 2).mean())
 
@@ -106,8 +106,8 @@ def test_importance_decides_which_value_asks_for_smoothing():
     noise = torch.randn(24, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
     both = torch.cat([bumps(places), noise], dim=1)
     asked = [fit_spline(places, both, importance=torch.tensor(weights)) for weights in ([1.0, 0.0], [0.0, 1.0])]
-    assert asked[0].smoothing == 0.0
-    assert asked[1].smoothing > 0.0
+    assert asked[0].sites.smoothing == 0.0
+    assert asked[1].sites.smoothing > 0.0
 
 
 def test_few_sites_make_a_function_that_does_not_run_away():
@@ -125,9 +125,9 @@ def test_few_sites_make_a_function_that_does_not_run_away():
         assert torch.allclose(few.at(scattered(count)), bumps(scattered(count)), rtol=0, atol=1e-9)
         far = 1e3 * (scattered(20, seed=1) - scattered(1))
         assert float(few.at(far).abs().max()) < 20.0
-    assert fit_spline(scattered(8), bumps(scattered(8)), importance=ONE).bending
-    assert fit_spline(flattened(scattered(6), 2), bumps(scattered(6)), importance=ONE).bending
-    with pytest.raises(EvaluationError, match="without any contact"):
+    assert fit_spline(scattered(8), bumps(scattered(8)), importance=ONE).sites.bending
+    assert fit_spline(flattened(scattered(6), 2), bumps(scattered(6)), importance=ONE).sites.bending
+    with pytest.raises(FitError, match="without any contact"):
         fit_spline(end[:0], values[:0], importance=ONE)
 
 

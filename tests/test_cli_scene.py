@@ -23,7 +23,7 @@ Streams = pytest.CaptureFixture[str]
 LIFT = ("--lift.encoder", "descriptors", "--lift.points", "600")
 MODES = ("--modes", "12")
 FIT = tuple(f"--fit.{word[2:]}" if word.startswith("--") else word for word in TINY[: -len(MODES)])
-SMALL = (*SMALL_SPLAT, *LIFT, *FIT, *MODES, "--features", "visual")
+SMALL = (*SMALL_SPLAT, *LIFT, *FIT, *MODES, "--gains", "visual")
 
 
 def photograph(folder: Path) -> Path:
@@ -75,12 +75,12 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     shutil.copytree(kept, cache)
     words = ["reconstruct", str(capture), "--cache", str(cache), *SMALL, "--json"]
     assert main(words) == 0
-    kept_all = dict.fromkeys(("views", "cloud", "features", "modes", "choice", "fit"), False)
+    kept_all = dict.fromkeys(("views", "cloud", "features", "modes", "fit"), False)
     assert made_now(capsys) == kept_all
     assert main([*words, "--fit.seed", "5"]) == 0
-    assert made_now(capsys) == kept_all | {"choice": True, "fit": True}
+    assert made_now(capsys) == kept_all | {"fit": True}
     assert main([*words, "--lift.components", "4"]) == 0
-    assert made_now(capsys) == kept_all | {"features": True, "choice": True, "fit": True}
+    assert made_now(capsys) == kept_all | {"features": True, "fit": True}
 
 
 def test_a_changed_picture_makes_everything_anew(capture: Path, kept: Path, tmp_path: Path, capsys: Streams) -> None:

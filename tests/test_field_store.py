@@ -70,7 +70,7 @@ def test_a_file_names_its_tensors_and_itself(tmp_path):
     assert {name.removeprefix("gain_field.") for name in names if name.startswith("gain_field.")} == set(
         field().gain_field.state_dict()
     )
-    assert record["format"] == 2
+    assert record["format"] == 3
     assert record["version"] == "0.1.0"
     assert record["sample_rate"] == 8000.0
     assert record["origin"]["capture"] == "a plate"
@@ -262,9 +262,9 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path):
 
 def test_a_newer_format_is_refused_by_name(tmp_path):
     def change(_: dict, record: dict) -> None:
-        record.update(format=3, version="3.1.4", something="new")
+        record.update(format=4, version="3.1.4", something="new")
 
-    with pytest.raises(FieldFileError, match=r"of format 2, found format 3, written by avmsf 3\.1\.4") as caught:
+    with pytest.raises(FieldFileError, match=r"of format 3, found format 4, written by avmsf 3\.1\.4") as caught:
         load(changed(tmp_path, change))
     assert "install avmsf 3.1.4 or newer" in str(caught.value)
 
@@ -310,7 +310,9 @@ def test_tensors_of_another_form_or_of_impossible_values_are_refused(tmp_path, n
     ],
 )
 def test_a_record_that_is_not_of_these_tensors_is_refused(tmp_path, keys, value):
-    with pytest.raises(FieldFileError, match=r"missing gain_field\.to_dampings|do not belong together"):
+    with pytest.raises(
+        FieldFileError, match=r"missing gain_field\.to_dampings|do not belong together|12 modes have gains, 13 have"
+    ):
         load(changed(tmp_path, lambda _, record: put(record, keys, value)))
 
 
@@ -321,8 +323,12 @@ def test_a_record_that_is_not_of_these_tensors_is_refused(tmp_path, keys, value)
         (("sample_rate",), "44100", "sample_rate"),
         (("sample_rate",), -1.0, "sample_rate"),
         (("samples",), 0, "samples"),
-        (("sizes",), {}, "points"),
-        (("sizes", "dim"), True, "dim"),
+        (("sizes",), {}, "modes"),
+        (("sizes", "bins"), True, "sizes.bins"),
+        (("gain_field",), {}, "kind"),
+        (("gain_field", "points"), 0, "points"),
+        (("gain_field", "dim"), True, "dim"),
+        (("gain_field", "encoder"), 5, "encoder"),
         (("gain_field", "kind"), "splines", "splines"),
         (("gain_field", "shape", "width"), 1.5, "width"),
         (("gain_field", "shape", "heads"), 4, "heads"),
@@ -350,12 +356,12 @@ def test_nothing_that_a_record_lacks_is_made_up(tmp_path, keys):
         load(changed(tmp_path, change))
 
 
-@pytest.mark.parametrize("words", ["", "[]", "{", '"avmsf"', '{"format": 2}'])
+@pytest.mark.parametrize("words", ["", "[]", "{", '"avmsf"', '{"format": 3}'])
 def test_a_record_that_is_none_is_refused(tmp_path, words):
     path = tmp_path / "plate.safetensors"
     save(field(), path)
     path.write_bytes(to_bytes(from_bytes(path.read_bytes()), {"avmsf": words}))
-    with pytest.raises(FieldFileError, match="expected the header of a sound field of format 2, found another"):
+    with pytest.raises(FieldFileError, match="expected the header of a sound field of format 3, found another"):
         load(path)
 
 

@@ -1,12 +1,16 @@
-"""Features are chosen by what they foretell of training contacts, never of others."""
+"""How gains are spread is chosen by what foretells training contacts, and what cannot be had is told."""
 
 from dataclasses import replace
 
+import pytest
 import torch
 
+from avmsf.errors import FitError, SimulationError
 from avmsf.field.config import FitConfig
+from avmsf.field.fit import gain_case
+from avmsf.field.recipes import Attention, ThinPlate
 from avmsf.modal.extract import HighResolution, extract
-from avmsf.pipeline.choice import choose_features
+from avmsf.pipeline.choice import all_recipes, recipe_for
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import plate_surface_points, sample_contacts, strike
 from plate_capture import CONTACT_TIME, HIGHEST, PLATE, RATE
@@ -28,14 +32,33 @@ def candidates() -> dict[str, FeatureField]:
     return {"shuffled": replace(true, features=20 * shuffled), "true": true}
 
 
+def no_physics():
+    raise SimulationError("no body can be made of this surface")
+
+
 def test_features_that_tell_where_a_place_is_win_over_the_same_ones_shuffled() -> None:
     train = blows(12)
-    choice = choose_features(train, extract(train, HighResolution(modes=10)), candidates(), CONFIG)
-    assert choice.name == "true"
-    assert choice.errors["true"] < 0.9 * choice.errors["shuffled"]
+    recipes = all_recipes(candidates(), no_physics)
+    networks = tuple(each for each in recipes.candidates if isinstance(each, Attention))
+    case = gain_case(train, candidates()["true"], extract(train, HighResolution(modes=10)), CONFIG)
+    choice = replace(recipes, candidates=networks).choose(case)
+    assert choice.recipe.name == "true"
+    errors = choice.report["choice"]["errors"]
+    assert errors["true"] < 0.9 * errors["shuffled"]
 
 
-def test_with_too_few_contacts_nothing_is_decided() -> None:
-    train = blows(3)
-    choice = choose_features(train, extract(train, HighResolution(modes=10)), candidates(), CONFIG)
-    assert (choice.name, choice.errors) == ("shuffled", {})
+def test_physics_that_cannot_be_had_is_told_and_left_out() -> None:
+    heard: list[str] = []
+    recipes = all_recipes(candidates(), no_physics, tell=heard.append)
+    assert [each.name for each in recipes.candidates] == ["spline", "shuffled", "true"]
+    assert recipes.unavailable == {"physics": "no body can be made of this surface"}
+    assert heard == ["no physics: no body can be made of this surface"]
+
+
+def test_a_recipe_is_found_by_its_name() -> None:
+    assert isinstance(recipe_for("spline", {}, no_physics), ThinPlate)
+    assert recipe_for("true", candidates(), no_physics).name == "true"
+    with pytest.raises(FitError, match="gains from visual need what the folder does not have; there are shuffled"):
+        recipe_for("visual", candidates(), no_physics)
+    with pytest.raises(SimulationError, match="no body"):
+        recipe_for("physics", candidates(), no_physics)

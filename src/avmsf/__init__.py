@@ -9,8 +9,11 @@ if TYPE_CHECKING:
     from avmsf.capture.cameras import Camera, View
     from avmsf.capture.views import find_foreground, read_views
     from avmsf.capture.views.write import write_views
+    from avmsf.field.automatic import Automatic
     from avmsf.field.config import PAPER, FitConfig
     from avmsf.field.fit import fit
+    from avmsf.field.physics import Physics
+    from avmsf.field.recipes import Attention, ThinPlate
     from avmsf.field.soundfield import SoundField
     from avmsf.field.store import load, save
     from avmsf.modal.bank import ModalBank
@@ -30,11 +33,14 @@ if TYPE_CHECKING:
     from avmsf.scene.splatconfig import SplatConfig
     from avmsf.scene.symmetry import Symmetries
     from avmsf.scene.symmetrysearch import find_symmetries
+    from avmsf.simulate.nominal import nominal_bodies
 
 __version__ = "0.1.0"
 
 __all__ = [
     "PAPER",
+    "Attention",
+    "Automatic",
     "Camera",
     "Capture",
     "CaptureSettings",
@@ -47,12 +53,14 @@ __all__ = [
     "ImageDescriptors",
     "Impacts",
     "ModalBank",
+    "Physics",
     "Residual",
     "ShortTime",
     "SoundField",
     "SplatConfig",
     "Surface",
     "Symmetries",
+    "ThinPlate",
     "View",
     "check",
     "evaluate",
@@ -63,6 +71,7 @@ __all__ = [
     "lift",
     "load",
     "load_features",
+    "nominal_bodies",
     "read_capture",
     "read_splats",
     "read_views",
@@ -115,7 +124,11 @@ _HOMES = {
     "avmsf.bench.evaluation": ("evaluate", "split"),
     "avmsf.capture": ("Capture", "CaptureSettings", "Impacts", "Surface", "check", "read_capture", "write_capture"),
     "avmsf.field.config": ("PAPER", "FitConfig"),
+    "avmsf.field.automatic": ("Automatic",),
     "avmsf.field.fit": ("fit",),
+    "avmsf.field.physics": ("Physics",),
+    "avmsf.field.recipes": ("Attention", "ThinPlate"),
+    "avmsf.simulate.nominal": ("nominal_bodies",),
     "avmsf.field.soundfield": ("SoundField",),
     "avmsf.field.store": ("load", "save"),
     "avmsf.modal.bank": ("ModalBank",),

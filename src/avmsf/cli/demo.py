@@ -115,7 +115,8 @@ def _go_all_the_way(folder: Path) -> str:
     facts = {
         "train": list(train.names),
         "test": list(test.names),
-        "features": made.features,
+        "gains": made.gains,
+        "choice": made.choice,
         "stages": {each.stage: each.seconds for each in made.stages},
     }
     write_text(folder / MARK, json_text(facts | {"scores": score_values(scores)}) + "\n")

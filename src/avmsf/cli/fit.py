@@ -1,5 +1,6 @@
 """`avmsf fit`: a capture folder in, a field file out."""
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,11 +18,16 @@ from avmsf.cli.progress import FitBar
 from avmsf.cli.scores import compare, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
+from avmsf.field.automatic import Automatic
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
+from avmsf.field.physics import Physics
+from avmsf.field.recipes import GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
 from avmsf.modal.keptmodes import extract_once
+from avmsf.pipeline.choice import all_recipes, recipe_for
+from avmsf.pipeline.physics import BodyConfig, physics_of
 from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features
@@ -48,6 +54,11 @@ class Options:
     """Row of impacts.csv, counted from 0, that this choice of contacts starts from."""
     features: Path | None = None
     """File of features that `avmsf lift` wrote, in the frame of the contacts; without it positions on the surface."""
+    gains: Literal["auto", "physics", "spline", "attention"] = "auto"
+    """How gains are spread over the object: physics, by its elastic mode shapes, of a capture with a mesh; spline, by
+    thin-plate splines; attention, by the paper's network on the features; auto, by what foretells best those training
+    contacts that are left out in turn."""
+    body: BodyConfig = field(default_factory=BodyConfig)
     method: Method = "high-resolution"
     """How modes are found; see `avmsf modes --help`."""
     modes: int = 128
@@ -100,6 +111,7 @@ def run(options: Options) -> int:
     expect_on_object(capture.impacts, features.points)
     say(f"finding the modes of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     modes = extract_once(train, finder(options.method, options.modes), _beside(options.output, "modes"))
+    recipe = _recipe(options, capture, features)
     say(f"fitting a field of {len(modes.bank)} modes")
     checkpoint = _beside(options.output, "checkpoint")
     try:
@@ -109,6 +121,7 @@ def run(options: Options) -> int:
                 features,
                 modes,
                 options.config,
+                gains=recipe,
                 capture=capture.name,
                 checkpoint=checkpoint,
                 progress=bar.show,
@@ -120,11 +133,14 @@ def run(options: Options) -> int:
     save(fitted, options.output)
     for ending in ("modes", "checkpoint"):
         _beside(options.output, ending).unlink(missing_ok=True)
+    shutil.rmtree(_beside(options.output, "bodies"), ignore_errors=True)
     scores = {} if test is None else compare(fitted, train, test, modes)
     screen = console(errors=options.json)
     if test is not None:
         title = f"{len(test)} contacts not trained on, {len(train)} trained on; lower is better"
         screen.print(score_table(title, scores))
+    for words in suspect_words(fitted):
+        screen.print(words, soft_wrap=True)
     screen.print(summary(fitted, len(train)), soft_wrap=True)
     screen.print(f"wrote {options.output}", soft_wrap=True)
     if options.json:
@@ -143,6 +159,20 @@ def run(options: Options) -> int:
             }
         )
     return 0
+
+
+def _recipe(options: Options, capture: Capture, features: FeatureField) -> GainRecipe | Automatic:
+    """Return how gains are spread."""
+
+    def physics() -> Physics:
+        if capture.surface is None:
+            raise FitError("physics needs the object's shape: lay its mesh into the capture folder as surface.obj")
+        cache = _beside(options.output, "bodies")
+        return physics_of(capture.surface, options.body, cache=cache, tell=say)
+
+    if options.gains == "auto":
+        return all_recipes({"attention": features}, physics, tell=say)
+    return recipe_for(options.gains, {"attention": features}, physics)
 
 
 def _beside(output: Path, ending: str) -> Path:
@@ -171,12 +201,19 @@ def part_contacts(
     return impacts, None
 
 
+def suspect_words(fitted: SoundField) -> list[str]:
+    """Say which strikes disagree with all others, one a line."""
+    suspects = fitted.origin.report.get("suspects", {})
+    return [f"left out of the gains, look at its row in impacts.csv: {words}" for words in suspects.values()]
+
+
 def summary(fitted: SoundField, contacts: int) -> str:
     """Say in a sentence what a fit came to."""
     report = fitted.origin.report
     how = "chosen on validation contacts" if report.get("validated") else "as set"
+    gains = report.get("gains", "attention")
     return (
-        f"field of {fitted.origin.capture}: {len(fitted.bank)} modes from {contacts} recordings, "
+        f"field of {fitted.origin.capture}: {len(fitted.bank)} modes from {contacts} recordings, gains by {gains}, "
         f"{report.get('damping', 'shared')} damping ({how}), {report.get('steps', fitted.origin.config.steps)} steps "
         "end to end"
     )

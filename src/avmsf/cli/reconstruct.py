@@ -1,15 +1,15 @@
 """`avmsf reconstruct`: a capture folder with all that it shows and sounds like in, a field out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from avmsf.capture import read_capture
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.fit import part_contacts, recipe_of, summary
+from avmsf.cli.fit import part_contacts, recipe_of, summary, suspect_words
 from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
@@ -20,7 +20,9 @@ from avmsf.cli.writing import expect_writable
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import Progress
 from avmsf.field.store import load
+from avmsf.pipeline.choice import Gains
 from avmsf.pipeline.features import LiftConfig
+from avmsf.pipeline.physics import BodyConfig
 from avmsf.pipeline.reconstruct import ReconstructConfig, reconstruct
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig
@@ -49,9 +51,11 @@ class Options(SceneOptions):
     """Most modes to keep."""
     json: bool = False
     """Print one JSON object on the standard output, all else on the standard error."""
-    features: Literal["validated", "visual", "positions"] = "validated"
-    """What the field reads of the object's points: their looks, their positions alone, or whichever of the two does
-    better on training contacts that are left out in turn."""
+    gains: Gains = "auto"
+    """How gains are spread over the object: physics, by its elastic mode shapes; spline; visual or positions, by the
+    paper's network on what places look like or on where they are; auto, by what foretells best those training contacts
+    that are left out in turn."""
+    body: BodyConfig = field(default_factory=BodyConfig)
     views: ViewsConfig = field(default_factory=ViewsConfig)
     splat: SplatConfig = field(default_factory=SplatConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
@@ -95,7 +99,10 @@ def run(options: Options) -> int:
                 capture,
                 train,
                 ReconstructConfig(
-                    options.features, SceneConfig(options.views, options.splat, options.lift), options.fit
+                    options.gains,
+                    options.body,
+                    SceneConfig(options.views, options.splat, options.lift),
+                    options.fit,
                 ),
                 method=finder(options.method, options.modes),
                 cache=options.kept,
@@ -111,14 +118,15 @@ def run(options: Options) -> int:
     screen = console(errors=options.json)
     if made.report:
         screen.print(features_words(made.report), soft_wrap=True)
-    if made.errors:
-        told = ", ".join(f"{name} {figure(error)}" for name, error in made.errors.items())
-        screen.print(f"read by the field: {made.features}; errors at training contacts left out in turn: {told}")
+    for words in choice_words(made.gains, made.choice):
+        screen.print(words, soft_wrap=True)
     rows = [[each.stage, figure(each.seconds), "now" if each.fresh else "before"] for each in made.stages]
     screen.print(table("stages", ["stage", "seconds", "made"], rows))
     if test is not None:
         title = f"{len(test)} contacts not trained on, {len(train)} trained on; lower is better"
         screen.print(score_table(title, scores))
+    for words in suspect_words(fitted):
+        screen.print(words, soft_wrap=True)
     screen.print(summary(fitted, len(train)), soft_wrap=True)
     screen.print(f"the field is {made.field}", soft_wrap=True)
     if options.output is not None:
@@ -129,8 +137,8 @@ def run(options: Options) -> int:
             {
                 "field": str(options.output or made.field),
                 "capture": capture.name,
-                "features": made.features,
-                "features_errors": made.errors,
+                "gains": made.gains,
+                "choice": made.choice,
                 "features_report": made.report,
                 "stages": [asdict(each) for each in made.stages],
                 "modes": len(fitted.bank),
@@ -141,6 +149,14 @@ def run(options: Options) -> int:
             }
         )
     return 0
+
+
+def choice_words(name: str, choice: Mapping[str, Any]) -> list[str]:
+    """Say how gains are spread, and why."""
+    errors, missing = choice.get("errors", {}), choice.get("missing", {})
+    told = ", ".join(f"{each} {figure(error)}" for each, error in errors.items())
+    words = [f"gains by {name}" + (f"; errors at training contacts left out in turn: {told}" if told else "")]
+    return words + [f"not by {each}: {reason}" for each, reason in missing.items()]
 
 
 def show_fit(progress: Progress, scene_bar: SceneBar, fit_bar: FitBar) -> None:

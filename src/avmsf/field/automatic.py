@@ -1,5 +1,6 @@
 """Which way of spreading gains suits an object, decided on its training contacts alone."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -8,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.errors import AvmsfError
+from avmsf.errors import AvmsfError, FitError
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.recipes import SHARED, Attention, GainCase, GainRecipe, ThinPlate
 from avmsf.field.training import Targets, TrainingRun
@@ -71,7 +72,8 @@ class Automatic:
         return Choice(best, report)
 
     def _error(self, recipe: GainRecipe, case: GainCase) -> float:
-        """Return a recipe's mean error at contacts left out in turn."""
+        """Return a recipe's mean error at contacts left out in turn; no error is relative to a silent recording."""
+        heard = case.train.sounds.abs().amax(1) > 0
         order = farthest_points(case.train.contacts, len(case.train)).tolist()
         parts = [order[first::FOLDS] for first in range(min(FOLDS, len(order)))]
         total = 0.0
@@ -79,8 +81,11 @@ class Automatic:
             if self.tell is not None:
                 self.tell(f"choice: {recipe.name}, {number} of {len(parts)}")
             learnt = [row for row in range(len(order)) if row not in held]
-            total += float(_errors(recipe, case, learnt, held).sum())
-        return total / len(order)
+            total += float(_errors(recipe, case, learnt, held)[heard[held]].sum())
+        error = total / int(heard.sum())
+        if not math.isfinite(error):
+            raise FitError(f"its error at contacts left out is {error}: lower warmup_rate")
+        return error
 
 
 def _errors(recipe: GainRecipe, case: GainCase, learnt: list[int], held: list[int]) -> Float[Tensor, " contacts"]:

@@ -9,8 +9,8 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.field.elasticpoints import ElasticPoints
-from avmsf.field.evidence import WIDTHS
-from avmsf.field.modalbasis import ModalBasis, fit_modal_basis
+from avmsf.field.evidence import WIDTHS, Regression, nearness
+from avmsf.field.modalbasis import ModalBasis, fit_modal_basis, sites_of
 from avmsf.simulate.nominal import NominalBody
 
 _FACTORS = torch.exp(torch.arange(-60, 61, dtype=torch.float64) * 0.05)
@@ -101,10 +101,12 @@ def likely_bodies(
     surfaces = [ElasticPoints.of(body.elastic, points) for body in bodies]
     likely = torch.stack([_frequencies_suit(strong.frequency, body.elastic.frequency) for body in bodies])
     trials = []
-    for row, factor in torch.nonzero(likely > likely.max() - _LAG).tolist():
-        body, scale, suits = bodies[row], float(_FACTORS[factor]), float(likely[row, factor])
-        chosen = ChosenBody(body.name, surfaces[row], body.elastic.frequency * scale, scale, 0.0, suits)
-        trials.append((suits + chosen.fit(strong).regression.evidence, chosen))
+    for body, surface, suits in zip(bodies, surfaces, likely, strict=True):
+        kept = torch.nonzero(suits > likely.max() - _LAG).flatten()
+        if len(kept):
+            evidence = suits[kept] + _gains_suit(strong, surface, body.elastic.frequency, _FACTORS[kept])
+            for scale, own, total in zip(_FACTORS[kept].tolist(), suits[kept].tolist(), evidence.tolist(), strict=True):
+                trials.append((total, ChosenBody(body.name, surface, body.elastic.frequency * scale, scale, 0.0, own)))
     trials.sort(key=lambda each: -each[0])
     found: list[ChosenBody] = []
     for evidence, each in trials:
@@ -129,3 +131,24 @@ def _frequencies_suit(
     # One width for all modes, of which none is likelier beforehand.
     together = torch.log((1.0 - _STRAY) * density + stray).sum(2)
     return torch.logsumexp(together, dim=0) - 0.5 * (torch.log(_FACTORS) / _KNOWN).square()
+
+
+def _gains_suit(
+    measured: MeasuredGains,
+    surface: ElasticPoints,
+    elastic: Float64[Tensor, " shapes"],
+    factors: Float64[Tensor, " factors"],
+) -> Float64[Tensor, " factors"]:
+    """Return the evidence of the gains for each factor on the elastic frequencies, as `ChosenBody.fit` would find it.
+
+    A factor changes the prior alone: what is known of the contacts is looked up once for all.
+    """
+    _, used = surface.along(measured.contacts, measured.directions)
+    priors = nearness(measured.frequency, (factors[:, None] * elastic).flatten())
+    return Regression.evidence_of(
+        sites_of(surface, measured.contacts.double(), used),
+        priors.reshape(*priors.shape[:2], len(factors), len(elastic)).movedim(2, 0),
+        measured.values,
+        floor=measured.floor,
+        doubt=measured.doubt,
+    )

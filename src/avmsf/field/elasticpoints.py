@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -28,7 +29,19 @@ class ElasticPoints:
 
     @classmethod
     def of(cls, elastic: ElasticModes, points: Float[Tensor, "points 3"]) -> "ElasticPoints":
-        """Return the shapes where the body's surface is nearest to each point."""
+        """Return the shapes where the body's surface is nearest to each point; each body's last are kept.
+
+        The same body is asked at the same points whenever strikes are left out to choose by.
+        """
+        kept = _KEPT.get(elastic)
+        if kept is not None and torch.equal(kept[0], points.double()):
+            return kept[1]
+        found = cls._looked_up(elastic, points)
+        _KEPT[elastic] = (points.double().clone(), found)
+        return found
+
+    @classmethod
+    def _looked_up(cls, elastic: ElasticModes, points: Float[Tensor, "points 3"]) -> "ElasticPoints":
         inward = -elastic.normals(points)
         shapes = elastic.at(points)
         size = torch.einsum("pkd,pd->pk", shapes, inward).square().mean(0).sqrt()
@@ -51,7 +64,10 @@ class ElasticPoints:
         # A neighbour at a time: the shapes of all at once would be several times the result.
         moved = sum(weights[:, near, None, None] * self.shapes[rows[:, near]].double() for near in range(rows.shape[1]))
         assert isinstance(moved, Tensor)
-        straight = self.inward[rows[:, 0]].double()
+        # On a thin wall the nearest point may be on its other side; what lies in the place's own plane is on its own.
+        offsets = contacts.double()[:, None] - self.points[rows].double()
+        side = (offsets * self.inward[rows].double()).sum(2).abs().argmin(1)
+        straight = self.inward[rows[torch.arange(len(rows)), side]].double()
         used = straight
         if directions is not None:
             length = directions.double().norm(dim=1, keepdim=True)
@@ -59,14 +75,18 @@ class ElasticPoints:
         return torch.einsum("ckd,cd->ck", moved, used), used
 
     def _near(self, contacts: Float[Tensor, "contacts 3"]) -> tuple[Tensor, Float64[Tensor, "contacts near"]]:
-        distances, rows = self._tree.query(contacts.double().numpy(), k=min(_NEIGHBOURS, len(self.points)))
-        distances = np.reshape(distances, (len(contacts), -1))
+        near = min(_NEIGHBOURS, len(self.points))
+        distances, rows = self._tree.query(contacts.double().numpy(), k=near)
+        distances = np.reshape(distances, (len(contacts), near))
         weights = 1.0 / (distances**2 + 1e-18 * self.size**2)
         return (
-            torch.from_numpy(np.reshape(rows, (len(contacts), -1))),
+            torch.from_numpy(np.reshape(rows, (len(contacts), near))),
             torch.from_numpy(weights / weights.sum(axis=1, keepdims=True)),
         )
 
     @cached_property
     def _tree(self) -> cKDTree:
         return cKDTree(self.points.double().numpy())
+
+
+_KEPT: WeakKeyDictionary[ElasticModes, tuple[Tensor, ElasticPoints]] = WeakKeyDictionary()

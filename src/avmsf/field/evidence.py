@@ -91,19 +91,39 @@ class Regression:
         doubt: Float64[Tensor, " contacts"],
     ) -> "Regression":
         """Weigh all hypotheses."""
-        blank = cls(sites, prior, values, floor, doubt, values.new_zeros(0), 0.0)
+        blank = cls(sites, prior, values, floor, doubt, values.new_zeros(0, values.shape[1], 2), 0.0)
         single = torch.cat([blank._likelihood(modes) for modes in blank._batches()], dim=1)
-        hypotheses, modes = single.shape[:2]
-        before = torch.full((hypotheses, 2), -math.log(hypotheses), dtype=torch.float64)
-        for _ in range(_ROUNDS):
-            counts = torch.softmax(single + before[:, None], dim=0).sum(1) + _PSEUDO * modes / hypotheses
-            before = torch.log(counts / counts.sum(0))
-        joint = single + before[:, None]
+        joint = _with_beliefs(single)
         weights = torch.softmax(joint, dim=0)
         weights = torch.where(weights < _NEGLIGIBLE, 0.0, weights)
         return cls(
             sites, prior, values, floor, doubt, weights / weights.sum(0), float(torch.logsumexp(joint, dim=0).sum())
         )
+
+    @classmethod
+    def evidence_of(
+        cls,
+        sites: Sites,
+        priors: Float64[Tensor, "trials modes widths shapes"],
+        values: Float64[Tensor, "contacts modes 2"],
+        *,
+        floor: Float64[Tensor, "contacts modes"],
+        doubt: Float64[Tensor, " contacts"],
+    ) -> Float64[Tensor, " trials"]:
+        """Return the evidence that `of` finds with each of several priors, all at once: many are soon tried."""
+        trials, modes = priors.shape[:2]
+        blank = cls(
+            sites,
+            priors.flatten(0, 1),
+            values.repeat(1, trials, 1),
+            floor.repeat(1, trials),
+            doubt,
+            values.new_zeros(0, trials * modes, 2),
+            0.0,
+        )
+        single = torch.cat([blank._likelihood(rows) for rows in blank._batches()], dim=1)
+        joint = _with_beliefs(single.reshape(len(single), trials, modes, 2).movedim(1, 0))
+        return torch.logsumexp(joint, dim=-3).sum((-2, -1))
 
     def take(self, modes: Int[Tensor, " modes"]) -> "Regression":
         """Return the regression of the given modes, in the given order."""
@@ -181,6 +201,40 @@ class Regression:
             middle = torch.einsum("hd,hpd->pd", weight, mean)
             columns.append((squares - middle.square()).clamp_min(0.0).sqrt())
         return torch.stack(columns, dim=1)
+
+    def posterior(
+        self,
+        mode: int,
+        shapes: Float64[Tensor, "places shapes"],
+        across: Float64[Tensor, "places contacts"],
+        among: Float64[Tensor, "places places"],
+    ) -> tuple[Float64[Tensor, "places places"], float]:
+        """Return the covariance of one mode's gains among places, and the variance that one more blow has of its own.
+
+        By the mode's likeliest hypothesis, both summed over the gains' two parts. `shapes` as in `Sites`, `across` the
+        remainder's kernel between places and contacts, `among` between places.
+        """
+        modes = torch.tensor([mode])
+        likeliest = int((self.weights[:, mode] * self.values[:, mode].square().sum(0)).sum(1).argmax())
+        width, remainder, noise = (int(each) for each in self._named(torch.tensor([likeliest])))
+        prior, part = self._scaled_prior(modes)[0, width], REMAINDERS[remainder]
+        cross = (1.0 - part) * (shapes * prior) @ self.sites.shapes.T + part * across
+        alone = (1.0 - part) * (shapes * prior) @ shapes.T + part * among
+        half = torch.linalg.solve_triangular(
+            torch.linalg.cholesky(self._covariance(modes)[likeliest, 0]), cross.T, upper=False
+        )
+        scale = float(self._scale(modes)[likeliest, 0].sum())
+        return scale * (alone - half.T @ half), scale * (NOISES[noise] + float(self.floor[:, mode].mean()))
+
+    @cached_property
+    def left_out(self) -> tuple[Float64[Tensor, "contacts modes 2"], Float64[Tensor, "contacts modes 2"]]:
+        """Return by how much each gain at a contact is missed by all others', and the deviation foretold of that.
+
+        Hypotheses are weighed without the gain that is left out, by the same belief beforehand; the deviation is of a
+        measured gain, noise and all.
+        """
+        found = [self._left_out(modes) for modes in self._batches()]
+        return torch.cat([missed for missed, _ in found], dim=1), torch.cat([spread for _, spread in found], dim=1)
 
     def covariance_of(self, width: int, remainder: int, noise: int) -> Float64[Tensor, "modes contacts contacts"]:
         """Return the gains' covariance over s^2 by one hypothesis, by the rows in the tables; its noise included."""
@@ -266,3 +320,30 @@ class Regression:
         solved = noise.transpose(1, 2)[..., None] * torch.cholesky_inverse(torch.linalg.cholesky(covariance))
         mean = torch.einsum("hmd,hmce->mdce", self.weights[:, modes], solved)
         return torch.eye(len(self.values), dtype=torch.float64) - mean
+
+    def _left_out(self, modes: Int[Tensor, " modes"]) -> tuple[Tensor, Tensor]:
+        inverse = torch.cholesky_inverse(self._factor(modes))
+        alone = torch.diagonal(inverse, dim1=-2, dim2=-1)[..., None]
+        solved = inverse @ self.values[:, modes].transpose(0, 1)
+        count, tiny = len(self.values), torch.finfo(torch.float64).tiny
+        whole = self._quadratic(modes, solved)[:, :, None]
+        rest = (whole - solved.square() / alone).clamp_min(tiny)
+        # A determinant without one row has the inverse's entry there as a factor.
+        change = 0.5 * (count * torch.log(whole) - (count - 1) * torch.log(rest) - torch.log(alone))
+        weights = torch.softmax(torch.log(self.weights[:, modes])[:, :, None] + change, dim=0)
+        missed, variance = solved / alone, rest / (max(count - 1, 1) * alone)
+        middle = (weights * missed).sum(0)
+        spread = (weights * (variance + missed.square())).sum(0) - middle.square()
+        return middle.transpose(0, 1), spread.clamp_min(tiny).sqrt().transpose(0, 1)
+
+
+def _with_beliefs(
+    single: Float64[Tensor, "*trials hypotheses modes 2"],
+) -> Float64[Tensor, "*trials hypotheses modes 2"]:
+    """Return the logs of the evidence of single modes, with how likely hypotheses are beforehand, learnt from all."""
+    hypotheses, modes = single.shape[-3:-1]
+    before = torch.full((hypotheses, 1, 2), -math.log(hypotheses), dtype=torch.float64)
+    for _ in range(_ROUNDS):
+        counts = torch.softmax(single + before, dim=-3).sum(-2, keepdim=True) + _PSEUDO * modes / hypotheses
+        before = torch.log(counts / counts.sum(-3, keepdim=True))
+    return single + before

@@ -1,6 +1,6 @@
 """Gains from elastic mode shapes: few taps say how much of each shape a measured mode has, physics says the rest."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -79,6 +79,16 @@ class ModalBasis:
         """Return the covariance over s^2 of gains with those at the field's own contacts, by one hypothesis."""
         shapes, used = self.surface.along(contacts, directions)
         return self.regression.kernel(shapes, self._remainder(contacts, used), width, remainder)
+
+    def posteriors(
+        self, places: Float64[Tensor, "places 3"], directions: Float64[Tensor, "places 3"] | None
+    ) -> Iterator[tuple[Float64[Tensor, "places places"], float]]:
+        """Return what `Regression.posterior` does of each mode in turn, for blows at places along unit vectors."""
+        shapes, used = self.surface.along(places, directions)
+        among = remainder_kernel(places, used, places, used, reach=REACH * self.surface.size)
+        across = self._remainder(places, used)
+        for mode in range(self.values.shape[1]):
+            yield self.regression.posterior(mode, shapes, across, among)
 
     def smoother(self) -> Float64[Tensor, "modes 2 contacts contacts"]:
         """Return what each contact's gain counts for at each contact."""

@@ -139,6 +139,10 @@ def _skeleton(header: Header, path: Path) -> dict[str, Tensor]:
         gains = _KINDS[header.kind].skeleton(header.gain_field)
     except (ValueError, TypeError, KeyError) as error:
         raise broken(path, error) from error
+    if header.gain_field["modes"] != header.modes:
+        raise broken(
+            path, ValueError(f"{header.gain_field['modes']} modes have gains, {header.modes} have frequencies")
+        )
     bank = torch.empty(header.modes, dtype=torch.float64, device="meta")
     named = {"bank.frequency": bank, "bank.damping": bank, "phase": bank}
     named["residual.magnitude"] = torch.empty(header.bins, device="meta")

@@ -55,7 +55,7 @@ class Suspect:
     distance: float
     """Metres from its label to the place of the surface that its gains fit best."""
     reversed: bool
-    """Whether they fit best with the blow's direction turned round."""
+    """Whether they fit best with a blow against the direction that the label says."""
     best: float
     """Squared misfit there, over that of silence."""
 
@@ -164,7 +164,10 @@ class _Judge:
         misfits = self._relative(squares, self.power[row], scatter)
         turned, place = divmod(int(misfits.argmin()), len(places))
         distance = float((places[place] - places[0]).norm())
-        return Suspect(row, float(misfits[0, 0]), distance, bool(turned), float(misfits[turned, place]))
+        # Straight in may be against the label's own direction, as it is next to a label that is turned round.
+        along = float(directions[place] @ directions[0])
+        against = (along < 0) != bool(turned)
+        return Suspect(row, float(misfits[0, 0]), distance, against, float(misfits[turned, place]))
 
     def _scatter(self, errors: Float64[Tensor, "speaking modes"], speaking: list[int]) -> Float64[Tensor, " modes"]:
         least = _FLOOR * self.power.mean(0)

@@ -50,8 +50,13 @@ class ThinPlateGains:
 
     def deviation(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts modes 2"]:
-        """Return the deviation of a random field whose mean the splines are (kriging), scaled by leaving sites out."""
+    ) -> Float[Tensor, "contacts modes 2"] | None:
+        """Return the deviation of a random field whose mean the splines are (kriging), scaled by leaving sites out.
+
+        None where all contacts are in one place: these say nothing of how gains vary.
+        """
+        if len(self.sites.sites) == 1:
+            return None
         variance = self.sites.field_variance(self.values.flatten(1)).reshape(-1, 2)
         return (self.sites.spread(contacts)[:, None, None] * variance).sqrt().float()
 

@@ -1,54 +1,48 @@
-"""Which features a field should read, decided on training contacts alone: looks do not always tell of sounds."""
+"""Which way of spreading gains suits an object: what there is to choose from, and the choice as a stage keeps it."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from typing import Literal
 
-from avmsf.bench.evaluation import evaluate
-from avmsf.capture import Impacts
-from avmsf.field.config import FitConfig
-from avmsf.field.fit import fit
-from avmsf.modal.extraction import Extraction
+from avmsf.errors import AvmsfError, FitError
+from avmsf.field.automatic import Automatic
+from avmsf.field.physics import Physics
+from avmsf.field.recipes import Attention, GainRecipe, ThinPlate
 from avmsf.scene.features import FeatureField
-from avmsf.scene.points import farthest_points
 
-FEWEST = 4
-"""Training contacts below which there is nothing to decide on."""
-_FOLDS = 4
-
-
-@dataclass(frozen=True)
-class Choice:
-    """One of several feature fields, and how well each did."""
-
-    name: str
-    errors: Mapping[str, float]
-    """Mean relative STFT error at training contacts left out in turn; empty where nothing was decided."""
+Gains = Literal["auto", "physics", "spline", "visual", "positions"]
+"""How gains are spread over an object: by its elastic mode shapes, by splines, by the paper's network on what places
+look like or on where they are; auto takes what foretells best those training contacts that are left out in turn."""
 
 
-def choose_features(
-    train: Impacts, modes: Extraction, candidates: Mapping[str, FeatureField], config: FitConfig
-) -> Choice:
-    """Return which of the candidates foretells training contacts best that are left out of the warm-up in turn.
+def recipe_for(name: str, candidates: Mapping[str, FeatureField], physics: Callable[[], Physics]) -> GainRecipe:
+    """Return the recipe of this name, on the candidates' features. Raises FitError where there are no such features.
 
-    Of the contacts in farthest-point order the later half is left out, a fourth of it at a time: they lie between the
-    earlier ones, as contacts that are struck later mostly do. All share the modes, which come from all training
-    recordings. With fewer than four contacts the first candidate is taken. Raises as `fit`.
+    `physics` makes the recipe that knows the object's shape, and raises AvmsfError where the shape does not serve.
     """
-    first = next(iter(candidates))
-    if len(train) < FEWEST or len(candidates) == 1:
-        return Choice(first, {})
-    between = farthest_points(train.contacts, len(train)).tolist()[len(train) // 2 :]
-    # Dampings, noise and the end-to-end stage change little in what a place tells of its gains.
-    brief = replace(config, warmup_steps=max(1, config.warmup_steps), steps=0, damping="shared", residual=False)
-    errors = dict.fromkeys(candidates, 0.0)
-    for fold in range(_FOLDS):
-        held = between[fold::_FOLDS]
-        if not held:
-            continue
-        learnt = [row for row in range(len(train)) if row not in held]
-        part = replace(modes, gains=modes.gains[learnt], quadrature=modes.quadrature[learnt])
-        for name, features in candidates.items():
-            fitted = fit(train.take(learnt), features, part, brief)
-            error = float(evaluate(fitted, train.take(held)).values["relative_stft"].sum())
-            errors[name] += error / len(between)
-    return Choice(min(errors, key=lambda name: errors[name]), errors)
+    if name == "physics":
+        return physics()
+    if name == "spline":
+        return ThinPlate()
+    if name not in candidates:
+        raise FitError(f"gains from {name} need what the folder does not have; there are {', '.join(candidates)}")
+    return Attention(candidates[name], name)
+
+
+def all_recipes(
+    candidates: Mapping[str, FeatureField],
+    physics: Callable[[], Physics],
+    *,
+    tell: Callable[[str], None] | None = None,
+) -> Automatic:
+    """Return all ways to choose from; where physics cannot be had, the choice's report says why."""
+    recipes: list[GainRecipe] = []
+    missing: dict[str, str] = {}
+    try:
+        recipes.append(physics())
+    except AvmsfError as error:
+        missing["physics"] = str(error)
+        if tell is not None:
+            tell(f"no physics: {error}")
+    recipes.append(ThinPlate())
+    recipes += [Attention(features, name) for name, features in candidates.items()]
+    return Automatic(tuple(recipes), missing, tell)

@@ -5,33 +5,39 @@ import json
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache as cache_result
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.capture import Capture, Impacts
+from avmsf.capture import Capture, Impacts, Surface
 from avmsf.capture.placement import judge_placement
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError, FitError
+from avmsf.errors import CaptureError, FitError, SceneError
 from avmsf.field.config import FitConfig
-from avmsf.field.fit import Progress, fit
+from avmsf.field.fit import Progress, fit, gain_case
+from avmsf.field.physics import Physics
 from avmsf.field.store import save
 from avmsf.files import write_whole
 from avmsf.modal.extract import ModeFinder
 from avmsf.modal.extraction import Extraction
 from avmsf.modal.keptmodes import extract_once
-from avmsf.pipeline.choice import choose_features
+from avmsf.pipeline.choice import Gains, all_recipes, recipe_for
+from avmsf.pipeline.physics import BodyConfig, physics_of
 from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
+from avmsf.scene.gaussiansurface import gaussian_surface
+from avmsf.scene.ply import read_splats
 
 CACHE = ".avmsf"
 """Folder inside the capture's that keeps what each stage made."""
 MODES, CHOICE, FIELD = "modes.safetensors", "choice.json", "field.safetensors"
+BODIES = "bodies"
 """What the last stages call their outputs."""
 
 
@@ -57,19 +63,21 @@ class Reconstruction:
     """What the features' file says of itself; empty where the folder shows nothing of the object."""
     modes: Extraction
     """The modes that the field started from."""
-    features: str
-    """What the field reads of the object's points: positions or visual."""
-    errors: Mapping[str, float]
-    """What that was decided on: relative STFT errors at training contacts left out in turn; empty where it was set."""
+    gains: str
+    """How the field's gains are spread: physics, spline, or the network on visual features or positions."""
+    choice: Mapping[str, Any]
+    """What that was decided on: `errors`, relative STFT errors at training contacts left out in turn, and `missing`,
+    why others took no part; empty where it was set."""
 
 
 @dataclass(frozen=True)
 class ReconstructConfig:
     """Settings of all stages."""
 
-    features: Literal["validated", "visual", "positions"] = "validated"
-    """What the field reads of the object's points: their looks, their positions alone, or whichever of the two does
-    better on training contacts that are left out in turn."""
+    gains: Gains = "auto"
+    """How gains are spread over the object."""
+    body: BodyConfig = field(default_factory=BodyConfig)
+    """How the object's shape becomes bodies that vibrate."""
     scene: SceneConfig = field(default_factory=SceneConfig)
     fit: FitConfig = field(default_factory=FitConfig)
 
@@ -100,35 +108,48 @@ def reconstruct(
     modes = extract_once(train, method, found.path)
     basis = {**heard, "features": shape.digest, "fit": asdict(config.fit)}
 
+    points = next(iter(shape.candidates.values()))
+
+    @cache_result
+    def physics() -> Physics:
+        listener.tell("bodies: what the object may be behind its surface")
+        return physics_of(shape.surface(), config.body, cache=cache / BODIES, tell=listener.tell)
+
     def choose(path: Path) -> None:
-        if len(shape.candidates) > 1:
-            listener.tell("choice: positions or looks, by training contacts left out in turn")
-        choice = choose_features(train, modes, shape.candidates, config.fit)
-        words = json.dumps({"name": choice.name, "errors": dict(choice.errors)})
+        listener.tell("choice: how gains are spread, by training contacts left out in turn")
+        recipes = all_recipes(shape.candidates, physics, tell=listener.tell)
+        choice = recipes.choose(gain_case(train, points, modes, config.fit))
+        words = json.dumps({"name": choice.recipe.name, **choice.report["choice"]})
         write_whole(path, lambda place: place.write_text(words, encoding="utf-8"), raising=FitError)
 
-    chosen = stages.keep(CHOICE, {**basis, "candidates": list(shape.candidates)}, choose)
-    choice = json.loads(chosen.path.read_text(encoding="utf-8"))
+    chosen, choice = None, {"name": config.gains}
+    if config.gains == "auto":
+        asked = {"candidates": list(shape.candidates), "body": asdict(config.body), "surface": shape.surface_digest}
+        chosen = stages.keep(CHOICE, {**basis, **asked}, choose)
+        choice = json.loads(chosen.path.read_text(encoding="utf-8"))
+    name = choice.pop("name")
 
     def make(path: Path) -> None:
-        listener.tell(f"fit: a field of {len(modes.bank)} modes on {choice['name']}")
+        listener.tell(f"fit: a field of {len(modes.bank)} modes, gains by {name}")
         fitted = fit(
             train,
-            shape.candidates[choice["name"]],
+            points,
             modes,
             config.fit,
+            gains=recipe_for(name, shape.candidates, physics),
             capture=capture.name,
             checkpoint=stages.checkpoint(FIELD),
             progress=fitting,
         )
-        told = {"features": choice["name"], "features_errors": choice["errors"]}
-        save(replace(fitted, origin=replace(fitted.origin, report={**fitted.origin.report, **told})), path)
+        report = {**fitted.origin.report, "choice": choice}
+        save(replace(fitted, origin=replace(fitted.origin, report=report)), path)
 
-    recipe = {**basis, "modes": found.digest, "chosen": choice["name"], "name": capture.name}
+    recipe = {**basis, "modes": found.digest, "chosen": name, "name": capture.name, "body": asdict(config.body)}
+    recipe["surface"] = shape.surface_digest
     kept = stages.keep(FIELD, recipe, make)
-    made = {**shape.made, "modes": found, "choice": chosen, "fit": kept}
+    made = {**shape.made, "modes": found} | ({} if chosen is None else {"choice": chosen}) | {"fit": kept}
     times = tuple(StageTime(name, each.seconds, each.fresh) for name, each in made.items())
-    return Reconstruction(kept.path, times, shape.report, modes, choice["name"], choice["errors"])
+    return Reconstruction(kept.path, times, shape.report, modes, name, choice)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +163,10 @@ class _Shape:
     report: Mapping[str, Any]
     found_frame: bool
     """Whether the cameras' frame was found by structure from motion, which knows nothing of the contacts'."""
+    surface: Callable[[], Surface]
+    """Makes the object's surface: its mesh, or what encloses its Gaussians. Raises SceneError without either."""
+    surface_digest: str
+    """Of what the surface is made of."""
 
     @property
     def digest(self) -> str:
@@ -173,15 +198,33 @@ def _shape(
             features = FeatureField.from_contacts(capture.impacts.contacts)
         else:
             features = FeatureField.from_points(capture.surface.vertices)
-        return _Shape(features.points, {"positions": features}, {}, {}, found_frame=False)
+        surface, digest = _mesh(capture, None)
+        return _Shape(features.points, {"positions": features}, {}, {}, False, surface, digest)
     features = load_features(scene.features.path)
     candidates = {}
-    if config.features != "visual":
-        candidates["positions"] = FeatureField.from_points(features.points)
-    if config.features != "positions":
-        candidates["visual"] = features
+    candidates["positions"] = FeatureField.from_points(features.points)
+    candidates["visual"] = features
     found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
-    return _Shape(features.points, candidates, scene.made(), read_report(scene.features.path), found_frame)
+    report = read_report(scene.features.path)
+    surface, digest = _mesh(capture, scene)
+    return _Shape(features.points, candidates, scene.made(), report, found_frame, surface, digest)
+
+
+def _mesh(capture: Capture, scene: SceneStages | None) -> tuple[Callable[[], Surface], str]:
+    """Return what makes the object's surface, and the digest of what it is made of: its mesh before its Gaussians."""
+    found = capture.surface
+    if found is not None and len(found.faces):
+        digest = hashlib.sha256(found.vertices.contiguous().numpy().tobytes())
+        digest.update(found.faces.contiguous().numpy().tobytes())
+        return lambda: found, digest.hexdigest()
+    cloud = scene.made().get("cloud") if scene is not None else None
+
+    def from_cloud() -> Surface:
+        if cloud is None:
+            raise SceneError("the folder holds neither a mesh nor pictures of the object, so its shape is unknown")
+        return gaussian_surface(read_splats(cloud.path))
+
+    return from_cloud, "" if cloud is None else cloud.digest
 
 
 def expect_on_object(impacts: Impacts, points: Float[Tensor, "points 3"], *, strict: bool = False) -> None:

@@ -1,0 +1,121 @@
+"""Pictures of doubt: over the object seen from several sides, with where it was struck and is to be, and in a sound."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from avmsf.field.doubt import SpectrumBand
+
+_SIDES = ((25.0, -60.0), (25.0, 60.0), (25.0, 180.0), (-40.0, -60.0))
+"""Elevation and azimuth of the eye, degrees: three sides from above, one from below."""
+_INK, _NEXT = "#1f3b5c", "#19e0c8"
+_RANGE_DB = 100.0
+"""What a spectrum shows below its highest level."""
+_FLAT = 1e-3
+"""Extent over the longest below which an object is flat."""
+_BEHIND = 0.04
+"""Depth over the object's size by which a point in front hides a mark."""
+_INCHES = 4.0
+"""Width of an object in its picture."""
+
+
+def draw_doubt(
+    points: Float[Tensor, "points 3"],
+    doubt: Float[Tensor, " points"],
+    *,
+    title: str,
+    struck: Float[Tensor, "struck 3"] | None = None,
+    suggested: Float[Tensor, "suggested 3"] | None = None,
+) -> Figure:
+    """Draw doubt (of `gain_doubt`, 0 is certainty) on an object's points (object frame, metres), from four sides.
+
+    `struck` contacts are marked by crosses, `suggested` ones by their numbers, each where it can be seen. What is flat
+    along an axis is drawn once, in its plane.
+    """
+    places, values = points.double().numpy(), doubt.double().numpy()
+    crosses, numbers = (None if each is None else each.double().numpy() for each in (struck, suggested))
+    extent = np.ptp(places, axis=0)
+    flat = np.flatnonzero(extent <= _FLAT * extent.max())
+    frames = [_side(*side) for side in _SIDES] if len(flat) == 0 else [_plane(int(flat[0]))]
+    figure = Figure(figsize=(11, 9.5) if len(frames) > 1 else (8, 5), layout="constrained")
+    grid = figure.subplots(2, 2).flatten() if len(frames) > 1 else np.array([figure.subplots()])
+    for axes, frame in zip(grid, frames, strict=True):
+        drawn = _scatter(axes, places @ frame, values)
+        if crosses is not None:
+            _mark(axes, places @ frame, crosses @ frame, None)
+        if numbers is not None:
+            _mark(axes, places @ frame, numbers @ frame, [str(number + 1) for number in range(len(numbers))])
+    figure.colorbar(drawn, ax=list(grid), shrink=0.7, label="doubt over the mean size of gains (0 = certain)")
+    known = [words for words, each in (("× struck", struck), ("numbers: next", suggested)) if each is not None]
+    figure.suptitle("\n".join([title, ", ".join(known)] if known else [title]))
+    return figure
+
+
+def draw_band(band: SpectrumBand, *, title: str) -> Figure:
+    """Draw where a sound's spectrum is believed to lie."""
+    figure = Figure(figsize=(9, 4.2), layout="constrained")
+    axes = figure.subplots()
+    frequencies = band.frequencies.numpy()
+    lower, middle, upper = (each.numpy() for each in (band.lower_db, band.middle_db, band.upper_db))
+    inside = f"holds {100 * band.level:g} % of what may be"
+    axes.fill_between(frequencies, lower, upper, color=_INK, alpha=0.3, linewidth=0, label=inside)
+    axes.plot(frequencies, middle, color=_INK, linewidth=1, label="as likely above as below")
+    axes.set_ylim(max(upper.max() - _RANGE_DB, lower.min() - 3.0), upper.max() + 3.0)
+    axes.set_xlim(0.0, float(frequencies[-1]))
+    axes.set_xlabel("frequency (Hz)")
+    axes.set_ylabel("energy (dB re loudest band)")
+    axes.grid(alpha=0.25)
+    axes.legend(frameon=False)
+    figure.suptitle(title)
+    return figure
+
+
+def _side(elevation: float, azimuth: float) -> np.ndarray:
+    """Return what takes places to right, up and towards the eye, one a column."""
+    up, round_ = math.radians(elevation), math.radians(azimuth)
+    right = [-math.sin(round_), math.cos(round_), 0.0]
+    above = [-math.sin(up) * math.cos(round_), -math.sin(up) * math.sin(round_), math.cos(up)]
+    towards = [math.cos(up) * math.cos(round_), math.cos(up) * math.sin(round_), math.sin(up)]
+    return np.array([right, above, towards]).T
+
+
+def _plane(thin: int) -> np.ndarray:
+    wide = [axis for axis in range(3) if axis != thin]
+    return np.eye(3)[:, [*wide, thin]]
+
+
+def _scatter(axes: Axes, seen: np.ndarray, values: np.ndarray) -> PathCollection:
+    wide, high = np.ptp(seen[:, 0]), np.ptp(seen[:, 1])
+    # Dots about twice as wide as their distance close to a surface; near ones cover far ones.
+    dot = 72 * _INCHES * 2.4 / math.sqrt(len(seen) * max(wide, high) / max(min(wide, high), 0.05 * wide))
+    order = np.argsort(seen[:, 2])
+    across, along = seen[order, 0], seen[order, 1]
+    top = max(float(values.max()), 1e-12)
+    drawn = axes.scatter(
+        across, along, c=values[order], s=dot**2, cmap="inferno", vmin=0.0, vmax=top, linewidths=0, rasterized=True
+    )
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+    return drawn
+
+
+def _mark(axes: Axes, seen: np.ndarray, marks: np.ndarray, names: list[str] | None) -> None:
+    """Draw marks that no point hides: crosses, or names in discs."""
+    size = float(np.linalg.norm(np.ptp(seen, axis=0)))
+    apart = np.linalg.norm(seen[None, :, :2] - marks[:, None, :2], axis=2)
+    nearer = seen[None, :, 2] - marks[:, None, 2] > _BEHIND * size
+    visible = ~np.any((apart < size / math.sqrt(len(seen))) & nearer, axis=1)
+    across, along = marks[visible, 0], marks[visible, 1]
+    if names is None:
+        axes.scatter(across, along, c="white", marker="x", s=45, linewidths=3.5)
+        axes.scatter(across, along, c="black", marker="x", s=35, linewidths=1.5)
+        return
+    axes.scatter(across, along, c=_NEXT, s=190, edgecolors="black", linewidths=1)
+    for row in np.flatnonzero(visible).tolist():
+        place = (float(marks[row, 0]), float(marks[row, 1]))
+        axes.annotate(names[row], place, ha="center", va="center", fontsize=9, fontweight="bold")

@@ -1,0 +1,131 @@
+"""`avmsf efficiency`: how many strikes each method needs, as a picture and as figures."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import tyro
+
+from avmsf.bench.efficiency import METHODS, curves, draw_efficiency, efficiency_protocol
+from avmsf.bench.judging import Judging
+from avmsf.bench.methods import method_named
+from avmsf.bench.parallel import RunProgress, Workers, run_objects
+from avmsf.bench.pictures import save_picture
+from avmsf.bench.plan import Evaluation
+from avmsf.bench.results import ResultsFolder, write_json
+from avmsf.capture.datasets import open_dataset
+from avmsf.cli import INTERRUPTED
+from avmsf.cli.evaluate import title_of
+from avmsf.cli.objectbar import ObjectBar
+from avmsf.cli.printing import console, decimals, print_json, say, table
+from avmsf.errors import EvaluationError
+from avmsf.modal.extract import HighResolution
+from avmsf.pipeline.objectbodies import ObjectBodies
+from avmsf.pipeline.objectlooks import ObjectLooks
+from avmsf.pipeline.scene import SceneConfig
+
+PICTURE, FIGURES = "efficiency.png", "efficiency.json"
+"""What is written for each object beside the results' own files."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Show how the error falls with the number of strikes learnt from, for several methods.
+
+    Training contacts are spread as far apart as they go, from several first ones; the same others judge all methods
+    and numbers. Every figure is kept as it comes: after an interruption the same command goes on, and methods may be
+    added later.
+    """
+
+    data: tyro.conf.Positional[Path]
+    """A capture folder with enough strikes, or a folder of such or a dataset with --object."""
+    object: str | None = None
+    """Which object of a dataset; not needed where there is only one."""
+    methods: tuple[str, ...] = METHODS
+    """Methods, apart from each other by commas or blanks, by the names that `avmsf evaluate` knows."""
+    counts: tuple[int, ...] = ()
+    """Numbers of strikes to learn from; 3, 4, 6, 8, 12, 16, ... as far as a quarter is left to judge by."""
+    starts: int = 3
+    """First contacts, spread evenly over the table."""
+    metric: str = "relative_stft"
+    """What is drawn: relative_stft, l1, l1_log or envelope."""
+    output: Path | None = None
+    """Folder of results; evaluation/DATA/efficiency in the current folder where it is not given."""
+    seed: int = 0
+    """Start of all chance in the methods."""
+    modes: int = 128
+    """Most modes that are sought in the training recordings."""
+    json: bool = False
+    """Print one JSON object on the standard output, all else on the standard error."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return tyro.cli(Options, prog="avmsf efficiency", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def run(options: Options) -> int:
+    """Evaluate, draw, and say what came of it; return 130 where Ctrl-C stopped it."""
+    names = tuple(word for each in options.methods for word in each.split(",") if word)
+    methods = tuple(method_named(name) for name in names)
+    protocol = efficiency_protocol(options.counts, starts=options.starts, methods=names)
+    dataset = open_dataset(options.data.resolve())
+    objects = dataset.objects()
+    if options.object is None and len(objects) != 1:
+        raise EvaluationError(f"{options.data}: holds {len(objects)} objects; name one with --object")
+    chosen = objects[0] if options.object is None else dataset.facts(options.object).identifier
+    title = title_of(dataset, options.data)
+    folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
+    scene = SceneConfig()
+    evaluation = Evaluation(
+        dataset,
+        title,
+        protocol,
+        methods,
+        ObjectLooks(dataset, folder / "features", scene),
+        ObjectBodies(dataset, folder / "features", scene=scene),
+        options.seed,
+        Judging(cdpam=False),
+        HighResolution(modes=options.modes),
+        {"scene": asdict(scene)},
+    )
+    results = ResultsFolder(folder)
+    say(f"{protocol.name} of {len(methods)} methods on {chosen}, results in {folder}")
+    try:
+        with ObjectBar() as bar:
+
+            def show(progress: RunProgress) -> None:
+                bar.show(progress.words, done=progress.done, total=progress.total)
+
+            run_objects(evaluation, [chosen], results, workers=Workers(), progress=show)
+    except KeyboardInterrupt:
+        say(f"avmsf efficiency: interrupted; the same command goes on from what {folder} holds")
+        return INTERRUPTED
+    record = results.read(chosen)
+    assert record is not None
+    found = curves(record, metric=options.metric)
+    picture, figures = (folder / chosen / name for name in (PICTURE, FIGURES))
+    contacts = f"{record.contacts} contacts, {options.starts} first ones"
+    save_picture(draw_efficiency(found, metric=options.metric, title=f"{chosen}: {contacts}"), picture)
+    failures = {f"{each.method}, {each.case}": each.failure for each in record.outcomes if each.failure is not None}
+    values = {
+        "object": chosen,
+        "metric": options.metric,
+        "methods": {curve.method: curve.values() for curve in found},
+        "failures": failures,
+    }
+    write_json(figures, values)
+    screen = console(errors=options.json)
+    counts = sorted({count for curve in found for count in curve.counts})
+    rows = []
+    for curve in found:
+        by_count = dict(zip(curve.counts, curve.mean, strict=True))
+        rows.append([curve.method, *(decimals(by_count.get(count), 3) for count in counts)])
+    heading = f"{options.metric} of {chosen} by the number of strikes learnt from; {contacts}"
+    screen.print(table(heading, ("method", *map(str, counts)), rows))
+    for where, why in failures.items():
+        screen.print(f"failed: {where}: {why}", soft_wrap=True)
+    screen.print(f"wrote {picture} and {figures}", soft_wrap=True)
+    if options.json:
+        print_json({**values, "results": str(folder)})
+    return 0

@@ -1,0 +1,124 @@
+"""`avmsf suggest`: where to strike next, as a table, a list to walk by and a picture."""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from avmsf.bench.doubtpictures import draw_doubt
+from avmsf.bench.pictures import save_picture
+from avmsf.capture import CaptureSettings, read_capture
+from avmsf.cli.printing import console, figure, print_json, say, table
+from avmsf.cli.writing import expect_writable, write_text
+from avmsf.field.belief import expect_doubt
+from avmsf.field.doubt import gain_doubt
+from avmsf.field.store import load
+from avmsf.field.suggest import Suggestions, suggest
+
+TABLE, PICTURE = "suggested.csv", "suggested.png"
+"""What the folder of results holds."""
+_DRAWN_POINTS = 4000
+
+
+@dataclass(frozen=True)
+class Options:
+    """Say where to strike next: the contacts that lower the expected error of the whole field most.
+
+    Each contact takes those before it as struck, so they are worth most in this order. Strike them, fit again with all
+    recordings, and ask again. The field has to know how sure it is, as those with physics or splines do.
+    """
+
+    field: tyro.conf.Positional[Path]
+    """Field file, as `avmsf fit` writes it."""
+    count: int = 5
+    """How many contacts."""
+    candidates: Path | None = None
+    """Capture whose contacts are the places that can be struck; all of the surface without it."""
+    settings: Path | None = None
+    """A capture.toml to use in place of that capture's own."""
+    output: Path | None = None
+    """Folder for suggested.csv, a list to walk by, and suggested.png, the contacts on the object; none without it."""
+    json: bool = False
+    """Print one JSON object on the standard output, all else on the standard error."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return tyro.cli(Options, prog="avmsf suggest", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def run(options: Options) -> int:
+    """Suggest, print and draw."""
+    paths = {} if options.output is None else {name: options.output / name for name in (TABLE, PICTURE)}
+    for path in paths.values():
+        expect_writable(path)
+    field = load(options.field)
+    gains = expect_doubt(field)
+    names: tuple[str, ...] | None = None
+    if options.candidates is None:
+        found = suggest(field, options.count)
+    else:
+        settings = None if options.settings is None else CaptureSettings.read(options.settings)
+        impacts = read_capture(options.candidates, settings).impacts
+        found = suggest(field, options.count, candidates=impacts.contacts, directions=impacts.directions)
+        names = tuple(impacts.names[row] for row in found.rows.tolist())
+    rows = _rows(found, names)
+    screen = console(errors=options.json)
+    title = f"where to strike next: expected error of the whole field now {figure(found.before)}"
+    columns = ["", *(("recording",) if names else ()), "x (m)", "y (m)", "z (m)"]
+    columns += [*(("nx", "ny", "nz") if found.directions is not None else ()), "error after"]
+    screen.print(
+        table(title, columns, [[_cell(value) for value in row.values()] for row in rows], words=1 + bool(names))
+    )
+    screen.print(
+        "error: relative to the energy of the gains, 0 = certain, 1 = as wrong as silence; nx, ny, nz: the way"
+    )
+    screen.print("the hammer moves, straight into the surface")
+    if paths:
+        write_text(paths[TABLE], _list(rows))
+        step = max(1, len(gains.points) // _DRAWN_POINTS)
+        points = gains.points[::step]
+        picture = draw_doubt(
+            points,
+            gain_doubt(field, points),
+            title=f"{field.origin.capture or 'field'}: doubt, and where to strike next",
+            struck=gains.contacts,
+            suggested=found.contacts,
+        )
+        save_picture(picture, paths[PICTURE])
+        for path in paths.values():
+            say(f"wrote {path}")
+    if options.json:
+        print_json({"capture": field.origin.capture, "before": found.before, "suggestions": rows})
+    return 0
+
+
+def _rows(found: Suggestions, names: Sequence[str] | None) -> list[dict[str, Any]]:
+    """Return a dictionary a contact, with the columns of tables of contacts."""
+    rows = []
+    for number, (contact, after) in enumerate(zip(found.contacts.tolist(), found.after, strict=True)):
+        row: dict[str, Any] = {"order": number + 1}
+        if names is not None:
+            row["recording"] = names[number]
+        row |= dict(zip("xyz", contact, strict=True))
+        if found.directions is not None:
+            row |= dict(zip(("nx", "ny", "nz"), found.directions[number].tolist(), strict=True))
+        rows.append(row | {"error_after": after})
+    return rows
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.4f}" if isinstance(value, float) else str(value)
+
+
+def _list(rows: Sequence[dict[str, Any]]) -> str:
+    words = io.StringIO()
+    writer = csv.DictWriter(words, fieldnames=list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({name: f"{each:.6g}" if isinstance(each, float) else each for name, each in row.items()})
+    return words.getvalue()

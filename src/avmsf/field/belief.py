@@ -1,0 +1,111 @@
+"""What a field believes of gains together: how uncertain they are at places, and how that hangs together."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from avmsf.errors import FitError
+from avmsf.field.modalbasis import ModalBasis
+from avmsf.field.soundfield import SoundField
+from avmsf.field.thinplategains import ThinPlateGains
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """What is not known of the gains of one mode, or of several that differ by a factor."""
+
+    covariance: Float64[Tensor, "places places"]
+    """Between gains at places, as energy: summed over both parts of the gains, over four times the damping."""
+    scatter: float
+    """What one more blow has of its own, likewise."""
+
+
+def expect_doubt(field: SoundField) -> ModalBasis | ThinPlateGains:
+    """Return the field's gains. Raises FitError where they know no doubt, with the kinds that do."""
+    gains = field.gain_field
+    if not isinstance(gains, ModalBasis | ThinPlateGains):
+        raise FitError(
+            f"gains of the kind {gains.kind!r} do not know how sure they are; those of {ModalBasis.kind} and of "
+            f"{ThinPlateGains.kind}s do: fit with one of these"
+        )
+    if len(torch.unique(gains.contacts, dim=0)) < 2:
+        raise FitError("gains from a single place say nothing of how sure they are elsewhere: strike a second place")
+    return gains
+
+
+def deviation_of(
+    field: SoundField, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+) -> Float64[Tensor, "contacts modes 2"]:
+    """Return the standard deviation of both parts of the gains, as the field has it. Raises as `expect_doubt`."""
+    deviation = expect_doubt(field).deviation(contacts, directions)
+    assert deviation is not None
+    return deviation.double()
+
+
+def energy_of(field: SoundField, gains: Float[Tensor, "contacts modes 2"]) -> Float64[Tensor, " contacts"]:
+    """Return the energy of gains in two parts: the sum over modes of their squares over four times the damping."""
+    return (gains.double().square().sum(2) / (4.0 * field.bank.damping.double())).sum(1)
+
+
+def parts_of(
+    field: SoundField, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+) -> Float64[Tensor, "contacts modes 2"]:
+    """Return both parts of the mean gains."""
+    known = field.known(contacts, directions=directions)
+    quadrature = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
+    return torch.stack([known.mean, quadrature], dim=2).double()
+
+
+def beliefs(
+    field: SoundField, places: Float64[Tensor, "places 3"], directions: Float64[Tensor, "places 3"] | None
+) -> Iterator[Belief]:
+    """Return what is not known of all modes' gains of blows at places.
+
+    With physics, of each mode by its likeliest hypothesis; of splines all modes' at once, by kriging. Raises FitError
+    for other gains.
+    """
+    gains = expect_doubt(field)
+    weights = 1.0 / (4.0 * field.bank.damping.double())
+    if isinstance(gains, ModalBasis):
+        for weight, (covariance, scatter) in zip(weights.tolist(), gains.posteriors(places, directions), strict=True):
+            yield Belief(weight * covariance, weight * scatter)
+    else:
+        variance = gains.sites.field_variance(gains.values.flatten(1)).reshape(-1, 2).sum(1)
+        noise = gains.noise.square().mean(0).sum(1)
+        yield Belief(float((variance * weights).sum()) * _kriged(gains, places), float((noise * weights).sum()))
+
+
+def left_out(field: SoundField) -> Float64[Tensor, "contacts modes 2"]:
+    """Return by how much each contact's gains are missed by all others', over the deviation foretold of that.
+
+    Contacts that are doubted have no part. Raises FitError for gains that know no doubt.
+    """
+    gains = expect_doubt(field)
+    tiny = torch.finfo(torch.float64).tiny
+    if isinstance(gains, ModalBasis):
+        errors, spread = gains.regression.left_out
+        return (errors / spread.clamp_min(tiny))[gains.regression.doubt <= 1.0]
+    flat = gains.values.flatten(1)
+    errors = gains.sites.left_out(flat)
+    single = torch.diagonal(gains.sites.inverse)[: len(errors)].abs()
+    spread = (gains.sites.field_variance(flat) / single[:, None]).sqrt()
+    return (errors / spread.clamp_min(tiny)).reshape(len(errors), -1, 2)
+
+
+def _kriged(gains: ThinPlateGains, places: Float64[Tensor, "places 3"]) -> Float64[Tensor, "places places"]:
+    """Return the covariance of what splines leave open, over the variance that `SplineSites.spread` is relative to.
+
+    The error of a spline is a sum of values whose linear function is nought, so the kernel is a covariance for it.
+    """
+    sites = gains.sites
+    spots, owner = torch.unique(gains.contacts, dim=0, return_inverse=True)
+    member = (owner[:, None] == torch.arange(len(spots))).double()
+    counts = torch.cat([torch.eye(len(places), dtype=torch.float64), -(sites.weights(places) @ member)], dim=1)
+    along = (torch.cat([places, spots]) - sites.middle) @ sites.axes
+    distance = (along[:, None, :] - along).square().sum(2).sqrt()
+    kernel = torch.special.xlogy(distance.square(), distance) if sites.bending else -distance
+    noise = torch.cat([torch.zeros(len(places)), torch.full((len(spots),), sites.smoothing)]).double()
+    return counts @ (kernel + torch.diag(noise)) @ counts.T

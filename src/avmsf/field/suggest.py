@@ -1,0 +1,193 @@
+"""Where to strike next: the places whose sounds would tell most of the sounds everywhere else."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Float64, Int
+from torch import Tensor
+
+from avmsf.errors import FitError
+from avmsf.field.belief import Belief, beliefs, energy_of, expect_doubt, parts_of
+from avmsf.field.modalbasis import ModalBasis
+from avmsf.field.soundfield import SoundField
+from avmsf.scene.points import farthest_points
+
+PLACES = 400
+"""Points of the surface that the expected error is summed over, and that are candidates unless others are given."""
+_OFF = 0.05
+"""Distance of a candidate from the surface over the object's size, from which on it is not on the object."""
+_SAME = 1e-6
+"""Distance between two places over the object's size, below which they are one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Suggestions:
+    """Where to strike next, in this order, and what that is expected to bring.
+
+    Errors are relative: the square root of the expected squared error of the gains, as energy, over the energy that is
+    expected on the mean over the surface. 0 is certainty, 1 as wrong as silence.
+    """
+
+    contacts: Float64[Tensor, "contacts 3"]
+    """Object frame, metres."""
+    directions: Float64[Tensor, "contacts 3"] | None
+    """Unit vectors straight into the body; None where the field knows nothing of directions."""
+    rows: Int[Tensor, " contacts"]
+    """Which of the candidates they are."""
+    before: float
+    """Expected error of the whole field with what has been struck."""
+    after: tuple[float, ...]
+    """Expected error of the whole field after each of the contacts and those before it."""
+    points: Float64[Tensor, "points 3"]
+    """Points spread evenly over the surface, metres."""
+    map_before: Float64[Tensor, " points"]
+    """Expected error at these with what has been struck."""
+    map_after: Float64[Tensor, " points"]
+    """Expected error at these after all the contacts."""
+
+
+def suggest(
+    field: SoundField,
+    count: int = 5,
+    *,
+    candidates: Float[Tensor, "candidates 3"] | None = None,
+    directions: Float[Tensor, "candidates 3"] | None = None,
+) -> Suggestions:
+    """Return the `count` contacts that lower the expected error of the whole field most, each given those before it.
+
+    Gains at two places hang together as far as the field believes they do, so a blow tells of other places too; its
+    expected gain is known before it is struck, for in a Gaussian field it does not depend on what will be heard.
+    `candidates` are the places to choose from (metres, on the surface; places that have been struck are passed over),
+    by itself points spread over the surface; `directions` the unit vectors along which they can be struck, straight
+    into the surface where not given.
+
+    Raises FitError for gains that know no doubt, a count below 1, candidates that are not finite or not on the object,
+    and fewer candidates than contacts asked for.
+    """
+    gains = expect_doubt(field)
+    spread = farthest_points(gains.points, min(PLACES, len(gains.points)))
+    points = gains.points[spread].double()
+    chosen_from = points if candidates is None else candidates.double()
+    _expect(gains.points, count, chosen_from, directions)
+    along = None
+    if isinstance(gains, ModalBasis):
+        _, along = gains.surface.along(chosen_from, directions)
+    size = float((points.amax(0) - points.amin(0)).norm())
+    allowed = _apart(chosen_from, gains.contacts, size=size)
+    if int(allowed.sum()) < count:
+        raise FitError(
+            f"{count} contacts are asked for and {int(allowed.sum())} of the {len(chosen_from)} candidates have not "
+            "been struck yet: ask for fewer, or give more candidates"
+        )
+    places = points if candidates is None else torch.cat([points, chosen_from])
+    ways = _ways(gains, points, along, candidates is None)
+    ledger = _Ledger(beliefs(field, places, ways), len(points), len(chosen_from))
+    energy = float(energy_of(field, parts_of(field, points.float())).mean()) + float(ledger.open.mean())
+    before, rows, after = ledger.open, [], []
+    for _ in range(count):
+        row = int(torch.where(allowed, ledger.worth(), -math.inf).argmax())
+        ledger.strike(row)
+        allowed &= _apart(chosen_from, chosen_from[row : row + 1], size=size)
+        rows.append(row)
+        after.append(math.sqrt(float(ledger.open.mean()) / energy))
+        if not bool(allowed.any()):
+            break
+    if len(rows) < count:
+        raise FitError(f"{count} contacts are asked for and the candidates are only {len(rows)} different places")
+    return Suggestions(
+        chosen_from[rows],
+        None if along is None else along[rows],
+        torch.tensor(rows),
+        math.sqrt(float(before.mean()) / energy),
+        tuple(after),
+        points,
+        (before / energy).sqrt(),
+        (ledger.open / energy).sqrt(),
+    )
+
+
+class _Ledger:
+    """What is not known yet, mode by mode, while strikes are added that have not been made."""
+
+    def __init__(self, believed: Iterator[Belief], points: int, candidates: int) -> None:
+        self.scatter: list[float] = []
+        self.shared: list[Float64[Tensor, "places candidates"]] = []
+        """Covariances between all places and the candidates, which are the last of the places."""
+        self.points, self.candidates = points, candidates
+        self.open = torch.zeros(points, dtype=torch.float64)
+        """Variance at the points, all modes together."""
+        for belief in believed:
+            self.open = self.open + torch.diagonal(belief.covariance)[:points].clamp_min(0.0)
+            self.shared.append(belief.covariance[:, -candidates:].clone())
+            self.scatter.append(belief.scatter)
+
+    def worth(self) -> Float64[Tensor, " candidates"]:
+        """Return by how much each candidate would lower the variance, summed over the points."""
+        total = torch.zeros(self.candidates, dtype=torch.float64)
+        for shared, scatter in zip(self.shared, self.scatter, strict=True):
+            total += shared[: self.points].square().sum(0) / self._measured(shared, scatter)
+        return total
+
+    def strike(self, row: int) -> None:
+        """Take account of a blow at a candidate."""
+        for shared, scatter in zip(self.shared, self.scatter, strict=True):
+            column = shared[:, row].clone()
+            measured = self._measured(shared, scatter)[row]
+            self.open = (self.open - column[: self.points].square() / measured).clamp_min(0.0)
+            shared -= torch.outer(column, column[-self.candidates :]) / measured
+
+    def _measured(self, shared: Tensor, scatter: float) -> Float64[Tensor, " candidates"]:
+        own = torch.diagonal(shared[-self.candidates :]).clamp_min(0.0)
+        return (own + scatter).clamp_min(torch.finfo(torch.float64).tiny)
+
+
+def _ways(
+    gains: object, points: Tensor, along: Float64[Tensor, "candidates 3"] | None, alike: bool
+) -> Float64[Tensor, "places 3"] | None:
+    """Return the directions of the blows at the points and at candidates beside them."""
+    if along is None or not isinstance(gains, ModalBasis):
+        return None
+    if alike:
+        return along
+    _, straight = gains.surface.along(points, None)
+    return torch.cat([straight, along])
+
+
+def _apart(
+    places: Float64[Tensor, "places 3"], others: Float64[Tensor, "others 3"], *, size: float
+) -> Bool[Tensor, " places"]:
+    """Return whether each place is none of the others."""
+    distance = (places[:, None, :] - others).square().sum(2).sqrt()
+    return distance.amin(1) > _SAME * size
+
+
+def _expect(
+    surface: Float[Tensor, "points 3"],
+    count: int,
+    candidates: Float64[Tensor, "candidates 3"],
+    directions: Float[Tensor, "candidates 3"] | None,
+) -> None:
+    if count < 1:
+        raise FitError(f"count = {count}: expected 1 contact or more")
+    if len(candidates) == 0:
+        raise FitError("candidates is empty: give places on the surface, in metres, or none at all")
+    if not bool(torch.isfinite(candidates).all()):
+        row = int(torch.nonzero(~torch.isfinite(candidates).all(1))[0])
+        raise FitError(f"candidate {row} is {candidates[row].tolist()}: expected finite coordinates in metres")
+    if directions is not None and not bool((directions.norm(dim=1) > 0).all()):
+        row = int(torch.nonzero(~(directions.norm(dim=1) > 0))[0])
+        raise FitError(f"candidate {row}: its direction is a vector of length zero: give the way the hammer moves")
+    points = surface.double()
+    size = float((points.amax(0) - points.amin(0)).norm())
+    distance = torch.cat(
+        [(part[:, None, :] - points).square().sum(2).amin(1).sqrt() for part in torch.split(candidates, 256)]
+    )
+    worst = int(distance.argmax())
+    if float(distance[worst]) > _OFF * size:
+        raise FitError(
+            f"candidate {worst} at {[round(each, 4) for each in candidates[worst].tolist()]} m is "
+            f"{float(distance[worst]):.2g} m from the object's surface: candidates lie on it, in metres, in the "
+            "object's frame"
+        )

@@ -1,0 +1,58 @@
+"""`avmsf suggest`: from a field file to a table, a list and a picture."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from avmsf.cli.suggest import parse, run
+from avmsf.errors import AvmsfError
+from avmsf.field.store import save
+from believing_field import bar_contacts, drawn_gains, physics_field, sound_field, spline_field
+
+Streams = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    contacts = bar_contacts(6)
+    path = tmp_path_factory.mktemp("fields") / "bar.safetensors"
+    save(sound_field(physics_field(contacts, drawn_gains(contacts, seed=1))), path)
+    return path
+
+
+def test_the_list_to_walk_by_is_what_is_printed(field: Path, tmp_path: Path, capsys: Streams) -> None:
+    assert run(parse([str(field), "--count", "3", "--output", str(tmp_path / "next"), "--json"])) == 0
+    out, err = capsys.readouterr()
+    printed = json.loads(out)
+    assert "where to strike next" in err
+    with open(tmp_path / "next" / "suggested.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["order"] for row in rows] == ["1", "2", "3"]
+    for row, known in zip(rows, printed["suggestions"], strict=True):
+        for name in ("x", "y", "z", "nx", "ny", "nz", "error_after"):
+            assert float(row[name]) == pytest.approx(known[name], rel=1e-5, abs=1e-9)
+    errors = [printed["before"], *(each["error_after"] for each in printed["suggestions"])]
+    assert errors == sorted(errors, reverse=True)
+    assert (tmp_path / "next" / "suggested.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_splines_say_no_direction(tmp_path: Path, capsys: Streams) -> None:
+    contacts = bar_contacts(6)
+    path = tmp_path / "bar.safetensors"
+    save(sound_field(spline_field(contacts, drawn_gains(contacts, seed=1))), path)
+    assert run(parse([str(path), "--count", "1"])) == 0
+    out, _ = capsys.readouterr()
+    assert "error after" in out
+    assert "nx (" not in out
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_what_cannot_be_done_is_said_before_any_work(field: Path, tmp_path: Path) -> None:
+    with pytest.raises(AvmsfError, match="count = 0: expected 1 contact or more"):
+        run(parse([str(field), "--count", "0"]))
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.raises(AvmsfError, match="is a file"):
+        run(parse([str(field), "--output", str(blocked)]))

@@ -1,0 +1,252 @@
+"""Doubt: against fields refitted without a contact, draws whose truth is known, and the sounds themselves."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from avmsf.bench.doubtpictures import draw_band, draw_doubt
+from avmsf.errors import FitError
+from avmsf.field.belief import left_out
+from avmsf.field.doubt import coverage, gain_doubt, spectrum_band, widening
+from avmsf.field.evidence import Regression
+from avmsf.field.modalbasis import ModalBasis, sites_of
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.residual import Residual
+from believing_field import (
+    BANK,
+    DOWN,
+    FIRST,
+    LENGTH,
+    bar_contacts,
+    bar_points,
+    drawn_gains,
+    physics_field,
+    sound_field,
+    spline_field,
+)
+
+
+def test_leaving_contacts_out_at_once_agrees_with_leaving_each_out_by_itself() -> None:
+    contacts = bar_contacts(6)
+    values = drawn_gains(contacts, seed=1)
+    gains = physics_field(contacts, values, only=FIRST)
+    missed, spread = gains.regression.left_out
+    whole = gains.regression.covariance_of(*FIRST)
+    for row in range(6):
+        kept = [each for each in range(6) if each != row]
+        for mode in range(4):
+            inverse = torch.linalg.inv(whole[mode][kept][:, kept])
+            cross = whole[mode][row, kept]
+            mean = cross @ inverse @ values[kept, mode]
+            scale = torch.einsum("cd,ce,ed->d", values[kept, mode], inverse, values[kept, mode]) / 5
+            variance = scale * (whole[mode][row, row] - cross @ inverse @ cross)
+            assert torch.allclose(missed[row, mode], values[row, mode] - mean)
+            assert torch.allclose(spread[row, mode], variance.sqrt())
+
+
+def test_hypotheses_are_weighed_without_the_gain_that_is_left_out() -> None:
+    contacts = bar_contacts(6)
+    values = drawn_gains(contacts, seed=2)
+    gains = physics_field(contacts, values)
+    known = gains.regression
+    # Shapes are scaled by all contacts; only what the evidence says of the others' gains is asked for.
+    single = known._likelihood(torch.arange(4))
+    before = torch.log(known.weights) - single
+    for row in (0, 4):
+        kept = torch.tensor([each for each in range(6) if each != row])
+        total = torch.zeros(4, 2, dtype=torch.float64)
+        mass = torch.zeros(4, 2, dtype=torch.float64)
+        for hypothesis in range(len(known.weights)):
+            whole = known.covariance_of(hypothesis // 18, hypothesis // 6 % 3, hypothesis % 6)
+            others = whole[:, kept][:, :, kept]
+            inverse, rest = torch.linalg.inv(others), values[kept].transpose(0, 1)
+            squares = (rest * (inverse @ rest)).sum(1)
+            evidence = -0.5 * (5 * torch.log(squares) + torch.logdet(others)[:, None])
+            weight = torch.exp(before[hypothesis] + evidence)
+            total += weight * (whole[:, row, kept][:, None] @ inverse @ rest)[:, 0]
+            mass += weight
+        assert torch.allclose(known.left_out[0][row], values[row] - total / mass, atol=1e-9)
+
+
+def test_splines_foretell_contacts_left_out_as_splines_without_them() -> None:
+    contacts = bar_contacts(9)
+    values = drawn_gains(contacts, seed=3)
+    scores = left_out(sound_field(spline_field(contacts, values)))
+    # The scale is told by the errors themselves, so that their mean square is one.
+    assert torch.allclose(scores.square().mean(0), torch.ones(4, 2, dtype=torch.float64))
+    # Contacts are in the order of `unique` there, and without one the unit of length differs, which scales all alike.
+    places, owner = torch.unique(contacts, dim=0, return_inverse=True)
+    order = torch.argsort(owner)
+    for site in (2, 5):
+        kept = order[[each for each in range(9) if each != site]]
+        there = spline_field(contacts[kept], values[kept]).at(places[site : site + 1])
+        missed = values[order[site]] - torch.stack([there.mean[0], there.quadrature[0]], dim=1).double()  # type: ignore[index]
+        ratio = scores[site] / missed
+        assert bool((ratio > 0).all())
+
+
+def test_what_is_drawn_from_the_belief_needs_no_widening_and_is_covered() -> None:
+    everywhere = bar_contacts(100, seed=11)
+    rates, widths = [], []
+    for seed in range(6):
+        values = drawn_gains(everywhere, seed=seed)
+        field = sound_field(physics_field(everywhere[:16], values[:16]))
+        found = coverage(field, everywhere[16:], values[16:])
+        rates.append((found.plain, found.by_energy))
+        widths.append(widening(field))
+    plain, by_energy = torch.tensor(rates).mean(0).tolist()
+    # Gains of one mode hang together: six fields of four modes scatter by about .02.
+    assert plain == pytest.approx(0.9, abs=0.05)
+    assert by_energy == pytest.approx(0.9, abs=0.05)
+    assert sum(widths) / 6 == pytest.approx(1.645, abs=0.25)
+
+
+def test_noise_that_is_not_believed_in_widens_until_it_is_covered() -> None:
+    everywhere = bar_contacts(100, seed=12)
+    values = drawn_gains(everywhere, seed=1, noise=0.5)
+    # The one hypothesis has a tenth of the noise's deviation, and shapes to explain the rest by.
+    field = sound_field(physics_field(everywhere[:30], values[:30], only=(3, 0, 0)))
+    widened = coverage(field, everywhere[30:], values[30:]).plain
+    spread = field.gain_field.deviation(everywhere[30:]).double().square()  # type: ignore[union-attr]
+    spread = (spread + field.gain_field.noise[0].square()).sqrt()  # type: ignore[attr-defined]
+    known = field.known(everywhere[30:])
+    missed = values[30:] - torch.stack([known.mean, known.quadrature], dim=2).double()  # type: ignore[list-item]
+    assert float((missed.abs() <= 1.645 * spread).double().mean()) < widened - 0.03
+    assert widened == pytest.approx(0.9, abs=0.06)
+
+
+def test_a_wider_interval_covers_more() -> None:
+    everywhere = bar_contacts(60, seed=13)
+    rates = []
+    for seed in range(4):
+        values = drawn_gains(everywhere, seed=seed)
+        field = sound_field(spline_field(everywhere[:20], values[:20]))
+        rates.append([coverage(field, everywhere[20:], values[20:], level=each).plain for each in (0.3, 0.6, 0.9)])
+    low, middle, high = torch.tensor(rates).mean(0).tolist()
+    assert low < middle < high
+    assert high == pytest.approx(0.9, abs=0.08)
+
+
+def test_strikes_that_are_doubted_do_not_widen_the_others_intervals() -> None:
+    contacts = bar_contacts(12)
+    values = drawn_gains(contacts, seed=5)
+    wrong = values.clone()
+    wrong[3] *= -20.0
+    doubt = torch.ones(12, dtype=torch.float64)
+    doubt[3] = 1e6
+    surface = physics_field(contacts, values).surface
+    sites = sites_of(surface, contacts, DOWN.expand(12, 3))
+    known = physics_field(contacts, values).regression
+    regression = Regression.of(sites, known.prior, wrong, floor=known.floor, doubt=doubt)
+    gains = ModalBasis(surface, contacts, DOWN.expand(12, 3), torch.arange(6).double(), regression)
+    assert left_out(sound_field(gains)).shape == (11, 4, 2)
+    assert widening(sound_field(gains)) < 4.0
+
+
+@pytest.mark.parametrize("made", [physics_field, spline_field])
+def test_doubt_grows_away_from_contacts_and_knows_no_unit(made: type) -> None:
+    contacts = bar_contacts(80)
+    contacts = contacts[contacts[:, 0] < 0.4 * LENGTH]
+    values = drawn_gains(contacts, seed=6)
+    points = bar_points()
+    doubt = gain_doubt(sound_field(made(contacts, values)), points)
+    near, far = doubt[points[:, 0] < 0.3 * LENGTH].mean(), doubt[points[:, 0] > 0.8 * LENGTH].mean()
+    assert float(far) > 2.0 * float(near)
+    louder = gain_doubt(sound_field(made(contacts, 7.0 * values)), points)
+    assert torch.allclose(louder, doubt, rtol=1e-4, atol=1e-6)
+
+
+def test_a_sound_without_doubt_has_its_own_spectrum() -> None:
+    contacts = bar_contacts(6)
+    gains = physics_field(contacts, drawn_gains(contacts, seed=7))
+    field = replace(sound_field(Certain(gains)), residual=Residual(torch.zeros(9)))
+    band = spectrum_band(field, contacts[2])
+    power = torch.fft.rfft(field.render(contacts[2:3])[0].double()).abs().square()
+    assert torch.allclose(band.lower_db, band.upper_db)
+    assert len(band.frequencies) == 400
+    assert float(band.middle_db.max()) == pytest.approx(0.0, abs=1e-9)
+    # 401 frequencies in 400 bands: all but one hold one.
+    levels = 10 * torch.log10(power / power.max())
+    first = band.frequencies < 500.0
+    assert torch.allclose(band.middle_db[first], levels[: int(first.sum())], atol=0.05)
+    assert torch.allclose(band.frequencies[first], torch.arange(int(first.sum())).double() * 2000 / 800)
+
+
+def test_bands_hold_what_the_gains_intervals_hold() -> None:
+    contacts = bar_contacts(10)
+    gains = physics_field(contacts, drawn_gains(contacts, seed=15))
+    field = replace(sound_field(gains), residual=Residual(torch.zeros(9)))
+    # One mode alone, whose energy is the square of its gains: two parts of means and deviations that are known.
+    lone = ModalBank(BANK.frequency[:1], BANK.damping[:1])
+    field = replace(field, bank=lone, phase=field.phase[:1], gain_field=gains.take(torch.tensor([0])))
+    far = torch.tensor([0.1, 0.0, 0.0])
+    known, spread = field.known(far[None]), field.gain_field.deviation(far[None])
+    assert known.quadrature is not None
+    assert spread is not None
+    mean = torch.stack([known.mean, known.quadrature], dim=2)[0, 0].double()
+    factor = widening(field, level=0.8) / 1.2816
+    drawn = mean + factor * spread[0, 0] * torch.randn(
+        20000, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
+    power = 10 * torch.log10(drawn.square().sum(1))
+    expected = torch.quantile(power, 0.9) - torch.quantile(power, 0.1)
+    band = spectrum_band(field, far, level=0.8)
+    peak = int((BANK.frequency[0] / 2000 * 800).round())
+    # 200 draws tell a tenth's quantile to about a tenth of the width.
+    assert float(band.upper_db[peak] - band.lower_db[peak]) == pytest.approx(float(expected), rel=0.25)
+
+
+def test_bands_are_the_same_every_time_and_wider_where_less_is_known() -> None:
+    contacts = bar_contacts(80)
+    contacts = contacts[contacts[:, 0] < 0.4 * LENGTH]
+    field = sound_field(physics_field(contacts, drawn_gains(contacts, seed=8)))
+    struck, far = contacts[0], torch.tensor([0.95 * LENGTH, 0.05, 0.0])
+    near, off, again = (spectrum_band(field, each) for each in (struck, far, far))
+    assert torch.equal(off.upper_db, again.upper_db)
+    peak = int((BANK.frequency[0] / 2000 * 800).round())
+    assert float((off.upper_db - off.lower_db)[peak]) > 2.0 * float((near.upper_db - near.lower_db)[peak])
+
+
+def test_pictures_are_drawn_of_solids_and_of_sheets() -> None:
+    contacts = bar_contacts(8)
+    field = sound_field(physics_field(contacts, drawn_gains(contacts, seed=9)))
+    points = bar_points()
+    doubt = gain_doubt(field, points)
+    sheet = draw_doubt(points, doubt, title="bar", struck=contacts, suggested=contacts[:2])
+    assert len(sheet.axes) == 2  # the sheet and its colours
+    bent = points + torch.tensor([0.0, 0.0, 1.0]) * points[:, :1].square()
+    solid = draw_doubt(bent, doubt, title="bent", suggested=contacts[:3])
+    assert len(solid.axes) == 5
+    band = draw_band(spectrum_band(field, contacts[0]), title="one blow")
+    assert band.axes[0].get_xlim() == (0.0, pytest.approx(1000.0, abs=5.0))
+
+
+def test_marks_behind_the_object_are_not_drawn() -> None:
+    generator = torch.Generator().manual_seed(0)
+    ball = torch.nn.functional.normalize(torch.randn(3000, 3, generator=generator), dim=1)
+    marks = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    picture = draw_doubt(ball, torch.ones(3000), title="ball", suggested=marks)
+    seen = [sorted(each.get_text() for each in axes.texts) for axes in picture.axes[:4]]
+    assert seen == [["1"], ["1"], ["1"], ["2"]]
+
+
+def test_what_cannot_be_said_is_refused() -> None:
+    contacts = bar_contacts(6)
+    values = drawn_gains(contacts, seed=10)
+    field = sound_field(physics_field(contacts, values))
+    with pytest.raises(FitError, match=r"level = 1: expected a probability between 0 and 1"):
+        spectrum_band(field, contacts[0], level=1.0)
+    with pytest.raises(FitError, match=r"gains are of shape \(6, 3, 2\): expected 6 contacts, the field's 4 modes"):
+        coverage(field, contacts, values[:, :3])
+
+
+class Certain(ModalBasis):
+    """The same means, without doubt."""
+
+    def __init__(self, known: ModalBasis) -> None:
+        super().__init__(known.surface, known.contacts, known.directions, known.elastic, known.regression)
+
+    def deviation(self, contacts: Tensor, directions: Tensor | None = None) -> Tensor:
+        return torch.zeros(len(contacts), 4, 2)

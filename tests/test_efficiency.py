@@ -1,0 +1,123 @@
+"""Error over the number of strikes: how contacts are chosen, what is drawn, and the command that does both."""
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import torch
+
+from avmsf.bench.cases import Choosing
+from avmsf.bench.efficiency import Growing, curves, draw_efficiency
+from avmsf.bench.results import CaseRecord, ObjectRecord, Outcome
+from avmsf.capture.impacts import Impacts
+from avmsf.cli.efficiency import parse, run
+from avmsf.errors import AvmsfError, EvaluationError
+from plate_capture import fill_plate
+
+Streams = pytest.CaptureFixture[str]
+
+
+def impacts_at(contacts: torch.Tensor) -> Impacts:
+    count = len(contacts)
+    return Impacts(contacts, torch.zeros(count, 4), 8000.0, tuple(f"{row}.wav" for row in range(count)))
+
+
+def test_choices_grow_and_all_of_a_start_are_judged_alike() -> None:
+    impacts = impacts_at(torch.rand(40, 3, generator=torch.Generator().manual_seed(0)))
+    growing = Growing(starts=2)
+    assert isinstance(growing, Choosing)
+    cases = growing.cases(impacts)
+    assert [case.label for case in cases[::2]] == [f"{count} strikes" for count in (3, 4, 6, 8, 12, 16, 24)]
+    assert len({case.key for case in cases}) == 14
+    for first in ("0.wav", "20.wav"):
+        of_start = [case for case in cases if case.fold == f"from {first}"]
+        for smaller, larger in pairwise(of_start):
+            assert larger.train[: len(smaller.train)] == smaller.train
+            assert larger.test == smaller.test
+        assert impacts.names[of_start[0].train[0]] == first
+        assert sorted(of_start[-1].train + of_start[-1].test) == list(range(40))
+
+
+def test_repeated_strikes_stay_together() -> None:
+    places = torch.rand(6, 3, generator=torch.Generator().manual_seed(1))
+    impacts = impacts_at(places.repeat(2, 1))
+    for case in Growing((2, 4), 1).cases(impacts):
+        assert {row % 6 for row in case.train}.isdisjoint(row % 6 for row in case.test)
+        assert len(case.train) == 2 * int(case.label.split()[0])
+
+
+WRONG = {
+    "2 different contacts are too few": (Growing(), 2),
+    "12 contacts to learn from leave none of 12": (Growing((3, 12)), 12),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_numbers_that_a_capture_does_not_have_are_refused(message: str) -> None:
+    growing, count = WRONG[message]
+    with pytest.raises(EvaluationError, match=message):
+        growing.cases(impacts_at(torch.rand(count, 3, generator=torch.Generator().manual_seed(2))))
+
+
+def test_settings_that_mean_nothing_are_refused() -> None:
+    with pytest.raises(EvaluationError, match=r"numbers of strikes are \[0, 3\]: expected 1 or more"):
+        Growing((0, 3))
+    with pytest.raises(EvaluationError, match="starts = 0: expected 1"):
+        Growing(starts=0)
+
+
+def record_of(errors: dict[tuple[str, int, str], tuple[float | None, ...]]) -> ObjectRecord:
+    keys = sorted({(count, fold) for _, count, fold in errors})
+    cases = tuple(CaseRecord(f"{count} strikes: {fold}", f"{count} strikes", (), ()) for count, fold in keys)
+    outcomes = tuple(
+        Outcome(f"{count} strikes: {fold}", method, {"l1": values}) for (method, count, fold), values in errors.items()
+    )
+    return ObjectRecord("mug", cases=cases, outcomes=outcomes)
+
+
+def test_curves_are_means_over_contacts_then_over_starts() -> None:
+    record = record_of(
+        {
+            ("knn3", 4, "a"): (1.0, 3.0),
+            ("knn3", 4, "b"): (4.0, None),
+            ("knn3", 12, "a"): (0.5, 0.7),
+            ("nearest", 12, "a"): (2.0, 2.0),
+        }
+    )
+    knn, nearest = curves(record, metric="l1")
+    assert (knn.method, knn.counts, knn.starts) == ("knn3", (4, 12), (2, 1))
+    assert knn.mean == pytest.approx((3.0, 0.6))
+    assert (knn.lowest, knn.highest) == (pytest.approx((2.0, 0.6)), pytest.approx((4.0, 0.6)))
+    assert (nearest.counts, nearest.mean) == ((12,), (2.0,))
+    axes = draw_efficiency((knn, nearest), metric="l1", title="mug").axes[0]
+    drawn = {str(line.get_label()): line.get_xydata() for line in axes.get_lines()}
+    assert drawn["knn3"] == pytest.approx(torch.tensor([[4.0, 3.0], [12.0, 0.6]]).numpy())
+    with pytest.raises(EvaluationError, match="no method has the metric 'l2'; there are l1"):
+        curves(record, metric="l2")
+
+
+def test_a_capture_becomes_a_picture_and_figures_and_methods_may_be_added(tmp_path: Path, capsys: Streams) -> None:
+    capture = fill_plate(tmp_path / "plate")
+    words = [str(capture), "--counts", "2", "4", "--starts", "2", "--modes", "6", "--output", str(tmp_path / "results")]
+    assert run(parse([*words, "--methods", "knn3"])) == 0
+    first = json.loads((tmp_path / "results" / "plate" / "efficiency.json").read_text())
+    assert list(first["methods"]) == ["knn3"]
+    capsys.readouterr()
+    assert run(parse([*words, "--methods", "knn3,nearest", "--json"])) == 0
+    out, _ = capsys.readouterr()
+    printed = json.loads(out)
+    assert printed["methods"]["knn3"] == first["methods"]["knn3"]
+    assert printed["methods"]["nearest"]["counts"] == [2, 4]
+    assert printed["methods"]["nearest"]["starts"] == [2, 2]
+    assert printed["failures"] == {}
+    assert (tmp_path / "results" / "plate" / "efficiency.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(AvmsfError, match="choosing is"):
+        run(parse([*words[:2], "3", *words[4:], "--methods", "knn3"]))
+
+
+def test_one_of_several_objects_has_to_be_named(tmp_path: Path) -> None:
+    fill_plate(tmp_path / "set" / "a")
+    fill_plate(tmp_path / "set" / "b")
+    with pytest.raises(AvmsfError, match="holds 2 objects; name one with --object"):
+        run(parse([str(tmp_path / "set"), "--output", str(tmp_path / "results")]))

@@ -1,0 +1,247 @@
+"""What holds of every gain field, whatever it is made of: the contract of `GainField`."""
+
+import json
+from copy import deepcopy
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load as from_bytes
+from safetensors.torch import save as to_bytes
+
+from avmsf.bench.renderer import Renderer
+from avmsf.errors import FieldFileError
+from avmsf.field.attention import AttentionGains
+from avmsf.field.gainfield import GainField
+from avmsf.field.refinement import RefinedGains
+from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.store import load, save
+from avmsf.modal.residual import Residual
+from made_fields import BANK, FIELDS, SIDES, blows, places
+
+MODES = len(BANK)
+PLACES = places(7, seed=8)
+BLOWS = blows(PLACES, seed=9)
+PHASE = torch.tensor([0.0, 0.4, -1.2, 3.0, 1.6], dtype=torch.float64)
+
+every_field = pytest.mark.parametrize("name", FIELDS)
+every_kind = pytest.mark.parametrize("name", ["attention", "spline", "physics"])
+
+
+def sound_field(gains: GainField, *, noise: float = 0.0) -> SoundField:
+    return SoundField(BANK, gains, PHASE, Residual(torch.full((9,), noise)), 8000.0, 600, Origin("plate"))
+
+
+def parts(field: GainField, contacts: torch.Tensor, directions: torch.Tensor | None = None) -> list[torch.Tensor]:
+    """Return all that a field says at contacts, those that it leaves out left out."""
+    known = field.at(contacts, directions)
+    said = [known.mean, known.quadrature, known.damping, field.deviation(contacts, directions)]
+    return [each for each in said if each is not None]
+
+
+def expect_close(found: list[torch.Tensor], expected: list[torch.Tensor], *, within: float = 1e-5) -> None:
+    """Compare to the rounding of float32 sums, which other orders of the same sums have."""
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=within, atol=within * float(other.abs().max()))
+
+
+@every_field
+def test_gains_are_a_number_a_contact_and_mode(name):
+    field = FIELDS[name]()
+    assert isinstance(field, GainField)
+    for count in (7, 1, 0):
+        known = field.at(PLACES[:count], BLOWS[:count])
+        for each in (known.mean, known.quadrature, known.damping):
+            assert each is None or (each.shape, each.dtype) == ((count, MODES), torch.float32)
+        doubt = field.deviation(PLACES[:count], BLOWS[:count])
+        assert doubt is None or (doubt.shape, doubt.dtype) == ((count, MODES, 2), torch.float32)
+    assert all(bool(torch.isfinite(each).all()) for each in parts(field, PLACES, BLOWS))
+    assert known.damping is None or float(field.at(PLACES).damping.min()) > 0
+    assert doubt is None or float(field.deviation(PLACES).min()) > 0
+    # They vary over the object, or nothing below would be seen.
+    assert float(field.at(PLACES).mean.std(0).min()) > 0
+
+
+@every_field
+def test_points_are_on_the_object(name):
+    points = FIELDS[name]().points
+    assert points.shape == (150, 3)
+    assert points.dtype == torch.float32
+    assert bool((points.abs() <= torch.tensor(SIDES) / 2 + 1e-6).all())
+
+
+@every_field
+@pytest.mark.parametrize("rows", [[0], [6, 2], [6, 5, 4, 3, 2, 1, 0], [3, 3, 3]])
+def test_a_contacts_gains_do_not_depend_on_its_company(name, rows):
+    field = FIELDS[name]()
+    together = [each[rows] for each in parts(field, PLACES, BLOWS)]
+    expect_close(parts(field, PLACES[rows], BLOWS[rows]), together)
+
+
+@every_field
+def test_contacts_in_float32_and_float64_are_the_same_places(name):
+    field = FIELDS[name]()
+    assert PLACES.dtype == torch.float64
+    single, double = (parts(field, contacts) for contacts in (PLACES.float(), PLACES))
+    assert all(torch.equal(*each) for each in zip(single, double, strict=True))
+
+
+@every_field
+def test_a_blow_from_the_other_side_has_opposite_gains_or_its_direction_is_not_heeded(name):
+    field = FIELDS[name]()
+    here, there = field.at(PLACES, BLOWS), field.at(PLACES, -BLOWS)
+    sign = -1.0 if name == "physics" else 1.0
+    assert torch.equal(there.mean, sign * here.mean)
+    if here.quadrature is not None:
+        assert torch.equal(there.quadrature, sign * here.quadrature)
+    doubts = [field.deviation(PLACES, directions) for directions in (BLOWS, -BLOWS)]
+    assert doubts == [None, None] or torch.equal(*doubts)
+
+
+@every_field
+def test_without_a_direction_a_blow_goes_straight_into_the_surface(name):
+    field = FIELDS[name]()
+    contacts = field.points[:7]
+    straight = torch.zeros_like(contacts)
+    straight[:, 2] = -contacts[:, 2].sign()
+    expect_close(parts(field, contacts), parts(field, contacts, straight))
+    askew = field.at(contacts, BLOWS).mean
+    assert torch.equal(askew, field.at(contacts).mean) == (name != "physics")
+
+
+@every_field
+def test_modes_put_in_another_order_are_the_same_modes(name):
+    order, field = torch.tensor([2, 4, 0, 3, 1]), FIELDS[name]()
+    trainable = deepcopy(field) if isinstance(field, AttentionGains) else RefinedGains(field, BANK)
+    moved = trainable.finished(order)
+    expect_close(parts(moved, PLACES, BLOWS), [each[:, order] for each in parts(field, PLACES, BLOWS)])
+    assert moved.record() == field.record()
+
+
+@every_field
+def test_a_skeleton_has_the_form_of_the_tensors_and_takes_no_memory(name):
+    field = FIELDS[name]()
+    record = json.loads(json.dumps(field.record(), allow_nan=False))
+    assert record == field.record()
+    assert record["modes"] == MODES
+    skeleton, tensors = field.skeleton(record), field.tensors()
+    assert {each.device.type for each in skeleton.values()} == {"meta"}
+    forms = [{key: (each.shape, each.dtype) for key, each in named.items()} for named in (skeleton, tensors)]
+    assert forms[0] == forms[1]
+    assert all(bool(torch.isfinite(each).all()) for each in tensors.values())
+
+
+@every_field
+def test_a_field_comes_back_from_its_file_to_the_last_bit(name, tmp_path):
+    saved = sound_field(FIELDS[name](), noise=0.01)
+    save(saved, tmp_path / "one")
+    loaded = load(tmp_path / "one")
+    assert type(loaded.gain_field) is type(saved.gain_field)
+    assert loaded.gain_field.record() == saved.gain_field.record()
+    assert torch.equal(loaded.gain_field.points, saved.gain_field.points)
+    for directions in (None, BLOWS):
+        said = zip(*(parts(each.gain_field, PLACES, directions) for each in (loaded, saved)), strict=True)
+        assert all(torch.equal(*each) for each in said)
+        sounds = [each.render(PLACES, directions=directions) for each in (loaded, saved)]
+        assert torch.equal(*sounds)
+    save(loaded, tmp_path / "two")
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+
+
+@every_field
+def test_a_sound_is_the_sum_of_damped_sines_and_cosines(name):
+    field = FIELDS[name]()
+    known, times = field.at(PLACES, BLOWS), torch.arange(600, dtype=torch.float64) / 8000.0
+    ahead = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
+    factors = torch.ones_like(known.mean) if known.damping is None else known.damping
+    assert (float(ahead.abs().max()) > 0) == (not name.startswith("attention"))
+    expected = torch.zeros(7, 600, dtype=torch.float64)
+    for mode in range(MODES):
+        angle = 2 * torch.pi * BANK.frequency[mode] * times + PHASE[mode]
+        decay = torch.exp(-BANK.damping[mode] * factors[:, mode, None].double() * times)
+        waves = known.mean[:, mode, None] * torch.sin(angle) + ahead[:, mode, None] * torch.cos(angle)
+        expected += decay * waves
+    renderer = sound_field(field)
+    assert isinstance(renderer, Renderer)
+    sounds = renderer.render(PLACES, directions=BLOWS)
+    # Float32 sums: a millionth of the loudest sample.
+    torch.testing.assert_close(sounds.double(), expected, rtol=0, atol=1e-6 * float(expected.abs().max()))
+    assert torch.equal(renderer.gains(PLACES, directions=BLOWS), known.mean)
+    if name == "physics":
+        assert not torch.equal(renderer.render(PLACES), sounds)
+
+
+def changed(name: str, folder: Path, tensors: dict[str, torch.Tensor], record: dict) -> Path:
+    """Save a field of this kind, with some of its tensors and of what it says of itself replaced; None takes it out."""
+    path = folder / "plate.safetensors"
+    if not (folder / "whole").exists():
+        save(sound_field(FIELDS[name]()), folder / "whole")
+    with safe_open(folder / "whole", framework="pt") as file:
+        header = json.loads(file.metadata()["avmsf"])
+    held = from_bytes((folder / "whole").read_bytes())
+    for old, new in ((held, {f"gain_field.{key}": each for key, each in tensors.items()}), (header, record)):
+        old |= new
+        for key in [key for key, value in new.items() if value is None]:
+            del old[key]
+    path.write_bytes(to_bytes(held, {"avmsf": json.dumps(header)}))
+    return path
+
+
+@every_kind
+def test_what_a_field_says_of_itself_is_refused_where_anything_is_missing_or_wrong(name, tmp_path):
+    field = FIELDS[name]()
+    whole = {"kind": field.kind, **field.record()}
+    load(changed(name, tmp_path, {}, {"gain_field": whole}))
+    for key, value in whole.items():
+        others = {dict: [None, {}], str: [None, 8], int: [None, True, -1, value], float: [None, "eight", -1.0]}
+        for other in others[type(value)]:
+            # No number of things is a fraction.
+            found = float(other) + 0.5 if other == value else other
+            path = changed(name, tmp_path, {}, {"gain_field": whole | {key: found}})
+            with pytest.raises(FieldFileError, match=rf"plate\.safetensors: .*\b{key}"):
+                load(path)
+        path = changed(name, tmp_path, {}, {"gain_field": {each: whole[each] for each in whole if each != key}})
+        with pytest.raises(FieldFileError, match=f"found another or a damaged one .*{key}"):
+            load(path)
+
+
+@every_kind
+def test_sizes_that_are_not_the_tensors_are_refused(name, tmp_path):
+    field = FIELDS[name]()
+    whole = {"kind": field.kind, **field.record()}
+    for key in ("points", "contacts", "shapes", "dim"):
+        if key in whole:
+            path = changed(name, tmp_path, {}, {"gain_field": whole | {key: whole[key] + 1}})
+            with pytest.raises(FieldFileError, match=r"expected gain_field\..* do not belong together"):
+                load(path)
+    path = changed(name, tmp_path, {}, {"gain_field": whole | {"modes": MODES + 1}})
+    with pytest.raises(FieldFileError, match="6 modes have gains, 5 have frequencies"):
+        load(path)
+
+
+@every_kind
+def test_damaged_tensors_are_refused_by_name(name, tmp_path):
+    for key, tensor in FIELDS[name]().tensors().items():
+        with pytest.raises(FieldFileError, match=rf"missing gain_field\.{key}; unexpected none"):
+            load(changed(name, tmp_path, {key: None}, {}))
+        with pytest.raises(FieldFileError, match=rf"expected gain_field\.{key} to be finite throughout"):
+            load(changed(name, tmp_path, {key: tensor * torch.nan}, {}))
+    with pytest.raises(FieldFileError, match=rf"expected gain_field\.{key} as .*, found float16"):
+        load(changed(name, tmp_path, {key: tensor.half()}, {}))
+    with pytest.raises(FieldFileError, match=r"unexpected gain_field\.more"):
+        load(changed(name, tmp_path, {"more": torch.ones(3)}, {}))
+
+
+def test_gains_of_other_modes_than_the_banks_are_not_saved(tmp_path):
+    field = FIELDS["spline"]().take(torch.tensor([0, 1, 2]))
+    with pytest.raises(FieldFileError, match="3 modes have gains, 5 have frequencies"):
+        save(sound_field(field), tmp_path / "plate")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_gain_field_that_nobody_knows_is_refused_with_those_that_are(tmp_path):
+    path = changed("spline", tmp_path, {}, {"gain_field": {"kind": "wavelets"}})
+    with pytest.raises(FieldFileError, match=r"gain_field\.kind is 'wavelets', not attention, spline, physics"):
+        load(path)

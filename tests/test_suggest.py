@@ -1,0 +1,189 @@
+"""Where to strike next: against linear algebra written out, and what can be asked for wrongly."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor
+
+from avmsf.errors import FitError
+from avmsf.field.belief import beliefs
+from avmsf.field.evidence import NOISES, REMAINDERS, WIDTHS
+from avmsf.field.fit import gain_case
+from avmsf.field.recipes import SHARED, Attention
+from avmsf.field.soundfield import SoundField
+from avmsf.field.suggest import suggest
+from believing_field import (
+    BANK,
+    DOWN,
+    ELASTIC,
+    FIRST,
+    LENGTH,
+    bar_contacts,
+    bar_points,
+    drawn_gains,
+    physics_field,
+    sound_field,
+    spline_field,
+)
+from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
+
+
+def of_one_hypothesis(count: int = 5) -> SoundField:
+    contacts = bar_contacts(count)
+    return sound_field(physics_field(contacts, drawn_gains(contacts, seed=1), only=FIRST))
+
+
+def open_variance(field: SoundField, extra: Tensor, points: Tensor) -> Tensor:
+    """Return the energy that is not known at points with `extra` struck too, by the textbook's formula."""
+    gains = field.gain_field
+    contacts, values = gains.contacts, gains.values  # type: ignore[attr-defined]
+    struck = torch.cat([contacts, extra])
+    total = torch.zeros(len(points), dtype=torch.float64)
+
+    def shapes(places: Tensor) -> Tensor:
+        return 2**0.5 * torch.cos(torch.pi * torch.arange(1, 7) * places[:, :1] / LENGTH)
+
+    reach = 0.15 * float((bar_points().amax(0) - bar_points().amin(0)).norm())
+    width, part, noise = WIDTHS[FIRST[0]], REMAINDERS[FIRST[1]], NOISES[FIRST[2]]
+    for mode in range(len(BANK)):
+        prior = torch.exp(-0.5 * (torch.log(BANK.frequency[mode] / ELASTIC) / width) ** 2) + 1e-3
+        prior = prior / (shapes(contacts).square() @ prior).mean()
+
+        def kernel(one: Tensor, two: Tensor, prior: Tensor = prior) -> Tensor:
+            smooth = torch.exp(-0.5 * (one[:, None] - two).square().sum(2) / reach**2)
+            return (1 - part) * shapes(one) @ torch.diag(prior) @ shapes(two).T + part * smooth
+
+        known = kernel(contacts, contacts) + noise * torch.eye(len(contacts))
+        scale = torch.einsum("cd,ce,ed->d", values[:, mode], torch.linalg.inv(known), values[:, mode]).sum()
+        all_of = kernel(struck, struck) + noise * torch.eye(len(struck))
+        left = kernel(points, points) - kernel(points, struck) @ torch.linalg.inv(all_of) @ kernel(struck, points)
+        total += scale / len(contacts) * torch.diagonal(left) / (4 * BANK.damping[mode])
+    return total
+
+
+def test_the_expected_error_is_that_of_regression_with_the_contacts_struck() -> None:
+    field = of_one_hypothesis()
+    found = suggest(field, 3)
+    ratio = found.before**2 / float(open_variance(field, found.contacts[:0], found.points).mean())
+    for count, after in enumerate(found.after, 1):
+        expected = float(open_variance(field, found.contacts[:count], found.points).mean())
+        # Shapes are held in float32.
+        assert after**2 == pytest.approx(ratio * expected, rel=1e-4)
+    assert torch.allclose(
+        found.map_after**2, ratio * open_variance(field, found.contacts, found.points), rtol=1e-3, atol=1e-9
+    )
+    assert torch.allclose(
+        found.map_before**2, ratio * open_variance(field, found.contacts[:0], found.points), rtol=1e-3
+    )
+
+
+def test_each_contact_is_the_best_of_all_candidates() -> None:
+    field = of_one_hypothesis()
+    candidates = bar_contacts(12, seed=7)
+    candidates = candidates[((candidates[:, None] - field.gain_field.contacts).norm(dim=2) > 1e-6).all(1)]  # type: ignore[attr-defined]
+    found = suggest(field, 2, candidates=candidates)
+    taken = candidates[:0]
+    for row in found.rows.tolist():
+        errors = [
+            float(open_variance(field, torch.cat([taken, each[None]]), found.points).mean()) for each in candidates
+        ]
+        assert min(range(len(errors)), key=errors.__getitem__) == row
+        taken = torch.cat([taken, candidates[row : row + 1]])
+    assert torch.equal(found.contacts, candidates[found.rows])
+
+
+def test_a_field_that_was_struck_on_one_side_is_to_be_struck_on_the_other() -> None:
+    contacts = bar_contacts(60)
+    contacts = contacts[contacts[:, 0] < 0.3 * LENGTH]
+    for gains in (physics_field, spline_field):
+        field = sound_field(gains(contacts, drawn_gains(contacts, seed=2)))
+        assert float(suggest(field, 1).contacts[0, 0]) > 0.6 * LENGTH
+
+
+@pytest.mark.parametrize("made", [physics_field, spline_field])
+def test_contacts_differ_lie_on_the_object_and_lower_the_error_each(made: type) -> None:
+    contacts = bar_contacts(6)
+    found = suggest(sound_field(made(contacts, drawn_gains(contacts, seed=3))), 8)
+    errors = [found.before, *found.after]
+    assert all(later < earlier for earlier, later in pairwise(errors))
+    assert errors[0] < 1.5
+    both = torch.cat([contacts, found.contacts])
+    assert len(torch.unique(both, dim=0)) == 14
+    assert float((found.contacts[:, None] - bar_points().double()).norm(dim=2).amin(1).max()) < 1e-9
+    assert (found.directions is None) == (made is spline_field)
+    if found.directions is not None:
+        assert torch.allclose(found.directions, DOWN.expand(8, 3))
+
+
+@pytest.mark.parametrize("count", [3, 5, 20])
+def test_what_splines_believe_of_two_places_agrees_with_what_they_believe_of_each(count: int) -> None:
+    contacts = bar_contacts(count)
+    contacts = torch.cat([contacts, contacts[:1]])
+    gains = spline_field(contacts, drawn_gains(contacts[:-1], seed=4)[[*range(count), 0]])
+    places = bar_contacts(40, seed=9)
+    (belief,) = beliefs(sound_field(gains), places, None)
+    single = gains.deviation(places)
+    assert single is not None
+    energy = (single.double().square().sum(2) / (4 * BANK.damping)).sum(1)
+    assert torch.allclose(torch.diagonal(belief.covariance), energy, rtol=1e-4, atol=1e-6 * float(energy.max()))
+    assert float(torch.linalg.eigvalsh(belief.covariance).min()) > -1e-9 * float(energy.max())
+
+
+def test_physics_of_one_hypothesis_believes_what_its_deviation_says() -> None:
+    field = of_one_hypothesis(8)
+    places = bar_contacts(30, seed=5)
+    total = sum(torch.diagonal(each.covariance) for each in beliefs(field, places, None))
+    single = field.gain_field.deviation(places)
+    assert single is not None
+    assert isinstance(total, Tensor)
+    assert torch.allclose(total, (single.double().square().sum(2) / (4 * BANK.damping)).sum(1), rtol=1e-4)
+
+
+def test_gains_without_doubt_are_refused_with_those_that_have_it() -> None:
+    impacts = plate_impacts()
+    modes = plate_extraction(impacts)
+    network = Attention().start(gain_case(impacts, plate_features(), modes, QUICK), SHARED)
+    field = replace(sound_field(network.finished(torch.arange(len(modes.bank)))), bank=modes.bank)
+    with pytest.raises(
+        FitError, match=r"'attention' do not know how sure they are; those of physics and of splines do"
+    ):
+        suggest(field)
+
+
+WRONG = {
+    "count = 0: expected 1": {"count": 0},
+    "candidates is empty": {"count": 1, "candidates": torch.zeros(0, 3)},
+    r"candidate 1 is \[0.0, nan, 0.0\]": {
+        "count": 1,
+        "candidates": torch.tensor([[0.0, 0, 0], [0.0, float("nan"), 0]]),
+    },
+    r"candidate 0 at \[0.4, 0.1, 0.2\] m is 0.2 m from": {"count": 1, "candidates": torch.tensor([[0.4, 0.1, 0.2]])},
+    "candidate 0: its direction is a vector of length zero": {
+        "count": 1,
+        "candidates": torch.tensor([[0.4, 0.1, 0.0]]),
+        "directions": torch.zeros(1, 3),
+    },
+    "2 contacts are asked for and 1 of the 2 candidates have not": {
+        "count": 2,
+        "candidates": torch.cat([bar_contacts(1), torch.tensor([[0.4, 0.1, 0.0]])]),
+    },
+    "2 contacts are asked for and the candidates are only 1 different": {
+        "count": 2,
+        "candidates": torch.tensor([[0.4, 0.1, 0.0], [0.4, 0.1, 0.0]]),
+    },
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_what_cannot_be_suggested_is_said(message: str) -> None:
+    with pytest.raises(FitError, match=message):
+        suggest(of_one_hypothesis(), **WRONG[message])  # type: ignore[arg-type]
+
+
+def test_one_place_says_nothing_of_doubt() -> None:
+    contacts = bar_contacts(1).expand(3, 3)
+    values = drawn_gains(bar_contacts(1), seed=6).expand(3, 4, 2)
+    with pytest.raises(FitError, match="strike a second place"):
+        suggest(sound_field(spline_field(contacts, values)))
