@@ -1,4 +1,4 @@
-"""`python -m benchmarks field`, `extract`, `speed`, `scene`, `proof` or `settings`."""
+"""`python -m benchmarks field`, `extract`, `speed`, `scene`, `proof`, `settings` or `suggest`."""
 
 import argparse
 import sys
@@ -8,7 +8,7 @@ from types import ModuleType
 
 from avmsf.capture import CaptureWarning
 from avmsf.errors import AvmsfError
-from benchmarks import extract, field, proof, scene, settings, speed
+from benchmarks import extract, field, proof, scene, settings, speed, suggest
 from benchmarks.material import MissingDataError
 from benchmarks.report import Options, show
 
@@ -19,6 +19,7 @@ BENCHMARKS: dict[str, ModuleType] = {
     "scene": scene,
     "proof": proof,
     "settings": settings,
+    "suggest": suggest,
 }
 
 

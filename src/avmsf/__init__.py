@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from avmsf.field.recipes import Attention, ThinPlate
     from avmsf.field.soundfield import SoundField
     from avmsf.field.store import load, save
+    from avmsf.field.suggest import suggest
     from avmsf.modal.bank import ModalBank
     from avmsf.modal.extract import HighResolution, ShortTime, extract
     from avmsf.modal.extraction import Extraction
@@ -82,6 +83,7 @@ __all__ = [
     "save_features",
     "splat",
     "split",
+    "suggest",
     "with_positions",
     "write_capture",
     "write_splats",
@@ -131,6 +133,7 @@ _HOMES = {
     "avmsf.simulate.nominal": ("nominal_bodies",),
     "avmsf.field.soundfield": ("SoundField",),
     "avmsf.field.store": ("load", "save"),
+    "avmsf.field.suggest": ("suggest",),
     "avmsf.modal.bank": ("ModalBank",),
     "avmsf.modal.extract": ("HighResolution", "ShortTime", "extract"),
     "avmsf.modal.extraction": ("Extraction",),

@@ -10,6 +10,7 @@ import tyro
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf.bench.doubtpictures import draw_band, draw_doubt
 from avmsf.bench.evaluation import evaluate
 from avmsf.bench.pictures import draw_gains, draw_modes, draw_spectrograms, save_picture
 from avmsf.capture import CaptureSettings, Impacts, read_capture
@@ -17,6 +18,8 @@ from avmsf.cli.modes import mode_table
 from avmsf.cli.modetable import levels, mode_rows
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.scores import score_table, score_values
+from avmsf.field.belief import expect_doubt, knows_doubt
+from avmsf.field.doubt import gain_doubt, spectrum_band
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.scene.points import farthest_points
@@ -141,6 +144,11 @@ def draw_field(
             names=chosen.names,
             title=f"{name}: recorded and rendered",
         )
+    if knows_doubt(field):
+        doubt = gain_doubt(field, points)
+        title = f"doubt of {name}"
+        pictures["doubt"] = draw_doubt(points, doubt, title=title, struck=expect_doubt(field).contacts)
+        pictures["spectrum"] = draw_band(spectrum_band(field, points[0]), title=f"{name}: one blow, and its doubt")
     for stem, picture in pictures.items():
         path = folder / f"{stem}.png"
         save_picture(picture, path)
@@ -160,6 +168,12 @@ def _unheard(impacts: Impacts, field: SoundField) -> tuple[Impacts, str]:
     return impacts.take(rows), "not trained on" if len(rows) < len(impacts) else "none of them trained on"
 
 
+def _gains_words(gains: dict[str, Any]) -> str:
+    what = {"attention": "the network's on features: {encoder}", "spline": "splines through {contacts} contacts"}
+    what["physics"] = "of {shapes} elastic mode shapes, by {contacts} contacts"
+    return what[gains["kind"]].format(**gains)
+
+
 def _words(values: dict[str, Any]) -> str:
     extent = " x ".join(f"{side:.3g}" for side in values["extent_metres"])
     report = values["report"]
@@ -169,7 +183,8 @@ def _words(values: dict[str, Any]) -> str:
         f"{'per newton' if values['per_newton'] else 'on the scale of the recordings'}",
         f"  modes      {values['mode_count']}, {report.get('damping', 'shared')} damping",
         f"  noise      {values['residual_rms']:.2g} (root mean square of the residual)",
-        f"  object     {values['points']} points, {extent} m, features: {values['encoder']}",
+        f"  object     {values['points']} points, {extent} m",
+        f"  gains      {_gains_words(values['gain_field'])}",
         f"  fitted to  {len(values['trained_on'])} recordings",
     ]
     if report.get("validated"):

@@ -59,10 +59,11 @@ class Automatic:
                     continue
                 return Choice(recipe, {"choice": {"errors": {}, "missing": missing}})
             return Choice(self.candidates[0], {"choice": {"errors": {}, "missing": missing}})
-        errors = {}
-        for recipe in self.candidates:
+        errors: dict[str, float] = {}
+        # What has to be learnt step by step comes last, and is given up where it is beaten anyway.
+        for recipe in sorted(self.candidates, key=lambda each: each.warms_up):
             try:
-                errors[recipe.name] = self._error(recipe, case)
+                errors[recipe.name] = self._error(recipe, case, least=min(errors.values(), default=math.inf))
             except AvmsfError as error:
                 missing[recipe.name] = str(error)
         report = {"choice": {"errors": errors, "missing": missing}}
@@ -71,8 +72,12 @@ class Automatic:
         best = min(self.candidates, key=lambda each: errors.get(each.name, float("inf")))
         return Choice(best, report)
 
-    def _error(self, recipe: GainRecipe, case: GainCase) -> float:
-        """Return a recipe's mean error at contacts left out in turn; no error is relative to a silent recording."""
+    def _error(self, recipe: GainRecipe, case: GainCase, *, least: float) -> float:
+        """Return a recipe's mean error at contacts left out in turn; no error is relative to a silent recording.
+
+        Raises FitError for an error that is not finite, and as soon as what is left out could be foretold without any
+        error and the mean would still be larger than `least`.
+        """
         heard = case.train.sounds.abs().amax(1) > 0
         order = farthest_points(case.train.contacts, len(case.train)).tolist()
         parts = [order[first::FOLDS] for first in range(min(FOLDS, len(order)))]
@@ -82,6 +87,11 @@ class Automatic:
                 self.tell(f"choice: {recipe.name}, {number} of {len(parts)}")
             learnt = [row for row in range(len(order)) if row not in held]
             total += float(_errors(recipe, case, learnt, held)[heard[held]].sum())
+            if recipe.warms_up and total / int(heard.sum()) > least and number < len(parts):
+                raise FitError(
+                    f"given up after {number} of {len(parts)} parts: its error is {total / int(heard.sum()):.3g} or "
+                    "more, larger than another's"
+                )
         error = total / int(heard.sum())
         if not math.isfinite(error):
             raise FitError(f"its error at contacts left out is {error}: lower warmup_rate")

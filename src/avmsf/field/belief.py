@@ -23,6 +23,15 @@ class Belief:
     """What one more blow has of its own, likewise."""
 
 
+def knows_doubt(field: SoundField) -> bool:
+    """Return whether the field knows how sure it is of its gains."""
+    try:
+        expect_doubt(field)
+    except FitError:
+        return False
+    return True
+
+
 def expect_doubt(field: SoundField) -> ModalBasis | ThinPlateGains:
     """Return the field's gains. Raises FitError where they know no doubt, with the kinds that do."""
     gains = field.gain_field
