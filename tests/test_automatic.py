@@ -87,24 +87,28 @@ class Told(ThinPlate):
         return RefinedGains(known.with_values(self.factor * known.values), case.modes.bank)
 
 
-@pytest.mark.parametrize(
-    ("kind", "best", "worst"), [("linear", "spline", "attention"), ("stuffs", "attention", "spline")]
-)
-def test_the_recipe_that_truly_foretells_best_is_chosen(kind, best, worst):
+@pytest.mark.parametrize(("kind", "best"), [("linear", "spline"), ("stuffs", "attention")])
+def test_the_recipe_that_truly_foretells_best_is_chosen(kind, best):
     things = made(kind)
     told: list[str] = []
     recipes = {each.name: each for each in (Attention(), ThinPlate())}
     choice = Automatic(tuple(recipes.values()), tell=told.append).choose(things.case())
-    errors = choice.report["choice"]["errors"]
+    errors, missing = choice.report["choice"]["errors"], choice.report["choice"]["missing"]
     assert choice.recipe is recipes[best]
-    assert errors[best] < 0.7 * errors[worst]
-    assert told == [f"choice: {name}, {number} of 8" for name in recipes for number in range(1, 9)]
+    # What is solved for goes first; what is learnt step by step is given up once it can no longer win.
+    assert told[:9] == [*(f"choice: spline, {number} of 8" for number in range(1, 9)), "choice: attention, 1 of 8"]
+    if best == "attention":
+        assert errors["attention"] < 0.7 * errors["spline"]
+        assert told[-1] == "choice: attention, 8 of 8"
+    else:
+        assert errors.keys() == {"spline"}
+        assert missing["attention"].startswith(f"given up after {len(told) - 8} of 8 parts: its error is ")
     # At forty contacts that took no part it is the better one as well.
     truly = {}
     for name, recipe in recipes.items():
         sounds = fit(things.train, things.features, things.modes, CONFIG, gains=recipe).render(things.test.contacts)
         truly[name] = float(relative_stft_error(sounds, things.test.sounds, fft_sizes=(1024, 256)).mean())
-    assert truly[best] < 0.7 * truly[worst]
+    assert truly[best] == min(truly.values()) < 0.7 * max(truly.values())
 
 
 def test_the_error_is_the_mean_over_contacts_each_left_out():
@@ -236,6 +240,6 @@ def test_a_fit_chooses_unless_it_is_told_and_says_how():
     field = fit(things.train, things.features, things.modes, CONFIG)
     report = field.origin.report
     assert report["gains"] == field.gain_field.kind == "spline"
-    assert report["choice"]["errors"].keys() == {"attention", "spline"}
-    assert report["choice"]["errors"]["spline"] == min(report["choice"]["errors"].values())
+    assert report["choice"]["errors"].keys() == {"spline"}
+    assert report["choice"]["missing"].keys() == {"attention"}
     assert isinstance(field.gain_field, ThinPlateGains)
