@@ -3,76 +3,14 @@
 import itertools
 import math
 from dataclasses import replace
-from functools import cache
 
-import numpy as np
 import pytest
 import torch
 
-from avmsf.capture.surface import Surface
-from avmsf.field.bodychoice import MeasuredGains, likely_bodies
+from avmsf.field.bodychoice import likely_bodies
 from avmsf.field.suspects import agreeing
-from avmsf.scene.features import FeatureField
-from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.nominal import NOMINAL, NominalBody
-from avmsf.simulate.shell import shell
-
-WALLS = (0.0015, 0.004, 0.01)
-STIFFER = 1.25
-"""Of the made objects over what their stiffness is taken to be: a factor on all frequencies."""
-
-
-@cache
-def dome() -> Surface:
-    """Return a shallow dome, whose shapes change with its wall as those of a flat sheet do not."""
-    x, y = np.meshgrid(np.linspace(-0.12, 0.12, 13), np.linspace(-0.09, 0.09, 11), indexing="ij")
-    rows = np.arange(x.size).reshape(x.shape)
-    a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
-    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    points = np.stack([x.ravel(), y.ravel(), (-1.5 * x**2 - 2.5 * y**2).ravel()], axis=1)
-    return Surface(torch.from_numpy(points).float(), torch.from_numpy(faces))
-
-
-@cache
-def bodies() -> tuple[NominalBody, ...]:
-    return tuple(
-        NominalBody(wall, elastic_modes(shell(dome(), thickness=wall, detail=0.09), NOMINAL, count=24))
-        for wall in WALLS
-    )
-
-
-@cache
-def truth(wall: float) -> ElasticModes:
-    """Return a dome of finer elements, whose material scatters by a tenth."""
-    solid = shell(dome(), thickness=wall, detail=0.07)
-    generator = torch.Generator().manual_seed(1)
-    uneven = torch.exp(0.1 * torch.randn(len(solid.cells), generator=generator, dtype=torch.float64))
-    return elastic_modes(solid, replace(NOMINAL, young=STIFFER**2 * NOMINAL.young), count=20, stiffness_factor=uneven)
-
-
-@cache
-def points() -> torch.Tensor:
-    return FeatureField.from_mesh(dome(), generator=torch.Generator().manual_seed(0), count=1500).points
-
-
-def struck(wall: float, count: int, *, seed: int = 0, noise: float = 0.03) -> MeasuredGains:
-    """Return the gains of blows straight into a made dome, with noise over each mode's size."""
-    generator = torch.Generator().manual_seed(seed)
-    contacts = points()[torch.randperm(len(points()), generator=generator)[:count]]
-    elastic = truth(wall)
-    directions = -elastic.normals(contacts)
-    gains = elastic.gains(contacts, directions)
-    values = torch.stack([gains, 0.2 * gains], dim=2)
-    size = values.square().mean(0, keepdim=True).sqrt()
-    return MeasuredGains(
-        contacts,
-        directions.float(),
-        values + noise * size * torch.randn(values.shape, dtype=torch.float64, generator=generator),
-        elastic.frequency,
-        torch.full_like(elastic.frequency, 10.0),
-        torch.zeros(count, len(elastic), dtype=torch.float64),
-        torch.ones(count, dtype=torch.float64),
-    )
+from avmsf.simulate.nominal import NominalBody
+from made_dome import STIFFER, WALLS, bodies, points, struck
 
 
 @pytest.mark.parametrize("wall", WALLS)

@@ -158,6 +158,19 @@ def test_weights_are_the_evidence_with_beliefs_that_modes_share():
     assert regression.evidence == pytest.approx(float((top + np.log(np.exp(joint - top).sum(0))).sum()), rel=1e-9)
 
 
+def test_modes_without_gains_have_no_say():
+    x, frequency, values = some()
+    quiet = torch.cat([values, torch.zeros_like(values[:, :2])], dim=1)
+    more = torch.cat([frequency, frequency[:2] * 1.1])
+    apart = [weighed(sites(x), frequency * each, values).evidence for each in (0.5, 2.0)]
+    with_silence = [weighed(sites(x), more * each, quiet).evidence for each in (0.5, 2.0)]
+    assert with_silence[1] - with_silence[0] == pytest.approx(apart[1] - apart[0], rel=0.05)
+    regression = weighed(sites(x), more, quiet)
+    assert regression.silent[6:].all()
+    assert not regression.silent[:6].any()
+    assert float(regression.expansion[0][:, 6:].abs().max()) == 0.0
+
+
 def test_trying_priors_at_once_finds_the_evidence_of_each(monkeypatch: pytest.MonkeyPatch):
     x, frequency, values = some()
     floor, doubt = 0.02 * torch.ones(9, 6, dtype=torch.float64), torch.linspace(1, 3, 9, dtype=torch.float64)

@@ -266,7 +266,7 @@ def test_a_newer_format_is_refused_by_name(tmp_path):
 
     with pytest.raises(FieldFileError, match=r"of format 3, found format 4, written by avmsf 3\.1\.4") as caught:
         load(changed(tmp_path, change))
-    assert "install avmsf 3.1.4 or newer" in str(caught.value)
+    assert "install a newer avmsf" in str(caught.value)
 
 
 def test_missing_and_unexpected_tensors_are_named(tmp_path):

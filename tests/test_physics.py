@@ -1,7 +1,7 @@
 """The recipe of elastic shapes: what it refuses, what it reports, and how far it carries."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import pytest
@@ -20,8 +20,8 @@ from avmsf.modal.leastsquares import fit_sine_gains
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise_phased
 from avmsf.scene.features import FeatureField
-from avmsf.simulate.nominal import NominalBodies
-from test_bodychoice import STIFFER, WALLS, bodies, points, truth
+from avmsf.simulate.nominal import NominalBodies, NominalBody
+from made_dome import STIFFER, WALLS, bodies, points, truth
 
 RATE, SAMPLES, LEVEL = 12000.0, 2400, 0.01
 CONFIG = FitConfig(warmup_steps=0, steps=6, fft_sizes=(1024, 256), early=1024, damping="shared")
@@ -29,6 +29,21 @@ CONFIG = FitConfig(warmup_steps=0, steps=6, fft_sizes=(1024, 256), early=1024, d
 
 def recipe() -> Physics:
     return Physics(NominalBodies(bodies(), {}))
+
+
+@dataclass
+class Finer:
+    """Makes bodies finer in name alone, and remembers which."""
+
+    fineness: str = ""
+    asked: list[str] = field(default_factory=list)
+
+    def __call__(self, body: NominalBody) -> NominalBody:
+        self.asked.append(body.name)
+        return replace(body, fine=True)
+
+    def digest(self) -> str:
+        return self.fineness
 
 
 def features() -> FeatureField:
@@ -98,15 +113,38 @@ def test_suspects_are_named_and_all_bodies_told():
 
 
 def test_the_chosen_body_alone_is_made_finer():
-    asked = []
+    finer = Finer()
+    started = replace(recipe(), finer=finer).start(case(), "shared")
+    assert finer.asked == [bodies()[1].name]
+    assert started.report["body"] == finer.asked[0]
 
-    def finer(body):
-        asked.append(body.name)
-        return replace(body, fine=True)
 
-    started = replace(recipe(), refine=finer).start(case(), "shared")
-    assert asked == [bodies()[1].name]
-    assert started.report["body"] == asked[0]
+def test_another_fineness_is_another_recipe():
+    digests = {replace(recipe(), finer=each).digest() for each in (None, Finer("20000"), Finer("40000"))}
+    assert len(digests) == 3
+
+
+def test_a_suspect_is_neither_trained_on_nor_moved():
+    impacts, _ = recorded(12)
+    directions = impacts.directions.clone()
+    directions[5] *= -1
+    started = recipe().start(case(directions=directions), "shared")
+    assert started.heeded() == [row for row in range(12) if row != 5]
+    with torch.no_grad():
+        started.shift += 1.0
+    moved = started.finished(torch.arange(started.shift.shape[1])).values - started.field.values
+    assert float(moved[5].abs().max()) == 0.0
+    assert float(moved[4, :, 0].min()) > 0.0
+    assert recipe().start(case(), "shared").heeded() == list(range(12))
+
+
+def test_blows_along_which_nothing_moves_are_refused():
+    still = [replace(each, elastic=replace(each.elastic, shapes=0.0 * each.elastic.shapes)) for each in bodies()[:1]]
+    moving = replace(still[0].elastic, shapes=still[0].elastic.shapes + torch.tensor([0.0, 1.0, 0.0]))
+    known = Physics(NominalBodies((replace(still[0], elastic=moving),), {}))
+    along = torch.tensor([1.0, 0.0, 0.0]).expand(12, 3)
+    with pytest.raises(FitError, match=r"no elastic shape of the body, .*, moves along the blows at all: check nx"):
+        known.start(case(directions=along), "shared")
 
 
 def test_reasons_against_other_bodies_are_told():

@@ -8,7 +8,7 @@ import torch
 
 from avmsf.field.bodychoice import ChosenBody, MeasuredGains, likely_bodies
 from avmsf.field.suspects import Suspect, agreeing, doubted, find_suspects
-from test_bodychoice import WALLS, bodies, points, struck
+from made_dome import WALLS, bodies, points, struck
 
 NAMES = tuple(f"strike {row}" for row in range(15))
 
@@ -63,6 +63,14 @@ def test_a_direction_turned_round_is_found_as_such(row: int):
     # Twice as far off as silence: four times its square.
     assert found.misfit == pytest.approx(4.0, rel=0.3)
     assert found.best < 0.2
+
+
+def test_where_no_directions_were_given_none_is_reversed():
+    measured = struck(WALLS[1], 15, seed=1)
+    contacts = measured.contacts.clone()
+    contacts[[2, 9, 5]] = contacts[[9, 5, 2]]
+    found = find_suspects(likely(measured), replace(measured, contacts=contacts, directions=None))
+    assert not any(each.reversed for each in found)
 
 
 def test_too_few_strikes_accuse_none():

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from avmsf.modal.extract import HighResolution, ShortTime, extract
     from avmsf.modal.extraction import Extraction
     from avmsf.modal.residual import Residual
+    from avmsf.pipeline.physics import BodyConfig, physics_of
     from avmsf.scene.descriptors import ImageDescriptors
     from avmsf.scene.dino import DinoEncoder
     from avmsf.scene.features import FeatureField
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from avmsf.scene.splatconfig import SplatConfig
     from avmsf.scene.symmetry import Symmetries
     from avmsf.scene.symmetrysearch import find_symmetries
-    from avmsf.simulate.nominal import nominal_bodies
 
 __version__ = "0.1.0"
 
@@ -42,6 +42,7 @@ __all__ = [
     "PAPER",
     "Attention",
     "Automatic",
+    "BodyConfig",
     "Camera",
     "Capture",
     "CaptureSettings",
@@ -72,7 +73,7 @@ __all__ = [
     "lift",
     "load",
     "load_features",
-    "nominal_bodies",
+    "physics_of",
     "read_capture",
     "read_splats",
     "read_views",
@@ -130,7 +131,6 @@ _HOMES = {
     "avmsf.field.fit": ("fit",),
     "avmsf.field.physics": ("Physics",),
     "avmsf.field.recipes": ("Attention", "ThinPlate"),
-    "avmsf.simulate.nominal": ("nominal_bodies",),
     "avmsf.field.soundfield": ("SoundField",),
     "avmsf.field.store": ("load", "save"),
     "avmsf.field.suggest": ("suggest",),
@@ -138,6 +138,7 @@ _HOMES = {
     "avmsf.modal.extract": ("HighResolution", "ShortTime", "extract"),
     "avmsf.modal.extraction": ("Extraction",),
     "avmsf.modal.residual": ("Residual",),
+    "avmsf.pipeline.physics": ("BodyConfig", "physics_of"),
     "avmsf.scene.features": ("FeatureField",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

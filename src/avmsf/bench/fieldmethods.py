@@ -85,7 +85,8 @@ class AutomaticField:
         candidates.append(ThinPlate())
         try:
             candidates.append(Attention(task.features("visual")))
-        except AvmsfError:
+        except AvmsfError as error:
+            missing["looks"] = str(error)
             candidates.append(Attention())
         gains = Automatic(tuple(candidates), missing)
         return fit_field(task, task.train, positions, task.modes(), self.config, gains=gains)

@@ -1,6 +1,5 @@
 """`avmsf fit`: a capture folder in, a field file out."""
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -133,7 +132,6 @@ def run(options: Options) -> int:
     save(fitted, options.output)
     for ending in ("modes", "checkpoint"):
         _beside(options.output, ending).unlink(missing_ok=True)
-    shutil.rmtree(_beside(options.output, "bodies"), ignore_errors=True)
     scores = {} if test is None else compare(fitted, train, test, modes)
     screen = console(errors=options.json)
     if test is not None:

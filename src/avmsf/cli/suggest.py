@@ -74,10 +74,9 @@ def run(options: Options) -> int:
     screen.print(
         table(title, columns, [[_cell(value) for value in row.values()] for row in rows], words=1 + bool(names))
     )
-    screen.print(
-        "error: relative to the energy of the gains, 0 = certain, 1 = as wrong as silence; nx, ny, nz: the way"
-    )
-    screen.print("the hammer moves, straight into the surface")
+    screen.print("error: relative to the energy of the gains, 0 = certain, 1 = as wrong as silence")
+    if found.directions is not None:
+        screen.print("nx, ny, nz: the way the hammer moves, straight into the surface")
     if paths:
         write_text(paths[TABLE], _list(rows))
         step = max(1, len(gains.points) // _DRAWN_POINTS)

@@ -16,7 +16,7 @@ from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.synthesis import synthesise_phased
 from avmsf.scene.points import farthest_points
 
-FEWEST = 3
+FEWEST = 4
 """Training contacts below which there is nothing to decide on."""
 FOLDS = 8
 """Most parts that the training contacts are left out in; up to as many contacts each is left out alone."""

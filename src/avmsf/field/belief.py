@@ -90,13 +90,15 @@ def beliefs(
 def left_out(field: SoundField) -> Float64[Tensor, "contacts modes 2"]:
     """Return by how much each contact's gains are missed by all others', over the deviation foretold of that.
 
-    Contacts that are doubted have no part. Raises FitError for gains that know no doubt.
+    Contacts that are doubted have no part, and NaN stands for parts of modes without any gains. Raises FitError for
+    gains that know no doubt.
     """
     gains = expect_doubt(field)
     tiny = torch.finfo(torch.float64).tiny
     if isinstance(gains, ModalBasis):
         errors, spread = gains.regression.left_out
-        return (errors / spread.clamp_min(tiny))[gains.regression.doubt <= 1.0]
+        scores = torch.where(gains.regression.silent, torch.nan, errors / spread.clamp_min(tiny))
+        return scores[gains.trusted]
     flat = gains.values.flatten(1)
     errors = gains.sites.left_out(flat)
     single = torch.diagonal(gains.sites.inverse)[: len(errors)].abs()

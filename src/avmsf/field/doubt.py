@@ -65,7 +65,7 @@ def widening(field: SoundField, *, level: float = LEVEL) -> float:
     scores = left_out(field).abs()
     if len(scores) < 2:
         raise FitError(f"{len(scores)} contacts cannot foretell one another: fit to two or more")
-    return float(torch.quantile(scores.flatten(), level))
+    return float(torch.nanquantile(scores.flatten(), level))
 
 
 def gain_doubt(field: SoundField, points: Float[Tensor, "points 3"]) -> Float64[Tensor, " points"]:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Float64, Int
+from jaxtyping import Bool, Float64, Int
 from torch import Tensor
 
 WIDTHS = (0.05, 0.1, 0.2, 0.4)
@@ -35,6 +35,8 @@ _PSEUDO = 0.1
 """Modes' worth of belief, each, in that all hypotheses are alike."""
 _NEGLIGIBLE = 0.01
 """Weight under which a hypothesis is dropped."""
+_SILENT = 1e-20
+"""Energy of gains over the strongest's, up to which they are none."""
 _MEMORY = 4_000_000
 """Numbers of a batch of matrices."""
 
@@ -278,7 +280,7 @@ class Regression:
         """Return the prior variances, such that gains at the contacts are of mean square one."""
         prior = self.prior[modes]
         size = torch.einsum("ck,mwk->mw", self.sites.shapes.square(), prior) / len(self.values)
-        return prior / size[..., None]
+        return prior / size.clamp_min(torch.finfo(torch.float64).tiny)[..., None]
 
     def _covariance(self, modes: Int[Tensor, " modes"]) -> Float64[Tensor, "hypotheses modes contacts contacts"]:
         """Return the gains' covariance over s^2, the noise included."""
@@ -304,13 +306,20 @@ class Regression:
         """Return s^2 as each hypothesis has it."""
         return self._quadratic(modes, self._solved(modes)) / len(self.values)
 
+    @cached_property
+    def silent(self) -> Bool[Tensor, "modes 2"]:
+        """Whether each part of each mode has no gains at all: nothing, then, tells of how they spread."""
+        power = self.values.square().sum(0)
+        return power <= _SILENT * power.max()
+
     def _likelihood(self, modes: Int[Tensor, " modes"]) -> Float64[Tensor, "hypotheses modes 2"]:
         """Return the log of each hypothesis's evidence, with s integrated out."""
         factor = self._factor(modes)
         values = self.values[:, modes].transpose(0, 1).expand(len(factor), -1, -1, -1)
         squares = self._quadratic(modes, torch.cholesky_solve(values, factor))
         spread = 2.0 * torch.log(torch.diagonal(factor, dim1=-2, dim2=-1)).sum(-1)
-        return -0.5 * (len(self.values) * torch.log(squares) + spread[..., None])
+        likely = -0.5 * (len(self.values) * torch.log(squares) + spread[..., None])
+        return torch.where(self.silent[modes], 0.0, likely)
 
     def _smoother(self, modes: Int[Tensor, " modes"]) -> Float64[Tensor, "modes 2 contacts contacts"]:
         covariance = self._covariance(modes)

@@ -178,7 +178,8 @@ class _Job:
     def run(self, name: str, learnt: list[int], plan: _Plan, *, held: list[int] | None = None) -> TrainingRun:
         """Train on the rows `learnt`; with `held`, note how well the best step does there."""
         run = self._start(learnt, plan)
-        targets = self._targets(learnt)
+        # What was struck elsewhere than its label says would pull the others' gains to its sound.
+        targets = self._targets([learnt[place] for place in run.network.heeded()])
         look = (
             None
             if held is None

@@ -84,7 +84,8 @@ def read_header(words: str, path: Path) -> Header:
     if found != FORMAT:
         raise FieldFileError(
             f"{path}: expected a sound field of format {FORMAT}, found format {found}, written by avmsf {writer} "
-            f"(this is avmsf {version('avmsf')}): install avmsf {writer} or newer"
+            f"(this is avmsf {version('avmsf')}): "
+            + ("fit the field again" if isinstance(found, int) and found < FORMAT else "install a newer avmsf")
         )
     try:
         return _header(record)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Float32, Float64, Int
+from jaxtyping import Bool, Float, Float32, Float64, Int
 from torch import Tensor
 
 from avmsf.field.elasticpoints import ElasticPoints
@@ -89,6 +89,11 @@ class ModalBasis:
         across = self._remainder(places, used)
         for mode in range(self.values.shape[1]):
             yield self.regression.posterior(mode, shapes, across, among)
+
+    @property
+    def trusted(self) -> Bool[Tensor, " contacts"]:
+        """Whether each contact is taken to be where its label says."""
+        return self.regression.doubt <= 1.0
 
     def smoother(self) -> Float64[Tensor, "modes 2 contacts contacts"]:
         """Return what each contact's gain counts for at each contact."""

@@ -1,8 +1,9 @@
 """The recipe that knows the object's shape: elastic modes of the likeliest body, and gains by evidence."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float64, Int
@@ -18,8 +19,23 @@ from avmsf.simulate.nominal import NominalBodies, NominalBody
 
 FEWEST = 3
 """Strikes below which evidence says nothing."""
+_STILL = 1e-9
+"""Most motion along the blows over the largest anywhere, that is none."""
 _SPREAD = 0.02
 """Diagonal of the contacts' box over the object's, below which all were struck in one place."""
+
+
+@runtime_checkable
+class Finer(Protocol):
+    """Makes a body that was good enough to choose by as fine as was asked for."""
+
+    def __call__(self, body: NominalBody) -> NominalBody:
+        """Return the body with finer elements, or as it is where that fails."""
+        ...
+
+    def digest(self) -> str:
+        """Return what tells its bodies from another's."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +44,7 @@ class Physics:
 
     bodies: NominalBodies
     """What may lie behind the object's surface."""
-    refine: Callable[[NominalBody], NominalBody] | None = None
+    finer: Finer | None = None
     """Makes the chosen body's elements finer, where there were several to choose from."""
 
     @property
@@ -43,7 +59,7 @@ class Physics:
 
     def digest(self) -> str:
         """Return a digest of the bodies."""
-        digest = hashlib.sha256()
+        digest = hashlib.sha256(("" if self.finer is None else self.finer.digest()).encode())
         for body in self.bodies.bodies:
             digest.update(body.name.encode())
             for tensor in (body.elastic.frequency, body.elastic.nodes, body.elastic.shapes):
@@ -61,14 +77,15 @@ class Physics:
         """
         _expect_strikes(case)
         heard, points, bodies = measured_gains(case), case.features.points, self.bodies.bodies
+        _expect_motion(bodies, heard)
         likely = likely_bodies(bodies, points, heard)
         suspects = find_suspects(likely, heard)
         measured = doubted(heard, suspects)
         likely = likely_bodies(bodies, points, measured) if suspects else likely
         body = agreeing(likely, measured)
-        if self.refine is not None:
-            finer = self.refine(next(each for each in bodies if each.name == body.name))
-            body = agreeing(likely_bodies([finer], points, measured), measured)
+        if self.finer is not None:
+            fine = self.finer(next(each for each in bodies if each.name == body.name))
+            body = agreeing(likely_bodies([fine], points, measured), measured)
         report = {
             "body": body.name,
             "factor": body.factor,
@@ -81,6 +98,19 @@ class Physics:
     def rows(self, case: GainCase) -> Int[Tensor, " contacts"]:
         """Return the contacts themselves."""
         return torch.arange(len(case.train))
+
+
+def _expect_motion(bodies: Sequence[NominalBody], measured: MeasuredGains) -> None:
+    """Raise FitError where no elastic shape moves along the blows."""
+    if measured.directions is None:
+        return
+    for body in bodies:
+        moved = body.elastic.gains(measured.contacts, measured.directions).abs().max()
+        if float(moved) <= _STILL * float(body.elastic.shapes.abs().max()):
+            raise FitError(
+                f"no elastic shape of the body, {body.name}, moves along the blows at all: check nx, ny, nz, or leave "
+                "them out"
+            )
 
 
 def measured_gains(case: GainCase) -> MeasuredGains:
@@ -117,7 +147,7 @@ def _expect_strikes(case: GainCase) -> None:
     if len(train) < FEWEST:
         raise FitError(
             f"physics needs {FEWEST} strikes or more to tell how much of each shape a mode has, found {len(train)}: "
-            "strike more places, or take gains='spline'"
+            "strike more places, or let splines spread the gains"
         )
     extent = float((train.contacts.amax(0) - train.contacts.amin(0)).norm())
     size = 2.0 * case.features.half_diagonal

@@ -3,7 +3,7 @@
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Float32, Float64, Int
+from jaxtyping import Bool, Float, Float32, Float64, Int
 from torch import Tensor, nn
 
 from avmsf.field.gainfield import GainField, Gains
@@ -34,6 +34,11 @@ class LinearGains(GainField, Protocol):
         """Standard error of each of the two parts of the gains at the contacts."""
         ...
 
+    @property
+    def trusted(self) -> Bool[Tensor, " contacts"]:
+        """Whether each contact is taken to be where its label says; the others' gains count for nothing."""
+        ...
+
     def smoother(self) -> Float64[Tensor, "modes 2 contacts contacts"]:
         """Return what each contact's gain counts for at each contact, for each part of each mode."""
         ...
@@ -53,6 +58,7 @@ class RefinedGains(nn.Module):
     smoother: Float32[Tensor, "modes 2 contacts contacts"]
     start: Float32[Tensor, "contacts modes 2"]
     noise: Float32[Tensor, "contacts modes 2"]
+    free: Float32[Tensor, "contacts 1 1"]
     share: Float32[Tensor, " modes"]
 
     def __init__(self, field: LinearGains, bank: ModalBank) -> None:
@@ -63,6 +69,7 @@ class RefinedGains(nn.Module):
         self.register_buffer("smoother", smoother.float())
         self.register_buffer("start", _applied(smoother, field.values).float())
         self.register_buffer("noise", field.noise.float())
+        self.register_buffer("free", field.trusted[:, None, None].float())
         energy = field.values.square().sum((0, 2)) / bank.damping
         self.register_buffer("share", (energy / energy.sum().clamp_min(torch.finfo(torch.float64).tiny)).float())
         self.shift = nn.Parameter(torch.zeros_like(self.start))
@@ -72,19 +79,28 @@ class RefinedGains(nn.Module):
         """What the field chose."""
         return self.field.report
 
+    def heeded(self) -> list[int]:
+        """Return the contacts that the field trusts."""
+        return torch.nonzero(self.field.trusted).flatten().tolist()
+
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
         """Return the gains at the contacts of these rows."""
-        parts = (self.start + _applied(self.smoother, _STEP * self.noise * self.shift))[rows]
+        parts = (self.start + _applied(self.smoother, self.noise * self._moved))[rows]
         return Gains(parts[..., 0], parts[..., 1])
+
+    @property
+    def _moved(self) -> Float[Tensor, "contacts modes 2"]:
+        """Shifts in standard errors; gains that count for nothing stay where they are."""
+        return _STEP * self.free * self.shift
 
     def penalty(self) -> Float[Tensor, ""]:
         """Return the squared shifts over the squared standard errors, each mode by its part of the energy."""
-        squares = (_STEP * self.shift).square().mean((0, 2))
+        squares = self._moved.square().mean((0, 2))
         return 0.5 * _STRENGTH * (squares * self.share).sum()
 
     def finished(self, order: Int[Tensor, " modes"]) -> LinearGains:
         """Return the field of the gains as they stand, with its modes in the given order."""
-        moved = self.field.values + (_STEP * self.noise * self.shift).detach().double()
+        moved = self.field.values + (self.noise * self._moved).detach().double()
         return self.field.with_values(moved).take(order)
 
 

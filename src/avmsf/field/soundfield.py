@@ -63,7 +63,7 @@ class SoundField:
     def known(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Gains:
-        """Return all that the gain field knows at the contacts: both parts of the gains, and their doubt."""
+        """Return all that a sound needs at the contacts: both parts of the gains, and the factors on the dampings."""
         with torch.no_grad():
             return self.gain_field.at(contacts, directions)
 

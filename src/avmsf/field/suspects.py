@@ -36,6 +36,8 @@ _PLACES = 500
 """Places at which a suspect is looked for."""
 _FLOOR = 1e-3
 """Least scatter of a mode's gains, over their mean square."""
+_NEAR = 0.05
+"""Distance over the object's size up to which a place is the label's own."""
 _NOWHERE = 0.55
 """Misfit beyond which a place does not explain a strike."""
 _BETTER = 0.35
@@ -167,6 +169,9 @@ class _Judge:
         # Straight in may be against the label's own direction, as it is next to a label that is turned round.
         along = float(directions[place] @ directions[0])
         against = (along < 0) != bool(turned)
+        # Elsewhere, or where no direction was given, a turned blow says nothing of the label's direction.
+        near = distance <= _NEAR * surface.size
+        against = against and near and self.measured.directions is not None
         return Suspect(row, float(misfits[0, 0]), distance, against, float(misfits[turned, place]))
 
     def _scatter(self, errors: Float64[Tensor, "speaking modes"], speaking: list[int]) -> Float64[Tensor, " modes"]:

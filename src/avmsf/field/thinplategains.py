@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Float32, Float64, Int
+from jaxtyping import Bool, Float, Float32, Float64, Int
 from torch import Tensor
 
 from avmsf.field.gainfield import Gains
@@ -72,6 +72,11 @@ class ThinPlateGains:
         size = self.values.square().mean((0, 2)).sqrt()
         noise = torch.maximum(left.square().mean(0).sqrt(), _ASTRAY * size[:, None])
         return noise.expand(len(self.contacts), -1, -1)
+
+    @property
+    def trusted(self) -> Bool[Tensor, " contacts"]:
+        """All: splines doubt no contact."""
+        return torch.ones(len(self.contacts), dtype=torch.bool)
 
     def with_values(self, values: Float64[Tensor, "contacts modes 2"]) -> "ThinPlateGains":
         """Return the same splines through other gains."""

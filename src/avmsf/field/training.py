@@ -57,6 +57,10 @@ class TrainableGains(Protocol):
         """What it chose before the training, as plain values."""
         ...
 
+    def heeded(self) -> list[int]:
+        """Return those of the contacts it was started from, by number, whose recordings are to be trained on."""
+        ...
+
     def parameters(self) -> Iterator[nn.Parameter]:
         """Yield what the training moves; matrices decay towards zero as the config asks for, the others do not."""
         ...

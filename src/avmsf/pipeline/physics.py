@@ -1,7 +1,7 @@
 """From what is known of an object's shape to the recipe of fields that know how it vibrates."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -32,26 +32,52 @@ class BodyConfig:
             raise SimulationError(f"shapes = {self.shapes}: expected 1 or more")
 
 
+@dataclass(frozen=True, eq=False)
+class FinerBodies:
+    """Makes bodies of a surface finer, each once."""
+
+    surface: Surface
+    freedoms: int
+    """Degrees of freedom to come near to."""
+    cache: Path | None
+    """Folder that keeps elastic modes by content."""
+    tell: Callable[[str], None]
+    """Told what is done, in words."""
+    made: dict[str, NominalBody] = field(default_factory=dict)
+    """Those that are done, by name."""
+
+    def __call__(self, body: NominalBody) -> NominalBody:
+        """Return the body with finer elements, or as it is where that fails: it was good enough to choose by."""
+        if body.name not in self.made:
+            try:
+                fine = refined(self.surface, body, freedoms=self.freedoms, cache=self.cache, tell=self.tell)
+            except SimulationError as error:
+                self.tell(f"{body.name} stays coarse: {error}")
+                fine = body
+            self.made[body.name] = fine
+        return self.made[body.name]
+
+    def digest(self) -> str:
+        """Return what tells these bodies from those of other settings."""
+        return f"{self.freedoms}"
+
+
 def physics_of(
-    surface: Surface, config: BodyConfig, *, cache: Path | None, tell: Callable[[str], None] | None = None
+    surface: Surface,
+    config: BodyConfig | None = None,
+    *,
+    cache: Path | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> Physics:
     """Return the recipe for an object with this surface; elastic modes are kept by content in `cache`.
 
     Raises SimulationError where no body can be had.
     """
+    config = BodyConfig() if config is None else config
     walls = None if config.wall is None else [config.wall or None]
     bodies = nominal_bodies(surface, walls=walls, count=config.shapes, freedoms=config.freedoms, cache=cache, tell=tell)
-
-    def refine(body: NominalBody) -> NominalBody:
-        try:
-            return refined(surface, body, freedoms=config.freedoms, cache=cache, tell=tell)
-        except SimulationError as error:
-            # What was good enough to choose by is better than nothing.
-            if tell is not None:
-                tell(f"{body.name} stays coarse: {error}")
-            return body
-
-    return Physics(bodies, None if len(bodies.bodies) == 1 else refine)
+    finer = FinerBodies(surface, config.freedoms, cache, tell or (lambda words: None))
+    return Physics(bodies, None if len(bodies.bodies) == 1 else finer)
 
 
 def roughened(surface: Surface, part: float, *, seed: int) -> Surface:

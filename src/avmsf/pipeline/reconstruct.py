@@ -16,7 +16,7 @@ from avmsf.capture import Capture, Impacts, Surface
 from avmsf.capture.placement import judge_placement
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import CaptureError, FitError, SceneError
+from avmsf.errors import AvmsfError, CaptureError, FitError, SceneError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import Progress, fit, gain_case
 from avmsf.field.physics import Physics
@@ -37,8 +37,9 @@ from avmsf.scene.ply import read_splats
 CACHE = ".avmsf"
 """Folder inside the capture's that keeps what each stage made."""
 MODES, CHOICE, FIELD = "modes.safetensors", "choice.json", "field.safetensors"
-BODIES = "bodies"
 """What the last stages call their outputs."""
+BODIES = "bodies"
+"""Folder of elastic modes in the cache, kept by content."""
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,12 @@ def reconstruct(
     chosen, choice = None, {"name": config.gains}
     if config.gains == "auto":
         asked = {"candidates": list(shape.candidates), "body": asdict(config.body), "surface": shape.surface_digest}
+        # A choice that was made without physics is made anew once there is physics.
+        try:
+            physics()
+            asked["missing"] = ""
+        except AvmsfError as error:
+            asked["missing"] = str(error)
         chosen = stages.keep(CHOICE, {**basis, **asked}, choose)
         choice = json.loads(chosen.path.read_text(encoding="utf-8"))
     name = choice.pop("name")
