@@ -15,8 +15,8 @@ from jaxtyping import Float32, Float64
 from scipy import ndimage
 
 from avmsf.capture.cameras import Camera
+from avmsf.capture.levelset import enclose
 from avmsf.capture.meshviews import orbit_cameras
-from avmsf.capture.reconstruction import enclose
 from avmsf.capture.surface import Surface
 from avmsf.errors import CaptureError, SceneError
 from avmsf.scene.gaussians import GaussianCloud

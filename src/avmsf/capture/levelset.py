@@ -1,0 +1,99 @@
+"""From values on a grid to the closed surface of what they enclose, drawn and thinned by libraries."""
+
+import importlib
+from types import ModuleType
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from avmsf.capture.surface import Surface
+from avmsf.errors import CaptureError
+
+_SPECK = 0.02
+"""Area of a part over the largest part's, below which it is no part of the body."""
+
+
+def enclose(
+    values: Float32[np.ndarray, "x y z"],
+    level: float,
+    *,
+    lowest: Float64[np.ndarray, " 3"],
+    spacing: float,
+    faces: int | None = None,
+) -> Surface:
+    """Return the closed surface around all that is above `level` on a grid, triangles counter-clockwise from outside.
+
+    `lowest` is the place of the first value and `spacing` the distance between two, metres; the values at the grid's
+    edge must be below the level. Parts much smaller than the largest are left out. With `faces` the surface is made
+    coarser until it has at most so many triangles, twice or four times as many where fewer would pinch it open. Raises
+    CaptureError where nothing or everything is above the level, and where scikit-image or fast-simplification is
+    missing.
+    """
+    if not float(values.max()) > level or any(
+        float(values.take(end, axis=axis).max()) >= level for axis in range(3) for end in (0, -1)
+    ):
+        raise CaptureError(
+            f"values from {values.min():g} to {values.max():g} enclose nothing at the level {level:g}: expected some "
+            "above it, and none at the edge of the grid"
+        )
+    measure = _package("skimage.measure", "scikit-image")
+    vertices, triangles, _, _ = measure.marching_cubes(values, level, gradient_direction="ascent")
+    vertices, triangles = _without_specks(vertices.astype(np.float64), triangles.astype(np.int64))
+    if faces is not None and len(triangles) > faces:
+        vertices, triangles = _coarser(vertices, triangles, faces)
+    return Surface(torch.from_numpy(lowest + spacing * vertices).float(), torch.from_numpy(triangles))
+
+
+def _without_specks(
+    vertices: Float64[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "faces 3"]
+) -> tuple[Float64[np.ndarray, "kept 3"], Int[np.ndarray, "remaining 3"]]:
+    ends = triangles[:, [0, 1]], triangles[:, [1, 2]]
+    rows, columns = np.concatenate(ends).T
+    links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(vertices), len(vertices)))
+    part = connected_components(links, directed=False)[1][triangles[:, 0]]
+    corners = vertices[triangles]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    size = np.bincount(part, weights=areas)
+    return _compact(vertices, triangles[size[part] >= _SPECK * size.max()])
+
+
+def _compact(
+    vertices: Float64[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "faces 3"]
+) -> tuple[Float64[np.ndarray, "kept 3"], Int[np.ndarray, "remaining 3"]]:
+    used, rows = np.unique(triangles, return_inverse=True)
+    return vertices[used], rows.reshape(-1, 3)
+
+
+def _coarser(
+    vertices: Float64[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "faces 3"], faces: int
+) -> tuple[Float64[np.ndarray, "fewer 3"], Int[np.ndarray, "coarse 3"]]:
+    simplify = _package("fast_simplification", "fast-simplification").simplify
+    wanted = faces
+    while wanted < len(triangles):
+        places, rows = simplify(vertices, triangles, target_count=wanted)
+        fewer, coarse = _compact(places.astype(np.float64), rows.astype(np.int64))
+        if _closed(coarse):
+            return fewer, coarse
+        # Where it pinches a thin part off, a finer one does not.
+        wanted *= 2
+    return vertices, triangles
+
+
+def _closed(triangles: Int[np.ndarray, "faces 3"]) -> bool:
+    """Return whether each edge is run along once in each direction."""
+    edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    once = np.unique(edges, axis=0)
+    return len(once) == len(edges) and bool(np.array_equal(once, np.unique(edges[:, ::-1], axis=0)))
+
+
+def _package(module: str, package: str) -> ModuleType:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise CaptureError(
+            f"surfaces from points and Gaussians need {package}, which cannot be imported ({error}): "
+            "pip install 'avmsf[fem]'"
+        ) from error
