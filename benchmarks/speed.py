@@ -13,6 +13,7 @@ from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture import Impacts
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import Progress, fit
+from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.extract import extract

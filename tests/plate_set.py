@@ -7,7 +7,8 @@ import torch
 
 from avmsf.bench.task import Look
 from avmsf.capture import Capture, Surface, write_capture
-from avmsf.errors import SceneError
+from avmsf.errors import SceneError, SimulationError
+from avmsf.field.physics import Physics
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 from avmsf.simulate.truth import TRUTH, Truth, write_truth
@@ -59,3 +60,12 @@ class PlateLooks:
         if look != "positions":
             raise SceneError(f"{identifier}: nothing shows its look")
         return FeatureField.from_points(plate_surface_points(plate_named(identifier), 200))
+
+
+@dataclass(frozen=True)
+class NoBodies:
+    """Knows no object's shape."""
+
+    def __call__(self, identifier: str) -> Physics:
+        """Raise SimulationError."""
+        raise SimulationError(f"{identifier} has no shape here")

@@ -31,7 +31,19 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def field(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("fields") / "plate.safetensors"
-    words = ["fit", str(capture), "--output", str(path), "--train-count", "5", "--start", "1", *TINY]
+    words = [
+        "fit",
+        str(capture),
+        "--output",
+        str(path),
+        "--train-count",
+        "5",
+        "--start",
+        "1",
+        "--gains",
+        "spline",
+        *TINY,
+    ]
     assert main(words) == 0
     return path
 
@@ -175,7 +187,20 @@ def test_a_mode_counts_as_heard_where_it_stands_clear_of_the_noise(capture: Path
 
 def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys: Streams) -> None:
     path = tmp_path / "deep" / "plate.safetensors"
-    words = ["fit", str(capture), "--output", str(path), "--train-fraction", "0.5", "--start", "2", "--json", *TINY]
+    words = [
+        "fit",
+        str(capture),
+        "--output",
+        str(path),
+        "--train-fraction",
+        "0.5",
+        "--start",
+        "2",
+        "--json",
+        "--gains",
+        "attention",
+        *TINY,
+    ]
     assert main([*words, "--seed", "3"]) == 0
     out, err = capsys.readouterr()
     told = json.loads(out)
@@ -216,7 +241,7 @@ def test_a_recipes_settings_hold_where_the_options_say_nothing() -> None:
 def test_without_a_surface_the_contacts_box_stands_for_the_object(tmp_path: Path, capsys: Streams) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
     path = tmp_path / "plate.safetensors"
-    assert main(["fit", str(folder), "--output", str(path), *TINY]) == 0
+    assert main(["fit", str(folder), "--output", str(path), "--gains", "attention", *TINY]) == 0
     assert "has no surface" in capsys.readouterr().err
     points = load(path).gain_field.points
     contacts = read_capture(folder).impacts.contacts
@@ -309,7 +334,7 @@ def test_the_demo_goes_all_the_way(tmp_path: Path, capsys: Streams, monkeypatch:
     small = SceneConfig(
         ViewsConfig(count=6), SplatConfig(steps=30, start_points=400), LiftConfig(encoder="descriptors")
     )
-    monkeypatch.setattr(demo, "CONFIG", ReconstructConfig("visual", small, QUICK))
+    monkeypatch.setattr(demo, "CONFIG", ReconstructConfig("visual", scene=small, fit=QUICK))
     folder = tmp_path / "demo"
     assert main(["demo", str(folder)]) == 0
     assert f"Listen to {folder}/sounds/walk.wav" in capsys.readouterr().out

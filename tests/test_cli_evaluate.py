@@ -82,7 +82,7 @@ def test_ctrl_c_keeps_what_is_there(
 ) -> None:
     from avmsf.bench.baselines import NearestStrike
 
-    def stop(self: NearestStrike, contacts: object) -> None:
+    def stop(self: NearestStrike, contacts: object, **how: object) -> None:
         raise KeyboardInterrupt
 
     words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results")]

@@ -11,6 +11,8 @@ from avmsf.field.fit import Progress
 from avmsf.field.store import load
 from plate_capture import TINY, fill_plate
 
+NETWORK = ("--gains", "attention", *TINY)
+
 Streams = pytest.CaptureFixture[str]
 
 
@@ -32,10 +34,10 @@ def test_the_same_command_goes_on_to_the_same_field(
 ) -> None:
     folder = fill_plate(tmp_path / "plate")
     whole, broken = tmp_path / "whole.safetensors", tmp_path / "broken.safetensors"
-    assert main(["fit", str(folder), "--output", str(whole), *TINY]) == 0
+    assert main(["fit", str(folder), "--output", str(whole), *NETWORK]) == 0
     capsys.readouterr()
     shown = interrupt_at(monkeypatch, 14)
-    words = ["fit", str(folder), "--output", str(broken), *TINY]
+    words = ["fit", str(folder), "--output", str(broken), *NETWORK]
     assert main(words) == 130
     checkpoint, modes = tmp_path / "broken.safetensors.checkpoint", tmp_path / "broken.safetensors.modes"
     assert checkpoint.exists()
@@ -69,7 +71,7 @@ def test_an_interruption_before_training_keeps_nothing(
 
     folder = fill_plate(tmp_path / "plate")
     monkeypatch.setattr(kept, "extract", stop)
-    assert main(["fit", str(folder), "--output", str(tmp_path / "field.safetensors"), *TINY]) == 130
+    assert main(["fit", str(folder), "--output", str(tmp_path / "field.safetensors"), *NETWORK]) == 130
     assert capsys.readouterr().err.splitlines()[-1] == "avmsf fit: interrupted"
     assert [path.name for path in tmp_path.iterdir()] == ["plate"]
 
@@ -86,7 +88,7 @@ def test_an_interruption_as_training_begins_keeps_the_modes(
     def refuse(*arguments: object) -> None:
         raise AssertionError("the modes were sought again")
 
-    words = ["fit", str(fill_plate(tmp_path / "plate")), "--output", str(tmp_path / "field.safetensors"), *TINY]
+    words = ["fit", str(fill_plate(tmp_path / "plate")), "--output", str(tmp_path / "field.safetensors"), *NETWORK]
     with monkeypatch.context() as patched:
         patched.setattr(verb, "fit", stop)
         assert main(words) == 130

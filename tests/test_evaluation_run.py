@@ -31,7 +31,7 @@ from avmsf.capture.datasets import CaptureCollection
 from avmsf.errors import AvmsfError, EvaluationError, FitError
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.simulate.truth import read_truth
-from plate_set import PlateLooks, fill_plates
+from plate_set import NoBodies, PlateLooks, fill_plates
 
 CHEAP = ("white-noise", "nearest", "knn3", "random-impact")
 
@@ -45,7 +45,14 @@ def planned(folder: Path, *methods: str | Method, protocol: str = "farthest", se
     chosen = tuple(method_named(each) if isinstance(each, str) else each for each in methods or CHEAP)
     dataset = CaptureCollection(folder)
     return Evaluation(
-        dataset, "plates", PROTOCOLS[protocol], chosen, PlateLooks(), seed=seed, judging=Judging(cdpam=False)
+        dataset,
+        "plates",
+        PROTOCOLS[protocol],
+        chosen,
+        PlateLooks(),
+        NoBodies(),
+        seed=seed,
+        judging=Judging(cdpam=False),
     )
 
 

@@ -20,12 +20,12 @@ VERBS = {
     "reconstruct": "Go all the way from a capture folder to a field: views, Gaussians, features, modes, gains.",
     "view-cloud": "Draw Gaussians or features from all sides: colours, features, clusters, symmetries.",
     "render": "Write the sounds of blows anywhere on the object as wav files.",
-    "suggest": "Say where to strike next, and how sure the field is.",
+    "suggest": "Say where to strike next: the contacts that lower the expected error of the whole field most.",
     "show": "Say what a field file holds, and draw it.",
     "dataset": "Say what of a dataset is there, object by object, and what is missing.",
     "simulate": "Simulate objects, how they sound and how they look, as capture folders with their truth.",
     "evaluate": "Judge methods by contacts that they were not trained on, on all objects of a dataset.",
-    "efficiency": "Show how the error falls with the number of strikes, for several methods.",
+    "efficiency": "Show how the error falls with the number of strikes learnt from, for several methods.",
     "demo": "Go all the way on a built-in example: images, Gaussians, features, a field, sounds, pictures.",
 }
 """Each verb's module in this package, and the first sentence of its help."""
