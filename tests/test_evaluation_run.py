@@ -29,6 +29,7 @@ from avmsf.bench.task import Method, Task
 from avmsf.capture import read_capture
 from avmsf.capture.datasets import CaptureCollection
 from avmsf.errors import AvmsfError, EvaluationError, FitError
+from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.simulate.truth import read_truth
 from plate_set import NoBodies, PlateLooks, fill_plates
@@ -369,7 +370,8 @@ def test_many_at_a_time_come_to_the_same_figures(plates: Path, tmp_path: Path) -
     heard: list[RunProgress] = []
     evaluation = planned(plates, *CHEAP, "spline-gains")
     # Workers find what the package holds, and not what lies beside the tests.
-    evaluation = replace(evaluation, features=ObjectLooks(evaluation.dataset, tmp_path / "features"))
+    dataset, kept = evaluation.dataset, tmp_path / "features"
+    evaluation = replace(evaluation, features=ObjectLooks(dataset, kept), bodies=ObjectBodies(dataset, kept))
     objects = evaluation.dataset.objects()
     run_objects(evaluation, objects, ResultsFolder(tmp_path / "one"))
     many = ResultsFolder(tmp_path / "many")
