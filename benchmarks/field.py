@@ -179,8 +179,10 @@ def thickened(surface: Surface, factor: float) -> Surface:
         along[:, 0] *= factor
         along[:, 1:] += lost * np.sign(along[:, 1:])
         part.vertices = middle + along @ axes.T
-    joined = trimesh.util.concatenate(parts)
-    return Surface(torch.tensor(np.asarray(joined.vertices)).float(), torch.tensor(np.asarray(joined.faces)).long())
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, first[:-1], strict=True)])
+    return Surface(torch.from_numpy(vertices).float(), torch.from_numpy(faces).long())
 
 
 def mislabelled(train: Impacts, count: int, *, seed: int) -> tuple[tuple[str, ...], Impacts]:

@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from typing import Any, Protocol, runtime_checkable
 
-import avmsf
 from avmsf.bench.judging import Judging
 from avmsf.bench.protocols import EvaluationProtocol
 from avmsf.bench.results import ResultsFolder
@@ -59,7 +59,7 @@ class Evaluation:
         """
         self.judging.prepare()
         identity = {
-            "version": avmsf.__version__,
+            "version": version("avmsf"),
             "protocol": self.protocol.name,
             "choosing": repr(self.protocol.choosing),
             "dataset": self.title,
