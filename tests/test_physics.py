@@ -129,13 +129,13 @@ def test_a_suspect_is_neither_trained_on_nor_moved():
     directions = impacts.directions.clone()
     directions[5] *= -1
     started = recipe().start(case(directions=directions), "shared")
-    assert started.heeded() == [row for row in range(12) if row != 5]
+    assert started.heeded(12) == [row for row in range(12) if row != 5]
     with torch.no_grad():
         started.shift += 1.0
     moved = started.finished(torch.arange(started.shift.shape[1])).values - started.field.values
     assert float(moved[5].abs().max()) == 0.0
     assert float(moved[4, :, 0].min()) > 0.0
-    assert recipe().start(case(), "shared").heeded() == list(range(12))
+    assert recipe().start(case(), "shared").heeded(12) == list(range(12))
 
 
 def test_blows_along_which_nothing_moves_are_refused():

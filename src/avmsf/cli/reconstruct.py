@@ -20,7 +20,7 @@ from avmsf.cli.writing import expect_writable
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import Progress
 from avmsf.field.store import load
-from avmsf.pipeline.choice import Gains
+from avmsf.pipeline.choice import Spreading
 from avmsf.pipeline.features import LiftConfig
 from avmsf.pipeline.physics import BodyConfig
 from avmsf.pipeline.reconstruct import ReconstructConfig, reconstruct
@@ -51,7 +51,7 @@ class Options(SceneOptions):
     """Most modes to keep."""
     json: bool = False
     """Print one JSON object on the standard output, all else on the standard error."""
-    gains: Gains = "auto"
+    gains: Spreading = "auto"
     """How gains are spread over the object: physics, by its elastic mode shapes; spline; visual or positions, by the
     paper's network on what places look like or on where they are; auto, by what foretells best those training contacts
     that are left out in turn."""

@@ -59,16 +59,14 @@ class AttentionGains(nn.Module):
         shape: AttentionShape,
         generator: torch.Generator,
         regions: Regions | None = None,
-        contacts: int = 0,
     ) -> None:
         """Build an untrained network whose gains are about `gain_scale` in size, mode by mode, in float32.
 
-        `contacts` is how many it is to be trained on, `regions` the features' clusters where they have been found
-        before.
+        `regions` are the features' clusters where they have been found before.
         """
         super().__init__()
         regions = features.clusters(shape.clusters) if regions is None else regions
-        self.shape, self.encoder, self.contacts = shape, features.encoder, contacts
+        self.shape, self.encoder = shape, features.encoder
         self.register_buffer("points", features.points.float())
         self.register_buffer("features", features.features.float())
         self.register_buffer("centers", regions.centers.float())
@@ -109,9 +107,9 @@ class AttentionGains(nn.Module):
         """Return nothing: the network chose nothing beforehand."""
         return {}
 
-    def heeded(self) -> list[int]:
+    def heeded(self, contacts: int) -> list[int]:
         """Return all contacts: the network doubts none."""
-        return list(range(self.contacts))
+        return list(range(contacts))
 
     @property
     def feature_field(self) -> FeatureField:

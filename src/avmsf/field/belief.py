@@ -84,7 +84,7 @@ def beliefs(
     else:
         variance = gains.sites.field_variance(gains.values.flatten(1)).reshape(-1, 2).sum(1)
         noise = gains.noise.square().mean(0).sum(1)
-        yield Belief(float((variance * weights).sum()) * _kriged(gains, places), float((noise * weights).sum()))
+        yield Belief(float((variance * weights).sum()) * gains.sites.covariance(places), float((noise * weights).sum()))
 
 
 def left_out(field: SoundField) -> Float64[Tensor, "contacts modes 2"]:
@@ -104,19 +104,3 @@ def left_out(field: SoundField) -> Float64[Tensor, "contacts modes 2"]:
     single = torch.diagonal(gains.sites.inverse)[: len(errors)].abs()
     spread = (gains.sites.field_variance(flat) / single[:, None]).sqrt()
     return (errors / spread.clamp_min(tiny)).reshape(len(errors), -1, 2)
-
-
-def _kriged(gains: ThinPlateGains, places: Float64[Tensor, "places 3"]) -> Float64[Tensor, "places places"]:
-    """Return the covariance of what splines leave open, over the variance that `SplineSites.spread` is relative to.
-
-    The error of a spline is a sum of values whose linear function is nought, so the kernel is a covariance for it.
-    """
-    sites = gains.sites
-    spots, owner = torch.unique(gains.contacts, dim=0, return_inverse=True)
-    member = (owner[:, None] == torch.arange(len(spots))).double()
-    counts = torch.cat([torch.eye(len(places), dtype=torch.float64), -(sites.weights(places) @ member)], dim=1)
-    along = (torch.cat([places, spots]) - sites.middle) @ sites.axes
-    distance = (along[:, None, :] - along).square().sum(2).sqrt()
-    kernel = torch.special.xlogy(distance.square(), distance) if sites.bending else -distance
-    noise = torch.cat([torch.zeros(len(places)), torch.full((len(spots),), sites.smoothing)]).double()
-    return counts @ (kernel + torch.diag(noise)) @ counts.T

@@ -14,7 +14,7 @@ were tried before).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -49,10 +49,6 @@ class Sites:
     """Elastic shapes along the blows, each of mean square one over the object."""
     remainder: Float64[Tensor, "contacts contacts"]
     """The smooth kernel between all pairs, one on the diagonal."""
-
-    def take(self, rows: Int[Tensor, " contacts"]) -> "Sites":
-        """Return some of the contacts."""
-        return Sites(self.shapes[rows], self.remainder[rows][:, rows])
 
 
 def nearness(
@@ -129,19 +125,17 @@ class Regression:
 
     def take(self, modes: Int[Tensor, " modes"]) -> "Regression":
         """Return the regression of the given modes, in the given order."""
-        return Regression(
-            self.sites,
-            self.prior[modes],
-            self.values[:, modes],
-            self.floor[:, modes],
-            self.doubt,
-            self.weights[:, modes],
-            self.evidence,
+        return replace(
+            self,
+            prior=self.prior[modes],
+            values=self.values[:, modes],
+            floor=self.floor[:, modes],
+            weights=self.weights[:, modes],
         )
 
     def with_values(self, values: Float64[Tensor, "contacts modes 2"]) -> "Regression":
         """Return the same hypotheses, as likely as before, on other gains."""
-        return Regression(self.sites, self.prior, values, self.floor, self.doubt, self.weights, self.evidence)
+        return replace(self, values=values)
 
     @cached_property
     def expansion(self) -> tuple[Float64[Tensor, "shapes modes 2"], Float64[Tensor, "contacts modes 2"]]:

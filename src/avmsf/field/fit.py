@@ -179,7 +179,7 @@ class _Job:
         """Train on the rows `learnt`; with `held`, note how well the best step does there."""
         run = self._start(learnt, plan)
         # What was struck elsewhere than its label says would pull the others' gains to its sound.
-        targets = self._targets([learnt[place] for place in run.network.heeded()])
+        targets = self._targets([learnt[place] for place in run.network.heeded(len(learnt))])
         look = (
             None
             if held is None

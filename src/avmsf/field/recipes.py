@@ -118,7 +118,6 @@ class Attention:
             gain_scale=gain_scale(gains),
             shape=replace(case.config.shape, spatial_damping=damping == PER_CONTACT),
             generator=torch.Generator().manual_seed(case.config.seed),
-            contacts=len(case.train),
         )
 
     def rows(self, case: GainCase) -> Int[Tensor, " contacts"]:

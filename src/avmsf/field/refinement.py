@@ -79,7 +79,7 @@ class RefinedGains(nn.Module):
         """What the field chose."""
         return self.field.report
 
-    def heeded(self) -> list[int]:
+    def heeded(self, contacts: int) -> list[int]:
         """Return the contacts that the field trusts."""
         return torch.nonzero(self.field.trusted).flatten().tolist()
 

@@ -89,6 +89,19 @@ class SplineSites:
         quadratic = -((terms @ self.inverse) * terms).sum(1)
         return (quadratic if self.bending else -quadratic).clamp_min(0.0)
 
+    def covariance(self, places: Float[Tensor, "places 3"]) -> Float64[Tensor, "places places"]:
+        """Return how what is not known of values at places hangs together; `spread` on the diagonal.
+
+        The error of a spline is a sum of values whose linear function is nought, so the kernel is a covariance for it.
+        """
+        count = len(self.sites)
+        along = torch.cat([(places.double() - self.middle) @ self.axes, self.sites])
+        known = self._terms(places) @ self.inverse[:, :count]
+        error = torch.cat([torch.eye(len(places), dtype=torch.float64), -known], dim=1)
+        kernel = _kernel(along, along, self.bending) * (1.0 if self.bending else -1.0)
+        noise = torch.cat([kernel.new_zeros(len(places)), kernel.new_full((count,), self.smoothing)])
+        return error @ (kernel + torch.diag(noise)) @ error.T
+
     def left_out(self, values: Float[Tensor, "contacts values"]) -> Float64[Tensor, "sites values"]:
         """Return the errors at sites whose values are left out in turn."""
         return self._coefficients(values)[: len(self.sites)] / self._diagonal[:, None]

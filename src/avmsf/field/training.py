@@ -57,8 +57,8 @@ class TrainableGains(Protocol):
         """What it chose before the training, as plain values."""
         ...
 
-    def heeded(self) -> list[int]:
-        """Return those of the contacts it was started from, by number, whose recordings are to be trained on."""
+    def heeded(self, contacts: int) -> list[int]:
+        """Return which of the contacts it was started from, as many as `contacts`, are to be trained on."""
         ...
 
     def parameters(self) -> Iterator[nn.Parameter]:

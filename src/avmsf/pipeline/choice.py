@@ -9,7 +9,7 @@ from avmsf.field.physics import Physics
 from avmsf.field.recipes import Attention, GainRecipe, ThinPlate
 from avmsf.scene.features import FeatureField
 
-Gains = Literal["auto", "physics", "spline", "visual", "positions"]
+Spreading = Literal["auto", "physics", "spline", "visual", "positions"]
 """How gains are spread over an object: by its elastic mode shapes, by splines, by the paper's network on what places
 look like or on where they are; auto takes what foretells best those training contacts that are left out in turn."""
 

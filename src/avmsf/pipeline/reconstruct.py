@@ -25,7 +25,7 @@ from avmsf.files import write_whole
 from avmsf.modal.extract import ModeFinder
 from avmsf.modal.extraction import Extraction
 from avmsf.modal.keptmodes import extract_once
-from avmsf.pipeline.choice import Gains, all_recipes, recipe_for
+from avmsf.pipeline.choice import Spreading, all_recipes, recipe_for
 from avmsf.pipeline.physics import BodyConfig, physics_of
 from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages
 from avmsf.pipeline.stages import Kept, StageFolder
@@ -75,7 +75,7 @@ class Reconstruction:
 class ReconstructConfig:
     """Settings of all stages."""
 
-    gains: Gains = "auto"
+    gains: Spreading = "auto"
     """How gains are spread over the object."""
     body: BodyConfig = field(default_factory=BodyConfig)
     """How the object's shape becomes bodies that vibrate."""
