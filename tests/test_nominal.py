@@ -75,17 +75,18 @@ def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkey
 def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path: Path):
     told: list[str] = []
     inwards = Surface(ball().vertices, ball().faces.flip(1))
-    found = nominal_bodies(inwards, walls=[None], count=20, freedoms=5000, cache=tmp_path, tell=told.append).bodies[0]
+    found = nominal_bodies(inwards, walls=[None], count=20, freedoms=10000, cache=tmp_path, tell=told.append).bodies[0]
     assert any(f"{len(inwards.faces)} of its {len(inwards.faces)} triangles were turned" in words for words in told)
     # Lamb: the torsional oscillation of degree 2, whose wave number times radius is 2.501, belongs to five modes.
     shear = math.sqrt(NOMINAL.young / (2 * (1 + NOMINAL.poisson)) / NOMINAL.density)
+    # Fillings differ from run to run, and their frequencies by 2 % at this size.
     assert found.elastic.frequency[:5].numpy() == pytest.approx(2.501 * shear / (2 * math.pi * 0.05), rel=0.04)
     kept = sorted(tmp_path.iterdir())
-    again = nominal_bodies(inwards, walls=[None], count=20, freedoms=5000, cache=tmp_path).bodies[0]
+    again = nominal_bodies(inwards, walls=[None], count=20, freedoms=10000, cache=tmp_path).bodies[0]
     assert torch.equal(again.elastic.shapes, found.elastic.shapes)
     assert sorted(tmp_path.iterdir()) == kept
     moved = Surface(inwards.vertices + 0.001, inwards.faces)
-    nominal_bodies(moved, walls=[None], count=20, freedoms=5000, cache=tmp_path)
+    nominal_bodies(moved, walls=[None], count=20, freedoms=10000, cache=tmp_path)
     assert len(sorted(tmp_path.iterdir())) == 2
 
 

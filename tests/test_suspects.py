@@ -67,10 +67,13 @@ def test_a_direction_turned_round_is_found_as_such(row: int):
 
 def test_where_no_directions_were_given_none_is_reversed():
     measured = struck(WALLS[1], 15, seed=1)
-    contacts = measured.contacts.clone()
-    contacts[[2, 9, 5]] = contacts[[9, 5, 2]]
-    found = find_suspects(likely(measured), replace(measured, contacts=contacts, directions=None))
-    assert not any(each.reversed for each in found)
+    values = measured.values.clone()
+    values[2] *= -1
+    (known,) = find_suspects(likely(measured), replace(measured, values=values))
+    (unknown,) = find_suspects(likely(measured), replace(measured, values=values, directions=None))
+    assert known.row == unknown.row == 2
+    assert known.reversed
+    assert not unknown.reversed
 
 
 def test_too_few_strikes_accuse_none():

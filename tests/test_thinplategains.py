@@ -161,3 +161,14 @@ def test_splines_without_contacts_are_refused():
     nothing = torch.zeros(0, 3, dtype=torch.float64)
     with pytest.raises(FitError, match="without any contact; give at least one"):
         thin_plate_gains(nothing, nothing.reshape(0, 2, 2), importance=torch.ones(2), points=scattered(4))
+
+
+@pytest.mark.parametrize("count", [4, 12])
+@pytest.mark.parametrize("smoothing", [0.0, 0.1])
+def test_what_is_not_known_of_places_has_the_spread_on_its_diagonal(count, smoothing):
+    generator = torch.Generator().manual_seed(5)
+    contacts, places = (torch.rand(rows, 3, generator=generator, dtype=torch.float64) for rows in (count, 7))
+    sites = SplineSites(contacts, smoothing)
+    covariance = sites.covariance(places)
+    assert torch.allclose(torch.diagonal(covariance), sites.spread(places), rtol=1e-6, atol=1e-9)
+    assert torch.allclose(covariance, covariance.T, atol=1e-9)

@@ -98,9 +98,10 @@ class SplineSites:
         along = torch.cat([(places.double() - self.middle) @ self.axes, self.sites])
         known = self._terms(places) @ self.inverse[:, :count]
         error = torch.cat([torch.eye(len(places), dtype=torch.float64), -known], dim=1)
-        kernel = _kernel(along, along, self.bending) * (1.0 if self.bending else -1.0)
+        kernel = _kernel(along, along, self.bending)
         noise = torch.cat([kernel.new_zeros(len(places)), kernel.new_full((count,), self.smoothing)])
-        return error @ (kernel + torch.diag(noise)) @ error.T
+        covariance = error @ (kernel + torch.diag(noise)) @ error.T
+        return covariance if self.bending else -covariance
 
     def left_out(self, values: Float[Tensor, "contacts values"]) -> Float64[Tensor, "sites values"]:
         """Return the errors at sites whose values are left out in turn."""
