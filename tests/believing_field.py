@@ -4,7 +4,8 @@ import torch
 from torch import Tensor
 
 from avmsf.field.elasticpoints import ElasticPoints
-from avmsf.field.evidence import Regression, nearness
+from avmsf.field.evidence import Regression
+from avmsf.field.hypotheses import nearness
 from avmsf.field.modalbasis import ModalBasis, sites_of
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.thinplategains import ThinPlateGains, thin_plate_gains

@@ -8,8 +8,9 @@ import torch
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
-from avmsf.field import evidence
-from avmsf.field.evidence import NOISES, REMAINDERS, WIDTHS, Regression, Sites, nearness
+from avmsf.field import foretelling, hypotheses
+from avmsf.field.evidence import Regression
+from avmsf.field.hypotheses import NOISES, REMAINDERS, WIDTHS, Sites, nearness
 
 ELASTIC = torch.tensor([100.0, 180, 240, 330, 460, 470, 610, 800], dtype=torch.float64)
 HYPOTHESES = len(WIDTHS) * len(REMAINDERS) * len(NOISES)
@@ -86,10 +87,10 @@ def test_the_nearest_shape_is_drawn_upon_most_and_the_farthest_a_thousandth():
     near = nearness(torch.tensor([240.0], dtype=torch.float64), ELASTIC)
     assert near.shape == (1, len(WIDTHS), len(ELASTIC))
     assert near.argmax(2).tolist() == [[2] * len(WIDTHS)]
-    assert float(near[0, 0, -1]) == pytest.approx(evidence.FARTHEST)
+    assert float(near[0, 0, -1]) == pytest.approx(hypotheses.FARTHEST)
     # One width away in log frequency: exp(-1/2).
     away = nearness(ELASTIC[:1] * math.exp(WIDTHS[1]), ELASTIC[:1])
-    assert float(away[0, 1, 0]) == pytest.approx(math.exp(-0.5) + evidence.FARTHEST)
+    assert float(away[0, 1, 0]) == pytest.approx(math.exp(-0.5) + hypotheses.FARTHEST)
 
 
 @pytest.mark.parametrize("hypothesis", [(0, 0, 0), (2, 1, 3), (3, 2, 5)])
@@ -125,9 +126,9 @@ def test_one_hypothesis_is_a_gaussian_process(hypothesis: tuple[int, int, int]):
 def test_evidence_is_the_normal_density_with_the_size_integrated_out():
     x, frequency, values = some(modes=2, contacts=5)
     regression = weighed(sites(x), frequency, values / values.square().mean((0, 2), keepdim=True).sqrt())
-    found = regression._likelihood(torch.arange(2))
+    found = regression.hypotheses.likelihood(torch.arange(2))
     direct = torch.empty_like(found)
-    covariance = regression._covariance(torch.arange(2)).numpy()
+    covariance = regression.hypotheses.covariance(torch.arange(2)).numpy()
     for hypothesis in range(0, HYPOTHESES, 13):
         for mode in range(2):
             for part in range(2):
@@ -147,7 +148,7 @@ def test_weights_are_the_evidence_with_beliefs_that_modes_share():
     x, frequency, values = some()
     regression = weighed(sites(x), frequency, values)
     assert torch.allclose(regression.weights.sum(0), torch.ones(6, 2, dtype=torch.float64))
-    single = regression._likelihood(torch.arange(6)).numpy()
+    single = regression.hypotheses.likelihood(torch.arange(6)).numpy()
     before = np.full((HYPOTHESES, 2), 1 / HYPOTHESES)
     for _ in range(5):
         after = np.exp(single - single.max(0)) * before[:, None]
@@ -177,7 +178,7 @@ def test_trying_priors_at_once_finds_the_evidence_of_each(monkeypatch: pytest.Mo
     priors = torch.stack([nearness(frequency, factor * ELASTIC) for factor in (0.7, 1.0, 1.3)])
     alone = [Regression.of(sites(x), prior, values, floor=floor, doubt=doubt).evidence for prior in priors]
     # Batches that end amid a trial.
-    monkeypatch.setattr(evidence, "_MEMORY", 5 * HYPOTHESES * 81)
+    monkeypatch.setattr(hypotheses, "MEMORY", 5 * HYPOTHESES * 81)
     together = Regression.evidence_of(sites(x), priors, values, floor=floor, doubt=doubt)
     assert together.tolist() == pytest.approx(alone, rel=1e-10)
     assert max(alone) - min(alone) > 1
@@ -280,3 +281,21 @@ def test_modes_may_be_taken_and_put_in_another_order():
     assert torch.allclose(foretold(taken, x, at), foretold(regression, x, at)[:, rows])
     doubled = regression.with_values(2 * values)
     assert torch.allclose(foretold(doubled, x, at), 2 * foretold(regression, x, at))
+
+
+def test_many_places_are_doubted_a_batch_at_a_time(monkeypatch: pytest.MonkeyPatch):
+    x, frequency, values = some()
+    regression, at = weighed(sites(x), frequency, values), places(100, seed=2)
+    asked = shapes_at(at), smooth(at, x), at.new_ones(100)
+    whole = regression.deviation(*asked)
+    sizes = []
+    solve = torch.linalg.solve_triangular
+
+    def counted(factor: torch.Tensor, cross: torch.Tensor, *, upper: bool) -> torch.Tensor:
+        sizes.append(cross.numel())
+        return solve(factor, cross, upper=upper)
+
+    monkeypatch.setattr(torch.linalg, "solve_triangular", counted)
+    monkeypatch.setattr(foretelling, "MEMORY", 2000)
+    assert torch.allclose(regression.deviation(*asked), whole, rtol=1e-9, atol=0)
+    assert max(sizes) <= 2000
