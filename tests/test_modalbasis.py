@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from avmsf.field.elasticpoints import ElasticPoints
-from avmsf.field.evidence import NOISES, REMAINDERS, WIDTHS
+from avmsf.field.hypotheses import NOISES, REMAINDERS, WIDTHS
 from avmsf.field.modalbasis import REACH, ModalBasis, fit_modal_basis, remainder_kernel
 from avmsf.field.thinplategains import thin_plate_gains
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from avmsf.errors import FitError
 from avmsf.field.belief import beliefs
-from avmsf.field.evidence import NOISES, REMAINDERS, WIDTHS
 from avmsf.field.fit import gain_case
+from avmsf.field.hypotheses import NOISES, REMAINDERS, WIDTHS
 from avmsf.field.recipes import SHARED, Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.suggest import suggest
@@ -180,6 +180,32 @@ WRONG = {
 def test_what_cannot_be_suggested_is_said(message: str) -> None:
     with pytest.raises(FitError, match=message):
         suggest(of_one_hypothesis(), **WRONG[message])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("made", [physics_field, spline_field])
+def test_of_very_many_candidates_some_that_are_far_apart_are_weighed(
+    made: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    contacts = bar_contacts(6)
+    field = sound_field(made(contacts, drawn_gains(contacts, seed=3)))
+    candidates = bar_contacts(120, seed=4)
+    whole = suggest(field, 3, candidates=candidates)
+    asked = []
+
+    def counted(field: SoundField, places: Tensor, ways: Tensor | None) -> object:
+        asked.append(len(places))
+        return beliefs(field, places, ways)
+
+    monkeypatch.setattr("avmsf.field.suggest.beliefs", counted)
+    monkeypatch.setattr("avmsf.field.suggest.MOST", 30)
+    fewer = suggest(field, 3, candidates=candidates, directions=DOWN.expand(120, 3))
+    assert asked == [len(whole.points) + 30]
+    assert torch.equal(fewer.contacts, candidates[fewer.rows])
+    # A quarter of them loses next to nothing.
+    assert fewer.after[-1] < whole.after[-1] + 0.1 * (whole.before - whole.after[-1])
+    with pytest.raises(FitError, match="121 contacts are asked for and"):
+        suggest(field, 121, candidates=candidates)
+    assert len(suggest(field, 40, candidates=candidates).rows) == 40
 
 
 def test_one_place_says_nothing_of_doubt() -> None:

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from avmsf.errors import FitError
-from avmsf.field.thinplate import SplineSites
+from avmsf.field import thinplate
+from avmsf.field.thinplate import NEAR, SplineSites, fit_spline
 from avmsf.field.thinplategains import ThinPlateGains, thin_plate_gains
 
 BOX = torch.tensor([0.3, 0.2, 0.1], dtype=torch.float64)
@@ -172,3 +173,96 @@ def test_what_is_not_known_of_places_has_the_spread_on_its_diagonal(count, smoot
     covariance = sites.covariance(places)
     assert torch.allclose(torch.diagonal(covariance), sites.spread(places), rtol=1e-6, atol=1e-9)
     assert torch.allclose(covariance, covariance.T, atol=1e-9)
+
+
+def beside(contacts: torch.Tensor, part: float) -> torch.Tensor:
+    """Return a place beside the first contact, so far over the diagonal of the box around all."""
+    size = float((contacts.amax(0) - contacts.amin(0)).norm())
+    return contacts[:1] + part * size * torch.tensor([[0.6, 0.0, 0.8]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("count", [9, 20])
+def test_two_blows_beside_each_other_that_differ_do_not_make_gains_run_away(count):
+    contacts, asked = scattered(count), scattered(400, seed=7)
+    values = torch.sin(20.0 * contacts[:, :1])
+    near = torch.cat([contacts, contacts[:1] + torch.tensor([[1e-4, 0.0, 0.0]], dtype=torch.float64)])
+    both = torch.cat([values, values[:1] + 2.0])
+    found = fit_spline(near, both, importance=torch.ones(1)).at(asked)
+    mean = torch.cat([values[:1] + 1.0, values[1:]])
+    expected = fit_spline(contacts, mean, importance=torch.ones(1)).at(asked)
+    # What a tenth of a millimetre moves the site by changes little; the slope of 2 over it would be 20 a millimetre.
+    assert float((found - expected).abs().max()) < 0.02
+    assert float(found.abs().max()) < 6.0
+
+
+@pytest.mark.parametrize(("count", "flat"), [(9, False), (20, False), (20, True)])
+def test_no_value_counts_for_much_more_than_itself_however_near_its_neighbour_is(count, flat):
+    contacts, asked = scattered(count, flat=flat), scattered(400, seed=7, flat=flat)
+    for part in (1e-5, 1e-3, 0.5 * NEAR, 0.99 * NEAR, 1.01 * NEAR, 2 * NEAR):
+        aside = beside(contacts, part)
+        near = torch.cat([contacts, aside * torch.tensor([1.0, 1.0, 0.0]) if flat else aside])
+        assert float(SplineSites(near, 0.0).weights(asked).abs().amax()) < 20.0
+
+
+def test_contacts_near_each_other_are_one_site_and_a_row_of_them_is_not():
+    contacts = scattered(12)
+    assert len(SplineSites(torch.cat([contacts, beside(contacts, 0.9 * NEAR)]), 0.0).sites) == 12
+    assert len(SplineSites(torch.cat([contacts, beside(contacts, 1.1 * NEAR)]), 0.0).sites) == 13
+    line = torch.linspace(0.0, 0.1, 251, dtype=torch.float64)[:, None] * torch.tensor([[1.0, 0.0, 0.0]])
+    sites = SplineSites(line.double(), 0.0)
+    # Each is near to the next; no site is longer than what is near.
+    assert 100 <= len(sites.sites) <= 200
+    reach = torch.stack([(line[rows > 0].amax(0) - line[rows > 0].amin(0)).norm() for rows in sites._places[1]])
+    assert float(reach.max()) <= NEAR * 0.1 + 1e-12
+    # Whatever their order.
+    rows = torch.randperm(251, generator=torch.Generator().manual_seed(3))
+    shuffled = SplineSites(line[rows].double(), 0.0)
+    assert torch.allclose(shuffled.weights(contacts)[:, rows.argsort()], sites.weights(contacts), rtol=0, atol=1e-6)
+
+
+def test_a_mean_of_several_blows_is_smoothed_as_much_less():
+    """Penalised least squares on all blows, solved as such, is the spline through means with their noise."""
+    contacts, smoothing = scattered(14), 0.05
+    again = torch.cat([contacts, contacts[:3], contacts[:1]])
+    values = torch.randn(18, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(8))
+    sites = SplineSites(again, smoothing)
+    kernel = covariance(contacts, contacts, sites)
+    drift = torch.cat([torch.ones(14, 1, dtype=torch.float64), contacts], dim=1)
+    owner = torch.tensor([*range(14), 0, 1, 2, 0])
+    # Weights that are orthogonal to linear functions, and the linear function.
+    free = torch.linalg.svd(drift.T)[2][4:].T
+    terms = torch.cat([kernel @ free, drift], dim=1)
+    bent = torch.zeros(14, 14, dtype=torch.float64)
+    bent[:10, :10] = free.T @ kernel @ free
+    solved = torch.linalg.solve(terms[owner].T @ terms[owner] + smoothing * bent, terms[owner].T @ values)
+    expected = terms @ solved
+    assert torch.allclose(sites.weights(contacts) @ values, expected, rtol=0, atol=1e-8)
+
+
+def test_a_site_of_several_blows_is_left_out_with_all_of_them():
+    contacts = scattered(13)
+    near = torch.cat([contacts, beside(contacts, 0.3 * NEAR)])
+    values = torch.sin(30.0 * near[:, :1])
+    values[-1] += 0.5
+    sites = SplineSites(near, 0.0)
+    part = SplineSites(contacts[1:], 0.0)
+    middle, mean = (near[0] + near[-1]) / 2, (values[0] + values[-1]) / 2
+    error = mean - (part.weights(middle[None]) @ values[1:13])[0]
+    assert len(sites.left_out(values)) == 13
+    assert float(sites.left_out(values)[0]) == pytest.approx(float(error), abs=1e-8)
+
+
+def test_many_places_are_asked_a_batch_at_a_time(monkeypatch: pytest.MonkeyPatch):
+    sites, asked = SplineSites(scattered(12), 0.0), scattered(50, seed=3)
+    whole = sites.weights(asked)
+    sizes = []
+    kernel = thinplate._kernel
+
+    def counted(places: torch.Tensor, others: torch.Tensor, bending: bool) -> torch.Tensor:
+        sizes.append(len(places))
+        return kernel(places, others, bending)
+
+    monkeypatch.setattr(thinplate, "_kernel", counted)
+    monkeypatch.setattr(thinplate, "_MEMORY", 7 * 37)
+    assert torch.equal(sites.weights(asked), whole)
+    assert max(sizes) <= 8

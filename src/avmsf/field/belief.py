@@ -9,6 +9,7 @@ from torch import Tensor
 
 from avmsf.errors import FitError
 from avmsf.field.modalbasis import ModalBasis
+from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import SoundField
 from avmsf.field.thinplategains import ThinPlateGains
 
@@ -35,12 +36,15 @@ def knows_doubt(field: SoundField) -> bool:
 def expect_doubt(field: SoundField) -> ModalBasis | ThinPlateGains:
     """Return the field's gains. Raises FitError where they know no doubt, with the kinds that do."""
     gains = field.gain_field
+    if isinstance(gains, ScaledGains):
+        raise FitError("the field was edited, and does not know how sure it is: ask the field that it was made from")
     if not isinstance(gains, ModalBasis | ThinPlateGains):
         raise FitError(
             f"gains of the kind {gains.kind!r} do not know how sure they are; those of {ModalBasis.kind} and of "
             f"{ThinPlateGains.kind}s do: fit with one of these"
         )
-    if len(torch.unique(gains.contacts, dim=0)) < 2:
+    places = gains.sites.sites if isinstance(gains, ThinPlateGains) else torch.unique(gains.contacts, dim=0)
+    if len(places) < 2:
         raise FitError("gains from a single place say nothing of how sure they are elsewhere: strike a second place")
     return gains
 
@@ -90,17 +94,14 @@ def beliefs(
 def left_out(field: SoundField) -> Float64[Tensor, "contacts modes 2"]:
     """Return by how much each contact's gains are missed by all others', over the deviation foretold of that.
 
+    The gains as measured with the field's own modes: those that the end-to-end stage moved suit one another too well.
     Contacts that are doubted have no part, and NaN stands for parts of modes without any gains. Raises FitError for
     gains that know no doubt.
     """
     gains = expect_doubt(field)
     tiny = torch.finfo(torch.float64).tiny
+    errors, spread = gains.missed()
+    scores = errors / spread.clamp_min(tiny)
     if isinstance(gains, ModalBasis):
-        errors, spread = gains.regression.left_out
-        scores = torch.where(gains.regression.silent, torch.nan, errors / spread.clamp_min(tiny))
-        return scores[gains.trusted]
-    flat = gains.values.flatten(1)
-    errors = gains.sites.left_out(flat)
-    single = torch.diagonal(gains.sites.inverse)[: len(errors)].abs()
-    spread = (gains.sites.field_variance(flat) / single[:, None]).sqrt()
-    return (errors / spread.clamp_min(tiny)).reshape(len(errors), -1, 2)
+        return torch.where(gains.regression.silent, torch.nan, scores)[gains.trusted]
+    return scores

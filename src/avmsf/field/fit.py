@@ -19,12 +19,13 @@ from avmsf.field.automatic import Automatic
 from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
 from avmsf.field.config import FitConfig
 from avmsf.field.losses import spectral_loss
-from avmsf.field.recipes import GainCase, GainRecipe
+from avmsf.field.recipes import GainCase, GainRecipe, along_phase
+from avmsf.field.refinement import LinearGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction import Extraction
-from avmsf.modal.leastsquares import fit_sine_gains
+from avmsf.modal.leastsquares import fit_gains, fit_sine_gains
 from avmsf.modal.phase import common_phase
 from avmsf.modal.residual import Residual
 from avmsf.modal.spectra import envelope
@@ -91,9 +92,14 @@ def fit(
     # Close modes may have passed one another on the way.
     order = torch.argsort(run.bank.frequency.detach())
     report = {"gains": recipe.name, **told, **run.network.report, **report}
+    bank = ModalBank(*(each.detach()[order] for each in (run.bank.frequency, run.bank.damping)))
+    finished = run.network.finished(order)
+    if isinstance(finished, LinearGains):
+        parts = fit_gains(train.sounds, bank, sample_rate=train.sample_rate)
+        finished = finished.judged_by(along_phase(*parts, case.phase[order]))
     return SoundField(
-        ModalBank(*(each.detach()[order] for each in (run.bank.frequency, run.bank.damping))),
-        run.network.finished(order),
+        bank,
+        finished,
         case.phase[order],
         Residual(run.residual.magnitude.detach().clone()),
         train.sample_rate,

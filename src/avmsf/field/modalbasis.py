@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float, Float32, Float64, Int
 from torch import Tensor
 
 from avmsf.field.elasticpoints import ElasticPoints
-from avmsf.field.evidence import NOISES, REMAINDERS, WIDTHS, Regression, Sites, nearness
+from avmsf.field.evidence import Regression
 from avmsf.field.gainfield import Gains
+from avmsf.field.hypotheses import NOISES, REMAINDERS, WIDTHS, Sites, nearness
 from avmsf.field.records import count_of, like
 
 REACH = 0.15
@@ -34,6 +35,8 @@ class ModalBasis:
     """What the gains at the contacts say of each mode."""
     report: dict[str, Any] = field(default_factory=dict)
     """How body and scale were chosen, as plain values; not saved."""
+    measured: Float64[Tensor, "contacts modes 2"] | None = None
+    """The gains that the field's own modes have in the recordings, by which it judges itself; None for `values`."""
 
     kind: ClassVar[str] = "physics"
 
@@ -99,13 +102,23 @@ class ModalBasis:
         """Return what each contact's gain counts for at each contact."""
         return self.regression.smoother
 
+    def judged_by(self, measured: Float64[Tensor, "contacts modes 2"]) -> "ModalBasis":
+        """Return the same field, which judges itself by these gains."""
+        return replace(self, measured=measured)
+
+    def missed(self) -> tuple[Float64[Tensor, "contacts modes 2"], Float64[Tensor, "contacts modes 2"]]:
+        """Return by how much all others' gains miss each contact's, and the deviation foretold of that."""
+        errors, spread = self.regression.left_out
+        return (errors if self.measured is None else errors + self.measured - self.values), spread
+
     def with_values(self, values: Float64[Tensor, "contacts modes 2"]) -> "ModalBasis":
         """Return the field of other gains, with hypotheses as likely as before."""
         return replace(self, regression=self.regression.with_values(values))
 
     def take(self, modes: Int[Tensor, " modes"]) -> "ModalBasis":
         """Return the field of the given modes, in the given order."""
-        return replace(self, regression=self.regression.take(modes))
+        measured = None if self.measured is None else self.measured[:, modes]
+        return replace(self, regression=self.regression.take(modes), measured=measured)
 
     def record(self) -> dict[str, Any]:
         """Return the sizes."""
@@ -130,6 +143,7 @@ class ModalBasis:
             "elastic": self.elastic,
             "prior": known.prior,
             "values": known.values,
+            "measured": known.values if self.measured is None else self.measured,
             "floor": known.floor,
             "doubt": known.doubt,
             "weights": known.weights,
@@ -149,6 +163,7 @@ class ModalBasis:
             "elastic": (shapes,),
             "prior": (modes, len(WIDTHS), shapes),
             "values": (contacts, modes, 2),
+            "measured": (contacts, modes, 2),
             "floor": (contacts, modes),
             "doubt": (contacts,),
             "weights": (_HYPOTHESES, modes, 2),
@@ -172,7 +187,7 @@ class ModalBasis:
             tensors["weights"],
             evidence=0.0,
         )
-        return cls(surface, contacts, directions, tensors["elastic"], regression)
+        return cls(surface, contacts, directions, tensors["elastic"], regression, measured=tensors["measured"])
 
     def _remainder(
         self, contacts: Float64[Tensor, "contacts 3"], directions: Float64[Tensor, "contacts 3"]

@@ -44,13 +44,22 @@ class GainCase:
     @property
     def parts(self) -> Float64[Tensor, "contacts modes 2"]:
         """The amplitudes along each mode's phase and a quarter of a period ahead of it."""
-        both = torch.complex(self.modes.gains.double(), self.modes.quadrature.double())
-        return torch.view_as_real(both * torch.polar(torch.ones_like(self.phase), -self.phase))
+        return along_phase(self.modes.gains, self.modes.quadrature, self.phase)
 
     def take(self, rows: list[int]) -> "GainCase":
         """Return the case of some of the recordings, with the same modes and phases."""
         modes = replace(self.modes, gains=self.modes.gains[rows], quadrature=self.modes.quadrature[rows])
         return replace(self, train=self.train.take(rows), modes=modes, gains=self.gains[rows])
+
+
+def along_phase(
+    gains: Float[Tensor, "contacts modes"],
+    quadrature: Float[Tensor, "contacts modes"],
+    phase: Float64[Tensor, " modes"],
+) -> Float64[Tensor, "contacts modes 2"]:
+    """Return amplitudes of sines and cosines as those along each mode's phase (radians) and a quarter period ahead."""
+    both = torch.complex(gains.double(), quadrature.double())
+    return torch.view_as_real(both * torch.polar(torch.ones_like(phase), -phase))
 
 
 @runtime_checkable

@@ -47,6 +47,10 @@ class LinearGains(GainField, Protocol):
         """Return the field made of other gains at the same contacts."""
         ...
 
+    def judged_by(self, measured: Float64[Tensor, "contacts modes 2"]) -> "LinearGains":
+        """Return the same field, which says how sure it is by how others foretell these gains of the same contacts."""
+        ...
+
     def take(self, modes: Int[Tensor, " modes"]) -> "LinearGains":
         """Return the field of the given modes, in the given order."""
         ...

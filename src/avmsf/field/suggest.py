@@ -16,6 +16,8 @@ from avmsf.scene.points import farthest_points
 
 PLACES = 400
 """Points of the surface that the expected error is summed over, and that are candidates unless others are given."""
+MOST = 500
+"""Candidates that are weighed; of more, as many that lie far apart. What is kept of them grows with their square."""
 _OFF = 0.05
 """Distance of a candidate from the surface over the object's size, from which on it is not on the object."""
 _SAME = 1e-6
@@ -61,7 +63,8 @@ def suggest(
     expected gain is known before it is struck, for in a Gaussian field it does not depend on what will be heard.
     `candidates` are the places to choose from (metres, on the surface; places that have been struck are passed over),
     by itself points spread over the surface; `directions` the unit vectors along which they can be struck, straight
-    into the surface where not given.
+    into the surface where not given. Of more than `MOST` candidates as many are weighed, spread as far apart as they
+    go.
 
     Raises FitError for gains that know no doubt, a count below 1, candidates that are not finite or not on the object,
     and fewer candidates than contacts asked for.
@@ -71,9 +74,6 @@ def suggest(
     points = gains.points[spread].double()
     chosen_from = points if candidates is None else candidates.double()
     _expect(gains.points, count, chosen_from, directions)
-    along = None
-    if isinstance(gains, ModalBasis):
-        _, along = gains.surface.along(chosen_from, directions)
     size = float((points.amax(0) - points.amin(0)).norm())
     allowed = _apart(chosen_from, gains.contacts, size=size)
     if int(allowed.sum()) < count:
@@ -81,6 +81,11 @@ def suggest(
             f"{count} contacts are asked for and {int(allowed.sum())} of the {len(chosen_from)} candidates have not "
             "been struck yet: ask for fewer, or give more candidates"
         )
+    kept = _weighed(chosen_from, allowed, max(MOST, count))
+    chosen_from, allowed = chosen_from[kept], allowed[kept]
+    along = None
+    if isinstance(gains, ModalBasis):
+        _, along = gains.surface.along(chosen_from, None if directions is None else directions[kept])
     places = points if candidates is None else torch.cat([points, chosen_from])
     ways = _ways(gains, points, along, candidates is None)
     ledger = _Ledger(beliefs(field, places, ways), len(points), len(chosen_from))
@@ -99,7 +104,7 @@ def suggest(
     return Suggestions(
         chosen_from[rows],
         None if along is None else along[rows],
-        torch.tensor(rows),
+        kept[rows],
         math.sqrt(float(before.mean()) / energy),
         tuple(after),
         points,
@@ -153,6 +158,16 @@ def _ways(
         return along
     _, straight = gains.surface.along(points, None)
     return torch.cat([straight, along])
+
+
+def _weighed(
+    places: Float64[Tensor, "candidates 3"], allowed: Bool[Tensor, " candidates"], most: int
+) -> Int[Tensor, " weighed"]:
+    """Return the candidates' rows, or of too many of them some that are allowed and far apart, in the same order."""
+    if len(places) <= most:
+        return torch.arange(len(places))
+    open_to = torch.nonzero(allowed).flatten()
+    return open_to[farthest_points(places[open_to], min(most, len(open_to)))].sort().values
 
 
 def _apart(

@@ -29,6 +29,8 @@ class ThinPlateGains:
     """Gains there along each mode's phase and a quarter of a period ahead, as if all blows came from one side."""
     smoothing: float
     """Of the splines, see `SplineSites`."""
+    measured: Float64[Tensor, "contacts modes 2"] | None = None
+    """The gains that the field's own modes have in the recordings, by which it judges itself; None for `values`."""
 
     kind: ClassVar[str] = "spline"
 
@@ -78,13 +80,28 @@ class ThinPlateGains:
         """All: splines doubt no contact."""
         return torch.ones(len(self.contacts), dtype=torch.bool)
 
+    def judged_by(self, measured: Float64[Tensor, "contacts modes 2"]) -> "ThinPlateGains":
+        """Return the same splines, which judge themselves by these gains."""
+        return replace(self, measured=measured)
+
+    def missed(self) -> tuple[Float64[Tensor, "sites modes 2"], Float64[Tensor, "sites modes 2"]]:
+        """Return by how much all others' gains miss those of each site, and the deviation foretold of that."""
+        flat = self.values.flatten(1)
+        errors = self.sites.left_out(flat)
+        single = torch.diagonal(self.sites.inverse)[: len(errors)].abs()
+        spread = (self.sites.field_variance(flat) / single[:, None]).sqrt()
+        if self.measured is not None:
+            errors = errors + self.sites.means(self.measured.flatten(1) - flat)
+        return errors.reshape(len(errors), -1, 2), spread.reshape(len(errors), -1, 2)
+
     def with_values(self, values: Float64[Tensor, "contacts modes 2"]) -> "ThinPlateGains":
         """Return the same splines through other gains."""
         return replace(self, values=values)
 
     def take(self, modes: Int[Tensor, " modes"]) -> "ThinPlateGains":
         """Return the field of the given modes, in the given order."""
-        return replace(self, values=self.values[:, modes])
+        measured = None if self.measured is None else self.measured[:, modes]
+        return replace(self, values=self.values[:, modes], measured=measured)
 
     def record(self) -> dict[str, Any]:
         """Return the sizes and the smoothing."""
@@ -97,7 +114,8 @@ class ThinPlateGains:
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the points, the contacts and the gains there."""
-        return {"points": self.points, "contacts": self.contacts, "values": self.values}
+        measured = self.values if self.measured is None else self.measured
+        return {"points": self.points, "contacts": self.contacts, "values": self.values, "measured": measured}
 
     @classmethod
     def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -109,12 +127,14 @@ class ThinPlateGains:
             "points": torch.empty(points, 3, device="meta"),
             "contacts": torch.empty(contacts, 3, dtype=torch.float64, device="meta"),
             "values": torch.empty(contacts, modes, 2, dtype=torch.float64, device="meta"),
+            "measured": torch.empty(contacts, modes, 2, dtype=torch.float64, device="meta"),
         }
 
     @classmethod
     def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "ThinPlateGains":
         """Return the field."""
-        return cls(tensors["points"], tensors["contacts"], tensors["values"], float(record["smoothing"]))
+        smoothing = float(record["smoothing"])
+        return cls(tensors["points"], tensors["contacts"], tensors["values"], smoothing, tensors["measured"])
 
 
 def thin_plate_gains(
