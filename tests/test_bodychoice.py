@@ -80,3 +80,14 @@ def test_the_strongest_modes_ring_longest_and_keep_their_order():
     assert measured.frequency[3] not in strong.frequency
     assert strong.values.shape == (6, 4, 2)
     assert strong.floor.shape == (6, 4)
+
+
+def test_bodies_are_told_apart_by_themselves_where_their_names_are_alike():
+    one, other = (NominalBody(wall, body.elastic) for wall, body in zip((0.00206, 0.00214), bodies()[:2], strict=True))
+    assert one.name == other.name
+    found = likely_bodies([one, other], points(), struck(WALLS[0], 8))
+    assert found[0].body is one
+    # Each has its own factors, of which the best of the other is near to the first's.
+    alone = [len(likely_bodies([each], points(), struck(WALLS[0], 8))) for each in (one, other)]
+    assert sum(each.body is one for each in found) == alone[0]
+    assert any(each.body is other for each in found)

@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from avmsf.errors import SimulationError
 from avmsf.simulate import nominal, nominalsolid
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
-from avmsf.simulate.nominal import NOMINAL, nominal_bodies, refined
+from avmsf.simulate.nominal import NOMINAL, NominalBody, nominal_bodies, refined
 
 needs_pytetwild = pytest.mark.skipif(
     importlib.util.find_spec("pytetwild") is None, reason="needs pytetwild: pip install 'avmsf[fem]'"
@@ -61,7 +62,7 @@ def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkey
     )
     assert not any(body.fine for body in found.bodies)
     assert any("42 of the mesh's edges are open" in words for words in told)
-    assert "42 of the mesh's edges are open" in found.refused["filled"]
+    assert "42 of the mesh's edges are open" in found.refused[None]
     body = found.bodies[1]
     fine = refined(sheet(), body, freedoms=4000)
     assert fine.fine
@@ -114,7 +115,7 @@ def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
     # A hollow ball, not a massive one.
     mass = NOMINAL.density * 4 / 3 * math.pi * (0.06**3 - 0.054**3)
     assert found.bodies[0].elastic.mass == pytest.approx(mass, rel=0.06)
-    reasons = [reason for name, reason in found.refused.items() if name != "filled"]
+    reasons = [reason for wall, reason in found.refused.items() if wall is not None]
     assert len(reasons) == 6
     assert all("both sides of a wall" in reason or "2 parts" in reason for reason in reasons)
 
@@ -128,7 +129,7 @@ def test_boxes_that_overlap_are_one_body():
     assert [body.name for body in found.bodies] == ["filled"]
     volume = 0.3 * 0.05 * 0.02 + (0.2 - 0.05) * 0.05 * 0.015
     assert found.bodies[0].elastic.mass == pytest.approx(NOMINAL.density * volume, rel=0.05)
-    assert "2 parts that share no vertex" in found.refused["wall of 1 mm"]
+    assert "2 parts that share no vertex" in found.refused[0.001]
 
 
 @needs_pytetwild
@@ -183,3 +184,65 @@ def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monk
 def test_settings_that_make_no_sense_are_named(settings: dict, words: str):
     with pytest.raises(SimulationError, match=words):
         nominal_bodies(sheet(), **settings)
+
+
+@pytest.fixture(scope="module")
+def coarse() -> NominalBody:
+    elastic = nominal_bodies(sheet(), walls=[0.004], count=4, freedoms=2000).bodies[0].elastic
+    return NominalBody(0.004, elastic, fine=False)
+
+
+def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory(
+    monkeypatch: pytest.MonkeyPatch, coarse: NominalBody
+):
+    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 1e9)
+    told: list[str] = []
+    assert refined(sheet(), coarse, freedoms=400_000, tell=told.append) is coarse
+    assert "wall of 4 mm stays coarse: 400000 degrees of freedom take about" in told[-1]
+    assert refined(sheet(), coarse, freedoms=400_000) is coarse
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (MemoryError(), r"stays coarse: the modes of \d+ degrees of freedom do not fit .*freedoms=1500"),
+        (SimulationError("badly shaped"), "stays coarse: badly shaped"),
+    ],
+)
+def test_a_body_stays_coarse_where_a_finer_one_fails(
+    monkeypatch: pytest.MonkeyPatch, coarse: NominalBody, error: Exception, words: str
+):
+    def fail(*solid: object, **settings: object) -> None:
+        raise error
+
+    monkeypatch.setattr(nominal, "elastic_modes", fail)
+    told: list[str] = []
+    assert refined(sheet(), coarse, freedoms=3000, tell=told.append) is coarse
+    assert re.search(words, told[-1])
+
+
+def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(monkeypatch: pytest.MonkeyPatch):
+    """A wall that does not fit is refused once it is made, so that a single one of several is left."""
+    made, told = nominal.elastic_modes, []
+
+    def fail(solid: object, *material: object, count: int) -> object:
+        if nominal.freedoms_of(solid) > 3000:  # type: ignore[arg-type]
+            raise MemoryError
+        if abs(solid.volumes.sum() - 0.24 * 0.17 * 0.004) > 1e-5:  # type: ignore[attr-defined]
+            raise SimulationError("of no use")
+        return made(solid, *material, count=count)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(nominal, "elastic_modes", fail)
+    monkeypatch.setattr(nominal, "TRIAL", 2000)
+    found = nominal_bodies(sheet(), walls=[0.004, 0.012], count=4, freedoms=4000, tell=told.append)
+    assert [(body.wall, body.fine) for body in found.bodies] == [(0.004, False)]
+    assert any("wall of 4 mm stays coarse" in words for words in told)
+    assert list(found.refused) == [0.012]
+
+
+def test_walls_whose_names_are_alike_are_refused_each():
+    with pytest.raises(SimulationError, match="wall of 2e\\+02 mm, wall of 2e\\+02 mm: a wall of") as caught:
+        nominal_bodies(sheet(), walls=[0.2, 0.2001])
+    assert "0.2001" not in str(caught.value)
+    found = nominal_bodies(sheet(), walls=[0.2, 0.2001, 0.004], count=4, freedoms=2000)
+    assert list(found.refused) == [0.2, 0.2001]

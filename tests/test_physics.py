@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from avmsf.capture.impacts import Impacts
+from avmsf.capture.surface import Surface
 from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit, gain_case
@@ -19,9 +20,10 @@ from avmsf.modal.extraction import Extraction
 from avmsf.modal.leastsquares import fit_sine_gains
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise_phased
+from avmsf.pipeline.physics import physics_of
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.nominal import NominalBodies, NominalBody
-from made_dome import STIFFER, WALLS, bodies, points, truth
+from made_dome import STIFFER, WALLS, bodies, dome, points, truth
 
 RATE, SAMPLES, LEVEL = 12000.0, 2400, 0.01
 CONFIG = FitConfig(warmup_steps=0, steps=6, fft_sizes=(1024, 256), early=1024, damping="shared")
@@ -36,10 +38,10 @@ class Finer:
     """Makes bodies finer in name alone, and remembers which."""
 
     fineness: str = ""
-    asked: list[str] = field(default_factory=list)
+    asked: list[NominalBody] = field(default_factory=list)
 
     def __call__(self, body: NominalBody) -> NominalBody:
-        self.asked.append(body.name)
+        self.asked.append(body)
         return replace(body, fine=True)
 
     def digest(self) -> str:
@@ -115,8 +117,25 @@ def test_suspects_are_named_and_all_bodies_told():
 def test_the_chosen_body_alone_is_made_finer():
     finer = Finer()
     started = replace(recipe(), finer=finer).start(case(), "shared")
-    assert finer.asked == [bodies()[1].name]
-    assert started.report["body"] == finer.asked[0]
+    assert finer.asked == [bodies()[1]]
+    assert started.report["body"] == finer.asked[0].name
+
+
+def test_the_body_that_is_made_finer_is_the_chosen_one_and_no_namesake():
+    finer = Finer()
+    # Both are walls of 4 mm by name; the wrong one comes first.
+    bad, good = (replace(body, wall=wall) for body, wall in zip(bodies()[:2], (0.00404, 0.00396), strict=True))
+    assert bad.name == good.name
+    report = Physics(NominalBodies((bad, good), {}), finer).start(case(), "shared").report
+    assert finer.asked == [good]
+    assert report["wall"] == 0.00396
+    assert {each["wall"] for each in report["bodies"]} <= {0.00404, 0.00396}
+
+
+def test_a_body_that_stayed_coarse_is_told():
+    assert recipe().start(case(), "shared").report["fine"]
+    coarse = tuple(replace(body, fine=False) for body in bodies()[1:2])
+    assert not Physics(NominalBodies(coarse, {})).start(case(), "shared").report["fine"]
 
 
 def test_another_fineness_is_another_recipe():
@@ -148,8 +167,9 @@ def test_blows_along_which_nothing_moves_are_refused():
 
 
 def test_reasons_against_other_bodies_are_told():
-    known = Physics(NominalBodies(bodies()[1:2], {"filled": "the mesh is open"}))
-    assert known.start(case(), "shared").report["bodies_refused"] == {"filled": "the mesh is open"}
+    known = Physics(NominalBodies(bodies()[1:2], {None: "the mesh is open"}))
+    refused = known.start(case(), "shared").report["bodies_refused"]
+    assert refused == [{"body": "filled", "wall": None, "reason": "the mesh is open"}]
 
 
 def test_bodies_that_differ_have_different_digests():
@@ -197,3 +217,53 @@ def test_the_variance_by_noise_is_the_scatter_of_least_squares_gains():
         made = GainCase(impacts, features(), modes, still, gains, CONFIG)
         scatter = float(fit_sine_gains(noise, bank, sample_rate=RATE).double().square().mean())
         assert float(gain_variance(made)) == pytest.approx(scatter, rel=0.1)
+
+
+def with_body(moved) -> Physics:
+    """Return the recipe of a body whose surface lies where `moved` says."""
+    body = bodies()[1]
+    return Physics(NominalBodies((replace(body, elastic=replace(body.elastic, nodes=moved(body.elastic.nodes))),), {}))
+
+
+ELSEWHERE = {
+    r"multiplied by 1000 they lie within .*: is the surface's unit mm\? State each one's unit": lambda x: 1000.0 * x,
+    r"multiplied by 39.37 .*: is the surface's unit inches\?": lambda x: x / 0.0254,
+    r"with \(x, y, z\) taken as .* another axis point up\? Undo this": lambda x: (
+        x[:, [0, 2, 1]] * x.new_tensor([1, -1, 1])
+    ),
+    r"no change of unit, axes or origin .*; bring both into one frame": lambda x: (
+        x @ torch.linalg.qr(torch.tensor([[1.0, 2, 3], [3, 1, -2], [1, -4, 1]]).double()).Q + 0.07
+    ),
+}
+
+
+@pytest.mark.parametrize("message", ELSEWHERE)
+def test_a_body_in_another_unit_or_frame_than_the_contacts_is_refused_with_what_would_fit(message: str):
+    with pytest.raises(FitError, match=f"physics needs contacts on the surface .*{message}"):
+        with_body(ELSEWHERE[message]).start(case(), "shared")
+
+
+def test_points_of_features_in_another_frame_are_refused():
+    elsewhere = FeatureField.from_points(1000.0 * points())
+    with pytest.raises(FitError, match=r"physics needs points of the features on the surface .* divided by 1000"):
+        recipe().start(replace(case(), features=elsewhere), "shared")
+
+
+@pytest.mark.parametrize("count", [4, 12])
+def test_rough_surfaces_thick_glue_and_a_wrong_row_are_not_refused(count: int):
+    generator = torch.Generator().manual_seed(4)
+    contacts = recorded(count)[0].contacts
+    size = float((points().amax(0) - points().amin(0)).norm())
+    rough = with_body(lambda x: x + 0.02 * size * torch.randn(x.shape, generator=generator, dtype=x.dtype))
+    above = contacts + 0.03 * size * torch.tensor([0.0, 0.0, 1.0])
+    above[-1] += 0.5 * size
+    for known, each in ((rough, contacts), (recipe(), above)):
+        assert known.start(case(count, contacts=each), "shared").report["body"]
+
+
+def test_contacts_elsewhere_are_refused_before_any_body_is_made():
+    told: list[str] = []
+    surface = Surface(1000.0 * dome().vertices, dome().faces)
+    with pytest.raises(FitError, match=r"is the surface's unit mm\?"):
+        physics_of(surface, impacts=recorded(12)[0], tell=told.append)
+    assert told == []

@@ -109,27 +109,30 @@ class Placement:
         rows = torch.argsort(self.distances, descending=True)
         return tuple(row for row in rows.tolist() if float(self.distances[row]) > self.tolerance)
 
-    def describe(self, names: Sequence[str] = ()) -> str:
-        """Return what to tell the contacts' owner, who knows them by these names or else by rows; "" if all is well."""
+    def describe(self, names: Sequence[str] = (), *, what: str = "contacts") -> str:
+        """Return what to tell the contacts' owner, who knows them by these names or else by rows; "" if all is well.
+
+        `what` are they, where it is something else whose place was judged.
+        """
         if self.on_surface:
             return ""
         if self.off:
             farthest = float(self.distances.max())
             few = self.mistake is None and 2 * len(self.off) < len(self.distances) and not self.shrunken
-            which = f"{len(self.off)} of {len(self.distances)} contacts lie" if few else "the contacts lie"
+            which = f"{len(self.off)} of {len(self.distances)} {what} lie" if few else f"the {what} lie"
             relative = _ratio(farthest / self.diagonal)
             found = f"{which} up to {_length(farthest)} ({relative} object diagonals) off the surface"
             if few:
                 shown = ", ".join(names[row] if names else f"row {row}" for row in self.off[:8])
                 return f"{found}, the others on it: check {shown}{', …' * (len(self.off) > 8)}"
         else:
-            found = f"the contacts lie within {_length(self.spread)} on an object {_length(self.diagonal)} across"
+            found = f"the {what} lie within {_length(self.spread)} on an object {_length(self.diagonal)} across"
         if self.mistake is not None:
             return f"{found}; {self.mistake}"
         if not self.off:
             return f"{found}: check that both are in one frame and unit"
         return (
-            f"{found}, and no change of unit, axes or origin that shows from so many contacts brings them onto it: "
+            f"{found}, and no change of unit, axes or origin that shows from so many {what} brings them onto it: "
             "both must be of one object in one frame (that of structure from motion is arbitrary: `align_similarity` "
             "brings it into the contacts')"
         )

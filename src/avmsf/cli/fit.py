@@ -166,7 +166,7 @@ def _recipe(options: Options, capture: Capture, features: FeatureField) -> GainR
         if capture.surface is None:
             raise FitError("physics needs the object's shape: lay its mesh into the capture folder as surface.obj")
         cache = _beside(options.output, "bodies")
-        return physics_of(capture.surface, options.body, cache=cache, tell=say)
+        return physics_of(capture.surface, options.body, impacts=capture.impacts, cache=cache, tell=say)
 
     if options.gains == "auto":
         return all_recipes({"attention": features}, physics, tell=say)

@@ -9,7 +9,8 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.field.elasticpoints import ElasticPoints
-from avmsf.field.evidence import WIDTHS, Regression, nearness
+from avmsf.field.evidence import Regression
+from avmsf.field.hypotheses import WIDTHS, nearness
 from avmsf.field.modalbasis import ModalBasis, fit_modal_basis, sites_of
 from avmsf.simulate.nominal import NominalBody
 
@@ -19,6 +20,8 @@ _KNOWN = 0.5
 """Standard deviation of the log of that factor beforehand: of plastics it is -1.3, of all that rings about 0."""
 _LAG = 10.0
 """Nats by which a factor may suit the frequencies less than the best and still be asked of the gains."""
+_EVERY = 2
+"""Steps between factors among which suspects are looked for."""
 _APART = 0.2
 """Log of a factor over another from which on they are two answers."""
 _STRAY = 0.2
@@ -65,7 +68,8 @@ class MeasuredGains:
 class ChosenBody:
     """A body, and the factor that its frequencies take."""
 
-    name: str
+    body: NominalBody
+    """Itself, for names may be alike."""
     surface: ElasticPoints
     elastic: Float64[Tensor, " shapes"]
     """Frequencies of the body's shapes times the factor, Hz."""
@@ -74,6 +78,11 @@ class ChosenBody:
     """Log of the likeliest body's evidence over this one's."""
     suits: float
     """Log likelihood of the measured frequencies, up to a constant of their number."""
+
+    @property
+    def name(self) -> str:
+        """What it is, for people."""
+        return self.body.name
 
     def fit(self, measured: MeasuredGains) -> ModalBasis:
         """Return the field of this body."""
@@ -106,13 +115,28 @@ def likely_bodies(
         if len(kept):
             evidence = suits[kept] + _gains_suit(strong, surface, body.elastic.frequency, _FACTORS[kept])
             for scale, own, total in zip(_FACTORS[kept].tolist(), suits[kept].tolist(), evidence.tolist(), strict=True):
-                trials.append((total, ChosenBody(body.name, surface, body.elastic.frequency * scale, scale, 0.0, own)))
+                trials.append((total, ChosenBody(body, surface, body.elastic.frequency * scale, scale, 0.0, own)))
     trials.sort(key=lambda each: -each[0])
     found: list[ChosenBody] = []
     for evidence, each in trials:
-        near = (known for known in found if known.name == each.name)
+        near = (known for known in found if known.body is each.body)
         if all(abs(math.log(each.factor / known.factor)) >= _APART for known in near):
             found.append(replace(each, lag=trials[0][0] - evidence))
+    return tuple(found)
+
+
+def plausible_bodies(
+    bodies: Sequence[NominalBody], points: Float[Tensor, "points 3"], measured: MeasuredGains
+) -> tuple[ChosenBody, ...]:
+    """Return bodies with every factor that suits the frequencies, whatever the gains say: wrong ones mislead."""
+    strong = measured.strongest()
+    likely = torch.stack([_frequencies_suit(strong.frequency, body.elastic.frequency) for body in bodies])
+    found = []
+    for body, suits in zip(bodies, likely, strict=True):
+        surface = ElasticPoints.of(body.elastic, points)
+        for row in torch.nonzero(suits > likely.max() - _LAG).flatten().tolist()[::_EVERY]:
+            scale = float(_FACTORS[row])
+            found.append(ChosenBody(body, surface, body.elastic.frequency * scale, scale, 0.0, float(suits[row])))
     return tuple(found)
 
 

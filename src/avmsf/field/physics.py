@@ -4,23 +4,30 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
+from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
+from avmsf.capture.placement import surface_points
+from avmsf.capture.surface import Surface
 from avmsf.errors import FitError
-from avmsf.field.bodychoice import MeasuredGains, likely_bodies
+from avmsf.field.bodychoice import MeasuredGains, likely_bodies, plausible_bodies
 from avmsf.field.config import FitConfig
+from avmsf.field.placed import expect_placed
 from avmsf.field.recipes import SHARED, GainCase
 from avmsf.field.refinement import RefinedGains
 from avmsf.field.suspects import agreeing, doubted, find_suspects
-from avmsf.simulate.nominal import NominalBodies, NominalBody
+from avmsf.simulate.elastic import ElasticModes
+from avmsf.simulate.nominal import NominalBodies, NominalBody, body_name
 
 FEWEST = 3
 """Strikes below which evidence says nothing."""
 _STILL = 1e-9
 """Most motion along the blows over the largest anywhere, that is none."""
+_LOOKED_AT = 200
+"""Most points of the features that are compared with the body's surface."""
 _SPREAD = 0.02
 """Diagonal of the contacts' box over the object's, below which all were struck in one place."""
 
@@ -73,24 +80,33 @@ class Physics:
     def start(self, case: GainCase, damping: str) -> RefinedGains:
         """Return the field of the likeliest body.
 
-        Raises FitError for fewer than three strikes, all strikes in one place, and directions of length zero.
+        Raises FitError for fewer than three strikes, all strikes in one place, directions of length zero, and contacts
+        or features that are not on the body's surface.
         """
-        _expect_strikes(case)
         heard, points, bodies = measured_gains(case), case.features.points, self.bodies.bodies
+        _expect_enough(case)
+        _expect_one_frame(case, bodies[0])
+        _expect_strikes(case)
         _expect_motion(bodies, heard)
-        likely = likely_bodies(bodies, points, heard)
-        suspects = find_suspects(likely, heard)
+        suspects = find_suspects(plausible_bodies(bodies, points, heard), heard)
         measured = doubted(heard, suspects)
-        likely = likely_bodies(bodies, points, measured) if suspects else likely
+        likely = likely_bodies(bodies, points, measured)
         body = agreeing(likely, measured)
         if self.finer is not None:
-            fine = self.finer(next(each for each in bodies if each.name == body.name))
+            fine = self.finer(body.body)
             body = agreeing(likely_bodies([fine], points, measured), measured)
         report = {
             "body": body.name,
+            "wall": body.body.wall,
+            "fine": body.body.fine,
             "factor": body.factor,
-            "bodies": [{"body": each.name, "factor": each.factor, "lag": each.lag} for each in likely],
-            "bodies_refused": dict(self.bodies.refused),
+            "bodies": [
+                {"body": each.name, "wall": each.body.wall, "factor": each.factor, "lag": each.lag} for each in likely
+            ],
+            "bodies_refused": [
+                {"body": body_name(wall), "wall": wall, "reason": reason}
+                for wall, reason in self.bodies.refused.items()
+            ],
             "suspects": {case.train.names[each.row]: each.describe(case.train.names) for each in suspects},
         }
         return RefinedGains(replace(body.fit(measured), report=report), case.modes.bank)
@@ -142,13 +158,26 @@ def gain_variance(case: GainCase) -> Float64[Tensor, " modes"]:
     return 4.0 * bank.damping * noise / (case.train.sample_rate * lasting)
 
 
+def _expect_enough(case: GainCase) -> None:
+    if len(case.train) < FEWEST:
+        raise FitError(
+            f"physics needs {FEWEST} strikes or more to tell how much of each shape a mode has, found "
+            f"{len(case.train)}: strike more places, or let splines spread the gains"
+        )
+
+
+def _expect_one_frame(case: GainCase, body: NominalBody) -> None:
+    """Raise FitError where the contacts, or the points that shapes are looked up at, are not on the body's surface."""
+    if body.elastic not in _POINTS:
+        # Kept, for the same body is asked whenever strikes are left out to choose by.
+        _POINTS[body.elastic] = surface_points(Surface(body.elastic.nodes, body.elastic.triangles[:, :3]))
+    surface, points = _POINTS[body.elastic], case.features.points
+    expect_placed(case.train.contacts, surface, names=case.train.names)
+    expect_placed(points[:: -(-len(points) // _LOOKED_AT)], surface, what="points of the features")
+
+
 def _expect_strikes(case: GainCase) -> None:
     train = case.train
-    if len(train) < FEWEST:
-        raise FitError(
-            f"physics needs {FEWEST} strikes or more to tell how much of each shape a mode has, found {len(train)}: "
-            "strike more places, or let splines spread the gains"
-        )
     extent = float((train.contacts.amax(0) - train.contacts.amin(0)).norm())
     size = 2.0 * case.features.half_diagonal
     if extent < _SPREAD * size:
@@ -165,3 +194,7 @@ def _expect_strikes(case: GainCase) -> None:
                 f"{train.names[row]}: its direction is a vector of length zero: give the way the hammer moved, or "
                 "leave nx, ny, nz out for all strikes"
             )
+
+
+_POINTS: WeakKeyDictionary[ElasticModes, Tensor] = WeakKeyDictionary()
+"""Points all over bodies' surfaces."""

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.field.bodychoice import ChosenBody, MeasuredGains
-from avmsf.field.evidence import NOISES, REMAINDERS, WIDTHS
+from avmsf.field.hypotheses import NOISES, REMAINDERS, WIDTHS
 from avmsf.scene.points import farthest_points
 
 _DOUBT = 1e6
@@ -28,6 +28,10 @@ _FEWEST = 6
 """Strikes below which none can be told from the others."""
 _BODIES = 6
 """Most of the likeliest bodies that are asked."""
+_ASKED = 16
+"""Bodies that are asked which strikes are wrong."""
+_WITNESSES = 4
+"""Bodies that have to agree on which strikes are wrong."""
 _LAG = 12.0
 """Nats of evidence that a body may lack of the likeliest."""
 _NATS = 10.0
@@ -61,6 +65,11 @@ class Suspect:
     best: float
     """Squared misfit there, over that of silence."""
 
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the label is: another place explains the strike, or nothing could be worse."""
+        return self.best < _BETTER * self.misfit or self.misfit > _SURELY
+
     def describe(self, names: Sequence[str]) -> str:
         """Say what is wrong with it."""
         turned = " with its direction reversed" if self.reversed else ""
@@ -90,20 +99,29 @@ def find_suspects(bodies: Sequence[ChosenBody], measured: MeasuredGains) -> tupl
 
     A strike is foretold by all others that speak. Taking one out has to save a sum of misfits, its own and what it does
     to the others'; strikes are taken out, put back and exchanged as long as that helps, a quarter of them at most.
-    Judged by the strongest modes, and by the body among `bodies` with which strikes agree best in the end: wrong ones
-    mislead the choice of the body.
+    Judged by the strongest modes, and by those of the plausible `bodies` with which strikes agree best in the end, of
+    which most have to call a strike wrong. Evidence would ask the wrong bodies, for wrong strikes are part of it.
     """
     strong = measured.strongest()
     if len(strong.contacts) < _FEWEST:
         return ()
-    outcomes = []
-    for body in [each for each in bodies if each.lag <= _LAG][:_BODIES]:
-        judge = _Judge(body, strong)
-        outcomes.append((*_quietest(judge), judge))
-    _, silent, judge = min(outcomes, key=lambda each: each[0])
-    found = [judge.located(row, silent) for row in sorted(silent)]
-    wrong = [each for each in found if each.best < _BETTER * each.misfit or each.misfit > _SURELY]
+    witnesses, silent = _silenced([_Judge(body, strong) for body in bodies])
+    wrong = []
+    for row in sorted(silent):
+        found = [witness.located(row, silent) for witness in witnesses]
+        if 2 * sum(each.is_wrong for each in found) > len(found):
+            wrong.append(next((each for each in found if each.is_wrong), found[0]))
     return tuple(sorted(wrong, key=lambda each: -each.misfit))
+
+
+def _silenced(judges: Sequence["_Judge"]) -> tuple[list["_Judge"], frozenset[int]]:
+    """Return those of the bodies that strikes agree with best, and the strikes that they together would leave out."""
+    none: frozenset[int] = frozenset()
+    asked = sorted(judges, key=lambda judge: judge.cost(none) + judge.handicap)[:_ASKED]
+    quick = {judge: _lessened(judge, none, exchange=False) for judge in asked}
+    best = sorted(asked, key=lambda judge: quick[judge][0] + judge.handicap)[:_WITNESSES]
+    offered = {_lessened(judge, quick[judge][1], exchange=True)[1] for judge in best}
+    return best, min(sorted(offered, key=sorted), key=lambda silent: sum(judge.cost(silent) for judge in best))
 
 
 def doubted(measured: MeasuredGains, suspects: Sequence[Suspect]) -> MeasuredGains:
@@ -113,14 +131,14 @@ def doubted(measured: MeasuredGains, suspects: Sequence[Suspect]) -> MeasuredGai
     return replace(measured, doubt=doubt)
 
 
-def _quietest(judge: "_Judge") -> tuple[float, frozenset[int]]:
-    """Return the least cost that is found, and those that are silent then."""
+def _lessened(judge: "_Judge", silent: frozenset[int], *, exchange: bool) -> tuple[float, frozenset[int]]:
+    """Return the least cost that is found from some silent strikes on, and those that are silent then."""
     count = len(judge.power)
-    silent: frozenset[int] = frozenset()
     cost = judge.cost(silent)
     while True:
         near = [silent ^ {row} for row in range(count)]
-        near += [silent - {out} | {row} for out in silent for row in range(count) if row not in silent]
+        if exchange:
+            near += [silent - {out} | {row} for out in silent for row in range(count) if row not in silent]
         allowed = [each for each in near if len(each) <= int(_MOST * count)]
         costs = [judge.cost(each) for each in allowed]
         best = min(range(len(allowed)), key=costs.__getitem__)
@@ -138,6 +156,11 @@ class _Judge:
         self.covariance = self.field.regression.covariance_of(*_HYPOTHESIS)
         self.values = measured.values.transpose(0, 1)
         self.power = measured.values.square().sum(2)
+
+    @property
+    def handicap(self) -> float:
+        """What the frequencies say against the body, as cost."""
+        return -self.body.suits / _NATS
 
     def cost(self, silent: frozenset[int]) -> float:
         """Return the sum of the misfits of those that speak, and of the price for those that do not."""

@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.placement import surface_points
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.field.physics import Physics
+from avmsf.field.placed import expect_placed
 from avmsf.simulate.nominal import NominalBody, nominal_bodies, refined
 
 
@@ -43,19 +46,14 @@ class FinerBodies:
     """Folder that keeps elastic modes by content."""
     tell: Callable[[str], None]
     """Told what is done, in words."""
-    made: dict[str, NominalBody] = field(default_factory=dict)
-    """Those that are done, by name."""
+    made: dict[float | None, NominalBody] = field(default_factory=dict)
+    """Those that are done, by their walls: names of two may be alike."""
 
     def __call__(self, body: NominalBody) -> NominalBody:
         """Return the body with finer elements, or as it is where that fails: it was good enough to choose by."""
-        if body.name not in self.made:
-            try:
-                fine = refined(self.surface, body, freedoms=self.freedoms, cache=self.cache, tell=self.tell)
-            except SimulationError as error:
-                self.tell(f"{body.name} stays coarse: {error}")
-                fine = body
-            self.made[body.name] = fine
-        return self.made[body.name]
+        if body.wall not in self.made:
+            self.made[body.wall] = refined(self.surface, body, freedoms=self.freedoms, cache=self.cache, tell=self.tell)
+        return self.made[body.wall]
 
     def digest(self) -> str:
         """Return what tells these bodies from those of other settings."""
@@ -66,14 +64,18 @@ def physics_of(
     surface: Surface,
     config: BodyConfig | None = None,
     *,
+    impacts: Impacts | None = None,
     cache: Path | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> Physics:
     """Return the recipe for an object with this surface; elastic modes are kept by content in `cache`.
 
-    Raises SimulationError where no body can be had.
+    Raises SimulationError where no body can be had, and FitError, before any is computed, where the contacts of the
+    `impacts` that it is meant for do not lie on the surface.
     """
     config = BodyConfig() if config is None else config
+    if impacts is not None:
+        expect_placed(impacts.contacts, surface_points(surface), names=impacts.names)
     walls = None if config.wall is None else [config.wall or None]
     bodies = nominal_bodies(surface, walls=walls, count=config.shapes, freedoms=config.freedoms, cache=cache, tell=tell)
     finer = FinerBodies(surface, config.freedoms, cache, tell or (lambda words: None))

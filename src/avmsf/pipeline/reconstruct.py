@@ -114,7 +114,7 @@ def reconstruct(
     @cache_result
     def physics() -> Physics:
         listener.tell("bodies: what the object may be behind its surface")
-        return physics_of(shape.surface(), config.body, cache=cache / BODIES, tell=listener.tell)
+        return physics_of(shape.surface(), config.body, impacts=train, cache=cache / BODIES, tell=listener.tell)
 
     def choose(path: Path) -> None:
         listener.tell("choice: how gains are spread, by training contacts left out in turn")

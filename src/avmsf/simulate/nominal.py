@@ -45,7 +45,7 @@ class NominalBody:
     @property
     def name(self) -> str:
         """What it is, for people."""
-        return _name(self.wall)
+        return body_name(self.wall)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +54,8 @@ class NominalBodies:
 
     bodies: tuple[NominalBody, ...]
     """At least one: the filled body first, then walls from thin to thick, or as the user states them."""
-    refused: Mapping[str, str]
-    """Reasons why others could not be had, by the others' names."""
+    refused: Mapping[float | None, str]
+    """Reasons why others could not be had, by the others' walls: names of two may be alike."""
 
 
 def nominal_bodies(
@@ -85,21 +85,21 @@ def nominal_bodies(
     expect_memory(freedoms)
     guessed = walls is None
     wanted: list[float | None] = list(_guesses(maker.checked)) if walls is None else list(dict.fromkeys(walls))
-    refused: dict[str, str] = {}
+    refused: dict[float | None, str] = {}
     likely: list[float | None] = []
     for wall in wanted:
         try:
             _expect_likely(maker.checked, wall, guessed=guessed)
             likely.append(wall)
         except SimulationError as error:
-            refused[_name(wall)] = str(error)
+            refused[wall] = str(error)
     fine = len(likely) == 1
     bodies = []
     for wall in likely:
         try:
             bodies.append(maker.body(wall, freedoms, fine=fine))
         except SimulationError as error:
-            refused[_name(wall)] = str(error)
+            refused[wall] = str(error)
     reasons = _grouped(refused)
     for reason in reasons:
         told(f"not {reason}")
@@ -123,14 +123,19 @@ def refined(
 ) -> NominalBody:
     """Return a body of `nominal_bodies` computed with about `freedoms` degrees of freedom; a fine one as it is.
 
-    Raises SimulationError as `nominal_bodies` does; the coarser one remains good then.
+    Where that fails, for want of memory or because it cannot be filled so finely, the coarser one is returned, which
+    was good enough to choose by, and `tell` hears of it. Raises SimulationError for settings that cannot be meant.
     """
     if body.fine:
         return body
+    told = tell or (lambda words: None)
     _expect_settings(len(body.elastic), freedoms, [body.wall])
-    expect_memory(freedoms)
-    maker = _Maker(surface, len(body.elastic), cache, tell or (lambda words: None))
-    return maker.body(body.wall, freedoms, fine=True)
+    try:
+        expect_memory(freedoms)
+        return _Maker(surface, len(body.elastic), cache, told).body(body.wall, freedoms, fine=True)
+    except SimulationError as error:
+        told(f"{body.name} stays coarse: {error}")
+        return body
 
 
 class _Maker:
@@ -163,11 +168,17 @@ class _Maker:
                 return load_modes(kept)
             except SimulationError as error:
                 self._tell(f"computing again what cannot be read ({error})")
-        self._tell(f"tetrahedra of the body, {_name(wall)}")
+        self._tell(f"tetrahedra of the body, {body_name(wall)}")
         solid = self._solid(wall, freedoms)
         size = freedoms_of(solid)
         self._tell(f"{self._count} elastic modes of {size} degrees of freedom")
-        elastic = elastic_modes(solid, NOMINAL, count=self._count)
+        try:
+            elastic = elastic_modes(solid, NOMINAL, count=self._count)
+        except MemoryError as error:
+            raise SimulationError(
+                f"the modes of {size} degrees of freedom do not fit into the memory: ask for fewer, as "
+                f"freedoms={max(freedoms // 2, FEWEST)}, or end other programs"
+            ) from error
         if kept is not None:
             save_modes(elastic, kept)
         return elastic
@@ -231,13 +242,14 @@ def _expect_settings(count: int, freedoms: int, walls: Sequence[float | None] | 
             raise SimulationError(f"wall = {wall:g} m: expected more than 0, or None for a filled body")
 
 
-def _grouped(refused: Mapping[str, str]) -> list[str]:
+def _grouped(refused: Mapping[float | None, str]) -> list[str]:
     """Return each reason once, after the names of all that it holds for."""
     names: dict[str, list[str]] = {}
-    for name, reason in refused.items():
-        names.setdefault(reason, []).append(name)
+    for wall, reason in refused.items():
+        names.setdefault(reason, []).append(body_name(wall))
     return [f"{', '.join(each)}: {reason}" for reason, each in names.items()]
 
 
-def _name(wall: float | None) -> str:
+def body_name(wall: float | None) -> str:
+    """Return what a body of this wall, metres, is called, with two digits."""
     return "filled" if wall is None else f"wall of {1000 * wall:.2g} mm"
