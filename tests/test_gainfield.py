@@ -2,6 +2,7 @@
 
 import json
 from copy import deepcopy
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -15,18 +16,26 @@ from avmsf.errors import FieldFileError
 from avmsf.field.attention import AttentionGains
 from avmsf.field.gainfield import GainField
 from avmsf.field.refinement import RefinedGains
+from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.residual import Residual
 from made_fields import BANK, FIELDS, SIDES, blows, places
 
+FACTORS = torch.tensor([2.0, -0.5, 1.5, 0.25, 3.0], dtype=torch.float64)
+SCALED = {
+    f"scaled {name}": cache(lambda name=name: ScaledGains(FIELDS[name](), FACTORS))
+    for name in ("attention with dampings", "spline", "physics")
+}
+"""Of every kind that can be inside; other sizes have tests of their own, for these objects have the same."""
+ALL = {**FIELDS, **SCALED}
 MODES = len(BANK)
 PLACES = places(7, seed=8)
 BLOWS = blows(PLACES, seed=9)
 PHASE = torch.tensor([0.0, 0.4, -1.2, 3.0, 1.6], dtype=torch.float64)
 
-every_field = pytest.mark.parametrize("name", FIELDS)
-every_kind = pytest.mark.parametrize("name", ["attention", "spline", "physics"])
+every_field = pytest.mark.parametrize("name", ALL)
+every_kind = pytest.mark.parametrize("name", ["attention", "spline", "physics", "scaled physics"])
 
 
 def sound_field(gains: GainField, *, noise: float = 0.0) -> SoundField:
@@ -49,7 +58,7 @@ def expect_close(found: list[torch.Tensor], expected: list[torch.Tensor], *, wit
 
 @every_field
 def test_gains_are_a_number_a_contact_and_mode(name):
-    field = FIELDS[name]()
+    field = ALL[name]()
     assert isinstance(field, GainField)
     for count in (7, 1, 0):
         known = field.at(PLACES[:count], BLOWS[:count])
@@ -66,7 +75,7 @@ def test_gains_are_a_number_a_contact_and_mode(name):
 
 @every_field
 def test_points_are_on_the_object(name):
-    points = FIELDS[name]().points
+    points = ALL[name]().points
     assert points.shape == (150, 3)
     assert points.dtype == torch.float32
     assert bool((points.abs() <= torch.tensor(SIDES) / 2 + 1e-6).all())
@@ -75,14 +84,14 @@ def test_points_are_on_the_object(name):
 @every_field
 @pytest.mark.parametrize("rows", [[0], [6, 2], [6, 5, 4, 3, 2, 1, 0], [3, 3, 3]])
 def test_a_contacts_gains_do_not_depend_on_its_company(name, rows):
-    field = FIELDS[name]()
+    field = ALL[name]()
     together = [each[rows] for each in parts(field, PLACES, BLOWS)]
     expect_close(parts(field, PLACES[rows], BLOWS[rows]), together)
 
 
 @every_field
 def test_contacts_in_float32_and_float64_are_the_same_places(name):
-    field = FIELDS[name]()
+    field = ALL[name]()
     assert PLACES.dtype == torch.float64
     single, double = (parts(field, contacts) for contacts in (PLACES.float(), PLACES))
     assert all(torch.equal(*each) for each in zip(single, double, strict=True))
@@ -90,9 +99,9 @@ def test_contacts_in_float32_and_float64_are_the_same_places(name):
 
 @every_field
 def test_a_blow_from_the_other_side_has_opposite_gains_or_its_direction_is_not_heeded(name):
-    field = FIELDS[name]()
+    field = ALL[name]()
     here, there = field.at(PLACES, BLOWS), field.at(PLACES, -BLOWS)
-    sign = -1.0 if name == "physics" else 1.0
+    sign = -1.0 if name.endswith("physics") else 1.0
     assert torch.equal(there.mean, sign * here.mean)
     if here.quadrature is not None:
         assert torch.equal(there.quadrature, sign * here.quadrature)
@@ -102,16 +111,16 @@ def test_a_blow_from_the_other_side_has_opposite_gains_or_its_direction_is_not_h
 
 @every_field
 def test_without_a_direction_a_blow_goes_straight_into_the_surface(name):
-    field = FIELDS[name]()
+    field = ALL[name]()
     contacts = field.points[:7]
     straight = torch.zeros_like(contacts)
     straight[:, 2] = -contacts[:, 2].sign()
     expect_close(parts(field, contacts), parts(field, contacts, straight))
     askew = field.at(contacts, BLOWS).mean
-    assert torch.equal(askew, field.at(contacts).mean) == (name != "physics")
+    assert torch.equal(askew, field.at(contacts).mean) == (not name.endswith("physics"))
 
 
-@every_field
+@pytest.mark.parametrize("name", FIELDS)
 def test_modes_put_in_another_order_are_the_same_modes(name):
     order, field = torch.tensor([2, 4, 0, 3, 1]), FIELDS[name]()
     trainable = deepcopy(field) if isinstance(field, AttentionGains) else RefinedGains(field, BANK)
@@ -122,7 +131,7 @@ def test_modes_put_in_another_order_are_the_same_modes(name):
 
 @every_field
 def test_a_skeleton_has_the_form_of_the_tensors_and_takes_no_memory(name):
-    field = FIELDS[name]()
+    field = ALL[name]()
     record = json.loads(json.dumps(field.record(), allow_nan=False))
     assert record == field.record()
     assert record["modes"] == MODES
@@ -135,7 +144,7 @@ def test_a_skeleton_has_the_form_of_the_tensors_and_takes_no_memory(name):
 
 @every_field
 def test_a_field_comes_back_from_its_file_to_the_last_bit(name, tmp_path):
-    saved = sound_field(FIELDS[name](), noise=0.01)
+    saved = sound_field(ALL[name](), noise=0.01)
     save(saved, tmp_path / "one")
     loaded = load(tmp_path / "one")
     assert type(loaded.gain_field) is type(saved.gain_field)
@@ -152,11 +161,11 @@ def test_a_field_comes_back_from_its_file_to_the_last_bit(name, tmp_path):
 
 @every_field
 def test_a_sound_is_the_sum_of_damped_sines_and_cosines(name):
-    field = FIELDS[name]()
+    field = ALL[name]()
     known, times = field.at(PLACES, BLOWS), torch.arange(600, dtype=torch.float64) / 8000.0
     ahead = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
     factors = torch.ones_like(known.mean) if known.damping is None else known.damping
-    assert (float(ahead.abs().max()) > 0) == (not name.startswith("attention"))
+    assert (float(ahead.abs().max()) > 0) == ("attention" not in name)
     expected = torch.zeros(7, 600, dtype=torch.float64)
     for mode in range(MODES):
         angle = 2 * torch.pi * BANK.frequency[mode] * times + PHASE[mode]
@@ -169,7 +178,7 @@ def test_a_sound_is_the_sum_of_damped_sines_and_cosines(name):
     # Float32 sums: a millionth of the loudest sample.
     torch.testing.assert_close(sounds.double(), expected, rtol=0, atol=1e-6 * float(expected.abs().max()))
     assert torch.equal(renderer.gains(PLACES, directions=BLOWS), known.mean)
-    if name == "physics":
+    if name.endswith("physics"):
         assert not torch.equal(renderer.render(PLACES), sounds)
 
 
@@ -177,7 +186,7 @@ def changed(name: str, folder: Path, tensors: dict[str, torch.Tensor], record: d
     """Save a field of this kind, with some of its tensors and of what it says of itself replaced; None takes it out."""
     path = folder / "plate.safetensors"
     if not (folder / "whole").exists():
-        save(sound_field(FIELDS[name]()), folder / "whole")
+        save(sound_field(ALL[name]()), folder / "whole")
     with safe_open(folder / "whole", framework="pt") as file:
         header = json.loads(file.metadata()["avmsf"])
     held = from_bytes((folder / "whole").read_bytes())
@@ -191,7 +200,7 @@ def changed(name: str, folder: Path, tensors: dict[str, torch.Tensor], record: d
 
 @every_kind
 def test_what_a_field_says_of_itself_is_refused_where_anything_is_missing_or_wrong(name, tmp_path):
-    field = FIELDS[name]()
+    field = ALL[name]()
     whole = {"kind": field.kind, **field.record()}
     load(changed(name, tmp_path, {}, {"gain_field": whole}))
     for key, value in whole.items():
@@ -209,7 +218,7 @@ def test_what_a_field_says_of_itself_is_refused_where_anything_is_missing_or_wro
 
 @every_kind
 def test_sizes_that_are_not_the_tensors_are_refused(name, tmp_path):
-    field = FIELDS[name]()
+    field = ALL[name]()
     whole = {"kind": field.kind, **field.record()}
     for key in ("points", "contacts", "shapes", "dim"):
         if key in whole:
@@ -223,7 +232,7 @@ def test_sizes_that_are_not_the_tensors_are_refused(name, tmp_path):
 
 @every_kind
 def test_damaged_tensors_are_refused_by_name(name, tmp_path):
-    for key, tensor in FIELDS[name]().tensors().items():
+    for key, tensor in ALL[name]().tensors().items():
         with pytest.raises(FieldFileError, match=rf"missing gain_field\.{key}; unexpected none"):
             load(changed(name, tmp_path, {key: None}, {}))
         with pytest.raises(FieldFileError, match=rf"expected gain_field\.{key} to be finite throughout"):
@@ -243,5 +252,5 @@ def test_gains_of_other_modes_than_the_banks_are_not_saved(tmp_path):
 
 def test_a_gain_field_that_nobody_knows_is_refused_with_those_that_are(tmp_path):
     path = changed("spline", tmp_path, {}, {"gain_field": {"kind": "wavelets"}})
-    with pytest.raises(FieldFileError, match=r"gain_field\.kind is 'wavelets', not attention, spline, physics"):
+    with pytest.raises(FieldFileError, match=r"gain_field\.kind is 'wavelets', not attention, spline, physics, scaled"):
         load(path)

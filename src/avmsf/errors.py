@@ -25,6 +25,14 @@ class FieldFileError(AvmsfError):
     """A file is not a field that this version can read, or a field cannot be written."""
 
 
+class LocationError(AvmsfError):
+    """A recording from which no contact with this object can be told."""
+
+
+class EditError(AvmsfError):
+    """A field cannot be edited as asked: the material, the reference, the prompt or the model does not allow it."""
+
+
 class EvaluationError(AvmsfError):
     """Sounds or contacts given to a metric, a baseline or a split do not fit together."""
 

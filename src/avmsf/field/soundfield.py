@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from avmsf.field.config import FitConfig
@@ -51,6 +51,11 @@ class SoundField:
     """Length of rendered sounds."""
     origin: Origin
 
+    @property
+    def audible(self) -> Bool[Tensor, " modes"]:
+        """Which modes sound: those below half the sample rate, above which an edit may have moved some."""
+        return self.bank.frequency < 0.5 * self.sample_rate
+
     def gains(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Float[Tensor, "contacts modes"]:
@@ -85,7 +90,7 @@ class SoundField:
 
         `force` in newtons where the recordings were divided by theirs, else relative to an average one of them. Of
         `samples` samples, or as long as the training sounds. The noise is one draw, the same at every contact and in
-        every call, so that a contact's sound depends on nothing else.
+        every call, so that a contact's sound depends on nothing else. Modes that are not `audible` are silent.
         """
         length = self.samples if samples is None else samples
         generator = torch.Generator().manual_seed(self.origin.config.seed)
@@ -98,12 +103,13 @@ class SoundField:
 
     def _modes(self, known: Gains, samples: int) -> Float[Tensor, "contacts samples"]:
         damping = self.bank.damping if known.damping is None else self.bank.damping * known.damping
+        heard = torch.nonzero(self.audible).flatten()
         return synthesise_phased(
-            known.mean,
-            self.bank.frequency,
-            damping,
-            self.phase,
+            known.mean[:, heard],
+            self.bank.frequency[heard],
+            damping[..., heard],
+            self.phase[heard],
             samples=samples,
             sample_rate=self.sample_rate,
-            quadrature=known.quadrature,
+            quadrature=None if known.quadrature is None else known.quadrature[:, heard],
         )

@@ -12,12 +12,11 @@ from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from avmsf.errors import FieldFileError
-from avmsf.field.attention import AttentionGains
 from avmsf.field.gainfield import GainField
 from avmsf.field.header import FORMAT, Header, broken, read_header
-from avmsf.field.modalbasis import ModalBasis
+from avmsf.field.kinds import FITTED
+from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import SoundField
-from avmsf.field.thinplategains import ThinPlateGains
 from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
@@ -25,7 +24,7 @@ from avmsf.modal.residual import Residual
 _KEY = "avmsf"
 _GAIN_FIELD = "gain_field."
 _POSITIVE = ("bank.frequency", "bank.damping")
-_KINDS: dict[str, type[GainField]] = {each.kind: each for each in (AttentionGains, ThinPlateGains, ModalBasis)}
+_KINDS: dict[str, type[GainField]] = {**FITTED, ScaledGains.kind: ScaledGains}
 """The gain fields that a file may hold, by what it calls them."""
 
 

@@ -11,7 +11,7 @@ class ModalBank:
     """Damped sines that all contacts share (paper, eq. 3): mode i sounds as exp(-d_i t) sin(2 pi f_i t)."""
 
     frequency: Float64[Tensor, " modes"]
-    """Damped frequencies, Hz, ascending."""
+    """Damped frequencies, Hz, ascending as extracted and fitted; edits keep the order of the modes."""
     damping: Float64[Tensor, " modes"]
     """Amplitude decay rates, 1/s, positive."""
 

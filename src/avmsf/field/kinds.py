@@ -1,0 +1,9 @@
+"""The gain fields that are fitted to recordings, by what a file calls them."""
+
+from avmsf.field.attention import AttentionGains
+from avmsf.field.gainfield import GainField
+from avmsf.field.modalbasis import ModalBasis
+from avmsf.field.thinplategains import ThinPlateGains
+
+FITTED: dict[str, type[GainField]] = {each.kind: each for each in (AttentionGains, ThinPlateGains, ModalBasis)}
+"""Those that hold no other field; `avmsf.field.scaledgains` holds one of them."""

@@ -1,0 +1,93 @@
+"""Gains of an edited object: another field's, times one factor a mode, on a body that may have another size."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float, Float32, Float64
+from torch import Tensor
+
+from avmsf.field.gainfield import GainField, Gains
+from avmsf.field.kinds import FITTED
+from avmsf.field.records import count_of, like
+
+_INNER = "field."
+
+
+@dataclass(frozen=True, eq=False)
+class ScaledGains:
+    """Gains that differ from a fitted field's by a factor a mode, so that their ratio between places is the same.
+
+    Of a field that is scaled already only the factors change: what is held is always a fitted field.
+    """
+
+    field: GainField
+    """The gains as they were fitted."""
+    scale: Float64[Tensor, " modes"]
+    """Factors on the gains of each mode; 0 mutes one."""
+    length: float = 1.0
+    """Lengths on this object over those on the fitted one: a place here is heard where it is, divided by this."""
+
+    kind: ClassVar[str] = "scaled"
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.length < math.inf:
+            raise ValueError(f"length is {self.length}")
+        inner = self.field
+        if isinstance(inner, ScaledGains):
+            object.__setattr__(self, "field", inner.field)
+            object.__setattr__(self, "scale", inner.scale * self.scale)
+            object.__setattr__(self, "length", inner.length * self.length)
+
+    @property
+    def points(self) -> Float32[Tensor, "points 3"]:
+        """Points of the object's surface, object frame, metres."""
+        return (self.field.points.double() * self.length).float()
+
+    def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
+        """Return the scaled gains; the factors on the dampings are the fitted ones."""
+        known = self.field.at(contacts.double() / self.length, directions)
+        quadrature = None if known.quadrature is None else self._scaled(known.quadrature)
+        return Gains(self._scaled(known.mean), quadrature, known.damping)
+
+    def deviation(
+        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts modes 2"] | None:
+        """Return the fitted gains' deviation, scaled like them: what is asked for by an edit is not in doubt."""
+        known = self.field.deviation(contacts.double() / self.length, directions)
+        return None if known is None else (known.double() * self.scale.abs()[:, None]).float()
+
+    def record(self) -> dict[str, Any]:
+        """Return the fitted field's record, what a file calls that field, and the length."""
+        return {**self.field.record(), "inner": self.field.kind, "length": self.length}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the factors and the fitted field's tensors."""
+        return {"scale": self.scale, **{_INNER + name: tensor for name, tensor in self.field.tensors().items()}}
+
+    @classmethod
+    def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return tensors like those of a field of these sizes."""
+        if not 0.0 < like(record["length"], 1.0, "length") < math.inf:
+            raise ValueError(f"length is {record['length']}")
+        inner = FITTED[_inner(record)].skeleton(record)
+        scale = torch.empty(count_of(record["modes"], "modes"), dtype=torch.float64, device="meta")
+        return {"scale": scale, **{_INNER + name: tensor for name, tensor in inner.items()}}
+
+    @classmethod
+    def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "ScaledGains":
+        """Return the field."""
+        inner = {name.removeprefix(_INNER): each for name, each in tensors.items() if name.startswith(_INNER)}
+        return cls(FITTED[_inner(record)].restore(record, inner), tensors["scale"], float(record["length"]))
+
+    def _scaled(self, gains: Float[Tensor, "contacts modes"]) -> Float32[Tensor, "contacts modes"]:
+        return (gains.double() * self.scale).float()
+
+
+def _inner(record: Mapping[str, Any]) -> str:
+    kind: str = like(record["inner"], "", "inner")
+    if kind not in FITTED:
+        raise ValueError(f"inner is {kind!r}, not {', '.join(FITTED)}")
+    return kind
