@@ -1,0 +1,1 @@
+"""What a sound field is for: find the blow, change the material."""

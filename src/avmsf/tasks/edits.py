@@ -1,0 +1,47 @@
+"""What all edits of a field have in common: other modes, factors on the gains, and a word in the field's report."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from avmsf.errors import EditError
+from avmsf.field.scaledgains import ScaledGains
+from avmsf.field.soundfield import SoundField
+from avmsf.modal.bank import ModalBank
+
+EDITS = "edits"
+"""Where a field's report lists what was done to it, in this order."""
+
+
+def edited(
+    field: SoundField,
+    bank: ModalBank,
+    scale: Float64[Tensor, " modes"],
+    *,
+    entry: Mapping[str, Any],
+    length: float = 1.0,
+) -> SoundField:
+    """Return the field of other modes, its gains times `scale`, its lengths times `length`.
+
+    The modes stay in the order that they had, whatever their frequencies have become, so that mode k is the same before
+    and after. `entry`, plain values, ends the list of edits, with the frequencies of the modes that have moved to half
+    the sample rate or above: these are silent, and stay in the bank for edits that bring them back. Raises `EditError`
+    where a frequency or a damping is not positive, or a number too large.
+    """
+    for name, values in (("frequency", bank.frequency), ("damping", bank.damping), ("gain factor", scale)):
+        fine = torch.isfinite(values) & (values > 0 if name != "gain factor" else True)
+        if not bool(fine.all()):
+            row = int(torch.nonzero(~fine)[0])
+            raise EditError(
+                f"the edit gives mode {row} (counted from 0, {float(field.bank.frequency[row]):.4g} Hz) the {name} "
+                f"{float(values[row]):g}: expected a finite one{'' if name == 'gain factor' else ' above 0'}; edit less"
+            )
+    changed = replace(field, bank=bank, gain_field=ScaledGains(field.gain_field, scale, length))
+    silent = bank.frequency[~changed.audible].tolist()
+    listed = [*field.origin.report.get(EDITS, []), {**entry, "silent_hertz": silent}]
+    report = {**field.origin.report, EDITS: listed}
+    return replace(changed, origin=replace(field.origin, report=report))

@@ -1,0 +1,136 @@
+"""The same shape in another material or size: what linear modal analysis says without a new solve.
+
+Where Poisson's ratio stays, stiffness goes as Young's modulus E and mass as the density r, so that the shapes of the
+modes stay. With the size times s, undamped angular frequencies become w' = w sqrt(E' / E) (r' / r)^(-1/2) / s, and
+mass-normalised shapes phi' = phi (r' / r)^(-1/2) s^(-3/2). With Rayleigh damping d = (alpha + beta w^2) / 2 a mode
+sounds at sqrt(w^2 - d^2) / 2 pi. What a blow moves at a place is the product of two shapes, over the damped angular
+frequency where that is a displacement.
+"""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from avmsf.errors import EditError
+from avmsf.field.soundfield import SoundField
+from avmsf.modal.bank import ModalBank
+from avmsf.simulate.material import Material
+from avmsf.tasks.edits import edited
+
+
+@dataclass(frozen=True)
+class GainLaw:
+    """How gains follow frequencies and the body's mass: a' = a ((r' / r)^(-1) s^(-3))^mass (f / f')^frequency."""
+
+    name: str
+    mass: float
+    """Power of the mass, which all modes share: 1, or 0 where only their ratios count."""
+    frequency: float
+    """Power of the frequencies."""
+
+
+DISPLACEMENT = GainLaw("displacement", mass=1.0, frequency=1.0)
+"""The full law, for gains that are displacements: a' = a (r' / r)^(-1) s^(-3) f / f'."""
+VELOCITY = GainLaw("velocity", mass=1.0, frequency=0.0)
+"""The full law for gains that are velocities, as a laser vibrometer's are."""
+ACCELERATION = GainLaw("acceleration", mass=1.0, frequency=-1.0)
+"""The full law for gains that are accelerations, which what a microphone close by hears goes with."""
+RATIO_ONLY = GainLaw("ratio-only", mass=0.0, frequency=1.0)
+"""The paper's law, a' = a f / f', which leaves mass and size out."""
+LAWS = {law.name: law for law in (DISPLACEMENT, VELOCITY, ACCELERATION, RATIO_ONLY)}
+"""All of them, by name."""
+
+
+def recast(
+    field: SoundField, old: Material, new: Material, *, size: float = 1.0, law: GainLaw = DISPLACEMENT
+) -> SoundField:
+    """Return the field of an object of the same shape, `size` times as large, in a new material.
+
+    The dampings of the field are multiplied by the ratio of what the two materials' Rayleigh laws say, so that what a
+    mode has of its own beside the law (its supports, what it radiates) stays in proportion; to give a material to
+    itself changes nothing, and by way of a third one comes to the same. Where neither material damps, dampings stay.
+    Ratios of gains between places stay, the residual too. A place on the new object is `size` times the old one's.
+
+    What was done is the last entry of `origin.report["edits"]`, with its remarks: modes that have moved to half the
+    sample rate or above, which are silent and come back with an edit that lowers them; modes that the new material
+    damps beyond the critical damping, which have no tone and are mute from then on; and another Poisson's ratio, which
+    changes shapes and takes a new solve.
+
+    Raises `EditError` for a size that is not positive, for an old material without damping where the new one has some,
+    and for the reverse, which would ring for ever.
+    """
+    _expect(old, new, size)
+    omega = torch.hypot(2.0 * math.pi * field.bank.frequency, field.bank.damping)
+    moved = omega * (math.sqrt(new.young / old.young) * math.sqrt(old.density / new.density) / size)
+    damping = field.bank.damping * _rayleigh_ratio(omega, moved, old, new)
+    dead = damping >= moved
+    # A mode without a tone keeps the frequency that it would have undamped: a bank holds no other.
+    angular = torch.where(dead, moved, torch.sqrt((moved.square() - damping.square()).clamp_min(0.0)))
+    bank = ModalBank(angular / (2.0 * math.pi), damping)
+    mass = (new.density / old.density) * size**3
+    scale = (field.bank.frequency / bank.frequency) ** law.frequency / mass**law.mass
+    entry: dict[str, Any] = {
+        "edit": "recast",
+        "from": asdict(old),
+        "to": asdict(new),
+        "size": float(size),
+        "law": law.name,
+        "overdamped_hertz": bank.frequency[dead].tolist(),
+        "remarks": _remarks(old, new, bank, dead),
+    }
+    return edited(field, bank, torch.where(dead, 0.0, scale), entry=entry, length=size)
+
+
+def rayleigh_damping(omega: Float64[Tensor, " modes"], material: Material) -> Float64[Tensor, " modes"]:
+    """Return a material's own dampings, 1/s, at undamped angular frequencies: (alpha + beta w^2) / 2."""
+    return 0.5 * (material.alpha + material.beta * omega.square())
+
+
+def _rayleigh_ratio(
+    omega: Float64[Tensor, " modes"], moved: Float64[Tensor, " modes"], old: Material, new: Material
+) -> Float64[Tensor, " modes"]:
+    if not _damps(old):
+        return torch.ones_like(omega)
+    return rayleigh_damping(moved, new) / rayleigh_damping(omega, old)
+
+
+def _damps(material: Material) -> bool:
+    return material.alpha > 0 or material.beta > 0
+
+
+def _remarks(old: Material, new: Material, bank: ModalBank, dead: Bool[Tensor, " modes"]) -> list[str]:
+    """Return what the owner of the field should know of an edit, in sentences."""
+    remarks = []
+    if new.poisson != old.poisson:
+        stiffer = math.sqrt((1.0 - old.poisson**2) / (1.0 - new.poisson**2)) - 1.0
+        remarks.append(
+            f"Poisson's ratio changes from {old.poisson:g} to {new.poisson:g}, which this law leaves out: a thin "
+            f"wall's bending frequencies would change by about {100 * stiffer:+.1f} %, and the shapes a little; only "
+            "a new solve shows that"
+        )
+    if bool(dead.any()):
+        remarks.append(
+            f"{int(dead.sum())} of {len(bank)} modes are damped beyond their critical damping by alpha {new.alpha:g} "
+            f"1/s and beta {new.beta:g} s, and are mute from now on: "
+            + ", ".join(f"{each:.4g} Hz" for each in bank.frequency[dead].tolist())
+        )
+    return remarks
+
+
+def _expect(old: Material, new: Material, size: float) -> None:
+    if not 0.0 < size < math.inf:
+        raise EditError(f"size = {size:g}: expected the new object's lengths over the old one's, more than 0, as 1.5")
+    if _damps(old) and not _damps(new):
+        raise EditError(
+            f"{new.name}: alpha and beta are 0, so that nothing would ever fall silent: give alpha (1/s) or beta (s) "
+            "a value above 0"
+        )
+    if _damps(new) and not _damps(old):
+        raise EditError(
+            f"{old.name}: alpha and beta are 0, so that {new.name} has nothing to be compared with: give the old "
+            "material the alpha (1/s) or beta (s) that its object has"
+        )
