@@ -1,0 +1,48 @@
+"""Sounds brought to a common rate, length and level, so that one can be compared with another."""
+
+from fractions import Fraction
+
+import torch
+from jaxtyping import Float
+from scipy.signal import resample_poly
+from torch import Tensor
+
+_ATTACK = 0.02
+"""Seconds over which a sound's level is taken: about what the ear adds up to one loudness of a click."""
+
+
+def resampled(
+    sounds: Float[Tensor, "contacts samples"], *, sample_rate: float, wanted: float
+) -> Float[Tensor, "contacts resampled"]:
+    """Return sounds at another sample rate, Hz, by a polyphase filter; they are not differentiable in what was given.
+
+    What lies above half the lower of the two rates is lost. Dtype and device stay.
+    """
+    if sample_rate == wanted:
+        return sounds
+    ratio = Fraction(wanted / sample_rate).limit_denominator(4096)
+    found = resample_poly(sounds.detach().cpu().double().numpy(), ratio.numerator, ratio.denominator, axis=1)
+    return torch.from_numpy(found).to(sounds)
+
+
+def lasting(sounds: Float[Tensor, "contacts samples"], samples: int) -> Float[Tensor, "contacts lasting"]:
+    """Return sounds of `samples` samples: cut at the end, or continued by silence."""
+    missing = samples - sounds.shape[1]
+    return torch.nn.functional.pad(sounds, (0, missing)) if missing > 0 else sounds[:, :samples]
+
+
+def level(sounds: Float[Tensor, "contacts samples"], *, sample_rate: float) -> Float[Tensor, " contacts"]:
+    """Return each sound's root mean square over its loudest 20 ms: how hard a blow sounds, however long it rings.
+
+    Differentiable; never zero, so that it can be divided by.
+    """
+    window = min(sounds.shape[1], max(1, round(_ATTACK * sample_rate)))
+    power = torch.nn.functional.avg_pool1d(sounds.square()[:, None], window, max(1, window // 4))[:, 0]
+    return power.amax(dim=1).clamp_min(torch.finfo(sounds.dtype).tiny).sqrt()
+
+
+def levelled(
+    sounds: Float[Tensor, "contacts samples"], like: Float[Tensor, "contacts samples"], *, sample_rate: float
+) -> Float[Tensor, "contacts samples"]:
+    """Return sounds scaled, row for row, to the level of `like`."""
+    return sounds * (level(like, sample_rate=sample_rate) / level(sounds, sample_rate=sample_rate))[:, None]

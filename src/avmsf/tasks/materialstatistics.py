@@ -1,0 +1,148 @@
+"""What objects of one material have in common: where their modes lie, how long these ring, how bright they are."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from scipy.optimize import nnls
+from torch import Tensor
+
+from avmsf.errors import EditError, ExtractionError
+from avmsf.field.soundfield import SoundField
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extract import HighResolution, extract_sounds
+from avmsf.modal.synthesis import synthesise
+from avmsf.simulate.material import Material
+from avmsf.tasks.reference import Reference, read_clip, wav_files
+
+_QUANTILES = 64
+_POINTS = 64
+"""Places at which a field's brightness is taken."""
+_MODES = 40
+"""Modes of a sound that is made up."""
+_SCATTER = 0.5
+"""Standard deviation of a mode's gain about the slope, logarithm: places and shapes differ."""
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialStatistics:
+    """How a material sounds, on the whole."""
+
+    name: str
+    frequency: Float64[Tensor, " quantiles"]
+    """Quantiles of modal frequencies, at the middles of equal parts of the probability, Hz, ascending."""
+    alpha: float
+    """1/s: a mode of angular frequency w decays at d = (alpha + beta w^2) / 2."""
+    beta: float
+    """Seconds."""
+    brightness: float
+    """Slope of the modes' gains over frequency, decibels an octave."""
+
+    @classmethod
+    def of_modes(
+        cls, banks: Sequence[ModalBank], gains: Sequence[Float[Tensor, " _modes"]], *, name: str
+    ) -> "MaterialStatistics":
+        """Sum up objects' modes, each object with the same weight, each mode of an object with its gain's.
+
+        `gains` holds the size of each mode's. The law of decay is fitted by least squares of the relative error with
+        both constants not negative, the brightness by least squares over the logarithms. Raises `EditError` where there
+        are no modes.
+        """
+        if not banks or any(len(bank) == 0 for bank in banks):
+            raise EditError(f"{name}: expected modes of every object, found none: there is nothing to sum up")
+        sizes = [size.double().abs() / size.double().abs().sum() for size in gains]
+        frequency, damping = (torch.cat([getattr(bank, each) for bank in banks]) for each in ("frequency", "damping"))
+        weight = torch.cat(sizes)
+        order = torch.argsort(frequency)
+        reached = torch.cumsum(weight[order], dim=0) / weight.sum()
+        middles = (torch.arange(_QUANTILES, dtype=torch.float64) + 0.5) / _QUANTILES
+        rows = torch.searchsorted(reached, middles).clamp_max(len(order) - 1)
+        root = weight.sqrt()[:, None].numpy()
+        terms = torch.stack([0.5 / damping, 0.5 * (2 * math.pi * frequency).square() / damping], dim=1).numpy()
+        # Scaled alike, for the second constant is a billionth of the first.
+        columns = np.abs(terms).max(axis=0)
+        law, _ = nnls(root * terms / columns, root[:, 0])
+        octaves = [torch.log2(bank.frequency) for bank in banks]
+        levels = [20 * torch.log10(each.clamp_min(1e-12)) for each in sizes]
+        # Each object has its own level: the slope is that within objects.
+        apart = torch.cat([each - each.mean() for each in octaves])
+        loud = torch.cat([each - each.mean() for each in levels])
+        spread = float((apart**2).sum())
+        slope = float((apart * loud).sum()) / spread if spread > 0 else 0.0
+        return cls(name, frequency[order][rows], float(law[0] / columns[0]), float(law[1] / columns[1]), slope)
+
+    @classmethod
+    def of_recordings(
+        cls, paths: str | Path | Sequence[str | Path], *, name: str | None = None, sample_rate: float = 44100.0
+    ) -> "MaterialStatistics":
+        """Sum up the modes in recordings of blows on things of one material; a folder stands for its wav files.
+
+        They are brought to `sample_rate`, Hz. Raises `EditError` for what cannot be read, is silent or too short, and
+        where a recording holds no modes.
+        """
+        found = wav_files(paths)
+        banks, gains = [], []
+        for path in found:
+            clip = read_clip(path, sample_rate=sample_rate)
+            try:
+                modes = extract_sounds(clip[None], sample_rate=sample_rate, method=HighResolution(modes=_MODES))
+            except ExtractionError as error:
+                raise EditError(f"{path}: expected a blow that rings: {error}; or leave the file out") from error
+            banks.append(modes.bank)
+            gains.append(torch.hypot(modes.gains[0], modes.quadrature[0]))
+        return cls.of_modes(banks, gains, name=name or found[0].parent.name)
+
+    @classmethod
+    def recast(cls, field: SoundField, old: Material, new: Material) -> "MaterialStatistics":
+        """Return what a field's object would be like in another material, by the laws of linear elasticity.
+
+        Its frequencies times sqrt(E'/E r/r'), the new material's damping, its own brightness.
+        """
+        ratio = math.sqrt(new.young / old.young * old.density / new.density)
+        points = field.gain_field.points
+        rows = torch.linspace(0, len(points) - 1, min(len(points), _POINTS)).long()
+        size = field.gains(points[rows]).square().mean(dim=0).sqrt()
+        moved = ModalBank(field.bank.frequency * ratio, field.bank.damping)
+        found = cls.of_modes([moved], [size], name=new.name)
+        return cls(new.name, found.frequency, new.alpha, new.beta, found.brightness)
+
+    def sounds(
+        self, count: int, *, samples: int, sample_rate: float, generator: torch.Generator
+    ) -> Float[Tensor, "count samples"]:
+        """Return made-up blows: modes drawn evenly from the distribution, decays by the law, gains about the slope.
+
+        Raises `EditError` where all modes lie at half the sample rate or above.
+        """
+        made = []
+        for _ in range(count):
+            drawn = (torch.arange(_MODES) + torch.rand(_MODES, generator=generator)).double() / _MODES
+            place = (drawn * len(self.frequency) - 0.5).clamp(0.0, len(self.frequency) - 1.0)
+            below = place.floor().long().clamp_max(len(self.frequency) - 2)
+            log = self.frequency.log()
+            frequency = torch.exp(torch.lerp(log[below], log[below + 1], place - below))
+            turns = torch.rand(_MODES, generator=generator)
+            scatter = torch.randn(_MODES, generator=generator)
+            heard = frequency < 0.5 * sample_rate
+            if not bool(heard.any()):
+                raise EditError(
+                    f"{self.name}: its modes lie at {float(self.frequency[0]):.4g} Hz and above, out of reach of a "
+                    f"field at {sample_rate:g} Hz"
+                )
+            octave = torch.log2(frequency / frequency[0])
+            size = torch.exp(_SCATTER * scatter) * 10 ** (self.brightness * octave / 20)
+            damping = 0.5 * (self.alpha + self.beta * (2 * math.pi * frequency).square()).clamp_min(1e-3)
+            signed = torch.where(turns < 0.5, -size, size).float()[heard]
+            made.append(
+                synthesise(signed[None], frequency[heard], damping[heard], samples=samples, sample_rate=sample_rate)
+            )
+        return torch.cat(made)
+
+    def reference(self, *, samples: int, sample_rate: float, count: int = 8, seed: int = 0) -> Reference:
+        """Return made-up blows as what a field shall sound like."""
+        generator = torch.Generator().manual_seed(seed)
+        sounds = self.sounds(count, samples=samples, sample_rate=sample_rate, generator=generator)
+        return Reference.of(sounds, sample_rate=sample_rate, name=self.name)

@@ -1,0 +1,114 @@
+"""What of an edit is free to move, how fast, and what holds it back."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float, Float64, Int
+from torch import Tensor
+
+from avmsf.tasks.modaledit import ModalEdit
+
+_QUANTITIES = ("pitch", "shift", "decay", "decay_shift", "scale")
+
+
+@dataclass(frozen=True)
+class Parameterisation:
+    """Rates are those of Adam, in logarithms a step; 0 keeps a quantity where it starts.
+
+    A quantity of a single mode is held near 0 by half the mean square over modes of its value over its deviation, times
+    `stiffness`, in the unit of the loss, which is a relative error.
+    """
+
+    name: str
+    """What the edit's report calls it."""
+    pitch_rate: float
+    """Of the common factor on frequencies."""
+    decay_rate: float
+    """Of the common factor on dampings."""
+    shift_rate: float
+    """Of each frequency."""
+    decay_shift_rate: float
+    """Of each damping."""
+    scale_rate: float
+    """Of each gain factor."""
+    stiffness: float
+    """Strength of what holds single modes back."""
+    shift_deviation: float = 0.05
+    """How far a frequency goes by itself, logarithm: .05 is almost a semitone."""
+    decay_shift_deviation: float = 0.3
+    """How far a damping goes by itself."""
+    scale_deviation: float = 1.0
+    """How far a gain factor goes, the common level aside."""
+
+
+HIERARCHICAL = Parameterisation("hierarchical", 0.02, 0.02, 0.003, 0.01, 0.02, 0.05)
+"""The paper's: one pitch and one decay take the object to another material, single modes refine."""
+INDEPENDENT = Parameterisation("independent", 0.0, 0.0, 0.02, 0.02, 0.02, 0.0)
+"""Audio-SDS's own, the paper's baseline: every frequency, damping and gain by itself, nothing in common."""
+
+
+class EditVariables:
+    """An edit on its way, and its optimiser."""
+
+    def __init__(self, start: ModalEdit, edited: Int[Tensor, " edited"], parameters: Parameterisation) -> None:
+        """Begin at `start`; the modes `edited` move by themselves, the others follow the common factors alone.
+
+        Quantities whose rate is 0 are 0 throughout.
+        """
+        self.parameters, self.modes, self.edited = parameters, len(start.shift), edited
+        self.values: dict[str, Float64[Tensor, "*edited"]] = {}
+        groups = []
+        for name in _QUANTITIES:
+            value: Tensor = getattr(start, name).detach().to(edited.device)
+            rate = getattr(parameters, f"{name}_rate")
+            chosen = value if value.ndim == 0 else value[edited]
+            self.values[name] = chosen.clone().requires_grad_() if rate > 0 else torch.zeros_like(chosen)
+            if rate > 0:
+                groups.append({"params": [self.values[name]], "lr": rate, "rate": rate})
+        # Targets change from step to step: a long memory of the gradient's square would brake what chance once pushed.
+        self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99))
+
+    def edit(self) -> ModalEdit:
+        """Return the edit as it stands, differentiable in the values."""
+        whole = {
+            name: value if value.ndim == 0 else value.new_zeros(self.modes).index_put((self.edited,), value)
+            for name, value in self.values.items()
+        }
+        return ModalEdit(**whole)
+
+    def penalty(self) -> Float64[Tensor, ""]:
+        """Return what speaks against single modes going their own ways, in the unit of the loss."""
+        parameters, scale = self.parameters, self.values["scale"]
+        parts = (
+            self.values["shift"] / parameters.shift_deviation,
+            self.values["decay_shift"] / parameters.decay_shift_deviation,
+            (scale - scale.mean()) / parameters.scale_deviation,
+        )
+        return 0.5 * parameters.stiffness * torch.stack([part.square().mean() for part in parts]).sum()
+
+    def differentiate(self, loss: Float[Tensor, ""]) -> bool:
+        """Take the gradient of a loss and the penalty; return whether it is finite."""
+        self.optimiser.zero_grad()
+        torch.autograd.backward(loss + self.penalty())
+        moving = [value.grad for value in self.values.values() if value.grad is not None]
+        return all(bool(torch.isfinite(gradient).all()) for gradient in moving)
+
+    def move(self, *, done: float) -> None:
+        """Take the step that the gradient asks for, with a part `done` of all steps behind it."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = group["rate"] * (0.525 + 0.475 * math.cos(math.pi * done))
+        self.optimiser.step()
+
+    def state(self) -> dict[str, Any]:
+        """Return all that decides how it goes on: tensors, numbers, containers of these."""
+        values = {name: value.detach().cpu().clone() for name, value in self.values.items()}
+        return {"values": values, "optimiser": self.optimiser.state_dict()}
+
+    def resume(self, state: dict[str, Any]) -> None:
+        """Go back to what `state` returned."""
+        with torch.no_grad():
+            for name, value in self.values.items():
+                value.copy_(state["values"][name])
+        self.optimiser.load_state_dict(state["optimiser"])

@@ -1,0 +1,121 @@
+"""Guides towards sounds that exist: recordings of another object, or sounds as a material makes them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.capture.audio import read_recording
+from avmsf.capture.prepare import prepare
+from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import CaptureError, EditError
+from avmsf.tasks.clips import lasting, levelled, resampled
+from avmsf.tasks.modaledit import ModalEdit, Struck
+from avmsf.tasks.startsearch import heard_spectrum, search_start
+
+_FADE = 0.01
+"""Seconds over which a reference that ends early hands over to the sound itself."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Clips to sound like: each rendered sound is pulled towards the clip whose spectrum is nearest, at its own level.
+
+    Where a clip ends before the sound does nothing is asked of the rest.
+    """
+
+    clips: Float[Tensor, "clips samples"]
+    """From their onsets on, padded with silence to the longest."""
+    lengths: tuple[int, ...]
+    """Samples of each."""
+    sample_rate: float
+    """Hz, the field's."""
+    name: str
+    """What reports call it."""
+
+    def __post_init__(self) -> None:
+        if not len(self.clips) or len(self.lengths) != len(self.clips):
+            raise EditError(f"expected clips and as many lengths, found {len(self.clips)} and {len(self.lengths)}")
+        if not bool(torch.isfinite(self.clips).all()):
+            raise EditError(f"{self.name}: expected samples that are finite numbers, found others: record it again")
+        silent = [row for row, clip in enumerate(self.clips) if float(clip.abs().max()) == 0.0]
+        if silent:
+            raise EditError(f"{self.name}: clip {silent[0]} (counted from 0) is silent: leave it out")
+
+    @classmethod
+    def of(cls, sounds: Float[Tensor, "clips samples"], *, sample_rate: float, name: str = "reference") -> "Reference":
+        """Refer to sounds at the field's rate that start at their onset, all of one length."""
+        return cls(sounds.float(), (sounds.shape[1],) * len(sounds), sample_rate, name)
+
+    @classmethod
+    def read(cls, paths: str | Path | Sequence[str | Path], *, sample_rate: float) -> "Reference":
+        """Read recordings of blows and bring them to the field's `sample_rate`, Hz; a folder stands for its wav files.
+
+        Each begins at its onset; of several channels the strongest is heard. Raises `EditError` for what is missing, no
+        sound file, silent, or shorter than 20 ms after the onset.
+        """
+        found = wav_files(paths)
+        clips = [read_clip(path, sample_rate=sample_rate) for path in found]
+        longest = max(len(clip) for clip in clips)
+        name = found[0].name if len(found) == 1 else f"{found[0].name} and {len(found) - 1} more"
+        padded = torch.cat([lasting(clip[None], longest) for clip in clips])
+        return cls(padded, tuple(len(clip) for clip in clips), sample_rate, name)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what tells it from other guides, as plain values."""
+        marks = [round(float(clip.double().square().sum()), 12) for clip in self.clips]
+        return {"reference": self.name, "lengths": list(self.lengths), "energies": marks}
+
+    def start(self, struck: Struck) -> ModalEdit:
+        """Return the common pitch and decay with which the field comes nearest, from a search over both."""
+        return search_start(struck, lambda sounds: self._nearest(sounds))
+
+    def targets(
+        self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return the nearest clip of each sound."""
+        return self._nearest(sounds)
+
+    def _nearest(self, sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, "contacts samples"]:
+        samples = sounds.shape[1]
+        clips = lasting(self.clips, samples).to(sounds)
+        distance = torch.cdist(heard_spectrum(sounds), heard_spectrum(clips), p=1.0)
+        chosen = distance.argmin(dim=1)
+        targets = levelled(clips[chosen], sounds, sample_rate=self.sample_rate)
+        ends = torch.tensor(self.lengths, device=sounds.device)[chosen, None]
+        fade = max(1, round(_FADE * self.sample_rate))
+        share = ((ends - torch.arange(samples, device=sounds.device)) / fade).clamp(0.0, 1.0).to(sounds)
+        share = torch.where(ends >= samples, torch.ones_like(share), share)
+        return share * targets + (1 - share) * sounds
+
+
+def wav_files(paths: str | Path | Sequence[str | Path]) -> list[Path]:
+    """Return sound files, those of folders in the order of their names. Raises `EditError` where there are none."""
+    given = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
+    found: list[Path] = []
+    for path in given:
+        found += sorted(each for each in path.iterdir() if each.suffix.lower() == ".wav") if path.is_dir() else [path]
+    if not found:
+        raise EditError(f"{', '.join(map(str, given)) or 'no path'}: expected wav files to sound like, found none")
+    return found
+
+
+def read_clip(path: Path, *, sample_rate: float) -> Float[Tensor, " samples"]:
+    """Return a recorded blow from its onset on, float32 at `sample_rate` Hz, of its strongest channel.
+
+    Raises `EditError` as `Reference.read`.
+    """
+    try:
+        recording = read_recording(path)
+        strongest = int(np.argmax(np.var(recording.channels, axis=1)))
+        mono = replace(recording, channels=recording.channels[strongest : strongest + 1])
+        sound = prepare(mono, CaptureSettings()).sound
+    except CaptureError as error:
+        raise EditError(f"the reference cannot be used: {error}") from error
+    clip = torch.from_numpy(np.ascontiguousarray(sound - sound.mean()))[None]
+    return resampled(clip, sample_rate=recording.sample_rate, wanted=sample_rate)[0].float()

@@ -1,0 +1,111 @@
+"""Where a descent towards a reference begins: the common pitch and decay, searched all over their range.
+
+Modes are sparse: between one that is there and one that is wanted a third of an octave higher, a spectrum's L1 distance
+has no slope. So the pitch comes from optimal transport, which in one dimension is a match of quantiles: a common factor
+on all frequencies moves the quantiles of the spectrum along a logarithmic axis by one step, and the best of them is the
+mean or median difference of two spectra's. A grid over the smoothed spectra's overlap proposes one more. The decay is
+searched on a grid for each proposal, and the loss that will be descended chooses.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.field.losses import spectral_loss, spectral_target
+from avmsf.modal.spectra import scaled_fft_size
+from avmsf.tasks.modaledit import ModalEdit, Struck
+
+_OCTAVES = 9
+"""Of the band that is looked at, down from half the sample rate."""
+_PER_OCTAVE = 24
+_WIDTH = 3.0
+"""Standard deviation of the smoothing, in bands: an eighth of an octave."""
+_MOST = math.log(8.0)
+"""How far the pitch may be moved."""
+_MOST_DECAY = math.log(64.0)
+_STRUCK = 6
+"""Contacts that the search listens to."""
+_FFT_SIZES = (2048, 1024, 512, 256)
+
+
+def heard_spectrum(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, "contacts bands"]:
+    """Return the share of each band, 24 an octave, in a sound's amplitudes: nine octaves up to half the sample rate.
+
+    Smoothed over an eighth of an octave; sums to one, so that level and unit do not matter.
+    """
+    power = torch.fft.rfft(sounds).abs().square()
+    bins = power.shape[1]
+    # Octaves below half the rate, the last bin; the first bin, no frequency at all, is left out.
+    place = torch.arange(1, bins, device=sounds.device, dtype=torch.float64) / (bins - 1)
+    band = (_PER_OCTAVE * (_OCTAVES + torch.log2(place))).floor().long().clamp_max(_OCTAVES * _PER_OCTAVE - 1)
+    inside = band >= 0
+    energy = power.new_zeros(len(power), _OCTAVES * _PER_OCTAVE).index_add(1, band[inside], power[:, 1:][:, inside])
+    reach = math.ceil(4 * _WIDTH)
+    bell = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, device=sounds.device) / _WIDTH).square()).to(energy)
+    smooth = torch.nn.functional.conv1d(energy[:, None], (bell / bell.sum())[None, None], padding=reach)[:, 0]
+    amplitude = smooth.clamp_min(0.0).sqrt()
+    return amplitude / amplitude.sum(dim=1, keepdim=True).clamp_min(torch.finfo(amplitude.dtype).tiny)
+
+
+def search_start(
+    struck: Struck, wanted: Callable[[Float[Tensor, "contacts samples"]], Float[Tensor, "contacts samples"]]
+) -> ModalEdit:
+    """Return the edit by a common pitch and decay alone with the least spectral error.
+
+    `wanted` gives what sounds are to be pulled towards, as a guide's targets.
+    """
+    struck = struck.first(_STRUCK)
+    best = (math.inf, 0.0, 0.0)
+    for pitch in _pitches(struck, wanted):
+        step, decay = _MOST_DECAY / 4, 0.0
+        tried: dict[float, float] = {}
+        # Nine places over the whole range, then three refinements about the best.
+        around = [step * place for place in range(-4, 5)]
+        for _ in range(4):
+            for each in around:
+                tried.setdefault(round(each, 9), _error(struck, wanted, pitch, each))
+            decay, step = min(tried, key=lambda each: tried[each]), step / 2
+            around = [decay - step, decay + step]
+        best = min(best, (tried[decay], pitch, decay))
+    return ModalEdit.none(struck.bank, pitch=best[1], decay=best[2])
+
+
+def _pitches(
+    struck: Struck, wanted: Callable[[Float[Tensor, "contacts samples"]], Float[Tensor, "contacts samples"]]
+) -> list[float]:
+    """Return proposals of log alpha: that of no change, and those by quantiles and overlap."""
+    sounds = struck.sounds(ModalEdit.none(struck.bank))
+    own, aim = (heard_spectrum(each).mean(dim=0) for each in (sounds, wanted(sounds)))
+    differences = (_quantiles(aim) - _quantiles(own)).clamp(-_MOST, _MOST)
+    # Moved by whole bands along the logarithmic axis, spectra overlap more or less.
+    most = round(_MOST / math.log(2.0) * _PER_OCTAVE)
+    padded = torch.nn.functional.pad(own, (most, most))
+    moved = padded.unfold(0, len(own), 1).flip(0)
+    overlap = (moved - aim).abs().sum(dim=1)
+    shift = (int(overlap.argmin()) - most) * math.log(2.0) / _PER_OCTAVE
+    return sorted({0.0, float(differences.mean()), float(differences.median()), shift})
+
+
+def _quantiles(spectrum: Float[Tensor, " bands"]) -> Float[Tensor, " quantiles"]:
+    """Return the frequencies below which 5, 10, ... 95 % of a spectrum lie, as logarithms up to a constant."""
+    shares = torch.linspace(0.05, 0.95, 19, device=spectrum.device, dtype=spectrum.dtype)
+    below = torch.cumsum(spectrum, dim=0)
+    band = torch.searchsorted(below / below[-1], shares).clamp(0, len(spectrum) - 1)
+    return band.to(spectrum) * (math.log(2.0) / _PER_OCTAVE)
+
+
+def _error(
+    struck: Struck,
+    wanted: Callable[[Float[Tensor, "contacts samples"]], Float[Tensor, "contacts samples"]],
+    pitch: float,
+    decay: float,
+) -> float:
+    sounds = struck.sounds(ModalEdit.none(struck.bank, pitch=pitch, decay=decay))
+    if float(sounds.abs().max()) == 0.0:
+        return math.inf
+    sizes = [scaled_fft_size(size, sample_rate=struck.sample_rate) for size in _FFT_SIZES]
+    target = spectral_target(wanted(sounds), fft_sizes=sizes, hops=[size // 4 for size in sizes])
+    return float(spectral_loss(sounds, target)) / len(sizes)

@@ -1,0 +1,261 @@
+"""The descent: a field's modes are moved until it sounds like what a guide asks for, the same wherever it is struck."""
+
+import math
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.errors import EditError
+from avmsf.field.losses import spectral_loss, spectral_target
+from avmsf.field.soundfield import SoundField
+from avmsf.modal.spectra import scaled_fft_size
+from avmsf.scene.points import farthest_points
+from avmsf.tasks.clips import level
+from avmsf.tasks.modaledit import ModalEdit, Struck
+from avmsf.tasks.parameters import HIERARCHICAL, EditVariables, Parameterisation
+from avmsf.tasks.steercheckpoint import asked, read_steering, write_steering
+
+_PROBES = 16
+"""Contacts, far apart, at which the loudest modes, the start and the level are judged."""
+_LISTENED = 2000
+"""Most points of the surface that are struck."""
+_SPOILT = 20
+"""Steps in a row without a usable target after which there is no hope."""
+_CHECKPOINT_SECONDS = 30.0
+
+
+@runtime_checkable
+class Guide(Protocol):
+    """Knows what a field shall sound like."""
+
+    def describe(self) -> dict[str, Any]:
+        """Return what tells it from other guides, as plain values: the edit's report and checkpoint keep it."""
+        ...
+
+    def start(self, struck: Struck) -> ModalEdit:
+        """Return where the descent begins, after a look at the field struck at places far apart."""
+        ...
+
+    def targets(
+        self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return what rendered sounds are to be pulled towards, row for row, at the level of these.
+
+        A row with a sample that is not finite is left out of the step.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class SteerConfig:
+    """How an edit descends. Raises `EditError` for values that cannot be meant."""
+
+    steps: int = 300
+    """Steps; Audio-SDS is said to take about 1,000."""
+    contacts: int = 10
+    """Places struck in each step, drawn anew from all over the surface."""
+    modes: int = 128
+    """Most modes that move by themselves, the loudest; the others follow the common factors."""
+    seconds: float | None = None
+    """How much of each sound is compared; as long as the field's sounds where it is not given."""
+    fft_sizes: tuple[int, ...] = (2048, 1024, 512, 256)
+    """Resolutions of the loss, samples at 44.1 kHz; frames are a quarter of each apart."""
+    seed: int = 0
+    """Of all chance: places, noise levels, noise."""
+    preview_every: int = 50
+    """Steps between previews that can be listened to; 0 for none."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("steps", 1), ("contacts", 1), ("modes", 1), ("preview_every", 0), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise EditError(f"{name} = {getattr(self, name)}: expected {least} or more")
+        if self.seconds is not None and not 0 < self.seconds < math.inf:
+            raise EditError(f"seconds = {self.seconds:g}: expected more than 0")
+        if not self.fft_sizes or any(size < 4 or size % 4 for size in self.fft_sizes):
+            raise EditError(f"fft_sizes = {self.fft_sizes}: expected multiples of 4, such as 2048, 1024, 512, 256")
+
+
+@dataclass(frozen=True, eq=False)
+class SteerProgress:
+    """Where an edit stands."""
+
+    step: int
+    """Steps done."""
+    steps: int
+    """Steps in all."""
+    loss: float
+    """Mean over resolutions of the last step's relative spectral error; NaN where its targets were not usable."""
+    pitch: float
+    """Factor on all frequencies so far."""
+    decay: float
+    """Factor on all dampings so far."""
+    preview: Float[Tensor, " samples"] | None
+    """The edited field's sound at one place, at the field's rate, every so many steps and at the end."""
+
+
+def steer(
+    field: SoundField,
+    guide: Guide,
+    *,
+    config: SteerConfig | None = None,
+    parameters: Parameterisation = HIERARCHICAL,
+    progress: Callable[[SteerProgress], None] | None = None,
+    checkpoint: str | Path | None = None,
+    device: torch.device | str = "cpu",
+) -> SoundField:
+    """Return the field with its modes moved towards what `guide` asks for; gain ratios between contacts stay.
+
+    Each step strikes random places, compares the sounds with the guide's targets by the multi-scale spectral loss that
+    fields are fitted with, and moves what `parameters` leaves free. How loud the object is as a whole is no part of the
+    edit: the sounds compared, and the field returned, have the level of the given one. Rendering and loss run on
+    `device`. With `checkpoint`, the state is kept there while the edit runs, on interruption and at the end, and an
+    edit of the same arguments goes on from it to the same result. Raises `EditError` for a field that is silent, for a
+    checkpoint of another edit, and where the guide's targets or the loss are no numbers.
+    """
+    config = SteerConfig() if config is None else config
+    run = _Steering(field, guide, config, parameters, None if checkpoint is None else Path(checkpoint), device)
+    return run.to_the_end(progress)
+
+
+class _Steering:
+    """An edit on its way."""
+
+    def __init__(
+        self,
+        field: SoundField,
+        guide: Guide,
+        config: SteerConfig,
+        parameters: Parameterisation,
+        checkpoint: Path | None,
+        device: torch.device | str,
+    ) -> None:
+        self.field, self.guide, self.config, self.parameters = field, guide, config, parameters
+        self.checkpoint, self.device, self.saved_at = checkpoint, torch.device(device), time.monotonic()
+        points = field.gain_field.points
+        self.places = (
+            points[farthest_points(points, min(len(points), _LISTENED))] if len(points) > _LISTENED else points
+        )
+        probes = self.places[farthest_points(self.places, min(len(self.places), _PROBES))]
+        self.probes = self._struck(probes)
+        self.loudness = self._expect_sound()
+        self.loudest_place = probes[int(self.loudness.argmax())]
+        self.sizes = [scaled_fft_size(size, sample_rate=field.sample_rate) for size in config.fft_sizes]
+        self.told = {**guide.describe(), "parameters": parameters.name, **asdict(config)}
+        self.step, self.spoilt = 0, 0
+        self.whole = True
+        """False while parameters are being moved: an interruption then leaves a state that nothing can go on from."""
+        self.asked = asked(field, probes, guide.describe(), {**asdict(config), **asdict(parameters)})
+        state = None if checkpoint is None else read_steering(checkpoint, wanted=self.asked)
+        start = guide.start(self.probes) if state is None else ModalEdit.none(self.probes.bank)
+        self.variables = EditVariables(start, self.probes.loudest(config.modes), parameters)
+        if state is not None:
+            self.variables.resume(state["variables"])
+            self.step, self.spoilt = state["step"], state["spoilt"]
+
+    def to_the_end(self, progress: Callable[[SteerProgress], None] | None) -> SoundField:
+        """Take the steps that are left and return the edited field."""
+        try:
+            while self.step < self.config.steps:
+                loss = self._advance()
+                if progress is not None:
+                    edit, every = self.variables.edit(), self.config.preview_every
+                    due = every > 0 and (self.step % every == 0 or self.step == self.config.steps)
+                    preview = self._preview() if due else None
+                    progress(
+                        SteerProgress(self.step, self.config.steps, loss, edit.pitch_factor, edit.decay_factor, preview)
+                    )
+                if time.monotonic() - self.saved_at > _CHECKPOINT_SECONDS:
+                    self._save()
+        except KeyboardInterrupt:
+            # Amid a step's changes there is nothing to keep but what was saved before.
+            if self.whole:
+                self._save()
+            raise
+        self._save()
+        return self._levelled().of(self.field, told=self.told)
+
+    def _advance(self) -> float:
+        """Take one step and return the loss before it."""
+        # All chance of a step hangs on its number, so that an edit goes on as if it had never been interrupted.
+        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
+        rows = torch.randperm(len(self.places), generator=generator)[: self.config.contacts]
+        struck = self._struck(self.places[rows])
+        before = level(struck.sounds(ModalEdit.none(struck.bank)), sample_rate=struck.sample_rate)
+        sounds = struck.sounds(self.variables.edit())
+        after = level(sounds, sample_rate=struck.sample_rate)
+        sounds = sounds * (before.square().sum() / after.square().sum()).sqrt()
+        with torch.no_grad():
+            targets = self.guide.targets(sounds.detach(), self.step, generator).to(sounds)
+        usable = torch.isfinite(targets).all(dim=1)
+        loss = math.nan
+        if bool(usable.any()):
+            loss = self._descend(sounds[usable], targets[usable])
+            self.spoilt = 0
+        else:
+            self.spoilt += 1
+            if self.spoilt >= _SPOILT:
+                raise EditError(
+                    f"the targets of {self.spoilt} steps in a row hold samples that are not finite numbers: lower the "
+                    "guidance, or compute in float32"
+                )
+        self.step += 1
+        self.whole = True
+        return loss
+
+    def _descend(self, sounds: Float[Tensor, "usable samples"], targets: Float[Tensor, "usable samples"]) -> float:
+        target = spectral_target(targets, fft_sizes=self.sizes, hops=[size // 4 for size in self.sizes])
+        error = spectral_loss(sounds, target) / len(self.sizes)
+        if not (self.variables.differentiate(error) and bool(torch.isfinite(error))):
+            raise EditError(
+                f"the edit diverged, its loss at step {self.step} is {float(error)} or its slope is no number: lower "
+                "the rates of its parameters"
+            )
+        self.whole = False
+        self.variables.move(done=self.step / self.config.steps)
+        return float(error.detach())
+
+    def _preview(self) -> Float[Tensor, " samples"]:
+        """Return the edited field's sound, noise and all, where the unedited one is loudest."""
+        return self._levelled().of(self.field).render(self.loudest_place[None])[0]
+
+    def _levelled(self) -> ModalEdit:
+        """Return the edit as it stands, as loud at the probes as the field was."""
+        with torch.no_grad():
+            edit = self.variables.edit()
+            after = level(self.probes.sounds(edit), sample_rate=self.field.sample_rate)
+            factor = (self.loudness.square().sum() / after.square().sum()).sqrt()
+            return edit.louder(factor).to("cpu")
+
+    def _struck(self, contacts: Float[Tensor, "contacts 3"]) -> Struck:
+        seconds = self.config.seconds
+        samples = self.field.samples if seconds is None else round(seconds * self.field.sample_rate)
+        return Struck.at(self.field, contacts, samples=max(1, samples), device=self.device)
+
+    def _expect_sound(self) -> Float[Tensor, " contacts"]:
+        sounds = self.probes.sounds(ModalEdit.none(self.probes.bank))
+        if not bool(torch.isfinite(sounds).all()) or float(sounds.abs().max()) == 0.0:
+            raise EditError("expected a field whose modes sound, found silence at all places: fit it again")
+        return level(sounds, sample_rate=self.field.sample_rate)
+
+    def _save(self) -> None:
+        if self.checkpoint is None:
+            return
+        state = {
+            "asked": self.asked,
+            "variables": self.variables.state(),
+            "step": self.step,
+            "spoilt": self.spoilt,
+        }
+        try:
+            write_steering(self.checkpoint, state)
+        except EditError as error:
+            # A full disk costs the checkpoint, not the edit.
+            warnings.warn(f"the edit goes on without a new checkpoint: {error}", stacklevel=2)
+        self.saved_at = time.monotonic()
