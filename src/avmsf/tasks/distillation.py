@@ -1,0 +1,221 @@
+"""Pull a sound towards words: noise it, let a text-to-audio diffusion model clean it up, take that for the target.
+
+Noise level t from 0 to 1 turns latents z by the angle a = pi t / 2: z_t = cos(a) z + sin(a) noise. A deterministic
+(DDIM) step estimates the clean latents and the noise from z_t and puts them together again at a lower level; partial
+denoising starts at a random level in the middle, so that much of the rendered sound stays. No gradient passes through
+the model: the decoded result is a target like a recording.
+"""
+
+import math
+import warnings
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.errors import EditError
+from avmsf.tasks.clips import lasting, levelled, resampled
+from avmsf.tasks.modaledit import ModalEdit, Struck
+
+
+@runtime_checkable
+class AudioDiffusion(Protocol):
+    """A frozen latent diffusion model that makes sound from words."""
+
+    @property
+    def name(self) -> str:
+        """What reports and checkpoints call it."""
+        ...
+
+    @property
+    def sample_rate(self) -> float:
+        """Of its waveforms, Hz."""
+        ...
+
+    @property
+    def channels(self) -> int:
+        """Of its waveforms: 2 for stereo."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        ...
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the denoiser."""
+        ...
+
+    def encode(self, waveforms: Float[Tensor, "contacts channels samples"]) -> Float[Tensor, "contacts dim frames"]:
+        """Return float32 latents of waveforms, continued by silence to the length that the model works at."""
+        ...
+
+    def decode(
+        self, latents: Float[Tensor, "contacts dim frames"], *, samples: int
+    ) -> Float[Tensor, "contacts channels samples"]:
+        """Return the first `samples` samples of the waveforms of latents, float32."""
+        ...
+
+    def embed(self, prompt: str, negative: str | None, *, seconds: float) -> Any:
+        """Return what `denoised` is conditioned on: words for a sound of so many seconds.
+
+        `negative` is what to move away from; None is no words at all.
+        """
+        ...
+
+    def denoised(
+        self,
+        latents: Float[Tensor, "contacts dim frames"],
+        level: Float[Tensor, " contacts"],
+        conditioning: Any,
+        *,
+        guidance: float,
+    ) -> Float[Tensor, "contacts dim frames"]:
+        """Return the clean latents that the model sees in noisy ones, float32 (see the module's text).
+
+        With classifier-free guidance g the estimate is u + g (c - u), c with the words and u with the negative ones.
+        """
+        ...
+
+
+def noised(
+    clean: Float[Tensor, "contacts dim frames"],
+    noise: Float[Tensor, "contacts dim frames"],
+    level: Float[Tensor, " contacts"],
+) -> Float[Tensor, "contacts dim frames"]:
+    """Return cos(a) clean + sin(a) noise, a = pi level / 2."""
+    angle = (0.5 * math.pi * level)[:, None, None]
+    return torch.cos(angle) * clean + torch.sin(angle) * noise
+
+
+def partial_denoising(
+    model: AudioDiffusion,
+    noisy: Float[Tensor, "contacts dim frames"],
+    level: Float[Tensor, " contacts"],
+    conditioning: Any,
+    *,
+    steps: int,
+    guidance: float,
+) -> Float[Tensor, "contacts dim frames"]:
+    """Return clean latents by deterministic (DDIM) steps from `level`, one a contact, down to 0 in equal parts."""
+    clean = noisy
+    for step in range(steps):
+        above, below = level * (1 - step / steps), level * (1 - (step + 1) / steps)
+        angle = (0.5 * math.pi * above)[:, None, None]
+        clean = model.denoised(noisy, above, conditioning, guidance=guidance)
+        noisy = noised(clean, (noisy - torch.cos(angle) * clean) / torch.sin(angle), below)
+    return clean
+
+
+class DecoderDistillation:
+    """A guide towards words (Audio-SDS's decoder variant with partial multi-step denoising)."""
+
+    def __init__(
+        self,
+        model: AudioDiffusion,
+        prompt: str,
+        *,
+        sample_rate: float,
+        negative: str | None = None,
+        guidance: float = 15.0,
+        steps: int = 4,
+        lowest: float = 0.025,
+        highest: float = 0.875,
+        batch: int = 10,
+    ) -> None:
+        """Set a prompt for sounds of `sample_rate` Hz, that of the field.
+
+        `guidance` is how many times the step from the negative words to the prompt is taken (Audio-SDS is said to have
+        gone up to 60), `steps` the partial denoising steps (2 to 10 are usual), `lowest` and `highest` the noise levels
+        drawn between, `batch` how many sounds the model is given at once. Raises `EditError` for an empty prompt and
+        for settings that cannot be meant.
+        """
+        if not prompt.strip():
+            raise EditError('expected a prompt, found an empty one: describe the sound, such as "a wooden bowl is hit"')
+        if not 0 < lowest <= highest < 1:
+            raise EditError(f"noise levels {lowest:g} to {highest:g}: expected 0 < lowest <= highest < 1")
+        for name, count in (("steps", steps), ("batch", batch)):
+            if count < 1:
+                raise EditError(f"{name} = {count}: expected 1 or more")
+        if not (guidance >= 0 and math.isfinite(guidance)):
+            raise EditError(f"guidance = {guidance:g}: expected a number that is not negative, such as 15")
+        self.model, self.prompt, self.negative, self.sample_rate = model, prompt.strip(), negative, sample_rate
+        self.guidance, self.steps, self.lowest, self.highest, self.batch = guidance, steps, lowest, highest, batch
+        self._conditioning: tuple[int, Any] | None = None
+
+    def describe(self) -> dict[str, Any]:
+        """Return what tells it from other guides, as plain values."""
+        return {
+            "prompt": self.prompt,
+            "negative": self.negative,
+            "model": self.model.name,
+            "guidance": self.guidance,
+            "denoising_steps": self.steps,
+            "noise_levels": [self.lowest, self.highest],
+        }
+
+    def start(self, struck: Struck) -> ModalEdit:
+        """Return the field as it is: Audio-SDS starts from the object's own sound."""
+        return ModalEdit.none(struck.bank)
+
+    def targets(
+        self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return what the model makes of rendered sounds, at their own level; a row that it spoils is not finite.
+
+        A batch that does not fit into the GPU's memory is halved, with a warning, and stays so. Raises `EditError`
+        where not even one sound fits, and for sounds too long for the model.
+        """
+        with torch.no_grad():
+            heard = resampled(sounds, sample_rate=self.sample_rate, wanted=self.model.sample_rate)
+            level = self.lowest + (self.highest - self.lowest) * torch.rand(len(sounds), generator=generator)
+            # One seed a sound: what is drawn depends neither on the batch nor on the device.
+            seeds = torch.randint(1 << 62, (len(sounds),), generator=generator).tolist()
+            made: list[Tensor] = []
+            while len(made) < len(sounds):
+                rows = slice(len(made), len(made) + self.batch)
+                try:
+                    made += self._cleaned(heard[rows], level[rows], seeds[rows]).unbind()
+                except torch.OutOfMemoryError as error:
+                    self._halve(error)
+            back = resampled(torch.stack(made), sample_rate=self.model.sample_rate, wanted=self.sample_rate)
+            return levelled(lasting(back.to(sounds), sounds.shape[1]), sounds, sample_rate=self.sample_rate)
+
+    def _cleaned(
+        self, heard: Float[Tensor, "batch heard"], level: Float[Tensor, " batch"], seeds: list[int]
+    ) -> Float[Tensor, "batch heard"]:
+        model, samples = self.model, heard.shape[1]
+        if self._conditioning is None or self._conditioning[0] != samples:
+            words = model.embed(self.prompt, self.negative, seconds=samples / model.sample_rate)
+            self._conditioning = (samples, words)
+        # A model of sound has heard music at full scale, not newtons: the loudest sample becomes .5.
+        peak = heard.abs().amax(dim=1, keepdim=True).clamp_min(torch.finfo(heard.dtype).tiny)
+        waveforms = (0.5 * heard / peak)[:, None].expand(-1, model.channels, -1).to(model.device)
+        latents = model.encode(waveforms)
+        draws = [torch.randn(latents.shape[1:], generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+        level = level.to(latents)
+        clean = partial_denoising(
+            model,
+            noised(latents, torch.stack(draws).to(latents), level),
+            level,
+            self._conditioning[1],
+            steps=self.steps,
+            guidance=self.guidance,
+        )
+        return model.decode(clean, samples=samples).mean(dim=1).float().cpu()
+
+    def _halve(self, error: torch.OutOfMemoryError) -> None:
+        if self.batch == 1:
+            raise EditError(
+                f"{self.model.name} runs out of memory on {self.model.device} with one sound at a time: give it fewer "
+                "seconds to work at, free memory there, or choose the device cpu"
+            ) from error
+        self.batch = max(1, self.batch // 2)
+        if self.model.device.type == "cuda":
+            torch.cuda.empty_cache()
+        warnings.warn(
+            f"{self.model.name} runs out of memory on {self.model.device}: going on with batches of {self.batch}",
+            stacklevel=3,
+        )

@@ -1,0 +1,162 @@
+"""Where Stable Audio's weights are: a folder, the hub's cache, or the hub; and what to do where they are not."""
+
+import json
+import warnings
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import torch
+from torch import nn
+
+from avmsf.errors import EditError
+
+STABLE_AUDIO: Final = "stabilityai/stable-audio-open-1.0"
+"""The model that the paper edits with, by its name on the hub."""
+_CLASS, _INDEX = "StableAudioPipeline", "model_index.json"
+_NETWORKS: Final = ("vae", "text_encoder", "projection_model", "transformer")
+_PARTS: Final = (*_NETWORKS, "tokenizer", "scheduler")
+_PRECONDITIONING: Final = ("precondition_inputs", "precondition_noise", "precondition_outputs")
+_SECONDS = 5.0
+"""How long to wait for the hub's first word."""
+
+
+def load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
+    """Return a `StableAudioPipeline` on the CPU and what it is to be called. Raises `EditError`.
+
+    All but its autoencoder is in `dtype`: in bfloat16 a waveform would have eight bits.
+    """
+    kind = _pipeline_class()
+    folder = Path(source).expanduser()
+    named = not folder.is_dir()
+    if named and not _is_name(source):
+        raise EditError(
+            f"{source}: expected a folder with a {_CLASS}, or a name of the hub such as {STABLE_AUDIO}; found no such "
+            "folder: check the path"
+        )
+    name = str(source) if named else folder.resolve().name
+    folder = _from_hub(kind, name) if named else folder
+    _expect_pipeline(folder)
+    try:
+        with warnings.catch_warnings():
+            # Nothing that a user of this package could mend.
+            warnings.filterwarnings("ignore", message="`torch.nn.utils.weight_norm` is deprecated")
+            pipeline = kind.from_pretrained(folder, local_files_only=True, use_safetensors=True)
+    except Exception as error:  # whatever is wrong with the files, the libraries have their own errors
+        raise EditError(f"{folder}: the pipeline cannot be loaded ({error}): copy the model's files again") from error
+    for part in _NETWORKS:
+        _expect_weights(folder / part, getattr(pipeline, part))
+    for part in _NETWORKS:
+        # By hand, for how a pipeline is told its precision changed between versions of diffusers.
+        getattr(pipeline, part).to(torch.float32 if part == "vae" else dtype)
+    lacking = [each for each in _PRECONDITIONING if not hasattr(pipeline.scheduler, each)]
+    if lacking:
+        raise EditError(
+            f"{folder / 'scheduler'}: expected a scheduler of the EDM family, such as "
+            f"CosineDPMSolverMultistepScheduler, found {type(pipeline.scheduler).__name__}: copy the model's files "
+            "again"
+        )
+    return pipeline, name
+
+
+def _is_name(source: str | Path) -> bool:
+    words = str(source).split("/")
+    return isinstance(source, str) and len(words) == 2 and all(words) and words[0] not in (".", "..", "~")
+
+
+def _from_hub(kind: Any, name: str) -> Path:
+    """Return the folder of a pipeline in the hub's cache, after downloading it where it is not there."""
+    from huggingface_hub import constants
+
+    try:
+        return Path(kind.download(name, local_files_only=True))
+    except Exception:  # not there, or not whole; the client raises whatever it does
+        pass
+    try:
+        if not constants.HF_HUB_OFFLINE:
+            _expect_network(f"{constants.ENDPOINT}/{name}/resolve/main/{_INDEX}")
+        return Path(kind.download(name))
+    except Exception as error:  # the hub's client raises whatever the network beneath it does
+        raise EditError(
+            f"{name}: not in the cache of downloaded models, and it cannot be downloaded ({type(error).__name__}: "
+            f"{_first_line(error)}). Its weights are gated: accept the licence at https://huggingface.co/{name}, make "
+            "a token at https://huggingface.co/settings/tokens and run: hf auth login. Without a network here, run "
+            f"where there is one: hf download {name} --local-dir FOLDER --exclude 'model.*', copy FOLDER here and give "
+            "it in place of the name"
+        ) from error
+
+
+def _expect_network(address: str) -> None:
+    """Ask once, for without a network the hub's client tries again for half a minute."""
+    try:
+        urlopen(Request(address, method="HEAD"), timeout=_SECONDS).close()
+    except HTTPError:
+        # It answers; the client asks again with the user's token.
+        return
+
+
+def _expect_pipeline(folder: Path) -> None:
+    """Raise `EditError` for a folder that holds another model or lacks a part."""
+    index = folder / _INDEX
+    if not index.is_file():
+        found = ", ".join(sorted(each.name for each in folder.iterdir())[:6]) or "nothing"
+        raise EditError(
+            f"{folder}: expected a {_CLASS} as diffusers saves it, with {_INDEX} and the folders {', '.join(_PARTS)}; "
+            f"found {found}: give the folder that holds {_INDEX}"
+        )
+    try:
+        record = json.loads(index.read_text(encoding="utf-8"))
+        found = record["_class_name"]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise EditError(f"{index}: cannot be read as a pipeline's index ({error!r}): copy it again") from error
+    if found != _CLASS:
+        raise EditError(f"{folder}: expected a {_CLASS}, found a {found}: give the folder of a Stable Audio model")
+    lacking = [part for part in _PARTS if not (folder / part).is_dir()]
+    if lacking:
+        raise EditError(f"{folder}: the model lacks its {' and its '.join(lacking)}: copy the missing folders there")
+    bare = [part for part in _NETWORKS if not any((folder / part).glob("*.safetensors"))]
+    if bare:
+        raise EditError(
+            f"{folder}: no weights (*.safetensors) in {' and '.join(bare)}: accept the licence at "
+            f"https://huggingface.co/{STABLE_AUDIO}, run: hf auth login, then: hf download {STABLE_AUDIO} --local-dir "
+            f"{folder} --exclude 'model.*'"
+        )
+
+
+def _expect_weights(folder: Path, network: nn.Module) -> None:
+    """Raise `EditError` where weights are missing in the files: they would have been left random."""
+    from safetensors import safe_open
+
+    there: set[str] = set()
+    for path in sorted(folder.glob("*.safetensors")):
+        with safe_open(path, framework="pt") as file:
+            there |= set(file.keys())
+    held = network.state_dict(keep_vars=True)
+    stored = {held[name].data_ptr() for name in there & held.keys()}
+    # What shares its memory with a weight that is there is another name of it.
+    missing = sorted(name for name, weight in held.items() if name not in there and weight.data_ptr() not in stored)
+    if missing:
+        raise EditError(
+            f"{folder}: lacks {len(missing)} of the model's weights, {missing[0]} among them: it belongs to another "
+            "config.json; copy both from one model"
+        )
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [""])[0][:200].rstrip(".")
+
+
+def _pipeline_class() -> Any:
+    try:
+        from diffusers import StableAudioPipeline
+
+        if find_spec("torchsde") is None:  # the scheduler asks for it late, in words that name no remedy
+            raise ImportError("no module named 'torchsde'")
+    except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
+        raise EditError(
+            f"editing by words needs diffusers, transformers and torchsde, which cannot be imported ({error}): "
+            "pip install 'avmsf[text]', or edit towards a recording, which needs none of them"
+        ) from error
+    return StableAudioPipeline

@@ -1,0 +1,300 @@
+"""Stable Audio's classes with tiny random weights, saved and loaded as a user's folder would be."""
+
+import json
+import math
+import shutil
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from avmsf.errors import EditError
+from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, partial_denoising
+from avmsf.tasks.modaledit import ModalEdit, Struck
+from avmsf.tasks.stableaudio import StableAudio
+from avmsf.tasks.stableaudiofiles import STABLE_AUDIO
+from avmsf.tasks.steer import SteerConfig, steer
+from ringing_field import RATE, ringing_field, sound_of
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    diffusers = pytest.importorskip("diffusers")
+    transformers = pytest.importorskip("transformers")
+    from diffusers import StableAudioPipeline
+
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.nn.utils.weight_norm` is deprecated:FutureWarning")
+FRAMES, STRIDES, DIM = 512, [2, 4], 8
+
+
+@pytest.fixture(autouse=True)
+def offline(monkeypatch) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+
+
+def tiny() -> "StableAudioPipeline":
+    torch.manual_seed(0)
+    words = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", 0.0), ("▁", -2.0)]
+    words += [(letter, -3.0) for letter in "abcdefghijklmnopqrstuvwxyz"]
+    tokenizer = transformers.T5Tokenizer(vocab=words, extra_ids=0, model_max_length=16)
+    text_encoder = transformers.T5EncoderModel(
+        transformers.T5Config(vocab_size=40, d_model=16, d_kv=8, d_ff=16, num_layers=1, num_heads=2)
+    )
+    return StableAudioPipeline(
+        vae=diffusers.AutoencoderOobleck(
+            encoder_hidden_size=DIM,
+            downsampling_ratios=STRIDES,
+            channel_multiples=[1, 2],
+            decoder_channels=DIM,
+            decoder_input_channels=DIM // 2,
+            audio_channels=2,
+            sampling_rate=int(RATE),
+        ),
+        text_encoder=text_encoder,
+        projection_model=diffusers.StableAudioProjectionModel(
+            text_encoder_dim=16, conditioning_dim=16, min_value=0, max_value=32
+        ),
+        tokenizer=tokenizer,
+        transformer=diffusers.StableAudioDiTModel(
+            sample_size=FRAMES,
+            in_channels=DIM // 2,
+            num_layers=1,
+            attention_head_dim=8,
+            num_attention_heads=2,
+            num_key_value_attention_heads=1,
+            out_channels=DIM // 2,
+            cross_attention_dim=16,
+            time_proj_dim=8,
+            global_states_input_dim=32,
+            cross_attention_input_dim=16,
+        ),
+        scheduler=diffusers.CosineDPMSolverMultistepScheduler(),
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    place = tmp_path_factory.mktemp("model") / "tiny-audio"
+    tiny().save_pretrained(place)
+    return place
+
+
+@pytest.fixture(scope="module")
+def model(folder) -> StableAudio:
+    return StableAudio.load(folder, device="cpu")
+
+
+def some_latents(count: int = 2) -> torch.Tensor:
+    return torch.randn(count, DIM // 2, FRAMES, generator=torch.Generator().manual_seed(1))
+
+
+def test_a_folder_is_loaded_and_frozen(model):
+    assert (model.name, model.sample_rate, model.channels) == ("tiny-audio", RATE, 2)
+    assert (model.device.type, model.dtype) == ("cpu", torch.float32)
+    assert isinstance(model, AudioDiffusion)
+    networks = (model.pipeline.vae, model.pipeline.transformer, model.pipeline.text_encoder)
+    assert not any(weight.requires_grad for network in networks for weight in network.parameters())
+
+
+def test_encoding_what_sounds_is_encoding_the_whole_window(model):
+    sounds = torch.randn(2, 2, 1600, generator=torch.Generator().manual_seed(2))
+    found = model.encode(sounds)
+    padded = torch.nn.functional.pad(sounds, (0, FRAMES * 8 - 1600))
+    with torch.no_grad():
+        whole = model.pipeline.vae.encode(padded).latent_dist.mode()
+    assert found.shape == whole.shape
+    # The window's own end is heard by the last frames alone.
+    torch.testing.assert_close(found[:, :, : FRAMES - 60], whole[:, :, : FRAMES - 60], rtol=0, atol=1e-5)
+
+
+def test_decoding_the_beginning_is_the_beginning_of_decoding(model):
+    latents = some_latents()
+    with torch.no_grad():
+        whole = model.pipeline.vae.decode(latents).sample
+    torch.testing.assert_close(model.decode(latents, samples=1001), whole[:, :, :1001], rtol=0, atol=1e-5)
+
+
+def test_the_estimate_is_the_v_prediction_of_the_paper(model):
+    # In the latents cos(a) z + sin(a) noise the network says v, and z = cos(a) noisy - sin(a) v; its time is t itself.
+    latents, level = some_latents(), torch.tensor([0.2, 0.7])
+    conditioning = model.embed("wood", None, seconds=0.4)
+    angle = (0.5 * math.pi * level)[:, None, None]
+    rotary = diffusers.models.embeddings.get_1d_rotary_pos_embed(
+        4, FRAMES + 1, use_real=True, repeat_interleave_real=False
+    )
+    with torch.no_grad():
+        v = model.pipeline.transformer(
+            latents,
+            level,
+            encoder_hidden_states=conditioning.text[1:].expand(2, -1, -1),
+            global_hidden_states=conditioning.times[1:].expand(2, -1, -1),
+            rotary_embedding=rotary,
+            return_dict=False,
+        )[0]
+    found = model.denoised(latents, level, conditioning, guidance=1.0)
+    torch.testing.assert_close(found, torch.cos(angle) * latents - torch.sin(angle) * v, rtol=1e-4, atol=1e-5)
+
+
+def test_guidance_is_linear_in_the_words(model):
+    latents, level = some_latents(), torch.tensor([0.3, 0.6])
+    conditioning = model.embed("glass", None, seconds=0.4)
+    at = [model.denoised(latents, level, conditioning, guidance=each) for each in (0.0, 1.0, 7.0)]
+    torch.testing.assert_close(at[2], at[0] + 7 * (at[1] - at[0]), rtol=1e-3, atol=1e-4)
+    assert float((at[1] - at[0]).abs().max()) > 1e-4
+
+
+def test_deterministic_steps_are_those_of_diffusers_own_solver(model):
+    # Of diffusers' schedulers, this one is deterministic: of first order it takes DDIM's steps. Given our levels, and
+    # this pipeline's reading of the network, it has to arrive where we do.
+    solver = diffusers.EDMDPMSolverMultistepScheduler(sigma_data=1.0, solver_order=1, final_sigmas_type="zero")
+    latents, steps, top = some_latents(1), 5, 0.8
+    conditioning = model.embed("steel", None, seconds=0.4)
+    levels = torch.tensor([top * (1 - step / steps) for step in range(steps)])
+    solver.set_timesteps(steps)
+    solver.sigmas = torch.cat([torch.tan(0.5 * math.pi * levels), torch.zeros(1)])
+    solver.timesteps = solver.precondition_noise(solver.sigmas[:-1])
+    noisy = latents / math.cos(0.5 * math.pi * top)
+    for step in range(steps):
+        angle = 0.5 * math.pi * levels[step]
+        clean = model.denoised(noisy * torch.cos(angle), levels[step : step + 1], conditioning, guidance=3.0)
+        # What this solver makes of its network's word has to be our estimate.
+        sigma = solver.sigmas[step]
+        out = (clean - noisy / (sigma**2 + 1)) / (sigma / (sigma**2 + 1).sqrt())
+        noisy = solver.step(out, solver.timesteps[step], noisy).prev_sample
+    found = partial_denoising(model, latents, torch.tensor([top]), conditioning, steps=steps, guidance=3.0)
+    torch.testing.assert_close(found, noisy, rtol=1e-3, atol=1e-4)
+
+
+def test_words_are_embedded_as_the_pipeline_does(model):
+    plain, against = model.embed("wood", None, seconds=0.4), model.embed("wood", "glass", seconds=0.4)
+    assert not bool(plain.text[0].any())
+    torch.testing.assert_close(against.text[1], plain.text[1])
+    torch.testing.assert_close(against.text[0, :-2], model.embed("glass", None, seconds=0.4).text[1, :-2])
+    assert not torch.allclose(plain.times, model.embed("wood", None, seconds=4.0).times)
+
+
+def test_gradient_reaches_the_modes_and_leaves_the_weights(model):
+    field = ringing_field(seconds=0.2)
+    guide = DecoderDistillation(model, "a wooden bowl", sample_rate=RATE, steps=2)
+    weights = {name: each.clone() for name, each in model.pipeline.transformer.state_dict().items()}
+    weights |= {name: each.clone() for name, each in model.pipeline.vae.state_dict().items()}
+    zero = ModalEdit.none(field.bank)
+    edit = replace(zero, **{name: getattr(zero, name).clone().requires_grad_() for name in vars(zero)})
+    sounds = Struck.at(field, field.gain_field.points, samples=1600).sounds(edit)
+    targets = guide.targets(sounds.detach(), 0, torch.Generator().manual_seed(0))
+    assert not targets.requires_grad
+    (sounds - targets).square().sum().backward()
+    for name, value in vars(edit).items():
+        assert float(value.grad.abs().max()) > 0, name
+    made = steer(field, guide, config=SteerConfig(steps=3, contacts=2, preview_every=0))
+    for before, after in ((field.bank.frequency, made.bank.frequency), (field.bank.damping, made.bank.damping)):
+        assert bool((before != after).all())
+    assert bool((made.gain_field.scale != 1).all())
+    now = {**model.pipeline.transformer.state_dict(), **model.pipeline.vae.state_dict()}
+    assert all(torch.equal(now[name], each) for name, each in weights.items())
+    again = steer(field, guide, config=SteerConfig(steps=3, contacts=2, preview_every=0))
+    assert torch.equal(again.bank.frequency, made.bank.frequency)
+
+
+def test_a_target_that_the_decoder_can_express_is_approached(model, monkeypatch):
+    # Latents of a lower, duller sound are all that this denoiser ever sees: their decoded sound is the target.
+    wanted = sound_of(ringing_field(pitch=0.98, decay=2.0, seconds=0.2))
+    clean = model.encode((0.5 * wanted / wanted.abs().max())[:, None].expand(-1, 2, -1))
+    monkeypatch.setattr(model, "denoised", lambda latents, *_, **__: clean.expand(len(latents), -1, -1))
+    guide, seen = DecoderDistillation(model, "duller", sample_rate=RATE), []
+    steer(
+        ringing_field(seconds=0.2),
+        guide,
+        config=SteerConfig(steps=25, contacts=2, preview_every=0),
+        progress=seen.append,
+    )
+    assert seen[-1].loss < 0.9 * seen[0].loss
+
+
+def test_a_sound_from_words_alone(model):
+    first, again, other = (model.generate("wood", seconds=0.3, seed=seed, steps=3) for seed in (1, 1, 2))
+    assert first.shape == (round(0.3 * RATE),)
+    assert torch.equal(first, again)
+    assert not torch.allclose(first, other)
+    with pytest.raises(EditError, match="expected a prompt"):
+        model.generate(" ", seconds=0.3, seed=0)
+
+
+def test_seconds_bound_the_window(folder):
+    short = StableAudio.load(folder, seconds=0.25, device="cpu")
+    assert short.encode(torch.zeros(1, 2, 1600)).shape[2] == 250
+    with pytest.raises(EditError, match=r"works at 0\.25 s, the sounds last 0\.5 s"):
+        short.encode(torch.zeros(1, 2, 4000))
+    with pytest.raises(EditError, match=r"seconds = 1: expected more than 0 and at most 0\.512"):
+        StableAudio.load(folder, seconds=1.0, device="cpu")
+
+
+def test_bfloat16_keeps_the_autoencoder_exact(folder):
+    rough = StableAudio.load(folder, device="cpu", dtype=torch.bfloat16)
+    assert rough.dtype == torch.bfloat16
+    sounds = torch.randn(1, 2, 800, generator=torch.Generator().manual_seed(2))
+    exact = StableAudio.load(folder, device="cpu")
+    assert torch.equal(rough.encode(sounds), exact.encode(sounds))
+    conditioning = rough.embed("wood", None, seconds=0.1)
+    found = rough.denoised(some_latents(), torch.tensor([0.3, 0.6]), conditioning, guidance=2.0)
+    expected = exact.denoised(
+        some_latents(), torch.tensor([0.3, 0.6]), exact.embed("wood", None, seconds=0.1), guidance=2.0
+    )
+    assert found.dtype == torch.float32
+    assert 1e-5 < float((found - expected).square().mean().sqrt()) < 0.1
+
+
+def test_weights_that_are_not_here(monkeypatch, tmp_path):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(
+        EditError, match=f"accept the licence at https://huggingface.co/{STABLE_AUDIO}, .*hf auth login"
+    ):
+        StableAudio.load()
+    with pytest.raises(EditError, match="found no such folder: check the path"):
+        StableAudio.load(tmp_path / "nowhere")
+
+
+def copied(folder: Path, place: Path) -> Path:
+    return Path(shutil.copytree(folder, place / "copy"))
+
+
+def test_a_folder_of_another_class(folder, tmp_path):
+    place = copied(folder, tmp_path)
+    index = json.loads((place / "model_index.json").read_text())
+    (place / "model_index.json").write_text(json.dumps({**index, "_class_name": "AudioLDM2Pipeline"}))
+    with pytest.raises(EditError, match="expected a StableAudioPipeline, found a AudioLDM2Pipeline"):
+        StableAudio.load(place)
+    (place / "model_index.json").write_text("{")
+    with pytest.raises(EditError, match="cannot be read as a pipeline's index"):
+        StableAudio.load(place)
+    (place / "model_index.json").unlink()
+    with pytest.raises(EditError, match=r"with model_index\.json .*; found projection_model, scheduler, "):
+        StableAudio.load(place)
+
+
+def test_a_folder_without_weights_or_with_a_part_of_them(folder, tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    place = copied(folder, tmp_path)
+    path = place / "transformer" / "diffusion_pytorch_model.safetensors"
+    weights = load_file(path)
+    save_file({name: each for name, each in weights.items() if name != "proj_in.weight"}, path)
+    with pytest.raises(EditError, match=r"lacks 1 of the model's weights, proj_in\.weight|cannot be loaded"):
+        StableAudio.load(place)
+    path.write_bytes(b"broken")
+    with pytest.raises(EditError, match="the pipeline cannot be loaded"):
+        StableAudio.load(place)
+    path.unlink()
+    with pytest.raises(EditError, match=r"no weights .* in transformer: accept the licence"):
+        StableAudio.load(place)
+    shutil.rmtree(place / "vae")
+    with pytest.raises(EditError, match="the model lacks its vae"):
+        StableAudio.load(place)
+
+
+def test_without_the_extra(monkeypatch, folder):
+    monkeypatch.setattr("avmsf.tasks.stableaudiofiles.find_spec", lambda name: None)
+    with pytest.raises(EditError, match=r"pip install 'avmsf\[text\]'"):
+        StableAudio.load(folder)
