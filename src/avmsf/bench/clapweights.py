@@ -1,0 +1,148 @@
+"""Where CLAP's weights come from: the hub or its cache, or a local folder; what else lies there is refused by name."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any, Final
+from urllib.request import Request, urlopen
+
+from torch import nn
+
+from avmsf.errors import EvaluationError
+
+MODELS: Final = ("laion/clap-htsat-unfused", "laion/clap-htsat-fused", "laion/larger_clap_general")
+"""Names under which the hub has networks that fit."""
+_CONFIG, _EXTRACTOR = "config.json", "preprocessor_config.json"
+_EXTRACTORS = (_EXTRACTOR, "processor_config.json")
+"""Either holds the feature extractor's settings; which one depends on the transformers that wrote the folder."""
+_WEIGHTS = ("model.safetensors", "pytorch_model.bin")
+"""Either will do."""
+_SECONDS = 5.0
+"""How long to wait for the hub's first word."""
+
+
+def find_clap(source: str | Path) -> Path:
+    """Return the folder that holds a network: `source` itself, or what the hub has under this name.
+
+    Raises EvaluationError where there is no such folder or model, and where it cannot be downloaded.
+    """
+    folder = Path(source).expanduser()
+    if folder.is_dir():
+        return folder
+    name = str(source)
+    # A name of the hub is an owner and a model; everything else is a path.
+    if not (name.count("/") == 1 and not name.startswith((".", "/", "~")) and all(name.split("/"))):
+        raise EvaluationError(
+            f"{name}: expected a folder that holds a CLAP model, or a name such as {', '.join(MODELS)}; found no such "
+            "folder: check the path"
+        )
+    return _from_hub(name)
+
+
+def transformers_clap(folder: Path) -> tuple[nn.Module, Any, str]:
+    """Load a folder's `ClapModel` and `ClapProcessor`; return them and a digest of what decides embeddings.
+
+    Raises EvaluationError where transformers is missing, and for a folder that holds another model or a part of one.
+    """
+    transformers = _transformers()
+    weights = _expect_clap(folder)
+    try:
+        model, report = transformers.ClapModel.from_pretrained(folder, local_files_only=True, output_loading_info=True)
+        processor = transformers.ClapProcessor.from_pretrained(folder, local_files_only=True)
+    except Exception as error:  # whatever is wrong with a file, transformers and safetensors have their own errors
+        raise EvaluationError(
+            f"{folder}: cannot be loaded as a CLAP model ({error}): copy the model's files again"
+        ) from error
+    # Any weight that is not there would be left random.
+    missing = sorted(name for name in report["missing_keys"] if not name.endswith("position_ids"))
+    if missing:
+        raise EvaluationError(
+            f"{weights}: lacks {len(missing)} of the model's weights, {missing[0]} among them: it belongs to another "
+            f"{_CONFIG}; copy both from one model"
+        )
+    digest = hashlib.sha256()
+    for path in (folder / _CONFIG, *(folder / name for name in _EXTRACTORS if (folder / name).is_file()), weights):
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return model, processor, digest.hexdigest()
+
+
+def _expect_clap(folder: Path) -> Path:
+    """Return the file of a folder's weights. Raises EvaluationError unless it holds a CLAP model."""
+    if (folder / "model_index.json").is_file():
+        kind = _record(folder / "model_index.json").get("_class_name")
+        raise EvaluationError(
+            f"{folder}: expected a CLAP model, found a pipeline of diffusers, {kind}: that one makes sounds, and what "
+            f"judges them is another model, such as {MODELS[0]}"
+        )
+    lacking = [] if (folder / _CONFIG).is_file() else [_CONFIG]
+    if not lacking:
+        kind = _record(folder / _CONFIG).get("model_type")
+        if kind != "clap":
+            raise EvaluationError(f"{folder / _CONFIG}: expected a model of type 'clap' (ClapModel), found {kind!r}")
+    lacking += [
+        " or ".join(each) for each in (_EXTRACTORS, _WEIGHTS) if not any((folder / name).is_file() for name in each)
+    ]
+    if lacking:
+        raise EvaluationError(
+            f"{folder}: expected a CLAP model, found no {' and no '.join(lacking)}: {_how_to_download(MODELS[0])}"
+        )
+    return next(folder / name for name in _WEIGHTS if (folder / name).is_file())
+
+
+def _from_hub(name: str) -> Path:
+    """Return the folder of a model in the hub's cache, after downloading it where it is not there."""
+    _transformers()
+    from huggingface_hub import constants, snapshot_download
+
+    settings = ["*.json", "*.txt"]
+    try:
+        kept = Path(snapshot_download(name, allow_patterns=settings, local_files_only=True))
+        if any((kept / weights).is_file() for weights in _WEIGHTS):
+            return kept
+    except Exception:  # not in the cache: the hub's client has an error of its own for each way of not being there
+        pass
+    try:
+        if not constants.HF_HUB_OFFLINE:
+            # Without a network the hub's client tries again for half a minute; one question tells at once.
+            question = Request(f"{constants.ENDPOINT}/{name}/resolve/main/{_CONFIG}", method="HEAD")
+            urlopen(question, timeout=_SECONDS).close()
+        for weights in _WEIGHTS:
+            folder = Path(snapshot_download(name, allow_patterns=[*settings, weights], etag_timeout=_SECONDS))
+            if (folder / weights).is_file():
+                return folder
+        raise FileNotFoundError(f"it holds neither {' nor '.join(_WEIGHTS)}")
+    except Exception as error:  # the hub's client raises whatever the network beneath it does
+        raise EvaluationError(
+            f"{name}: not in the cache of downloaded models, and it cannot be downloaded ({type(error).__name__}: "
+            f"{error}). {_how_to_download(name)}"
+        ) from error
+
+
+def _how_to_download(name: str) -> str:
+    return (
+        f"Where there is a network, say: hf download {name} --local-dir FOLDER; copy FOLDER here, and give its path in "
+        "place of the name"
+    )
+
+
+def _record(path: Path) -> dict[str, Any]:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise EvaluationError(f"{path}: cannot be read as JSON ({error}): copy it again") from error
+    if not isinstance(record, dict):
+        raise EvaluationError(f"{path}: expected a JSON object, found {type(record).__name__}: copy it again")
+    return record
+
+
+def _transformers() -> Any:
+    try:
+        import transformers
+        from transformers import ClapModel, ClapProcessor  # noqa: F401
+    except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
+        raise EvaluationError(
+            f"the CLAP score needs the package transformers, which cannot be imported ({error}): "
+            "pip install 'avmsf[eval]'"
+        ) from error
+    return transformers

@@ -1,0 +1,118 @@
+"""How well edits reach another material: the paper's protocol, its baselines, and one without words (supplement).
+
+An object of one material is led towards another, by words or by recordings of things of that material, and judged by
+where its modes lie afterwards among those of labelled objects (`avmsf.bench.modespace`), by how far its sounds are from
+the reference's, and, towards words, by the CLAP score. All scores of the object as it was stand beside them.
+"""
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from avmsf.bench.clap import Clap
+from avmsf.bench.editmethods import Edited, EditMethod
+from avmsf.bench.edittasks import EditTask
+from avmsf.bench.metrics import default_fft_sizes
+from avmsf.bench.modespace import MaterialSpace
+from avmsf.errors import EvaluationError
+from avmsf.files import write_whole
+from avmsf.modal.spectra import magnitude_stft
+from avmsf.tasks.clips import lasting, level
+from avmsf.tasks.reference import Reference
+
+
+@dataclass(frozen=True)
+class EditScore:
+    """What one method came to in one task."""
+
+    method: str
+    object: str
+    source: str
+    target: str
+    prompt: str | None
+    seed: int
+    umap: Mapping[str, float]
+    """Distance to the centre of the target's cluster, by the names of the spaces; in UMAP's units."""
+    octaves: Mapping[str, float]
+    """The same without UMAP, in octaves."""
+    spectral: float | None
+    """Mean relative STFT error of the sounds from the nearest clip of the reference, at equal level."""
+    clap: float | None
+    """Mean cosine of the sounds and the prompt."""
+    seconds: float
+    """That the edit took."""
+
+
+def judge(
+    tasks: Sequence[EditTask],
+    methods: Sequence[EditMethod],
+    spaces: Mapping[str, MaterialSpace],
+    *,
+    clap: Clap | None = None,
+    progress: Callable[[EditScore], None] | None = None,
+) -> tuple[EditScore, ...]:
+    """Return every method's scores in every task. An object's field is made beforehand and not counted as time."""
+    scores = []
+    for task in tasks:
+        _ = task.object.sound_field
+        for method in methods:
+            begun = time.perf_counter()
+            made = method.edit(task)
+            seconds = time.perf_counter() - begun
+            said = None
+            if clap is not None and task.prompt is not None:
+                said = float(clap.score(made.sounds, [task.prompt], sample_rate=made.sample_rate).mean())
+            scores.append(
+                EditScore(
+                    method.name,
+                    task.object.name,
+                    task.object.material,
+                    task.target,
+                    task.prompt,
+                    task.seed,
+                    {name: space.distance(made.bank, task.target) for name, space in spaces.items()},
+                    {name: space.plain_distance(made.bank, task.target) for name, space in spaces.items()},
+                    None if task.reference is None else spectral_distance(made, task.reference),
+                    said,
+                    seconds,
+                )
+            )
+            if progress is not None:
+                progress(scores[-1])
+    return tuple(scores)
+
+
+def write_scores(scores: Sequence[EditScore], spaces: Mapping[str, MaterialSpace], path: Path) -> None:
+    """Write scores and the embeddings that they rest on to one JSON file. Raises EvaluationError where it cannot."""
+    record = {
+        "scores": [asdict(score) for score in scores],
+        "spaces": {name: space.record() for name, space in spaces.items()},
+    }
+    text = json.dumps(record, allow_nan=False, indent=1)
+    write_whole(path, lambda place: place.write_text(text, encoding="utf-8"), raising=EvaluationError)
+
+
+def spectral_distance(made: Edited, reference: Reference) -> float:
+    """Return the mean over sounds of the relative STFT error from the nearest clip, all clips at the sound's level.
+
+    Free of level; 0 for a sound that is one of the clips, 1 for silence. Raises EvaluationError for another rate.
+    """
+    if made.sample_rate != reference.sample_rate:
+        raise EvaluationError(
+            f"sounds at {made.sample_rate:g} Hz and a reference at {reference.sample_rate:g} Hz; resample one of them"
+        )
+    clips = lasting(reference.clips, made.sounds.shape[1]).double()
+    heard, wanted = (
+        sounds / level(sounds, sample_rate=made.sample_rate)[:, None] for sounds in (made.sounds.double(), clips)
+    )
+    sizes = default_fft_sizes(made.sample_rate)
+    errors = torch.zeros(len(heard), len(wanted), dtype=torch.float64)
+    for size in sizes:
+        own, aims = (magnitude_stft(sounds, fft_size=size, hop=max(1, size // 4)) for sounds in (heard, wanted))
+        sums = torch.stack([(one - aims).abs().sum(dim=(1, 2)) for one in own])
+        errors += sums / aims.sum(dim=(1, 2)) / len(sizes)
+    return float(errors.amin(dim=1).mean())

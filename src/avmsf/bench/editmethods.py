@@ -1,0 +1,170 @@
+"""Ways to come by an object's sound in another material: the paper's, its baselines, and the laws of elasticity."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.bench.editingobjects import amplitudes_of, heard_modes
+from avmsf.bench.edittasks import EditTask
+from avmsf.capture.audio import Recording
+from avmsf.capture.prepare import prepare
+from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import EvaluationError
+from avmsf.field.soundfield import SoundField
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extract import HighResolution, extract_sounds
+from avmsf.simulate.material import MATERIALS
+from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation
+from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, Parameterisation
+from avmsf.tasks.recast import recast
+from avmsf.tasks.steer import Guide, SteerConfig, steer
+
+
+@dataclass(frozen=True, eq=False)
+class Edited:
+    """What a method made of a task."""
+
+    bank: ModalBank
+    """Modes that are heard."""
+    sounds: Float[Tensor, "contacts samples"]
+    sample_rate: float
+    """Hz."""
+
+
+@runtime_checkable
+class EditMethod(Protocol):
+    """A way to come by the sound of an object in another material."""
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        ...
+
+    def edit(self, task: EditTask) -> Edited:
+        """Return the edited object, or what stands in its place. Raises AvmsfError where it cannot."""
+        ...
+
+
+@dataclass(frozen=True)
+class Untouched:
+    """The object as it was: what an edit has to better."""
+
+    name: str = "before"
+
+    def edit(self, task: EditTask) -> Edited:
+        """Return the object's own sounds."""
+        return heard(task.object.sound_field, task)
+
+
+@dataclass(frozen=True)
+class Recast:
+    """The laws of elasticity with both materials' constants, which neither words nor recordings tell."""
+
+    name: str = "physics"
+
+    def edit(self, task: EditTask) -> Edited:
+        """Return the recast object. Raises EvaluationError for a material without constants."""
+        for material in (task.object.material, task.target):
+            if material not in MATERIALS:
+                raise EvaluationError(f"no constants are known of {material!r}; they are of {', '.join(MATERIALS)}")
+        old, new = MATERIALS[task.object.material], MATERIALS[task.target]
+        return heard(recast(task.object.sound_field, old, new), task)
+
+
+@dataclass(frozen=True, eq=False)
+class Steered:
+    """Descent towards what a guide asks for, in one parameterisation or another."""
+
+    name: str
+    guide: Callable[[EditTask], Guide]
+    parameters: Parameterisation
+    config: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of `SteerConfig` other than the seed, which is the task's."""
+
+    def edit(self, task: EditTask) -> Edited:
+        """Return the steered object."""
+        config = SteerConfig(**{"preview_every": 0, **self.config, "seed": task.seed})
+        return heard(steer(task.object.sound_field, self.guide(task), config=config, parameters=self.parameters), task)
+
+
+@runtime_checkable
+class TextToAudio(Protocol):
+    """A model that makes a sound from words alone."""
+
+    @property
+    def sample_rate(self) -> float:
+        """Hz."""
+        ...
+
+    def generate(self, prompt: str, *, seconds: float, seed: int) -> Float[Tensor, " samples"]:
+        """Return a mono sound."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Generation:
+    """Direct generation (the paper's baseline): no object at all, and the modes extracted from what is made."""
+
+    model: TextToAudio
+    seconds: float = 3.0
+    name: str = "generation"
+
+    def edit(self, task: EditTask) -> Edited:
+        """Return the generated sound from its onset on, and its modes. Raises as preparing and extracting do."""
+        rate = self.model.sample_rate
+        made = self.model.generate(task.words(), seconds=self.seconds, seed=task.seed).double().cpu()
+        recording = Recording(f"generated from {task.words()!r}", made[None].numpy(), rate, "FLOAT")
+        sound = torch.from_numpy(np.array(prepare(recording, CaptureSettings()).sound))[None]
+        modes = extract_sounds(sound, sample_rate=rate, method=HighResolution())
+        bank = heard_modes(modes.bank, torch.complex(modes.gains.double(), modes.quadrature.double()))
+        return Edited(bank, sound.float(), rate)
+
+
+def towards_reference(config: Mapping[str, Any] | None = None) -> tuple[EditMethod, ...]:
+    """Return the methods of the protocol without words: as it was, unconstrained, ours, and the laws of elasticity."""
+    settings = config or {}
+    return (
+        Untouched(),
+        Steered("unconstrained", _reference, INDEPENDENT, settings),
+        Steered("hierarchical", _reference, HIERARCHICAL, settings),
+        Recast(),
+    )
+
+
+def towards_words(
+    model: AudioDiffusion, config: Mapping[str, Any] | None = None, **guidance: Any
+) -> tuple[EditMethod, ...]:
+    """Return the methods of the paper's table: as it was, generation (of a model that can), Audio-SDS, and ours.
+
+    `guidance` are settings of `DecoderDistillation`.
+    """
+
+    def guide(task: EditTask) -> Guide:
+        return DecoderDistillation(model, task.words(), sample_rate=task.object.sound_field.sample_rate, **guidance)
+
+    settings = config or {}
+    generation = (Generation(model),) if isinstance(model, TextToAudio) else ()
+    return (
+        Untouched(),
+        *generation,
+        Steered("audio-sds", guide, INDEPENDENT, settings),
+        Steered("hierarchical", guide, HIERARCHICAL, settings),
+    )
+
+
+def heard(edited: SoundField, task: EditTask) -> Edited:
+    """Return a field's modes and sounds at the task's contacts."""
+    amplitudes = amplitudes_of(edited, task.contacts)
+    bank = heard_modes(edited.bank, amplitudes, sample_rate=edited.sample_rate)
+    return Edited(bank, edited.render(task.contacts), edited.sample_rate)
+
+
+def _reference(task: EditTask) -> Guide:
+    if task.reference is None:
+        raise EvaluationError(f"{task.object.name} towards {task.target}: expected a reference, found none")
+    return task.reference

@@ -1,0 +1,85 @@
+"""What is asked for in the protocol of editing: transitions between materials, words for them, and single edits."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.bench.editingobjects import KnownObject
+from avmsf.errors import EvaluationError
+from avmsf.tasks.reference import Reference
+
+_LISTENED = 8
+"""Contacts at which an edited object is heard."""
+PROMPTS: Mapping[str, tuple[str, str]] = {
+    "wood": ("a single knock on a wooden object, short and dull", "tapping a hollow wooden bowl with a mallet"),
+    "glass": ("a single tap on a wine glass, clear and bright", "a glass bottle is struck once and rings"),
+    "metal": ("a single strike on a metal object, ringing for long", "a hammer hits a metal pan once"),
+    "steel": ("a single strike on a steel object, ringing for long", "a hammer hits a steel pipe once"),
+    "ceramic": ("a single tap on a ceramic cup, a short bright clink", "a porcelain bowl is struck once with a stick"),
+}
+"""Two prompts for each target material. The paper has two a transition and prints none: these are ours."""
+
+
+@dataclass(frozen=True)
+class Transition:
+    """From one material to another."""
+
+    source: str
+    target: str
+
+    @property
+    def prompts(self) -> tuple[str, str]:
+        """Words for the target. Raises EvaluationError for a material that has none here."""
+        if self.target not in PROMPTS:
+            raise EvaluationError(f"there are no prompts for {self.target!r}; there are for {', '.join(PROMPTS)}")
+        return PROMPTS[self.target]
+
+
+RECORDED_TRANSITIONS = (
+    Transition("ceramic", "wood"),
+    Transition("wood", "ceramic"),
+    Transition("wood", "glass"),
+    Transition("glass", "metal"),
+)
+"""Contrasting pairs for the 26 objects. The paper shows the first two and calls the others contrastive: ours."""
+SIMULATED_TRANSITIONS = (Transition("ceramic", "wood"), Transition("glass", "steel"), Transition("wood", "glass"))
+
+
+@dataclass(frozen=True, eq=False)
+class EditTask:
+    """One edit that is asked for."""
+
+    object: KnownObject
+    target: str
+    """Material."""
+    prompt: str | None = None
+    """Words to go by, for methods that do."""
+    reference: Reference | None = None
+    """Sounds to go by, for methods that do; where there are any, the spectral distance is taken from them."""
+    seed: int = 0
+
+    @property
+    def contacts(self) -> Float[Tensor, "contacts 3"]:
+        """Where the object is struck to be heard."""
+        return self.object.impacts.contacts[:_LISTENED]
+
+    def words(self) -> str:
+        """Return the prompt. Raises EvaluationError where there is none."""
+        if self.prompt is None:
+            raise EvaluationError(f"{self.object.name} towards {self.target}: expected a prompt, found none")
+        return self.prompt
+
+
+def prompted_tasks(
+    objects: Sequence[KnownObject], transitions: Sequence[Transition], *, seed: int = 0
+) -> tuple[EditTask, ...]:
+    """Return every object of a transition's source material, with each of the two prompts."""
+    return tuple(
+        EditTask(each, transition.target, prompt=prompt, seed=seed)
+        for transition in transitions
+        for each in objects
+        if each.material == transition.source
+        for prompt in transition.prompts
+    )
