@@ -171,7 +171,7 @@ def _unheard(impacts: Impacts, field: SoundField) -> tuple[Impacts, str]:
 def _gains_words(gains: dict[str, Any]) -> str:
     what = {"attention": "the network's on features: {encoder}", "spline": "splines through {contacts} contacts"}
     what["physics"] = "of {shapes} elastic mode shapes, by {contacts} contacts"
-    return what[gains["kind"]].format(**gains)
+    return what[gains.get("inner", gains["kind"])].format(**gains)
 
 
 def _words(values: dict[str, Any]) -> str:
@@ -187,6 +187,9 @@ def _words(values: dict[str, Any]) -> str:
         f"  gains      {_gains_words(values['gain_field'])}",
         f"  fitted to  {len(values['trained_on'])} recordings",
     ]
+    for edit in report.get("edits", []):
+        told = ", ".join(f"{name} {value}" for name, value in edit.items() if isinstance(value, str | int | float))
+        lines.append(f"  edited     {told}")
     if report.get("validated"):
         held = report.get("validation_spectral", {})
         errors = ", ".join(f"{name} {float(error):.3g}" for name, error in held.items())

@@ -1,0 +1,242 @@
+"""`avmsf edit`: a field in, the field of another material, size, pitch or sound out."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+from jaxtyping import Float
+from rich.table import Table
+from torch import Tensor
+
+from avmsf.bench.editpictures import HeardModes, draw_edit, draw_sound_change
+from avmsf.bench.pictures import save_picture
+from avmsf.cli import INTERRUPTED
+from avmsf.cli.contacts import contacts_at, refuse_far
+from avmsf.cli.editmaterial import MaterialChange
+from avmsf.cli.printing import console, decimals, figure, print_json, say, table
+from avmsf.cli.steering import Steering, beside
+from avmsf.cli.writing import Level, OutputError, expect_writable, write_sound
+from avmsf.errors import EditError
+from avmsf.field.soundfield import SoundField
+from avmsf.field.store import load, save
+from avmsf.tasks.edits import EDITS
+from avmsf.tasks.retune import retune
+
+MODES, SPECTROGRAMS, BEFORE, AFTER = "modes.png", "spectrograms.png", "before.wav", "after.wav"
+"""What the folder of pictures holds."""
+_LISTED = 20
+"""Modes in the table, the loudest."""
+_CANDIDATES = 64
+"""Points of the surface among which the loudest is looked for."""
+_NEAR = 0.02
+"""By which part a mode's frequency may be off the one that it is called by."""
+
+
+@dataclass(frozen=True)
+class Sliders:
+    """Every mode by hand."""
+
+    pitch: float = 1.0
+    """Factor on all frequencies."""
+    decay: float = 1.0
+    """Factor on the times in which modes die away."""
+    brightness: float = 0.0
+    """Tilt of the spectrum about its middle, dB an octave."""
+    mode_db: Annotated[tyro.conf.UseAppendAction[tuple[tuple[float, float], ...]], tyro.conf.arg(metavar="HZ DB")] = ()
+    """Raise the mode of this frequency, as the field has it before the edit, by so many dB; -inf mutes it."""
+
+    @property
+    def asked(self) -> bool:
+        """Whether anything changes."""
+        return (self.pitch, self.decay, self.brightness) != (1.0, 1.0, 0.0) or bool(self.mode_db)
+
+    def apply(self, field: SoundField, *, named: Float[Tensor, " modes"]) -> SoundField:
+        """Return the retuned field; modes are called by the frequencies `named`, Hz."""
+        levels = torch.zeros(len(named), dtype=torch.float64)
+        for frequency, level in self.mode_db:
+            row = int((named - frequency).abs().argmin())
+            if not abs(float(named[row]) - frequency) <= _NEAR * float(named[row]):
+                raise EditError(
+                    f"--mode-db {frequency:g}: no mode is there, the nearest is at {float(named[row]):.5g} Hz; "
+                    "`avmsf show` lists them"
+                )
+            levels[row] += level
+        return retune(field, pitch=self.pitch, decay=self.decay, brightness_db=self.brightness, gains_db=levels)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Give a field another material, size, pitch or decay, or lead it towards words or a recording.
+
+    First the material, then the sliders, then the words or the recording. Where on the object a mode is loud stays, so
+    the edited field renders and locates like any other.
+    """
+
+    field: tyro.conf.Positional[Path]
+    """Field file, as `avmsf fit` writes it."""
+    output: Annotated[Path, tyro.conf.arg(metavar="NEW.safetensors")]
+    """File to write the edited field to."""
+    change: tyro.conf.OmitArgPrefixes[MaterialChange] = dataclasses.field(default_factory=MaterialChange)
+    sliders: tyro.conf.OmitArgPrefixes[Sliders] = dataclasses.field(default_factory=Sliders)
+    steering: tyro.conf.OmitArgPrefixes[Steering] = dataclasses.field(default_factory=Steering)
+    pictures: Path | None = None
+    """Folder for modes.png and spectrograms.png, and to listen, before.wav and after.wav; none without it."""
+    at: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    """Contact of these sounds, metres, on the object as it was; where it is loudest without it."""
+    json: bool = False
+    """Print one JSON object on the standard output, all else on the standard error."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return tyro.cli(Options, prog="avmsf edit", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def run(options: Options) -> int:
+    """Edit, write, and say what came of it; return 130 where Ctrl-C stopped it."""
+    _expect(options)
+    old = load(options.field)
+    contact = _contact(old, options.at)
+    try:
+        new = _edited(options, old)
+    except KeyboardInterrupt:
+        kept = beside(options.output, "checkpoint")
+        where = f"from {kept}, or delete it" if kept.exists() else "from the start"
+        say(f"avmsf edit: interrupted; give the same command again to go on {where}")
+        return INTERRUPTED
+    save(new, options.output)
+    for ending in ("checkpoint", "preview.wav"):
+        beside(options.output, ending).unlink(missing_ok=True)
+    edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
+    before, after = HeardModes.of(old), HeardModes.of(new)
+    screen = console(errors=options.json)
+    screen.print(_table(before, after))
+    for words in _remarks(edits, new):
+        screen.print(words, soft_wrap=True)
+    if options.pictures is not None:
+        _show(options.pictures, (old, contact), (new, options.change.size * contact))
+    screen.print(f"wrote {options.output}", soft_wrap=True)
+    if options.json:
+        print_json(
+            {
+                "field": str(options.field),
+                "output": str(options.output),
+                "capture": new.origin.capture,
+                "edits": edits,
+                "silent_modes": int((~new.audible).sum()),
+                "modes": _rows(before, after),
+            }
+        )
+    return 0
+
+
+def _edited(options: Options, field: SoundField) -> SoundField:
+    named = field.bank.frequency
+    if options.change.asked:
+        field = options.change.apply(field)
+    if options.sliders.asked:
+        field = options.sliders.apply(field, named=named)
+    if options.steering.asked:
+        field = options.steering.apply(field, output=options.output)
+    return field
+
+
+def _expect(options: Options) -> None:
+    """Raise before any work for what cannot be done or written."""
+    options.steering.expect_one()
+    if options.change.old is not None and not options.change.asked:
+        raise EditError("--from is given without anything to lead to: add --material, --size or a constant")
+    if not (options.change.asked or options.sliders.asked or options.steering.asked):
+        raise EditError(
+            "nothing is asked for: give --material, --size or a constant of a material, --pitch, --decay, --brightness "
+            "or --mode-db, --prompt or --like"
+        )
+    expect_writable(options.output)
+    if options.output.exists() and options.field.exists() and options.output.samefile(options.field):
+        raise OutputError(f"{options.output}: is the field itself, which would be lost: name another file")
+    if options.pictures is not None:
+        for name in (MODES, SPECTROGRAMS, BEFORE, AFTER):
+            expect_writable(options.pictures / name)
+
+
+def _contact(field: SoundField, at: tuple[float, float, float] | None) -> Float[Tensor, " 3"]:
+    """Return the place that is listened to: the one that is asked for, or among some the loudest."""
+    if at is not None:
+        chosen = contacts_at([at], metres=1.0)
+        refuse_far(chosen, field)
+        return chosen.places[0].double()
+    points = field.gain_field.points
+    some = points[:: max(1, len(points) // _CANDIDATES)]
+    energy = (field.gains(some).double().square() * field.audible / field.bank.damping).sum(1)
+    return some[int(energy.argmax())].double()
+
+
+def _show(
+    folder: Path, before: tuple[SoundField, Float[Tensor, " 3"]], after: tuple[SoundField, Float[Tensor, " 3"]]
+) -> None:
+    """Write pictures and sounds of both fields at a place each; sounds by one factor, so that levels compare."""
+    old, new = before[0], after[0]
+    name = old.origin.capture or "field"
+    sounds = torch.cat([field.render(place[None]) for field, place in (before, after)])
+    modes = draw_edit(
+        HeardModes.of(old), HeardModes.of(new), sample_rate=old.sample_rate, title=f"modes of {name}, edited"
+    )
+    pictures = {
+        MODES: modes,
+        SPECTROGRAMS: draw_sound_change(*sounds, sample_rate=old.sample_rate, title=f"a blow on {name}, edited"),
+    }
+    for each, picture in pictures.items():
+        save_picture(picture, folder / each)
+    factor = Level("peak", -1.0).factor(sounds)
+    for each, sound in zip((BEFORE, AFTER), sounds, strict=True):
+        write_sound(folder / each, factor * sound, sample_rate=old.sample_rate, coding="float32")
+    for each in (*pictures, BEFORE, AFTER):
+        say(f"wrote {folder / each}")
+
+
+def _rows(before: HeardModes, after: HeardModes) -> list[dict[str, Any]]:
+    """Return what became of each mode, in the field's order."""
+    change = 20.0 * torch.log10(after.size / before.size)
+    columns = (before.frequency, after.frequency, before.t60, after.t60, change)
+    names = ("frequency_before", "frequency_after", "t60_before", "t60_after", "level_change_db")
+    return [
+        {**dict(zip(names, row, strict=True)), "silent": size == 0.0}
+        for *row, size in zip(*(column.tolist() for column in columns), after.size.tolist(), strict=True)
+    ]
+
+
+def _table(before: HeardModes, after: HeardModes) -> Table:
+    loudest = torch.argsort(torch.maximum(before.size, after.size), descending=True)[:_LISTED].sort().values.tolist()
+    rows = _rows(before, after)
+    cells = [
+        [
+            figure(row["frequency_before"], 5),
+            figure(row["frequency_after"], 5),
+            figure(row["t60_before"]),
+            figure(row["t60_after"]),
+            "silent" if row["silent"] else decimals(row["level_change_db"], 1),
+        ]
+        for row in (rows[place] for place in loudest)
+    ]
+    title = f"{len(rows)} modes" if len(rows) <= _LISTED else f"the {_LISTED} loudest of {len(rows)} modes"
+    columns = ["before (Hz)", "after (Hz)", "T60 before (s)", "T60 after (s)", "level (dB)"]
+    return table(f"{title}, before and after", columns, cells, words=0)
+
+
+def _remarks(edits: Sequence[dict[str, Any]], field: SoundField) -> list[str]:
+    """Return what the owner of the field should know, a sentence a line."""
+    words = [f"note: {remark}" for entry in edits for remark in entry.get("remarks", [])]
+    silent = field.bank.frequency[~field.audible].tolist()
+    if silent:
+        words.append(
+            f"note: {len(silent)} of {len(field.bank)} modes lie at or above half the sample rate of "
+            f"{field.sample_rate:g} Hz and are silent, from {min(silent):.4g} Hz to {max(silent):.4g} Hz; an edit that "
+            "lowers them brings them back"
+        )
+    if not bool(field.audible.any()):
+        words.append("note: nothing but noise is left of the sound: edit less")
+    return words

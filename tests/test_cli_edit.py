@@ -1,0 +1,225 @@
+"""`avmsf edit`: from a field file to another, with pictures, sounds and words."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import soundfile
+import torch
+
+from avmsf.cli import main, steering
+from avmsf.cli.edit import parse, run
+from avmsf.errors import AvmsfError
+from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.store import load, save
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.residual import Residual
+from avmsf.simulate.material import CERAMIC, GLASS, WOOD
+from avmsf.tasks.edits import EDITS
+from avmsf.tasks.recast import RATIO_ONLY, rayleigh_damping, recast
+from avmsf.tasks.retune import retune
+from made_fields import FIELDS, places
+
+Streams = pytest.CaptureFixture[str]
+RATE = 8000.0
+PLACES = places(5, seed=3)
+FREQUENCY = torch.tensor([390.0, 850.0, 1300.0, 1360.0, 2300.0], dtype=torch.float64)
+
+
+def ceramic() -> SoundField:
+    """Return a field whose dampings are near to ceramic's."""
+    damping = rayleigh_damping(2 * math.pi * FREQUENCY, CERAMIC) * torch.tensor([1.1, 1.0, 0.9, 1.2, 1.0])
+    bank, phase = ModalBank(FREQUENCY, damping), torch.zeros(5, dtype=torch.float64)
+    return SoundField(bank, FIELDS["spline"](), phase, Residual(torch.full((9,), 1e-6)), RATE, 2400, Origin("plate"))
+
+
+@pytest.fixture
+def field(tmp_path: Path) -> Path:
+    save(ceramic(), tmp_path / "plate.safetensors")
+    return tmp_path / "plate.safetensors"
+
+
+def edited(field: Path, *words: str, name: str = "new") -> SoundField:
+    output = field.with_name(f"{name}.safetensors")
+    assert run(parse([str(field), "--output", str(output), *words])) == 0
+    return load(output)
+
+
+def expect_same(found: SoundField, expected: SoundField) -> None:
+    assert torch.equal(found.bank.frequency, expected.bank.frequency)
+    assert torch.equal(found.bank.damping, expected.bank.damping)
+    assert torch.equal(found.render(PLACES), expected.render(PLACES))
+
+
+def test_a_material_by_its_name_with_pictures_sounds_and_numbers(field: Path, capsys: Streams) -> None:
+    folder = field.parent / "look"
+    words = ["--material", "Wood", "--from", "ceramic", "--size", "2", "--pictures", str(folder), "--json"]
+    new = edited(field, *words)
+    out, err = capsys.readouterr()
+    expect_same(new, recast(ceramic(), CERAMIC, WOOD, size=2.0))
+    told = json.loads(out)
+    assert told["edits"][0]["to"]["name"] == "wood"
+    assert [row["frequency_after"] for row in told["modes"]] == pytest.approx(new.bank.frequency.tolist())
+    assert [row["frequency_before"] for row in told["modes"]] == FREQUENCY.tolist()
+    assert [row["t60_after"] for row in told["modes"]] == pytest.approx((math.log(1000) / new.bank.damping).tolist())
+    change = 20 * torch.log10((new.gains(2 * PLACES) / ceramic().gains(PLACES))[0].abs())
+    assert [row["level_change_db"] for row in told["modes"]] == pytest.approx(change.tolist(), abs=1e-4)
+    assert "Poisson's ratio changes from 0.19 to 0.25" in err
+    for name in ("modes.png", "spectrograms.png"):
+        assert (folder / name).read_bytes().startswith(b"\x89PNG")
+    before, after = (soundfile.read(folder / f"{name}.wav")[0] for name in ("before", "after"))
+    # The loudest place of the old object, and the same one of the new, twice as large; both by one factor.
+    levels = [float(abs(each).max()) for each in (before, after)]
+    assert max(levels) == pytest.approx(10 ** (-1 / 20), rel=1e-6)
+    points = ceramic().gain_field.points[::2].double()
+    ratios = new.render(2 * points).abs().amax(1) / ceramic().render(points).abs().amax(1)
+    assert float((ratios - levels[1] / levels[0]).abs().min()) < 1e-4 * levels[1] / levels[0]
+
+
+def test_constants_stand_in_place_of_the_tables(field: Path) -> None:
+    new = edited(field, "--from", "ceramic", "--young", "1e10", "--beta", "2e-7", "--law", "ratio-only")
+    custom = replace(CERAMIC, young=1e10, beta=2e-7)
+    expect_same(new, recast(ceramic(), CERAMIC, custom, law=RATIO_ONLY))
+    other = edited(field, "--material", "glass", "--from", "ceramic", "--density", "5000", name="other")
+    expect_same(other, recast(ceramic(), CERAMIC, replace(GLASS, density=5000.0)))
+
+
+def test_the_old_material_is_told_by_the_dampings_or_the_last_edit(field: Path, capsys: Streams) -> None:
+    wood = edited(field, "--material", "wood", name="wood")
+    assert wood.origin.report[EDITS][0]["from"]["name"] == "ceramic"
+    assert "taken to be of ceramic: half of its modes have that material's damping within a factor of 1.1" in (
+        capsys.readouterr().err
+    )
+    edited(field.with_name("wood.safetensors"), "--pitch", "1.5", name="high")
+    back = edited(field.with_name("high.safetensors"), "--material", "ceramic", name="back")
+    assert back.origin.report[EDITS][2]["from"]["name"] == "wood"
+    assert "is of wood, which it was recast to before" in capsys.readouterr().err
+    strange = replace(ceramic(), bank=ModalBank(FREQUENCY, FREQUENCY))
+    save(strange, field)
+    with pytest.raises(AvmsfError, match=r"--from is not given, and no material's damping .* nearest, which half of"):
+        edited(field, "--material", "wood")
+
+
+def test_sliders_follow_the_material_and_call_modes_by_their_old_frequencies(field: Path) -> None:
+    sliders = ["--pitch", "1.2", "--decay", "0.5", "--brightness", "3", "--mode-db", "852", "-inf"]
+    new = edited(field, "--material", "wood", "--from", "ceramic", *sliders, "--mode-db", "2300", "6")
+    levels = [0.0, -math.inf, 0.0, 0.0, 6.0]
+    expected = retune(recast(ceramic(), CERAMIC, WOOD), pitch=1.2, decay=0.5, brightness_db=3.0, gains_db=levels)
+    expect_same(new, expected)
+    with pytest.raises(AvmsfError, match="--mode-db 1000: no mode is there, the nearest is at 850 Hz"):
+        edited(field, "--mode-db", "1000", "3")
+
+
+def test_silent_modes_are_said(field: Path, capsys: Streams) -> None:
+    edited(field, "--pitch", "3")
+    said = "note: 2 of 5 modes lie at or above half the sample rate of 8000 Hz and are silent, from 4080 Hz to 6900 Hz"
+    out, _ = capsys.readouterr()
+    assert said in out
+    assert "nothing but noise" not in out
+    edited(field, "--pitch", "30", "--json")
+    out, err = capsys.readouterr()
+    assert "nothing but noise is left of the sound" in err
+    told = json.loads(out)
+    assert told["silent_modes"] == 5
+    assert told["edits"][0]["silent_hertz"] == pytest.approx((30 * FREQUENCY).tolist())
+    assert [row["silent"] for row in told["modes"]] == [True] * 5
+    assert {row["level_change_db"] for row in told["modes"]} == {None}
+
+
+def test_towards_a_recording_and_an_interrupted_edit_goes_on(
+    field: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = retune(ceramic(), pitch=1.3).render(PLACES[:1])[0]
+    soundfile.write(field.with_name("like.wav"), torch.cat([torch.zeros(800), target]).numpy() / 50, int(RATE))
+    words = ["--like", str(field.with_name("like.wav")), "--steps", "4", "--contacts", "2", "--preview-every", "2"]
+    whole = edited(field, *words, "--json", name="whole")
+    told = json.loads(capsys.readouterr().out)
+    assert told["edits"][0]["reference"] == "like.wav"
+    assert float((whole.bank.frequency / FREQUENCY).median()) == pytest.approx(1.3, rel=0.1)
+    shown = steering.SteerBar.show
+
+    def impatient(bar: steering.SteerBar, progress: steering.SteerProgress) -> None:
+        shown(bar, progress)
+        if progress.step == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(steering.SteerBar, "show", impatient)
+    command = [str(field), "--output", str(field.with_name("part.safetensors")), *words]
+    assert run(parse(command)) == 130
+    assert f"again to go on from {field.with_name('part.safetensors.checkpoint')}" in capsys.readouterr().err
+    assert not field.with_name("part.safetensors").exists()
+    preview, rate = soundfile.read(field.with_name("part.safetensors.preview.wav"))
+    assert (len(preview), rate) == (2400, RATE)
+    steps = []
+    monkeypatch.setattr(steering.SteerBar, "show", lambda bar, progress: steps.append(progress.step))
+    expect_same(edited(field, *words, name="part"), whole)
+    assert steps == [3, 4]
+    assert not list(field.parent.glob("*.preview.wav")) + list(field.parent.glob("*.checkpoint"))
+
+
+class Echo:
+    """A model of sound that answers every prompt with the same ring, whatever it is given."""
+
+    name, sample_rate, channels = "echo", RATE, 1
+    device, dtype = torch.device("cpu"), torch.float32
+
+    def __init__(self, answer: torch.Tensor) -> None:
+        self.answer, self.asked = answer, []
+
+    def encode(self, waveforms: torch.Tensor) -> torch.Tensor:
+        return waveforms
+
+    def decode(self, latents: torch.Tensor, *, samples: int) -> torch.Tensor:
+        return latents[..., :samples]
+
+    def embed(self, prompt: str, negative: str | None, *, seconds: float) -> str:
+        self.asked.append((prompt, negative))
+        return prompt
+
+    def denoised(
+        self, latents: torch.Tensor, level: torch.Tensor, conditioning: str, *, guidance: float
+    ) -> torch.Tensor:
+        return self.answer.expand_as(latents)
+
+
+def test_towards_words(field: Path, monkeypatch: pytest.MonkeyPatch, capsys: Streams) -> None:
+    model = Echo(retune(ceramic(), pitch=1.02).render(PLACES[:1])[0])
+    loaded = []
+
+    def load_model(source: str, **settings: object) -> Echo:
+        loaded.append((source, settings))
+        return model
+
+    monkeypatch.setattr(steering.StableAudio, "load", load_model)
+    words = ["--prompt", "a bell", "--negative", "wood", "--model", "here", "--steps", "40", "--contacts", "2"]
+    new = edited(field, *words, "--model-seconds", "1")
+    assert loaded == [("here", {"seconds": 1.0, "device": None})]
+    assert model.asked[0] == ("a bell", "wood")
+    assert new.origin.report[EDITS][0]["prompt"] == "a bell"
+    # The answer is 2 % higher.
+    assert 1.005 < float((new.bank.frequency / FREQUENCY).median()) < 1.035
+    assert "loss" in capsys.readouterr().err
+
+
+def test_what_cannot_be_done_is_said_before_any_work(field: Path, capsys: Streams) -> None:
+    def refused(match: str, *words: str) -> None:
+        with pytest.raises(AvmsfError, match=match):
+            edited(field, *words)
+        assert not field.with_name("new.safetensors").exists()
+
+    refused("nothing is asked for: give --material")
+    refused("--from is given without anything to lead to", "--from", "wood")
+    refused("found both: edit by one, then by the other", "--prompt", "a bell", "--like", "like.wav")
+    refused("--prompt is empty: describe the sound", "--prompt", "  ")
+    refused("no material is called 'cheese'; there are ceramic, glass", "--material", "cheese")
+    refused("young = -1 Pa: expected more than 0", "--from", "ceramic", "--young", "-1")
+    refused(r"size = 0: expected the new object's lengths", "--from", "ceramic", "--size", "0")
+    refused(r"pitch = 0: expected factors above 0", "--pitch", "0")
+    refused("nowhere.wav", "--like", str(field.with_name("nowhere.wav")))
+    refused("steps = 0: expected 1 or more", "--like", "like.wav", "--steps", "0")
+    assert main(["edit", str(field), "--output", str(field), "--pitch", "2"]) == 2
+    assert "is the field itself, which would be lost: name another file" in capsys.readouterr().err
+    far = ["--pitch", "2", "--at", "100", "0", "0"]
+    refused("the contact .* lies .* m outside an object", *far)
