@@ -35,10 +35,23 @@ if TYPE_CHECKING:
     from avmsf.scene.splatconfig import SplatConfig
     from avmsf.scene.symmetry import Symmetries
     from avmsf.scene.symmetrysearch import find_symmetries
+    from avmsf.simulate.material import MATERIALS, Material
+    from avmsf.tasks.distillation import DecoderDistillation
+    from avmsf.tasks.listening import Listener
+    from avmsf.tasks.locate import locate
+    from avmsf.tasks.locator import Locator
+    from avmsf.tasks.materialstatistics import MaterialStatistics
+    from avmsf.tasks.recast import recast
+    from avmsf.tasks.reference import Reference
+    from avmsf.tasks.retune import retune
+    from avmsf.tasks.severalblows import locate_blows
+    from avmsf.tasks.stableaudio import StableAudio
+    from avmsf.tasks.steer import SteerConfig, steer
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "MATERIALS",
     "PAPER",
     "Attention",
     "Automatic",
@@ -46,6 +59,7 @@ __all__ = [
     "Camera",
     "Capture",
     "CaptureSettings",
+    "DecoderDistillation",
     "DinoEncoder",
     "Extraction",
     "FeatureField",
@@ -54,12 +68,19 @@ __all__ = [
     "HighResolution",
     "ImageDescriptors",
     "Impacts",
+    "Listener",
+    "Locator",
+    "Material",
+    "MaterialStatistics",
     "ModalBank",
     "Physics",
+    "Reference",
     "Residual",
     "ShortTime",
     "SoundField",
     "SplatConfig",
+    "StableAudio",
+    "SteerConfig",
     "Surface",
     "Symmetries",
     "ThinPlate",
@@ -73,17 +94,22 @@ __all__ = [
     "lift",
     "load",
     "load_features",
+    "locate",
+    "locate_blows",
     "physics_of",
     "read_capture",
     "read_splats",
     "read_views",
+    "recast",
     "reduce",
     "refine",
     "resize",
+    "retune",
     "save",
     "save_features",
     "splat",
     "split",
+    "steer",
     "suggest",
     "with_positions",
     "write_capture",
@@ -139,6 +165,24 @@ _HOMES = {
     "avmsf.modal.extraction": ("Extraction",),
     "avmsf.modal.residual": ("Residual",),
     "avmsf.pipeline.physics": ("BodyConfig", "physics_of"),
+    "avmsf.tasks.locate": ("locate",),
+    "avmsf.tasks.locator": ("Locator",),
+    "avmsf.tasks.severalblows": ("locate_blows",),
+    "avmsf.tasks.listening": ("Listener",),
+    "avmsf.tasks.recast": ("recast",),
+    "avmsf.tasks.retune": ("retune",),
+    "avmsf.tasks.steer": (
+        "SteerConfig",
+        "steer",
+    ),
+    "avmsf.tasks.reference": ("Reference",),
+    "avmsf.tasks.distillation": ("DecoderDistillation",),
+    "avmsf.tasks.stableaudio": ("StableAudio",),
+    "avmsf.tasks.materialstatistics": ("MaterialStatistics",),
+    "avmsf.simulate.material": (
+        "MATERIALS",
+        "Material",
+    ),
     "avmsf.scene.features": ("FeatureField",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

@@ -20,6 +20,8 @@ VERBS = {
     "reconstruct": "Go all the way from a capture folder to a field: views, Gaussians, features, modes, gains.",
     "view-cloud": "Draw Gaussians or features from all sides: colours, features, clusters, symmetries.",
     "render": "Write the sounds of blows anywhere on the object as wav files.",
+    "locate": "Say where on the object a recorded blow fell, with a heat map and how sure that is.",
+    "edit": "Give a field another material, size, pitch or decay, or lead it towards words or a recording.",
     "suggest": "Say where to strike next: the contacts that lower the expected error of the whole field most.",
     "show": "Say what a field file holds, and draw it.",
     "dataset": "Say what of a dataset is there, object by object, and what is missing.",

@@ -1,0 +1,220 @@
+"""How near located contacts come to true ones, strike by strike, by several methods; and whether regions hold them.
+
+Conventions. Errors are relative to the diagonal of the box around the object's points (`rmed`), once from the true
+contact and once from the nearest of its images under the object's symmetries (`rmed_modulo`), for a symmetric object
+may sound the same at all of them. The methods:
+
+- `random`: a point drawn evenly from the object's, and of it no draw but the expected error;
+- `nearest`: the contact of the training recording whose spectrum is most like the sound's;
+- `cosine`: the point whose gains have the least cosine distance from the sound's (the paper);
+- `posterior`: the likeliest place by all that is known of noise and doubt, with the region that holds the truth with a
+  stated probability.
+
+A recording that the locator refuses counts as a random point, and its row says why.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from avmsf.bench.locatingbaselines import NearestSpectrum, random_distance
+from avmsf.bench.locatingimages import Images
+from avmsf.bench.results import write_json
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import EvaluationError, LocationError
+from avmsf.tasks.contactmap import ContactMap
+from avmsf.tasks.locator import Locator
+
+METHODS = ("random", "nearest", "cosine", "posterior")
+LEVEL = 0.9
+"""Probability of the region whose calibration is judged."""
+
+
+@dataclass(frozen=True)
+class StrikeRow:
+    """One held-out strike by one method."""
+
+    recording: str
+    method: str
+    place: tuple[float, float, float] | None
+    """Where it was located, metres; None where the error is that of a random point."""
+    truth: tuple[float, float, float]
+    rmed: float
+    rmed_modulo: float
+    covered: bool | None = None
+    """Whether the region holds the truth; None for methods that have none."""
+    covered_modulo: bool | None = None
+    """Whether it holds any of its images."""
+    region: float | None = None
+    """The region's part of the surface, 0 to 1."""
+    explained: float | None = None
+    """Part of the sound's energy that the field explains."""
+    refusal: str | None = None
+    """Why the recording could not be located."""
+
+
+@dataclass(frozen=True)
+class LocatingScores:
+    """How well the contacts of one object's held-out strikes were found."""
+
+    name: str
+    """What was judged."""
+    rows: tuple[StrikeRow, ...]
+    """By recording, then in the order of the methods."""
+    diagonal: float
+    """Of the box around the object's points, metres."""
+    scale: float
+    """Size that contact errors are relative to in the ObjectFolder benchmark, metres; the diagonal unless told."""
+    level: float
+    """Probability of the regions."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Seed and settings that decided the figures, as plain values."""
+
+    def figures(self, method: str) -> dict[str, float]:
+        """Return a method's means: `rmed`, `rmed_modulo`, `contact_error` and, of regions, `covered`,
+        `covered_modulo` and `region`. Raises EvaluationError for a method that was not judged."""
+        rows = [row for row in self.rows if row.method == method]
+        if not rows:
+            judged = ", ".join(dict.fromkeys(row.method for row in self.rows))
+            raise EvaluationError(f"{self.name}: no strike was located by {method!r}; judged were {judged}")
+        means = {name: _mean([getattr(row, name) for row in rows]) for name in ("rmed", "rmed_modulo")}
+        means["contact_error"] = means["rmed"] * self.diagonal / self.scale
+        sure = [row for row in rows if row.region is not None]
+        if sure:
+            for name in ("covered", "covered_modulo", "region"):
+                means[name] = _mean([float(getattr(row, name)) for row in sure])
+        return means
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, rows included, and the package's version."""
+        methods = dict.fromkeys(row.method for row in self.rows)
+        means = {method: self.figures(method) for method in methods}
+        return {"version": version("avmsf"), **asdict(self), "means": means}
+
+    def write(self, path: Path) -> None:
+        """Write everything as JSON. Raises EvaluationError where that cannot be."""
+        write_json(path, self.to_dict())
+
+
+def judge_locating(
+    locator: Locator,
+    train: Impacts,
+    test: Impacts,
+    *,
+    name: str,
+    images: Images | None = None,
+    truth: Float[Tensor, "contacts 3"] | None = None,
+    methods: Sequence[str] = METHODS,
+    level: float = LEVEL,
+    scale: float | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> LocatingScores:
+    """Locate every strike of `test` by every method and compare.
+
+    `images` are those of the object's symmetries; `truth` is where the blows fell, metres, where that is known better
+    than by the recordings' table. Raises EvaluationError for unknown methods and sounds at another rate than the
+    field's.
+    """
+    unknown = [method for method in methods if method not in METHODS]
+    if unknown or not methods:
+        raise EvaluationError(f"expected methods of {', '.join(METHODS)}, found {', '.join(unknown) or 'none'}")
+    if test.sample_rate != locator.field.sample_rate:
+        raise EvaluationError(
+            f"{name}: recordings at {test.sample_rate:g} Hz cannot be located by a field of "
+            f"{locator.field.sample_rate:g} Hz: resample them"
+        )
+    if truth is not None and len(truth) != len(test):
+        raise EvaluationError(f"{name}: {len(truth)} true contacts for {len(test)} recordings: give one for each")
+    right = test.contacts if truth is None else truth
+    ground = _Ground(locator.points.double(), Images.none() if images is None else images, level)
+    alike = NearestSpectrum(train)
+    rows: list[StrikeRow] = []
+    for row in sorted(range(len(test)), key=lambda each: test.names[each]):
+        sound, place = test.sounds[row], right[row].double()
+        rows += _located(locator, alike, ground, sound, place, name=test.names[row], methods=methods)
+    size = ground.diagonal
+    return LocatingScores(name, tuple(rows), size, size if scale is None else scale, level, dict(settings or {}))
+
+
+@dataclass(frozen=True, eq=False)
+class _Ground:
+    """An object's points, and what is as right as a true place."""
+
+    points: Float64[Tensor, "points 3"]
+    images: Images
+    level: float
+
+    @property
+    def diagonal(self) -> float:
+        return float((self.points.amax(0) - self.points.amin(0)).norm())
+
+    def errors(self, place: Float64[Tensor, " 3"], truth: Float64[Tensor, " 3"]) -> tuple[float, float]:
+        """Return `rmed` and `rmed_modulo` of a place."""
+        apart = (self.images.at(truth) - place).norm(dim=1)
+        return float((truth - place).norm()) / self.diagonal, float(apart.min()) / self.diagonal
+
+    def random_errors(self, truth: Float64[Tensor, " 3"]) -> tuple[float, float]:
+        """Return what is expected of both for a point drawn evenly."""
+        return (
+            random_distance(self.points, truth[None]) / self.diagonal,
+            random_distance(self.points, self.images.at(truth)) / self.diagonal,
+        )
+
+    def holds(self, region: Bool[Tensor, " points"], place: Float64[Tensor, " 3"]) -> bool:
+        """Return whether the point nearest to a place is in the region."""
+        return bool(region[(self.points - place).norm(dim=1).argmin()])
+
+
+def _located(
+    locator: Locator,
+    alike: NearestSpectrum,
+    ground: _Ground,
+    sound: Float[Tensor, " samples"],
+    truth: Float64[Tensor, " 3"],
+    *,
+    name: str,
+    methods: Sequence[str],
+) -> list[StrikeRow]:
+    """Return one strike's rows."""
+    found: ContactMap | LocationError | None = None
+    if {"cosine", "posterior"} & set(methods):
+        try:
+            found = locator.locate(sound)
+        except LocationError as error:
+            found = error
+    rows = []
+    for method in methods:
+        place: Float64[Tensor, " 3"] | None = None
+        more: dict[str, Any] = {}
+        if method == "nearest":
+            place = alike.place(sound)
+        elif method != "random" and isinstance(found, ContactMap):
+            place = ground.points[int(found.distance.argmin())] if method == "cosine" else found.place.double()
+            more = {"explained": found.explained}
+            more |= _regions(found, ground, truth) if method == "posterior" else {}
+        elif method != "random":
+            more = {"refusal": " ".join(str(found).split())}
+        errors = ground.random_errors(truth) if place is None else ground.errors(place, truth)
+        there = None if place is None else _plain(place)
+        rows.append(StrikeRow(name, method, there, _plain(truth), *errors, **more))
+    return rows
+
+
+def _regions(found: ContactMap, ground: _Ground, truth: Float64[Tensor, " 3"]) -> dict[str, Any]:
+    region = found.region(ground.level)
+    inside = [ground.holds(region, image) for image in ground.images.at(truth)]
+    return {"covered": inside[0], "covered_modulo": any(inside), "region": float(region.double().mean())}
+
+
+def _plain(place: Float64[Tensor, " 3"]) -> tuple[float, float, float]:
+    across, along, up = place.tolist()
+    return across, along, up
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)

@@ -1,0 +1,208 @@
+"""`avmsf locate`: where recorded blows fell, in words, as heat maps and as point clouds."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+
+from avmsf.bench.contactpictures import draw_contact, write_contact_cloud
+from avmsf.bench.pictures import save_picture
+from avmsf.capture import CaptureSettings
+from avmsf.capture.audio import Recording, read_recording
+from avmsf.capture.folder import SETTINGS
+from avmsf.cli.printing import console, figure, print_json, say
+from avmsf.cli.writing import OutputError, expect_writable
+from avmsf.errors import AvmsfError
+from avmsf.field.soundfield import SoundField
+from avmsf.field.store import load
+from avmsf.scene.symmetry import Symmetries
+from avmsf.scene.symmetrysearch import find_symmetries
+from avmsf.tasks.contactmap import ContactMap
+from avmsf.tasks.locate import locate
+from avmsf.tasks.locator import Locator
+from avmsf.tasks.severalblows import locate_blows
+
+UNLOCATED = 2
+"""The exit code where one of several recordings could not be located."""
+_JUDGED = 600
+"""Points of the object in which symmetries are looked for."""
+_CLOSED = 0.02
+"""Part of the surface that may have its counterpart in a hole: a field's points cover their object."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Say where on the object a recorded blow fell, with a heat map and how sure that is.
+
+    Each recording holds one blow, of any force and polarity; with --several, any number of them.
+    """
+
+    field: tyro.conf.Positional[Path]
+    """Field file, as `avmsf fit` writes it."""
+    recordings: tyro.conf.Positional[tuple[Path, ...]]
+    """Recordings of blows on the same object: wav, flac or another format that libsndfile reads."""
+    capture: Path | None = None
+    """Capture folder whose capture.toml says how recordings are read, where these were made like those of the fit."""
+    settings: Path | None = None
+    """A capture.toml to use in place of that folder's own."""
+    several: bool = False
+    """The recordings hold several blows each; every one of them is located."""
+    level: float = 0.9
+    """Probability of the region that is said to hold the contact."""
+    output: Path | None = None
+    """Folder for a heat map and a coloured point cloud of every blow, NAME.png and NAME.ply; none without it."""
+    json: bool = False
+    """Print one JSON object on the standard output, all else on the standard error."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return tyro.cli(Options, prog="avmsf locate", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def run(options: Options) -> int:
+    """Locate, print and draw; return 2 where one of several recordings could not be located."""
+    if not options.recordings:
+        raise OutputError("expected one recording or more after the field, such as HIT.wav")
+    if not 0.0 < options.level < 1.0:
+        raise OutputError(f"--level is {options.level:g}; expected a probability between 0 and 1, such as 0.9")
+    if options.output is not None:
+        expect_writable(options.output / "blow.png")
+    settings = _settings(options)
+    known = _Known(load(options.field))
+    screen = console(errors=options.json)
+    names, found, failures = Counter[str](), list[dict[str, Any]](), list[dict[str, str]]()
+    for path in options.recordings:
+        try:
+            blows = _blows(known, read_recording(path), settings, several=options.several)
+        except AvmsfError as error:
+            if len(options.recordings) == 1:
+                raise
+            failures.append({"recording": str(path), "error": " ".join(str(error).split())})
+            say(f"avmsf locate: {failures[-1]['error']}")
+            continue
+        for seconds, contact in blows:
+            values = _describe(str(path), seconds, contact, known, options.level)
+            screen.print(_words(values), soft_wrap=True)
+            if options.output is not None:
+                values |= _draw(contact, options.output, _name(path, names), values)
+            found.append(values)
+    if options.json:
+        print_json({"field": str(options.field), "blows": found, "failures": failures})
+    return UNLOCATED if failures else 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """A field, and what is asked of it only where it is needed."""
+
+    field: SoundField
+
+    @cached_property
+    def locator(self) -> Locator:
+        return Locator.of(self.field)
+
+    @cached_property
+    def symmetries(self) -> Symmetries | None:
+        """The symmetries of the field's points; None where these are too few to tell."""
+        points = self.field.gain_field.points
+        try:
+            return find_symmetries(points, generator=torch.Generator().manual_seed(0), missing=_CLOSED, limit=_JUDGED)
+        except AvmsfError:
+            return None
+
+
+def _blows(
+    known: _Known, recording: Recording, settings: CaptureSettings | None, *, several: bool
+) -> list[tuple[float | None, ContactMap]]:
+    """Return when the blows of a recording began, seconds, where that tells them apart, and where they fell."""
+    if several:
+        return [*locate_blows(known.field, recording, settings=settings, locator=known.locator)]
+    return [(None, locate(known.field, recording, settings=settings, locator=known.locator))]
+
+
+def _settings(options: Options) -> CaptureSettings | None:
+    """Return how recordings are read. Raises OutputError for a capture folder that is not there."""
+    if options.settings is not None:
+        return CaptureSettings.read(options.settings)
+    if options.capture is None:
+        return None
+    if not options.capture.is_dir():
+        raise OutputError(f"{options.capture}: expected a capture folder, found none: check the name, or leave it out")
+    path = options.capture / SETTINGS
+    return CaptureSettings.read(path) if path.is_file() else None
+
+
+def _describe(name: str, seconds: float | None, contact: ContactMap, known: _Known, level: float) -> dict[str, Any]:
+    """Return all that is found out about a blow, as plain values."""
+    region = contact.region(level)
+    others = contact.counterparts(known.symmetries, level) if len(contact.peaks(level)) > 1 else ()
+    return {
+        "recording": name,
+        "seconds": seconds,
+        "place": contact.place.tolist(),
+        "region": {
+            "level": level,
+            "radius_metres": _radius(contact, level),
+            "share": float(region.double().mean()),
+        },
+        "explained": contact.explained,
+        "modes_explain": contact.modal,
+        "force": contact.force,
+        "cosine": {
+            "place": contact.points[contact.best].tolist(),
+            "distance": float(contact.distance[contact.best]),
+        },
+        "ambiguous": bool(others),
+        "counterparts": [
+            {"place": other.place.tolist(), "probability": other.probability, "words": str(other)} for other in others
+        ],
+        "notes": list(contact.notes),
+    }
+
+
+def _radius(contact: ContactMap, level: float) -> float:
+    """Return how far from the likeliest place the blow fell at most, with a probability of `level`, metres."""
+    apart = (contact.points.double() - contact.place.double()).norm(dim=1)
+    order = torch.argsort(apart, stable=True)
+    reached = torch.cumsum(contact.probability[order], 0) >= level * contact.probability.sum()
+    return float(apart[order][int(reached.double().argmax())])
+
+
+def _words(values: dict[str, Any]) -> str:
+    """Return one line about a blow, and one more for each thing to know besides."""
+    region = values["region"]
+    when = "" if values["seconds"] is None else f" at {values['seconds']:.3f} s"
+    where = ", ".join(f"{value + 0.0:.4f}" for value in values["place"])
+    lines = [
+        f"{values['recording']}{when}: struck at ({where}) m; {100 * region['level']:g} % within "
+        f"{figure(1000 * region['radius_metres'], 2)} mm, {figure(100 * region['share'], 2)} % of the surface; the "
+        f"field explains {100 * values['explained']:.0f} % of the sound"
+    ]
+    if values["ambiguous"]:
+        lines.append("  ambiguous: several places sound about the same")
+    lines += [f"  {other['words']}" for other in values["counterparts"]]
+    return "\n".join([*lines, *(f"  note: {note}" for note in values["notes"])])
+
+
+def _name(path: Path, names: Counter[str]) -> str:
+    """Return what a blow's files are called: the recording's name, numbered from its second blow on."""
+    names[path.stem] += 1
+    return path.stem if names[path.stem] == 1 else f"{path.stem}-{names[path.stem]}"
+
+
+def _draw(contact: ContactMap, folder: Path, name: str, values: dict[str, Any]) -> dict[str, str]:
+    picture, cloud = folder / f"{name}.png", folder / f"{name}.ply"
+    others = [other["place"] for other in values["counterparts"]]
+    marks = torch.tensor(others) if others else None
+    title = f"{values['recording']}: where it was struck"
+    save_picture(draw_contact(contact, title=title, others=marks), picture)
+    write_contact_cloud(contact, cloud)
+    for path in (picture, cloud):
+        say(f"wrote {path}")
+    return {"picture": str(picture), "cloud": str(cloud)}

@@ -1,0 +1,171 @@
+"""How strongly known modes sound in one sound, and how sure that is: least squares in closed form, with its errors.
+
+With B the modes' sines and cosines, sampled, the amplitudes that fit a sound y best are c = G^-1 B' y, G = B' B, and
+noise of variance s^2 in every sample errs them by the covariance s^2 G^-1. Both matrices are known in closed form
+(`avmsf.modal.leastsquares`), so that an answer costs the products B' y alone. A mode's two amplitudes are one complex
+number, sine + i cosine. Modes that the sound is too short to tell apart err together, and strongly: `mixing` turns
+them into mixtures whose errors have nothing to do with one another.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Complex128, Float, Float64, Int64
+from torch import Tensor
+
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.leastsquares import gram, poles_of, project
+from avmsf.modal.residual import Residual
+from avmsf.modal.synthesis import synthesise
+
+_RIDGE = 1e-10
+"""Relative to the Gram matrix's diagonal: two modes that a short sound cannot tell apart share what they explain."""
+_COHERENT = 0.5
+"""Correlation between the errors of two modes from which on they are looked at together."""
+_BAND = 512
+"""Samples of the frames that the noise's power is measured in, at most."""
+_QUIET = 0.25
+"""Part of the bands that count as quiet."""
+
+
+@dataclass(frozen=True, eq=False)
+class Amplitudes:
+    """What a sound has of each mode."""
+
+    values: Complex128[Tensor, " modes"]
+    """Amplitudes of exp(-d t) sin(2 pi f t), and of exp(-d t) cos(2 pi f t) as imaginary part, in the sound's unit."""
+    noise: Float64[Tensor, " modes"]
+    """Variance of the noise per sample near each mode's frequency, as if it were white."""
+    products: Float64[Tensor, " two_modes"]
+    """The sound's inner products with all sines, then with all cosines."""
+    energy: float
+    """Sum of the sound's squares, without what is noise."""
+
+    @property
+    def explained(self) -> float:
+        """Part of the sound's energy that the modes explain, free to sound as strongly as they like."""
+        both = torch.cat([self.values.real, self.values.imag])
+        return self.part(float(both @ self.products))
+
+    def part(self, energy: float) -> float:
+        """Return an energy as part of the sound's, 0 to 1."""
+        return min(1.0, max(0.0, energy / self.energy)) if self.energy > 0 else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Extractor:
+    """All that the amplitudes of modes in sounds of one length need."""
+
+    bank: ModalBank
+    sample_rate: float
+    """Hz."""
+    samples: int
+    gram: Float64[Tensor, "two_modes two_modes"]
+    """Inner products of all sines and cosines."""
+    inverse: Float64[Tensor, "two_modes two_modes"]
+    """Its inverse: the covariance of the amplitudes' errors where the noise has variance one."""
+    mixing: Complex128[Tensor, "modes modes"]
+    """Unitary; `mixing.mH` makes mixtures of amplitudes whose errors are uncorrelated."""
+    spread: Float64[Tensor, " modes"]
+    """Variance of each mixture's error where the noise has variance one."""
+
+    @classmethod
+    def of(cls, bank: ModalBank, *, sample_rate: float, samples: int) -> "Extractor":
+        """Return the extractor of a bank's modes, all below half the sample rate (Hz)."""
+        inner = gram(poles_of(bank, sample_rate), samples, power=0)
+        scale = torch.sqrt(torch.diagonal(inner))
+        ridge = _RIDGE * torch.eye(len(scale), dtype=inner.dtype)
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky(inner / (scale[:, None] * scale) + ridge))
+        inverse = inverse / (scale[:, None] * scale)
+        mixing, spread = _separate(inverse)
+        return cls(bank, sample_rate, samples, inner, inverse, mixing, spread)
+
+    def extract(self, sound: Float[Tensor, " samples"], *, colour: Residual | None) -> Amplitudes:
+        """Return the amplitudes in a sound; `colour` is the noise to expect, of which the shape alone counts.
+
+        Its level is measured in the sound's own quiet bands, and where a band holds more than that which the modes
+        leave over, it is taken to be as noisy as it is. Without `colour` there is no noise.
+        """
+        products, _ = project(sound[None], poles_of(self.bank, self.sample_rate))
+        both = self.inverse @ products[0]
+        values = torch.complex(*both.chunk(2))
+        energy = float(sound.double().square().sum())
+        if colour is None:
+            return Amplitudes(values, torch.zeros_like(self.bank.frequency), products[0], energy)
+        power, quiet = self._noise(sound, values, colour)
+        place = self.bank.frequency / (0.5 * self.sample_rate) * (len(power) - 1)
+        left = place.floor().long().clamp(0, len(power) - 2)
+        noise = torch.lerp(power[left], power[left + 1], place - left)
+        return Amplitudes(values, noise, products[0], max(energy - self.samples * quiet, 0.0))
+
+    def _noise(
+        self, sound: Float[Tensor, " samples"], values: Complex128[Tensor, " modes"], colour: Residual
+    ) -> tuple[Float64[Tensor, " bands"], float]:
+        """Return the noise's power in bands up to half the sample rate, and its mean as the quiet bands have it."""
+        modelled = synthesise(
+            values.real[None],
+            self.bank.frequency,
+            self.bank.damping,
+            samples=self.samples,
+            sample_rate=self.sample_rate,
+            quadrature=values.imag[None],
+        )[0]
+        # Each amplitude takes its share of the noise away.
+        free = self.samples / max(self.samples - 2 * len(self.bank), 0.5 * self.samples)
+        own = free * _band_power(sound.double() - modelled)
+        level = _at(colour.magnitude.double(), len(own)).square()
+        if not bool(level.any()):
+            level = torch.ones_like(own)
+        level = level.clamp_min(1e-6 * float(level.mean()))
+        level = level * torch.quantile(own / level, _QUIET)
+        return torch.maximum(own, level), float(level.mean())
+
+
+def _separate(
+    inverse: Float64[Tensor, "two_modes two_modes"],
+) -> tuple[Complex128[Tensor, "modes modes"], Float64[Tensor, " modes"]]:
+    """Return mixtures of complex amplitudes whose errors are uncorrelated, and the variances of these.
+
+    Only modes that hang together are mixed. What tells sine from cosine in a mode's errors is left out: it is little
+    for a mode that turns more than once before it ends.
+    """
+    modes = len(inverse) // 2
+    sine, cosine = inverse[:modes, :modes], inverse[modes:, modes:]
+    mixed = inverse[modes:, :modes]
+    covariance = torch.complex(sine + cosine, mixed - mixed.T)
+    spread = torch.diagonal(covariance).real.clone()
+    coherence = covariance.abs() / (spread.sqrt()[:, None] * spread.sqrt())
+    mixing = torch.eye(modes, dtype=torch.complex128)
+    for group in _groups(coherence > _COHERENT):
+        values, vectors = torch.linalg.eigh(covariance[group][:, group])
+        spread[group] = values.clamp_min(torch.finfo(torch.float64).tiny)
+        mixing[group[:, None], group[None]] = vectors
+    return mixing, spread
+
+
+def _groups(linked: Tensor) -> list[Int64[Tensor, " group"]]:
+    """Return the rows of each set of two or more that hang together."""
+    left, groups = set(range(len(linked))), []
+    while left:
+        found, new = set[int](), {min(left)}
+        while new:
+            found |= new
+            new = set(torch.nonzero(linked[sorted(new)].any(0)).flatten().tolist()) - found
+        left -= found
+        if len(found) > 1:
+            groups.append(torch.tensor(sorted(found)))
+    return groups
+
+
+def _band_power(sound: Float64[Tensor, " samples"]) -> Float64[Tensor, " bands"]:
+    """Return the power in bands: white noise of variance v gives v."""
+    size = min(_BAND, 2 ** int(math.log2(max(len(sound) // 2, 2))))
+    window = torch.hann_window(size, dtype=torch.float64)
+    frames = sound.unfold(0, size, size // 2) * window
+    return torch.fft.rfft(frames).abs().square().mean(0) / window.square().sum()
+
+
+def _at(values: Float64[Tensor, " bins"], count: int) -> Float64[Tensor, " bands"]:
+    """Return values spread evenly over a band, at `count` evenly spread places of it."""
+    return torch.nn.functional.interpolate(values[None, None], size=count, mode="linear", align_corners=True)[0, 0]

@@ -1,0 +1,139 @@
+"""Where a blow may have fallen: a score and a probability for every point of the surface."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Float64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avmsf.errors import LocationError
+from avmsf.scene.symmetry import Symmetries
+from avmsf.tasks.counterparts import Counterpart, name_counterpart
+
+LEVEL = 0.9
+"""Probability that a credible region holds, where nothing else is asked for."""
+COMPARABLE = 0.25
+"""Part of the likeliest place's probability from which on another place is as good an answer."""
+_NEIGHBOUR_SPACINGS = 2.5
+_NEIGHBOUR_PART = 0.04
+
+
+@dataclass(frozen=True, eq=False)
+class Peak:
+    """A place, as large as it may be, where the blow may have fallen."""
+
+    row: int
+    """Its likeliest point."""
+    place: Float32[Tensor, " 3"]
+    """Where that is, object frame, metres."""
+    probability: float
+    """That the blow fell here: of all points that hang together with this one."""
+    points: Bool[Tensor, " points"]
+    """Which points these are."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactMap:
+    """Scores of all points of a surface for one blow (paper, section Contact Localization, and beyond it)."""
+
+    points: Float32[Tensor, "points 3"]
+    """Object frame, metres."""
+    distance: Float64[Tensor, " points"]
+    """The paper's cosine distance between heard and foretold gains, for a blow of either polarity: 0 where they agree
+    up to a factor, 1 where they have nothing in common."""
+    probability: Float64[Tensor, " points"]
+    """That the blow fell on the part of the surface that a point stands for; sums to one."""
+    explained: float
+    """Part of the sound's energy, without its noise, that a blow at the field's likeliest point explains, 0 to 1."""
+    modal: float
+    """Part of the same energy that the object's modes explain if each may be as strong as it likes, 0 to 1."""
+    force: float = 1.0
+    """Strength of that blow, with its sign, relative to one that sounds as the field renders it."""
+    notes: tuple[str, ...] = field(default=())
+    """What a user should know of the recording, in sentences."""
+
+    @property
+    def best(self) -> int:
+        """Row of the point of least distance: the paper's answer."""
+        return int(torch.argmin(self.distance))
+
+    @property
+    def most_probable(self) -> int:
+        """Row of the most probable point."""
+        return int(torch.argmax(self.probability))
+
+    @property
+    def place(self) -> Float32[Tensor, " 3"]:
+        """Where the most probable point is, object frame, metres."""
+        return self.points[self.most_probable]
+
+    def region(self, level: float = LEVEL) -> Bool[Tensor, " points"]:
+        """Return the smallest set of points that holds the blow with a probability of `level` or more.
+
+        Raises LocationError for a level that is not between 0 and 1.
+        """
+        if not 0.0 < level < 1.0:
+            raise LocationError(f"level = {level:g}: expected a probability between 0 and 1, as .9")
+        order = torch.argsort(self.probability, descending=True, stable=True)
+        before = torch.cumsum(self.probability[order], 0) - self.probability[order]
+        inside = torch.zeros(len(self.points), dtype=torch.bool)
+        inside[order[before < level]] = True
+        return inside
+
+    @cached_property
+    def radius(self) -> float:
+        """Metres up to which two points of a region are taken to be one place.
+
+        Two and a half times the distance between neighbouring points, and no less than 4 % of the object's diagonal.
+        """
+        places = self.points.double().numpy()
+        diagonal = float(np.linalg.norm(np.ptp(places, axis=0)))
+        if len(places) < 2:
+            return diagonal
+        spacing = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
+        return max(_NEIGHBOUR_SPACINGS * spacing, _NEIGHBOUR_PART * diagonal)
+
+    def peaks(self, level: float = LEVEL, *, comparable: float = COMPARABLE) -> tuple[Peak, ...]:
+        """Return the separate places in the credible region, likeliest first, whose probabilities are comparable.
+
+        A place is a set of the region's points that are linked by steps of at most `radius`. Comparable is what has at
+        least that part of the first place's probability. Raises as `region`.
+        """
+        rows = torch.nonzero(self.region(level)).flatten()
+        places = self.points[rows].double().numpy()
+        pairs = cKDTree(places).query_pairs(self.radius, output_type="ndarray")
+        links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(rows), len(rows)))
+        count, labels = connected_components(links, directed=False)
+        found = []
+        for label in range(count):
+            own = rows[torch.from_numpy(labels == label)]
+            row = int(own[torch.argmax(self.probability[own])])
+            members = torch.zeros(len(self.points), dtype=torch.bool)
+            members[own] = True
+            found.append(Peak(row, self.points[row], float(self.probability[own].sum()), members))
+        found.sort(key=lambda peak: (-peak.probability, peak.row))
+        return tuple(peak for peak in found if peak.probability >= comparable * found[0].probability)
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether several separate places are comparably probable."""
+        return len(self.peaks()) > 1
+
+    def counterparts(self, symmetries: Symmetries | None = None, level: float = LEVEL) -> tuple[Counterpart, ...]:
+        """Return the other places that are about as probable as the first, and how the object's symmetries explain it.
+
+        Of the symmetries, that one is named which carries the first place nearest to the other, if nearer than twice
+        `radius`. Empty where the answer is not ambiguous. Raises as `region`.
+        """
+        first, *others = self.peaks(level)
+        return tuple(
+            name_counterpart(
+                first.place, other.place, symmetries, probability=other.probability, tolerance=2.0 * self.radius
+            )
+            for other in others
+        )

@@ -1,0 +1,298 @@
+"""From the sound of a blow to where it fell: the gains heard in it against those that the field foretells."""
+
+from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
+from statistics import NormalDist
+
+import torch
+from jaxtyping import Complex64, Complex128, Float, Float32, Float64
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avmsf.capture.prepare import shortest_allowed
+from avmsf.errors import LocationError
+from avmsf.field.belief import knows_doubt
+from avmsf.field.doubt import LEVEL, widening
+from avmsf.field.soundfield import SoundField
+from avmsf.modal.bank import ModalBank
+from avmsf.tasks.amplitudes import Amplitudes, Extractor
+from avmsf.tasks.contactmap import ContactMap as ContactMap
+from avmsf.tasks.posterior import Force, Foretold, Judgement, judge
+from avmsf.tasks.slack import contacts_of, spread_by
+
+_BATCH = 2048
+"""Points whose gains are asked for at once."""
+_NEIGHBOURS = 8
+"""Of a point, by which it is told how gains vary about it."""
+_PATCH = 1.0 / 9.0
+"""Variance over a square of surface around a point, over the mean square difference from the squares about it."""
+_KEPT_LENGTHS = 8
+"""Lengths of sounds whose equations are kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Locator:
+    """What blows at all points of a field's surface are foretold to sound like, ready for any number of sounds."""
+
+    field: SoundField
+    points: Float32[Tensor, "points 3"]
+    """Object frame, metres."""
+    gains: Complex64[Tensor, "points modes"]
+    """What the field foretells: amplitudes of sines, and of cosines as imaginary part, in the training sounds' unit."""
+    variance: Float32[Tensor, "points modes"]
+    """How wrong these are thought to be: what the field does not know, and how they vary about the point."""
+    dampings: Float32[Tensor, "points modes"] | None
+    """Factors on the modes' dampings, where the field has these vary."""
+    areas: Float64[Tensor, " points"]
+    """What each point stands for, relative."""
+    slack: csr_array | None
+    """Moves probability to the points about, by how far off a field's places are; None where that is nothing."""
+    heeds_residual: bool
+    """Whether gains that could be noise count for less."""
+    lengths: dict[tuple[int, float], "_Length"] = dataclass_field(default_factory=dict, repr=False)
+    """What is known of sounds of lengths met before."""
+
+    @classmethod
+    def of(
+        cls,
+        field: SoundField,
+        *,
+        points: Float[Tensor, "points 3"] | None = None,
+        directions: Float[Tensor, "..."] | None = None,
+        areas: Float[Tensor, "..."] | None = None,
+        use_residual: bool = True,
+    ) -> "Locator":
+        """Return the locator of a field, over the points (metres) of its gains unless others are given.
+
+        `directions`, unit vectors, are those of blows at the points; without them they go straight into the surface.
+        `areas` are how much of the surface each point stands for, in any unit; without them all the same. Without
+        `use_residual` nothing is taken for noise (the paper's ablation). Raises LocationError for points, directions
+        or areas that are none.
+        """
+        places = (field.gain_field.points if points is None else points).detach().cpu()
+        _expect_points(places, directions, areas)
+        gains, variance, dampings = _foretell(field, places, directions)
+        return cls(
+            field,
+            places.float(),
+            gains,
+            variance + _patches(places, gains),
+            dampings,
+            torch.ones(len(places), dtype=torch.float64) if areas is None else areas.detach().cpu().double(),
+            spread_by(places, contacts=contacts_of(field)),
+            use_residual,
+        )
+
+    def locate(
+        self, sound: Float[Tensor, " samples"], *, highest: float | None = None, force: Force | None = None
+    ) -> ContactMap:
+        """Return how well a blow at each point explains a sound that starts at its onset, at the field's rate.
+
+        20 ms and more; what is longer than the training sounds is not heard. Modes above `highest` Hz are left out,
+        for a recording that does not hold them. `force`, where it is known, is in newtons for a field that was fitted
+        to sounds per newton, else relative to an average blow of its training. Fields whose dampings vary with the
+        contact are heard through their mean dampings, and their gains corrected for that. Raises LocationError for
+        sounds that are too short, silent or not finite, and where the modes explain no more than they would of noise.
+        """
+        heard = sound.detach().cpu()[: self.field.samples]
+        self._expect_sound(heard)
+        length = self._length(len(heard), float("inf") if highest is None else highest)
+        amplitudes = length.extractor.extract(heard, colour=self.field.residual if self.heeds_residual else None)
+        values, noise = length.separate(amplitudes)
+        _expect_more_than_noise(values, noise)
+        found = judge(length.foretold, values, noise, force=length.scaled(force))
+        row = int(torch.argmax(found.log_likelihood))
+        explained = length.explained(amplitudes, found, row)
+        probability = torch.softmax(found.trust(explained) * found.log_likelihood + self.areas.log(), 0)
+        if self.slack is not None:
+            probability = torch.from_numpy(self.slack @ probability.numpy())
+        return ContactMap(
+            self.points,
+            length.distance(values, noise),
+            probability,
+            explained,
+            amplitudes.explained,
+            float(found.force[row]) / length.unit,
+        )
+
+    def _expect_sound(self, sound: Float[Tensor, " samples"]) -> None:
+        rate = self.field.sample_rate
+        least = shortest_allowed(rate)
+        if len(sound) < least:
+            raise LocationError(
+                f"the sound is too short: {len(sound)} samples ({len(sound) / rate * 1e3:.3g} ms) from its onset on, "
+                f"expected at least {least}: record the blow until it has died away"
+            )
+        if not bool(torch.isfinite(sound).all()):
+            count = int((~torch.isfinite(sound)).sum())
+            raise LocationError(f"{count} samples of the sound are not finite numbers: export it again")
+        if float(sound.max()) == float(sound.min()):
+            raise LocationError("the sound is silent: record the blow again")
+
+    def _length(self, samples: int, highest: float) -> "_Length":
+        key = (samples, highest)
+        if key not in self.lengths:
+            while len(self.lengths) >= _KEPT_LENGTHS:
+                del self.lengths[next(iter(self.lengths))]
+            self.lengths[key] = _Length.of(self, samples, highest)
+        return self.lengths[key]
+
+
+@dataclass(frozen=True, eq=False)
+class _Length:
+    """What is known of all sounds of one length."""
+
+    extractor: Extractor
+    foretold: Foretold
+    """Of the mixtures of modes that can be told apart, in units of `unit`."""
+    parts: Float32[Tensor, "points two_modes"]
+    """The modes' own gains over their length at each point, sine and cosine in turn."""
+    unit: float
+
+    @classmethod
+    def of(cls, locator: Locator, samples: int, highest: float) -> "_Length":
+        """Return it for the modes up to `highest` Hz."""
+        whole, rate = locator.field.bank, locator.field.sample_rate
+        heard = torch.nonzero(whole.frequency < min(highest, 0.5 * rate)).flatten()
+        if not len(heard):
+            raise LocationError(
+                f"none of the object's {len(whole)} modes lies below {min(highest, 0.5 * rate):g} Hz, the lowest is at "
+                f"{float(whole.frequency.min()):g} Hz: record at a higher sample rate"
+            )
+        bank = ModalBank(whole.frequency[heard].double(), whole.damping[heard].double())
+        extractor = Extractor.of(bank, sample_rate=rate, samples=samples)
+        gains = locator.gains[:, heard]
+        if locator.dampings is not None:
+            gains = gains * _seen_through(bank.damping, locator.dampings[:, heard], samples / rate)
+        unit = float(gains.abs().square().mean().sqrt())
+        if unit == 0.0:
+            raise LocationError("the field is silent at all points: fit it to sounds that are not")
+        gains = gains / unit
+        parts = torch.nn.functional.normalize(torch.view_as_real(gains).flatten(1), dim=1)
+        foretold = _mixed(gains, locator.variance[:, heard] / unit**2, extractor)
+        return cls(extractor, foretold, parts, unit)
+
+    def separate(self, amplitudes: Amplitudes) -> tuple[Complex128[Tensor, " modes"], Float64[Tensor, " modes"]]:
+        """Return the amplitudes of mixtures, and the variances of their independent errors."""
+        mixing = self.extractor.mixing
+        noise = mixing.abs().square().T @ amplitudes.noise
+        # Never quite zero: what is exact in arithmetic is not in float32.
+        least = 1e-10 * float(amplitudes.values.abs().max()) ** 2
+        return mixing.mH @ amplitudes.values, noise * self.extractor.spread + least
+
+    def scaled(self, force: Force | None) -> Force | None:
+        """Return a known force in the unit of the gains here."""
+        return None if force is None else replace(force, expected=force.expected * self.unit)
+
+    def distance(
+        self, values: Complex128[Tensor, " modes"], noise: Float64[Tensor, " modes"]
+    ) -> Float64[Tensor, " points"]:
+        """Return the cosine distance of each point's gains from those heard, of which what may be noise is taken."""
+        power = values.abs().square()
+        kept = ((power - noise) / power.clamp_min(1e-300)).clamp_min(0.0)
+        heard = torch.view_as_real(self.extractor.mixing @ (kept * values)).flatten()
+        heard = torch.nn.functional.normalize(heard, dim=0).float()
+        return (1.0 - (self.parts @ heard).double().abs()).clamp(0.0, 1.0)
+
+    def explained(self, amplitudes: Amplitudes, found: Judgement, row: int) -> float:
+        """Return the part of the sound's energy that a blow at a point explains."""
+        extractor = self.extractor
+        turned = torch.polar(
+            found.force[row].expand(len(extractor.bank)).abs(),
+            2.0 * torch.pi * float(found.shift[row]) * extractor.bank.frequency,
+        )
+        own = extractor.mixing @ self.foretold.gains[row].to(torch.complex128) * turned * found.force[row].sign()
+        both = torch.cat([own.real, own.imag])
+        return amplitudes.part(float(2.0 * both @ amplitudes.products - both @ extractor.gram @ both))
+
+
+def _foretell(
+    sound_field: SoundField, points: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"] | None
+) -> tuple[Complex64[Tensor, "points modes"], Float32[Tensor, "points modes"], Float32[Tensor, "points modes"] | None]:
+    """Return gains, the variance of what the field does not know of them, and factors on dampings."""
+    doubtful = knows_doubt(sound_field) and len(getattr(sound_field.gain_field, "contacts", ())) > 2
+    factor = widening(sound_field) / NormalDist().inv_cdf(0.5 + LEVEL / 2.0) if doubtful else 1.0
+    turned = torch.polar(torch.ones_like(sound_field.phase), sound_field.phase).to(torch.complex64)
+    gains, variances, dampings = [], [], []
+    for rows in torch.split(torch.arange(len(points)), _BATCH):
+        places, along = points[rows], None if directions is None else directions[rows]
+        known = sound_field.known(places, directions=along)
+        ahead = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
+        gains.append(torch.complex(known.mean.float(), ahead.float()) * turned)
+        with torch.no_grad():
+            deviation = sound_field.gain_field.deviation(places, along)
+        variances.append(
+            torch.zeros_like(known.mean.float()) if deviation is None else (factor * deviation).square().sum(2).float()
+        )
+        if known.damping is not None:
+            dampings.append(known.damping.float())
+    return torch.cat(gains), torch.cat(variances), torch.cat(dampings) if dampings else None
+
+
+def _patches(
+    points: Float[Tensor, "points 3"], gains: Complex64[Tensor, "points modes"]
+) -> Float32[Tensor, "points modes"]:
+    """Return the variance of gains over the patch of surface that each point stands for."""
+    count = min(_NEIGHBOURS, len(points) - 1)
+    total = torch.zeros(gains.shape)
+    if count < 1:
+        return total
+    places = points.double().numpy()
+    _, rows = cKDTree(places).query(places, k=count + 1)
+    for near in torch.from_numpy(rows[:, 1:].T.copy()):
+        total += (gains[near] - gains).abs().square()
+    return total * (_PATCH / count)
+
+
+def _seen_through(
+    damping: Float64[Tensor, " modes"], factors: Float32[Tensor, "points modes"], seconds: float
+) -> Float32[Tensor, "points modes"]:
+    """Return the amplitude that a mode of another damping seems to have, looked at with the shared one."""
+    both, own = damping * (1.0 + factors.double()), 2.0 * damping
+    shared = torch.expm1(-both * seconds) / both
+    return (shared / (torch.expm1(-own * seconds) / own)).float()
+
+
+def _mixed(
+    gains: Complex64[Tensor, "points modes"], variance: Float32[Tensor, "points modes"], extractor: Extractor
+) -> Foretold:
+    """Return what is foretold of mixtures of modes."""
+    mixing = extractor.mixing
+    shares = mixing.abs().square()
+    entangled = torch.nonzero(torch.diagonal(shares) < 1.0 - 1e-9).flatten()
+    if len(entangled):
+        inner = mixing[entangled][:, entangled]
+        gains, variance = gains.clone(), variance.clone()
+        gains[:, entangled] = gains[:, entangled] @ inner.conj().to(torch.complex64)
+        variance[:, entangled] = variance[:, entangled] @ inner.abs().square().float()
+    power = gains.abs().square()
+    usual = power.mean(0)
+    usual = usual.clamp_min(1e-8 * float(usual.max()))
+    return Foretold(gains, power, variance, usual, shares.T @ extractor.bank.frequency)
+
+
+def _expect_more_than_noise(values: Complex128[Tensor, " modes"], noise: Float64[Tensor, " modes"]) -> None:
+    """Raise LocationError where the amplitudes are what noise alone would leave."""
+    surplus = values.abs().square() / noise
+    modes = len(values)
+    chance, clear = 1.0 + 5.0 / modes**0.5, 12.0 + float(torch.log(torch.tensor(float(modes))))
+    if float(surplus.mean()) < chance and float(surplus.max()) < clear:
+        raise LocationError(
+            f"the sound is noise: the object's {modes} modes are {float(surplus.mean()):.2g} times as strong in it as "
+            f"chance makes them, and a blow is heard from {chance:.2g} on: record it louder, or in a quieter place"
+        )
+
+
+def _expect_points(
+    points: Float[Tensor, "points 3"],
+    directions: Float[Tensor, "..."] | None,
+    areas: Float[Tensor, "..."] | None,
+) -> None:
+    if not len(points) or not bool(torch.isfinite(points).all()):
+        raise LocationError(f"expected points [points, 3] that are finite, found {len(points)}: give others")
+    if directions is not None and directions.shape != points.shape:
+        raise LocationError(f"{len(directions)} directions do not go with {len(points)} points: give one a point")
+    fit = areas is None or (areas.shape == points.shape[:1] and bool((areas > 0).all() & torch.isfinite(areas).all()))
+    if not fit:
+        raise LocationError(f"expected a positive area for each of {len(points)} points: mend or leave out `areas`")

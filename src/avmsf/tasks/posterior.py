@@ -1,0 +1,246 @@
+"""How likely a blow at each of many points is to have made a sound, whose modes' amplitudes are known in part.
+
+A blow at x of unknown force and polarity s, noticed a little late or early, makes the amplitudes
+
+    c = s a(x) exp(i w t) + e,     E |e|^2 = n + s^2 (v(x) + r^2 b(x)),
+
+one complex number a mode: a(x) is what the field foretells, t the shift of the onset, n the noise of the extraction,
+v(x) what the field itself does not know, and r how wrong fields and blows are beyond that, as part of b(x), the mean of
+the gains' squares at x and over the whole surface. The force has no scale (p(s) = 1 / |s|) unless it is known, and is
+integrated over; t is taken where it fits best; r is unknown as well: every value in `MISFITS` and `BETWEEN` has its
+say as loud as the sound supports it. So a field that foretells the sound to a hair's breadth gives a sharp answer, and
+a rough one a broad answer. What is wrong in one mode is wrong in others too, and modes whose errors hang together tell
+less than their number: where it is the field that errs, the log likelihood counts for a part of itself, and for the
+less the less of the sound the field explains at its best (`INDEPENDENT`).
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Complex64, Complex128, Float32, Float64, Int64
+from torch import Tensor
+
+MISFITS = (0.8, 0.15, 0.03)
+"""How wrong gains may be, relative: what every point is tried with."""
+BETWEEN = (1.6, 0.35, 0.07, 0.015)
+"""More of them, for the points that have a part in the answer."""
+INDEPENDENT = (0.3, 0.75)
+"""What a mode tells where fields err, over what it would tell if every mode erred for itself: of a field that explains
+nothing of a sound even at its best point, and of one that explains all of it. Measured on plates."""
+SHIFT = 5e-4
+"""How far the onset may be off, seconds, either way."""
+SHIFT_DEVIATION = 2e-4
+"""Standard deviation of that, seconds."""
+_COARSE, _FINE = 0.9, 0.3
+"""Radians that the sound's typical frequency turns by between two shifts that are tried, at all points and at those
+looked at closely."""
+_CLOSELY = 2000
+"""Points that are looked at closely: those whose gains look most alike."""
+_MOST_SHIFTS = 201
+_NEGLIGIBLE = 40.0
+"""A point this far below the best in log likelihood has no part in the answer."""
+_TINY = torch.finfo(torch.float32).tiny
+_BATCH = 512
+"""Points judged at once: few enough that what they need stays in a processor's cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Foretold:
+    """What blows at points are foretold to sound like."""
+
+    gains: Complex64[Tensor, "points modes"]
+    power: Float32[Tensor, "points modes"]
+    """Squares of the gains' magnitudes."""
+    variance: Float32[Tensor, "points modes"]
+    """v(x): what the field does not know of the gains."""
+    usual: Float32[Tensor, " modes"]
+    """The gains' squares on the mean over the surface, nowhere zero."""
+    frequency: Float64[Tensor, " modes"]
+    """Hz."""
+
+
+@dataclass(frozen=True, eq=False)
+class Force:
+    """What is known beforehand of a blow's strength."""
+
+    expected: float
+    """In the unit in which a blow of one is as loud as the field renders it."""
+    spread_db: float = 3.0
+    """Standard deviation, dB."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What a sound says of every point."""
+
+    log_likelihood: Float64[Tensor, " points"]
+    """Up to a constant, as if every mode erred for itself."""
+    force: Float64[Tensor, " points"]
+    """The force that fits best, with its sign; 0 at points that were not looked at closely."""
+    shift: Float64[Tensor, " points"]
+    """Seconds by which the sound is best taken to begin after the blow."""
+    noisy: float
+    """Which part of the errors is noise, 0 to 1."""
+
+    def trust(self, explained: float) -> float:
+        """Return what the log likelihood counts for, where the likeliest point explains that part of the sound."""
+        least, most = INDEPENDENT
+        return self.noisy + (1.0 - self.noisy) * (least + (most - least) * explained)
+
+
+def judge(
+    foretold: Foretold,
+    amplitudes: Complex128[Tensor, " modes"],
+    noise: Float64[Tensor, " modes"],
+    *,
+    force: Force | None = None,
+) -> Judgement:
+    """Return what amplitudes, with the variances of their errors, say of each point."""
+    # In units in which the strongest is one, so that float32 holds all squares.
+    unit = float(amplitudes.abs().max())
+    values, errors = amplitudes / unit, (noise / unit**2).float()
+    strength = None if force is None else replace(force, expected=force.expected / unit)
+    trial = _Trial.of(foretold, values, errors, strength)
+    rows = trial.alike(_CLOSELY)
+    found = trial.judge(rows, MISFITS)
+    near = torch.nonzero(found[0] > found[0].max() - _NEGLIGIBLE).flatten()
+    finer = trial.judge(rows[near], BETWEEN)
+    better = finer[0] > found[0][near]
+    found[1][near[better]] = finer[1][better]
+    found[0][near] = torch.logaddexp(found[0][near], finer[0])
+    # The others are no likelier than the least likely of those.
+    count, logs = len(foretold.gains), found[0].double()
+    evidence = torch.full((count,), float(logs.min()), dtype=torch.float64)
+    forces, shifts = torch.zeros(count, dtype=torch.float64), torch.zeros(count, dtype=torch.float64)
+    evidence[rows], forces[rows], shifts[rows] = logs, unit * found[1].double(), found[2]
+    return Judgement(evidence, forces, shifts, trial.noisy)
+
+
+@dataclass(frozen=True, eq=False)
+class _Strengths:
+    """How strong the sound is, and what makes a blow of force one as strong, summed over modes in one measure."""
+
+    sound: Float32[Tensor, ""]
+    power: Float32[Tensor, " points"]
+    variance: Float32[Tensor, " points"]
+    usual: Float32[Tensor, ""]
+
+    @classmethod
+    def of(
+        cls, foretold: Foretold, values: Complex128[Tensor, " modes"], noise: Float32[Tensor, " modes"]
+    ) -> "_Strengths":
+        surplus = (values.abs().square().float() - noise).clamp_min(0.0)
+        level = (surplus.sum() / foretold.usual.sum()).clamp_min(1e-12)
+        weights = 1.0 / (noise + level * foretold.usual)
+        return cls(weights @ surplus, foretold.power @ weights, foretold.variance @ weights, weights @ foretold.usual)
+
+    def forces(self, rows: Int64[Tensor, " rows"], misfit: float) -> Float32[Tensor, " rows"]:
+        """Return the squares of the forces at which blows with their errors are as strong as the sound."""
+        part = 0.5 * misfit**2
+        own = (1.0 + part) * self.power[rows] + self.variance[rows] + part * self.usual
+        return (self.sound / own.clamp_min(_TINY)).clamp(1e-24, 1e24)
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """One sound's amplitudes, in units in which the strongest is one, against what is foretold."""
+
+    foretold: Foretold
+    values: Complex128[Tensor, " modes"]
+    noise: Float32[Tensor, " modes"]
+    weights: Float32[Tensor, " modes"]
+    """One over the errors' variance, roughly: with these the shift is found."""
+    strengths: _Strengths
+    force: Force | None
+    noisy: float
+    """Which part of the errors is noise."""
+
+    @classmethod
+    def of(
+        cls,
+        foretold: Foretold,
+        values: Complex128[Tensor, " modes"],
+        noise: Float32[Tensor, " modes"],
+        force: Force | None,
+    ) -> "_Trial":
+        """Return the trial of amplitudes of which the greatest has magnitude one."""
+        usual, unknown = foretold.usual, foretold.variance.mean(0)
+        level = (values.abs().square().float() - noise).clamp_min(0.0).sum() / (usual + unknown).sum()
+        error = level.clamp_min(1e-12) * (unknown + MISFITS[1] ** 2 * usual)
+        weights = 1.0 / (noise + error)
+        noisy = float((weights * noise).mean())
+        return cls(foretold, values, noise, weights, _Strengths.of(foretold, values, noise), force, noisy)
+
+    def alike(self, count: int) -> Int64[Tensor, " rows"]:
+        """Return the rows, ascending, of the points whose gains match the amplitudes best, whatever the force."""
+        if len(self.foretold.gains) <= count:
+            return torch.arange(len(self.foretold.gains))
+        _, turned = self._turned(_COARSE)
+        match = (torch.view_as_real(self.foretold.gains).flatten(1) @ self._weighted(turned)).abs().amax(1)
+        size = (self.foretold.power @ self.weights).clamp_min(_TINY).sqrt()
+        return torch.sort(torch.topk(match / size, count).indices).values
+
+    def _turned(self, step: float) -> tuple[Float64[Tensor, " shifts"], Complex64[Tensor, "shifts modes"]]:
+        """Return evenly spaced shifts, zero among them, and the amplitudes turned back by each.
+
+        As close as the frequencies of what is heard ask for, which turn by `step` radians from one to the next.
+        """
+        frequency = self.foretold.frequency
+        heard = self.weights.double() * self.values.abs().square()
+        typical = float(((heard * frequency.square()).sum() / heard.sum()).sqrt())
+        count = min(_MOST_SHIFTS, 1 + 2 * math.ceil(SHIFT * 2.0 * math.pi * typical / step))
+        shifts = torch.linspace(-SHIFT, SHIFT, count, dtype=torch.float64)
+        back = torch.polar(torch.ones((), dtype=torch.float64), -2.0 * math.pi * shifts[:, None] * frequency)
+        return shifts, (self.values * back).to(torch.complex64)
+
+    def _weighted(self, turned: Complex64[Tensor, "shifts modes"]) -> Float32[Tensor, "two_modes shifts"]:
+        return torch.view_as_real(turned * self.weights).flatten(1).T.contiguous()
+
+    def judge(
+        self, rows: Int64[Tensor, " rows"], misfits: tuple[float, ...]
+    ) -> tuple[Float32[Tensor, " rows"], Float32[Tensor, " rows"], Float64[Tensor, " rows"]]:
+        """Return the log of the likelihood of points, summed over misfits, the likeliest's force, and the shift."""
+        steps, turned = self._turned(_FINE)
+        prior = -0.5 * (steps / SHIFT_DEVIATION).square()
+        weighted, heard = self._weighted(turned), turned[0].abs().square()
+        evidence, forces, shifts = [], [], []
+        for part in torch.split(rows, _BATCH):
+            gains, power = self.foretold.gains[part], self.foretold.power[part]
+            match = torch.view_as_real(gains).flatten(1) @ weighted
+            gained = match.square() / (power @ self.weights).clamp_min(_TINY)[:, None]
+            chosen = torch.argmax(gained + prior.float(), dim=1)
+            both = torch.view_as_real(gains) * torch.view_as_real(turned[chosen])
+            cross, variance = both[..., 0] + both[..., 1], self.foretold.variance[part]
+            tried = []
+            for misfit in misfits:
+                error = torch.add(variance, power + self.foretold.usual, alpha=0.5 * misfit**2)
+                tried.append(self._weigh(cross, heard, power, error, self.strengths.forces(part, misfit)))
+            found, strength = (torch.stack(each) for each in zip(*tried, strict=True))
+            evidence.append(torch.logsumexp(found, 0) + prior[chosen].float())
+            forces.append(strength.gather(0, found.argmax(0)[None])[0])
+            shifts.append(steps[chosen])
+        return torch.cat(evidence), torch.cat(forces), torch.cat(shifts)
+
+    def _weigh(
+        self,
+        cross: Float32[Tensor, "rows modes"],
+        heard: Float32[Tensor, " modes"],
+        power: Float32[Tensor, "rows modes"],
+        error: Float32[Tensor, "rows modes"],
+        squares: Float32[Tensor, " rows"],
+    ) -> tuple[Float32[Tensor, " rows"], Float32[Tensor, " rows"]]:
+        """Return the log likelihood, the force integrated over, and the force that fits best.
+
+        `squares` are those of the forces that the errors are taken at.
+        """
+        weights = error.mul_(squares[:, None]).add_(self.noise).reciprocal_()
+        match = torch.linalg.vecdot(weights, cross)
+        own = torch.linalg.vecdot(weights, power).clamp_min(_TINY)
+        strength = match / own
+        found = weights.log().sum(1) - weights @ heard + match * strength - 0.5 * own.log()
+        if self.force is None:
+            return found - 0.5 * squares.log(), strength
+        size = strength.abs().clamp_min(_TINY)
+        spread = self.force.spread_db * math.log(10.0) / 20.0
+        return found - size.log() - 0.5 * ((size / self.force.expected).log() / spread).square(), strength

@@ -1,0 +1,144 @@
+"""Several blows in one recording: each is located by what it brought, without what still rings of those before."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import scipy.linalg
+import scipy.signal
+import torch
+from jaxtyping import Float64
+from scipy.fft import irfft, next_fast_len, rfft
+from torch import Tensor
+
+from avmsf.capture.onset import find_onset
+from avmsf.capture.prepare import remove_rumble, shortest_allowed
+from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import CaptureError, LocationError
+from avmsf.field.soundfield import SoundField
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.synthesis import synthesise
+from avmsf.tasks.amplitudes import Extractor
+from avmsf.tasks.contactmap import ContactMap
+from avmsf.tasks.hearing import Sound, as_recording, at_field_rate, describe
+from avmsf.tasks.locator import Locator
+
+_BEFORE = 0.005
+"""Seconds before a blow that are left out of what rang before it: it may begin a little earlier than it is found."""
+_LISTENED = 0.15
+"""Seconds before a blow that say what still rings: what is heard longer ago is farther from what it has become."""
+_ORDER_SECONDS = 0.006
+"""How much of the past foretells the next sample."""
+_SUDDEN, _FAINTEST = 4.0, 0.1
+
+
+def locate_blows(
+    field: SoundField,
+    recording: Sound,
+    *,
+    sample_rate: float | None = None,
+    settings: CaptureSettings | None = None,
+    locator: Locator | None = None,
+) -> list[tuple[float, ContactMap]]:
+    """Return when each blow of a recording begins, seconds, and where it fell, in order.
+
+    Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `hear`; `locator` saves making the
+    field's anew. What rang before a blow is fitted by the object's modes, carried on as they decay, and subtracted.
+    Blows closer than 30 ms are not told apart. Raises LocationError as `hear`, and where no blow can be located.
+    """
+    chosen = CaptureSettings() if settings is None else settings
+    whole = as_recording(recording, field, sample_rate=sample_rate)
+    notes = describe(whole, chosen)
+    try:
+        sound = remove_rumble(
+            whole.response(chosen.response_channel, force_channel=chosen.force_channel), chosen.highpass, whole
+        )
+    except CaptureError as error:
+        raise LocationError(str(error)) from error
+    onsets = find_blows(sound, sample_rate=whole.sample_rate)
+    resampled, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
+    finder = Locator.of(field) if locator is None else locator
+    ratio = len(resampled) / len(sound)
+    starts = [round(onset * ratio) for onset in onsets]
+    found = []
+    refused: list[LocationError] = []
+    for number, (onset, start) in enumerate(zip(onsets, starts, strict=True)):
+        end = starts[number + 1] if number + 1 < len(starts) else len(resampled)
+        own = resampled[start : min(end, start + field.samples)].double()
+        if number:
+            own = own - still_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
+        try:
+            located = finder.locate(own.float(), highest=highest)
+        except LocationError as error:
+            refused.append(error)
+            continue
+        found.append((onset / whole.sample_rate, replace(located, notes=(*notes, *remark, *located.notes))))
+    if not found:
+        raise refused[0]
+    return found
+
+
+def find_blows(sound: Float64[np.ndarray, " frames"], *, sample_rate: float) -> list[int]:
+    """Return the samples at which blows begin, in order, at least 30 ms apart; where none is sudden, the likeliest.
+
+    What rings on follows from its own past, a blow does not. So the sound is foretold linearly from the samples before
+    (the same weights throughout, by its autocorrelation), and a blow is where that fails suddenly: where the error's
+    root mean square over 2 ms is `_SUDDEN` times that of the 25 ms before, and at least `_FAINTEST` of the greatest.
+    """
+    error = _unforetold(sound, round(_ORDER_SECONDS * sample_rate))
+    short, past, apart = (max(4, round(seconds * sample_rate)) for seconds in (0.002, 0.025, 0.03))
+    power = np.concatenate([[0.0], np.cumsum(error**2)])
+    level = np.sqrt((power[short:] - power[:-short]) / short)
+    floor = _FAINTEST * level.max()
+    onsets: list[int] = []
+    place = 0
+    while place < len(level):
+        # The blow's own beginning is no past.
+        begin, end = max(0, place - past), max(0, place - short)
+        if onsets:
+            begin = max(begin, min(onsets[-1] + 2 * short, end - short))
+        before = math.sqrt(max(power[end] - power[begin], 0.0) / (end - begin)) if end - begin >= short else 0.0
+        if level[place] < floor or level[place] < _SUDDEN * before:
+            place += 1
+            continue
+        window = np.abs(error[place : place + 2 * short])
+        onsets.append(place + int(np.argmax(window >= 0.25 * window.max())))
+        place = onsets[-1] + apart
+    least = shortest_allowed(sample_rate)
+    kept = [onset for onset in onsets if len(sound) - onset >= least]
+    return kept or [find_onset(sound, sample_rate=sample_rate)]
+
+
+def _unforetold(sound: Float64[np.ndarray, " frames"], order: int) -> Float64[np.ndarray, " frames"]:
+    """Return what of each sample does not follow from the `order` samples before it."""
+    order = max(8, min(order, len(sound) // 8))
+    size = next_fast_len(len(sound) + order + 1, real=True)
+    correlation = irfft(np.abs(rfft(sound, size)) ** 2, size)[: order + 1]
+    # As if there were noise 70 dB down: without any, the weights follow rounding.
+    correlation[0] *= 1.0 + 1e-7
+    weights = scipy.linalg.solve_toeplitz(correlation[:-1], correlation[1:])
+    foretold = scipy.signal.fftconvolve(sound, weights)[: len(sound) - 1]
+    return sound - np.concatenate([[0.0], foretold])
+
+
+def still_ringing(
+    field: SoundField, sound: Tensor, last: int, start: int, samples: int, *, highest: float | None
+) -> Float64[Tensor, " samples"]:
+    """Return what of the blow that began at sample `last` is heard from sample `start` on, by the object's modes."""
+    rate = field.sample_rate
+    stop = start - min(round(_BEFORE * rate), (start - last) // 4)
+    begin = max(last, stop - round(_LISTENED * rate))
+    heard = torch.nonzero(field.bank.frequency < min(0.5 * rate, highest or 0.5 * rate)).flatten()
+    bank = ModalBank(field.bank.frequency[heard], field.bank.damping[heard])
+    extractor = Extractor.of(bank, sample_rate=rate, samples=stop - begin)
+    values = extractor.extract(sound[begin:stop], colour=None).values
+    seconds = (start - begin) / rate
+    values = values * torch.polar(torch.exp(-bank.damping * seconds), 2.0 * torch.pi * bank.frequency * seconds)
+    return synthesise(
+        values.real[None],
+        bank.frequency,
+        bank.damping,
+        samples=samples,
+        sample_rate=rate,
+        quadrature=values.imag[None],
+    )[0]

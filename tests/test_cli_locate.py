@@ -1,0 +1,191 @@
+"""`avmsf locate`: words, JSON, heat maps and clouds; and what is said of recordings that hold no blow on the object."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+import trimesh
+from torch import Tensor
+
+from avmsf.cli import main
+from avmsf.cli.locate import parse, run
+from avmsf.errors import AvmsfError
+from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.store import save
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.residual import Residual
+from avmsf.modal.synthesis import synthesise
+from avmsf.tasks.locator import Locator
+from made_fields import BANK, spline
+
+Streams = pytest.CaptureFixture[str]
+RATE, SAMPLES = 8000, 4000
+STRUCK, SECOND = 68, 102
+
+
+@dataclass(frozen=True)
+class Place:
+    folder: Path
+    field: str
+    points: Tensor
+    gains: Tensor
+
+    def wav(self, name: str, sound: Tensor, *, rate: int = RATE, peak: float = 0.5) -> str:
+        path = self.folder / name
+        soundfile.write(path, (peak * sound / sound.abs().max()).numpy(), rate, subtype="FLOAT")
+        return str(path)
+
+    def blow(self, row: int, *, before: float = 0.1, bank: ModalBank = BANK, rate: int = RATE) -> Tensor:
+        """Return a blow in faint noise, with some quiet before it."""
+        gains = self.gains[row][None].to(torch.complex128)
+        sound = synthesise(
+            gains.real,
+            bank.frequency,
+            bank.damping,
+            samples=SAMPLES * rate // RATE,
+            sample_rate=float(rate),
+            quadrature=gains.imag,
+        )[0]
+        whole = torch.cat([torch.zeros(round(before * rate), dtype=torch.float64), sound])
+        noise = torch.randn(len(whole), generator=torch.Generator().manual_seed(row), dtype=torch.float64)
+        return whole + 1e-4 * sound.abs().max() * noise
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
+    folder = tmp_path_factory.mktemp("place")
+    zero = torch.zeros(len(BANK), dtype=torch.float64)
+    field = SoundField(BANK, spline(), zero, Residual(torch.full((9,), 1e-3)), float(RATE), SAMPLES, Origin("plate"))
+    save(field, folder / "plate.safetensors")
+    locator = Locator.of(field)
+    return Place(folder, str(folder / "plate.safetensors"), locator.points, locator.gains)
+
+
+def located(words: list[str], capsys: Streams) -> tuple[dict, str]:
+    assert run(parse([*words, "--json"])) == 0
+    out, err = capsys.readouterr()
+    return json.loads(out), err
+
+
+def test_a_blow_is_found_drawn_and_told(place: Place, tmp_path: Path, capsys: Streams) -> None:
+    hit = place.wav("hit.wav", -place.blow(STRUCK))
+    printed, err = located([place.field, hit, "--output", str(tmp_path / "maps")], capsys)
+    (blow,) = printed["blows"]
+    assert blow["place"] == pytest.approx(place.points[STRUCK].tolist(), abs=1e-6)
+    assert blow["recording"] == hit
+    assert blow["explained"] > 0.98
+    assert blow["region"]["level"] == 0.9
+    assert 0.0 < blow["region"]["share"] < 0.2
+    assert f"{hit}: struck at (" in err
+    assert "of the surface; the field explains" in err
+    assert (tmp_path / "maps" / "hit.png").read_bytes().startswith(b"\x89PNG")
+    cloud = trimesh.load(tmp_path / "maps" / "hit.ply")
+    likeliest = int(np.argmax(cloud.metadata["_ply_raw"]["vertex"]["data"]["probability"]))
+    assert cloud.vertices[likeliest] == pytest.approx(blow["place"], abs=1e-6)
+
+
+def test_a_surer_region_is_larger(place: Place, capsys: Streams) -> None:
+    hit = place.wav("sure.wav", place.blow(STRUCK))
+    shares = []
+    for level in ("0.5", "0.999"):
+        printed, _ = located([place.field, hit, "--level", level], capsys)
+        shares.append((printed["blows"][0]["region"]["share"], printed["blows"][0]["region"]["radius_metres"]))
+    assert shares[0][0] < shares[1][0]
+    assert shares[0][1] < shares[1][1]
+
+
+def test_plain_words_go_to_the_standard_output(place: Place, capsys: Streams) -> None:
+    assert run(parse([place.field, place.wav("plain.wav", place.blow(STRUCK))])) == 0
+    out, _ = capsys.readouterr()
+    assert "struck at (" in out
+    assert "% within" in out
+
+
+def test_several_blows_are_told_apart(place: Place, tmp_path: Path, capsys: Streams) -> None:
+    first, second = place.blow(STRUCK, before=0.1), place.blow(SECOND, before=0.4)
+    both = torch.cat([first, torch.zeros(len(second) - len(first), dtype=torch.float64)]) + second
+    two = place.wav("two.wav", both)
+    printed, _ = located([place.field, two, "--several", "--output", str(tmp_path)], capsys)
+    assert [blow["seconds"] for blow in printed["blows"]] == pytest.approx([0.1, 0.4], abs=0.002)
+    for blow, row in zip(printed["blows"], (STRUCK, SECOND), strict=True):
+        assert blow["place"] == pytest.approx(place.points[row].tolist(), abs=0.01)
+    assert {path.name for path in tmp_path.iterdir()} == {"two.png", "two.ply", "two-2.png", "two-2.ply"}
+    alone, err = located([place.field, two], capsys)
+    assert len(alone["blows"]) == 1
+    assert "holds more than one blow" in err
+
+
+def test_another_rate_and_clipping_are_said(place: Place, capsys: Streams) -> None:
+    fast = place.wav("fast.wav", place.blow(STRUCK, rate=16000), rate=16000)
+    printed, err = located([place.field, fast], capsys)
+    assert printed["blows"][0]["place"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
+    assert "note: " in err
+    assert "resampled from 16000 Hz to the field's 8000 Hz" in err
+    loud = place.blow(STRUCK)
+    loud = loud.clamp(-0.4 * loud.abs().max(), 0.4 * loud.abs().max())
+    _, err = located([place.field, place.wav("loud.wav", loud, peak=1.0)], capsys)
+    assert "is clipped" in err
+
+
+def test_recordings_without_a_blow_on_the_object_are_refused(place: Place) -> None:
+    silent = str(place.folder / "silent.wav")
+    soundfile.write(silent, np.zeros(SAMPLES), RATE)
+    with pytest.raises(AvmsfError, match="is silent"):
+        run(parse([place.field, silent]))
+    noise = torch.randn(SAMPLES, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    with pytest.raises(AvmsfError, match="holds no blow"):
+        run(parse([place.field, place.wav("noise.wav", noise)]))
+    other = ModalBank(BANK.frequency * 1.27 + 40.0, BANK.damping)
+    with pytest.raises(AvmsfError, match=r"modes of this object explain \d+ % of the sound"):
+        run(parse([place.field, place.wav("other.wav", place.blow(STRUCK, bank=other))]))
+
+
+def test_one_bad_recording_does_not_cost_the_others(place: Place, capsys: Streams) -> None:
+    silent = str(place.folder / "quiet.wav")
+    soundfile.write(silent, np.zeros(SAMPLES), RATE)
+    hit = place.wav("beside.wav", place.blow(STRUCK))
+    assert run(parse([place.field, silent, hit, "--json"])) == 2
+    out, err = capsys.readouterr()
+    printed = json.loads(out)
+    assert [blow["recording"] for blow in printed["blows"]] == [hit]
+    assert [each["recording"] for each in printed["failures"]] == [silent]
+    assert "is silent" in printed["failures"][0]["error"]
+    assert "is silent" in err
+
+
+def test_a_captures_settings_say_how_recordings_are_read(place: Place, tmp_path: Path, capsys: Streams) -> None:
+    blow = place.blow(STRUCK)
+    noise = torch.randn(len(blow), generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+    path = place.folder / "stereo.wav"
+    soundfile.write(path, torch.stack([0.1 * noise, blow / blow.abs().max()], dim=1).numpy(), RATE, subtype="FLOAT")
+    with pytest.raises(AvmsfError, match="2 different channels"):
+        run(parse([place.field, str(path)]))
+    (tmp_path / "capture.toml").write_text("response_channel = 2\n")
+    printed, _ = located([place.field, str(path), "--capture", str(tmp_path)], capsys)
+    assert printed["blows"][0]["place"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
+    given, _ = located([place.field, str(path), "--settings", str(tmp_path / "capture.toml")], capsys)
+    assert given == printed
+
+
+def test_what_cannot_be_done_is_said_in_one_line(place: Place, tmp_path: Path, capsys: Streams) -> None:
+    hit = place.wav("again.wav", place.blow(STRUCK))
+    (tmp_path / "file").write_text("")
+    wrong = {
+        (place.field,): "expected one recording or more",
+        (place.field, str(tmp_path / "nowhere.wav")): "there is no such file",
+        (place.field, hit, "--level", "1.5"): "--level is 1.5; expected a probability between 0 and 1",
+        (place.field, hit, "--output", str(tmp_path / "file")): "is a file",
+        (place.field, hit, "--capture", str(tmp_path / "nowhere")): "expected a capture folder",
+        (hit, hit): "a file of another kind",
+    }
+    for words, said in wrong.items():
+        try:
+            code = main(["locate", *words])
+        except SystemExit as left:
+            code = int(left.code or 0)
+        assert code == 2
+        assert said in capsys.readouterr().err

@@ -1,0 +1,173 @@
+"""Blows in a stream: found where and when they fell, whatever rings, and whatever blocks the stream comes in."""
+
+from dataclasses import fields
+from functools import cache
+
+import pytest
+import torch
+from torch import Tensor
+
+from avmsf.errors import LocationError
+from avmsf.field.soundfield import Origin, SoundField
+from avmsf.modal.residual import Residual
+from avmsf.modal.synthesis import synthesise
+from avmsf.tasks.listening import Blow, Listener
+from avmsf.tasks.locator import Locator
+from avmsf.tasks.ringing import Ringing
+from made_fields import BANK, spline
+
+RATE = 8000.0
+STRUCK = (68, 60, 102, 8, 107)
+"""Points that are struck one after the other, none of which sounds like another of the field's 150."""
+BEGINS = (1203, 2555, 3400, 4711, 6002)
+"""Their first samples: 106 to 169 ms apart."""
+FORCES = (1.0, -0.6, 2.0, 0.7, -1.0)
+
+
+@cache
+def locator() -> Locator:
+    zero = torch.zeros(len(BANK), dtype=torch.float64)
+    field = SoundField(BANK, spline(), zero, Residual(torch.full((9,), 1e-3)), RATE, 4000, Origin("plate"))
+    return Locator.of(field)
+
+
+@cache
+def stream(*, noise: float = 1e-3) -> Tensor:
+    """Return all blows, each ringing on beneath the following ones, in noise."""
+    gains = locator().gains[list(STRUCK)].to(torch.complex128) * torch.tensor(FORCES, dtype=torch.float64)[:, None]
+    sounds = synthesise(gains.real, BANK.frequency, BANK.damping, samples=4000, sample_rate=RATE, quadrature=gains.imag)
+    total = torch.zeros(BEGINS[-1] + 4000, dtype=torch.float64)
+    for begin, sound in zip(BEGINS, sounds, strict=True):
+        total[begin : begin + 4000] += sound
+    level = noise * float(sounds.abs().max())
+    return total + level * torch.randn(len(total), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+def heard(listener: Listener, sound: Tensor, block: int = 100) -> list[Blow]:
+    return [blow for part in torch.split(sound, block) for blow in listener.hear(part)]
+
+
+def spot(blow: Blow) -> int:
+    return blow.map.most_probable
+
+
+def test_every_blow_is_found_while_earlier_ones_ring() -> None:
+    blows = heard(Listener(locator(), sample_rate=RATE), stream())
+    assert [spot(blow) for blow in blows] == list(STRUCK)
+    # The first swing of a sine stands out of the noise within two samples.
+    assert [round(blow.seconds * RATE) for blow in blows] == pytest.approx(BEGINS, abs=2)
+    # What rings of earlier blows is a tenth and more of a faint one's energy: left in it, less would be explained.
+    assert min(blow.map.explained for blow in blows) > 0.98
+    assert {blow.final for blow in blows} == {True}
+
+
+def test_forces_come_out_with_their_signs() -> None:
+    blows = heard(Listener(locator()), stream())
+    assert [blow.map.force for blow in blows] == pytest.approx(FORCES, rel=0.05)
+
+
+def test_blocks_do_not_matter() -> None:
+    whole = Listener(locator()).hear(stream())
+    generator = torch.Generator().manual_seed(1)
+    lengths, ragged = torch.randint(0, 300, (200,), generator=generator).tolist(), Listener(locator())
+    blows, begin = [], 0
+    for length in [*lengths, len(stream())]:
+        blows += ragged.hear(stream()[begin : begin + length])
+        begin += length
+    assert [blow.seconds for blow in blows] == [blow.seconds for blow in whole]
+    for one, other in zip(blows, whole, strict=True):
+        assert torch.equal(one.map.probability, other.map.probability)
+
+
+def test_the_answer_waits_for_its_window_and_little_more() -> None:
+    for blow in heard(Listener(locator()), stream(), block=80):
+        assert blow.heard == pytest.approx(0.05)
+        # The stream's part of the latency: window, two hops of 2.5 ms and a block of 10 ms. The rest is computing.
+        assert blow.latency >= 0.05
+    tardy = Listener(locator()).hear(stream())
+    assert tardy[0].latency > (len(stream()) - BEGINS[0]) / RATE
+
+
+def test_a_later_answer_rests_on_more() -> None:
+    blows = heard(Listener(locator(), later=0.12), stream(noise=3e-3))
+    first = [blow for blow in blows if not blow.final]
+    final = [blow for blow in blows if blow.final]
+    assert [spot(blow) for blow in final] == list(STRUCK)
+    assert [blow.seconds for blow in final] == [blow.seconds for blow in first]
+    # The second blow was cut short by the third, 106 ms later; the others had their time.
+    assert [blow.heard for blow in final] == pytest.approx([0.12, 0.104, 0.12, 0.12, 0.12], abs=0.006)
+
+
+def test_nothing_grows_with_time() -> None:
+    listener = Listener(locator(), later=0.2)
+    sizes = []
+    for _ in range(3):
+        heard(listener, stream())
+        parts = [getattr(listener.ears, each.name) for each in fields(listener.ears)]
+        sizes.append([part.numel() for part in parts if isinstance(part, Tensor) and part is not listener.ears.rest])
+    assert sizes[0] == sizes[1] == sizes[2]
+    assert len(listener.ears.rest) < listener.hop
+    assert listener.ears.clock + len(listener.ears.rest) == 3 * len(stream())
+
+
+def test_an_offset_and_rumble_are_not_heard() -> None:
+    times = torch.arange(len(stream()), dtype=torch.float64) / RATE
+    loudest = float(stream().abs().max())
+    disturbed = stream() + 0.5 * loudest + 0.2 * loudest * torch.sin(2 * torch.pi * 1.5 * times)
+    blows = heard(Listener(locator()), disturbed)
+    # The filter starts with the stream, and its own start is a jump; it is over before the first blow.
+    found = [spot(blow) for blow in blows if blow.seconds > 0.1]
+    assert found == list(STRUCK)
+
+
+def test_noise_alone_is_no_blow() -> None:
+    listener = Listener(locator())
+    noise = torch.randn(16000, generator=torch.Generator().manual_seed(2))
+    assert heard(listener, noise) == []
+    assert listener.ears.strangers == 0
+
+
+def test_what_does_not_belong_to_the_object_is_counted_and_the_next_blow_found() -> None:
+    listener = Listener(locator())
+    burst = torch.zeros(800, dtype=torch.float64)
+    burst[200:480] = torch.randn(280, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    first = heard(listener, 1e-4 * torch.randn(800, dtype=torch.float64, generator=torch.Generator().manual_seed(4)))
+    foreign = heard(listener, 10 * burst)
+    assert first == []
+    assert listener.ears.strangers + len(foreign) == 1
+    assert all(blow.map.explained < 0.3 for blow in foreign)
+    assert [spot(blow) for blow in heard(listener, stream())] == list(STRUCK)
+
+
+def test_ringing_is_followed_and_fitted_exactly() -> None:
+    size = torch.ones(len(BANK))
+    modes = Ringing.of(BANK, size, sample_rate=RATE, hop=20, window=480)
+    amplitudes = torch.complex(*torch.randn(2, len(BANK), generator=torch.Generator().manual_seed(0)).double())
+    sound = synthesise(
+        amplitudes.real[None],
+        BANK.frequency,
+        BANK.damping,
+        samples=1200,
+        sample_rate=RATE,
+        quadrature=amplitudes.imag[None],
+    )[0]
+    assert torch.allclose(modes.hear(amplitudes, 1200), sound, atol=1e-9)
+    assert torch.allclose(modes.hear(modes.after(amplitudes, 300), 900), sound[300:], atol=1e-9)
+    assert torch.allclose(modes.fit(sound[:480], 0.0), amplitudes, atol=1e-6)
+    # Noise alone, as loud as it is said to be, is no ringing.
+    assert not modes.fit(1e-3 * sound[:480], 1.0).abs().any()
+
+
+def test_streams_that_cannot_be_listened_to_are_refused() -> None:
+    with pytest.raises(LocationError, match="comes at 44100 Hz and the field is of 8000 Hz"):
+        Listener(locator(), sample_rate=44100.0)
+    with pytest.raises(LocationError, match="window = 0 s"):
+        Listener(locator(), window=0.0)
+    with pytest.raises(LocationError, match=r"later = 0\.05"):
+        Listener(locator(), window=0.06, later=0.05)
+    with pytest.raises(LocationError, match="rumble = 4000 Hz"):
+        Listener(locator(), rumble=4000.0)
+    listener = Listener(locator())
+    with pytest.raises(LocationError, match="not finite"):
+        listener.hear(torch.tensor([0.0, float("nan")]))
+    assert listener.ears.clock + len(listener.ears.rest) == 0

@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+import torch
+
+from avmsf.errors import LocationError
+from avmsf.tasks.locator import Locator
+from avmsf.tasks.severalblows import find_blows, locate_blows, still_ringing
+from test_locate import RATE, locator_of, missed, struck, true_field
+
+
+@pytest.fixture
+def locator() -> Locator:
+    return locator_of()
+
+
+def overlapping(starts: list[float], strengths: list[float], *, seed: int):
+    """Return blows that ring into one another, and where they fell."""
+    impacts = struck(len(starts), seed=seed)
+    sound = torch.zeros(round(RATE * (starts[-1] + 0.4)) + 10)
+    for start, strength, own in zip(starts, strengths, impacts.sounds, strict=True):
+        begin = round(start * RATE)
+        sound[begin : begin + len(own)] += strength * own / own.abs().max()
+    noise = torch.randn(len(sound), generator=torch.Generator().manual_seed(seed))
+    return sound + 1e-3 * noise, impacts.contacts
+
+
+@pytest.mark.parametrize("strengths", [[1.0, 0.8, 1.2], [0.3, 1.0, -0.7]])
+def test_every_blow_is_found_where_and_when_it_fell(strengths, locator):
+    starts = [0.1, 0.25, 0.36]
+    sound, contacts = overlapping(starts, strengths, seed=31)
+    found = locate_blows(true_field(), sound, locator=locator)
+    assert [round(seconds, 3) for seconds, _ in found] == pytest.approx(starts, abs=2e-3)
+    for (_, each), contact in zip(found, contacts, strict=True):
+        assert missed(each, each.most_probable, contact) < 0.05
+
+
+def test_what_rings_on_is_carried_over_a_blow():
+    sound, _ = overlapping([0.05, 0.2], [1.0, 1.0], seed=32)
+    alone, _ = overlapping([0.05, 0.2], [1.0, 0.0], seed=32)
+    start = round(0.2 * RATE)
+    carried = still_ringing(true_field(), sound, round(0.05 * RATE), start, 3000, highest=None)
+    true = alone[start : start + 3000].double()
+    assert float((carried - true).norm() / true.norm()) < 0.1
+
+
+def test_one_blow_is_one(locator):
+    sound, _ = overlapping([0.1], [1.0], seed=33)
+    assert len(locate_blows(true_field(), sound, locator=locator)) == 1
+
+
+def test_a_faint_blow_before_a_loud_one_is_found():
+    sound, _ = overlapping([0.1, 0.5], [0.2, 1.0], seed=34)
+    onsets = find_blows(sound.double().numpy(), sample_rate=RATE)
+    assert [onset / RATE for onset in onsets] == pytest.approx([0.1, 0.5], abs=2e-3)
+
+
+def test_noise_holds_no_blows(locator):
+    noise = torch.from_numpy(np.random.default_rng(0).standard_normal(18000))
+    with pytest.raises(LocationError, match="noise"):
+        locate_blows(true_field(), noise, locator=locator)

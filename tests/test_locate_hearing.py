@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+import scipy.signal
+import torch
+
+from avmsf.capture.audio import Recording
+from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import LocationError
+from avmsf.tasks.hearing import hear
+from avmsf.tasks.locate import locate
+from avmsf.tasks.locator import Locator
+from test_locate import RATE, locator_of, missed, struck, true_field
+
+
+def recorded(sound: torch.Tensor, *, before: float = 0.1, rate: float = RATE, seed: int = 0) -> Recording:
+    """Return the sound with faint noise before it and beneath, as it would come from a recorder."""
+    samples = np.concatenate([np.zeros(round(before * rate)), sound.double().numpy()])
+    noise = 1e-3 * np.abs(samples).max() * np.random.default_rng(seed).standard_normal(len(samples))
+    return Recording("hit.wav", (0.5 * (samples + noise) / np.abs(samples).max())[None], rate, "FLOAT")
+
+
+@pytest.fixture
+def locator() -> Locator:
+    return locator_of()
+
+
+def test_the_onset_is_found_and_the_blow_located(locator):
+    impacts = struck(6, seed=21)
+    for sound, contact in zip(impacts.sounds, impacts.contacts, strict=True):
+        heard = hear(recorded(sound), true_field())
+        assert abs(heard.onset - round(0.1 * RATE)) <= 8
+        assert heard.notes == ()
+        found = locate(true_field(), recorded(sound), locator=locator)
+        assert missed(found, found.most_probable, contact) < 0.03
+        assert found.modal > 0.95
+
+
+@pytest.mark.parametrize("rate", [44100.0, 48000.0, 12000.0])
+def test_another_rate_is_resampled_and_said(rate, locator):
+    impacts = struck(1, seed=22)
+    sound = recorded(impacts.sounds[0]).channels[0]
+    samples = scipy.signal.resample_poly(sound, round(rate / 100), round(RATE / 100))
+    heard = hear(torch.from_numpy(samples), true_field(), sample_rate=rate)
+    assert f"resampled from {rate:g} Hz to the field's 18000 Hz" in heard.notes[0]
+    assert ("modes, above 5400 Hz, were left out" in heard.notes[0]) == (rate == 12000.0)
+    found = locate(true_field(), torch.from_numpy(samples), sample_rate=rate, locator=locator)
+    assert missed(found, found.most_probable, impacts.contacts[0]) < 0.03
+    assert found.modal > 0.9
+
+
+def test_a_rate_that_holds_no_mode_is_refused():
+    sound = torch.from_numpy(recorded(struck(1, seed=1).sounds[0]).channels[0][::40].copy())
+    with pytest.raises(LocationError, match=r"at 450 Hz and holds sound up to 202\.5 Hz, and the lowest .* record at"):
+        hear(sound, true_field(), sample_rate=450.0)
+
+
+def test_clipping_is_said_with_its_share(locator):
+    recording = recorded(struck(1, seed=23).sounds[0])
+    clipped = Recording("hit.wav", np.clip(8 * recording.channels, -1, 1), RATE, "PCM_16")
+    assert "hit.wav is clipped:" in locate(true_field(), clipped, locator=locator).notes[0]
+
+
+def test_a_second_blow_is_said_and_not_heard(locator):
+    impacts = struck(2, seed=24)
+    both = torch.cat([impacts.sounds[0][:5400], impacts.sounds[1]])
+    found = locate(true_field(), recorded(both), locator=locator)
+    assert "more than one blow, at 0.100 s and at 0.4" in found.notes[0]
+    assert "locate_blows" in found.notes[0]
+    assert missed(found, found.most_probable, impacts.contacts[0]) < 0.03
+
+
+@pytest.mark.parametrize(
+    ("samples", "message"),
+    [
+        (torch.zeros(9000), "the recording is silent"),
+        (torch.full((9000,), torch.inf), "9000 samples are not finite"),
+        (torch.ones(100), "too short, 100 samples"),
+        (torch.randn(9000, generator=torch.Generator().manual_seed(1)), "holds no blow"),
+        (torch.sin(0.3 * torch.arange(9000)), "holds no blow"),
+    ],
+)
+def test_what_holds_no_blow_is_refused(samples, message):
+    with pytest.raises(LocationError, match=message):
+        hear(samples, true_field())
+
+
+def test_channels_follow_the_capture_where_the_recording_has_them():
+    one = recorded(struck(1, seed=25).sounds[0]).channels[0]
+    two = Recording("hit.wav", np.stack([0.1 * one[::-1], one]), RATE, "FLOAT")
+    with pytest.raises(LocationError, match="2 different channels"):
+        hear(two, true_field())
+    settings = CaptureSettings(response_channel=2, highpass=30.0)
+    assert abs(hear(two, true_field(), settings=settings).onset - 1800) <= 8
+    alone = hear(Recording("hit.wav", one[None], RATE, "FLOAT"), true_field(), settings=settings)
+    torch.testing.assert_close(alone.sound, hear(two, true_field(), settings=settings).sound)
+    with pytest.raises(LocationError, match="sample_rate says 8000 Hz"):
+        hear(two, true_field(), sample_rate=8000.0)

@@ -1,0 +1,109 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from avmsf.errors import LocationError
+from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
+from avmsf.simulate.plate import plate_surface_points
+from avmsf.tasks.contactmap import ContactMap
+from avmsf.tasks.counterparts import images, name_counterpart
+from avmsf.tasks.locator import Locator
+from test_locate import PLATE, TrueGains, field_of, struck
+
+
+def middle() -> torch.Tensor:
+    return torch.tensor([PLATE.length / 2, PLATE.width / 2, 0.0], dtype=torch.float64)
+
+
+def axis(number: int) -> torch.Tensor:
+    return torch.eye(3, dtype=torch.float64)[number]
+
+
+def plate_symmetries() -> Symmetries:
+    mirrors = tuple(MirrorSymmetry(axis(number), middle(), 0.1, 0.0) for number in (0, 1))
+    return Symmetries((RotationalSymmetry(axis(2), middle(), 2, 0.1, 0.0),), mirrors, 0.005, 0.38, math.inf)
+
+
+def made(probability: list[float]) -> ContactMap:
+    """Return a map of points in a row, a centimetre apart."""
+    points = torch.zeros(len(probability), 3)
+    points[:, 0] = 0.01 * torch.arange(len(probability))
+    chances = torch.tensor(probability, dtype=torch.float64)
+    return ContactMap(points, 1 - chances, chances, 0.9, 0.9)
+
+
+def test_region_is_the_smallest_set_of_that_probability():
+    found = made([0.05, 0.5, 0.3, 0.05, 0.1])
+    assert found.region(0.9).tolist() == [False, True, True, False, True]
+    assert found.region(0.5).tolist() == [False, True, False, False, False]
+    assert found.region(0.97).sum() == 5
+    with pytest.raises(LocationError, match=r"level = 1\.5: expected a probability"):
+        found.region(1.5)
+
+
+def test_peaks_are_places_apart_of_comparable_probability():
+    chances = [0.0] * 30
+    chances[3], chances[4], chances[5] = 0.2, 0.2, 0.1
+    chances[20], chances[21] = 0.25, 0.2
+    chances[28] = 0.05
+    found = made(chances)
+    first, second = found.peaks(0.95)
+    assert (first.row, second.row) == (3, 20)
+    assert first.probability == pytest.approx(0.5)
+    assert second.probability == pytest.approx(0.45)
+    assert second.points.nonzero().flatten().tolist() == [20, 21]
+    assert found.ambiguous
+    assert len(found.peaks(0.99, comparable=0.05)) == 3
+    assert not made([0.1, 0.8, 0.1]).ambiguous
+
+
+def test_a_symmetric_plate_is_ambiguous_and_each_counterpart_is_named():
+    # Heard from its middle, where all modes that are odd about it are silent.
+    plate = replace(PLATE, pickup=(0.5, 0.5))
+    field = field_of(TrueGains(plate_surface_points(PLATE, 1600).float(), plate=plate))
+    found = Locator.of(field).locate(struck(1, seed=14, noise_db=-20.0, plate=plate).sounds[0])
+    others = found.counterparts(plate_symmetries())
+    assert len(others) == 3
+    assert found.ambiguous
+    assert sorted(type(each.symmetry).__name__ for each in others) == [
+        "MirrorSymmetry",
+        "MirrorSymmetry",
+        "RotationalSymmetry",
+    ]
+    for each in others:
+        assert each.symmetry is not None
+        image = (
+            each.symmetry.reflect(found.place[None])
+            if isinstance(each.symmetry, MirrorSymmetry)
+            else each.symmetry.turn(found.place[None], each.angle)
+        )[0]
+        assert float((image - each.place).norm()) < 2 * found.radius
+    words = " ".join(str(each) for each in others)
+    assert "its image in the mirror plane with normal (1 0 0)" in words
+    assert "it turned by 180 degrees about the axis (0 0 1)" in words
+    assert all("no known symmetry" in str(each) for each in found.counterparts())
+
+
+def test_a_place_that_no_symmetry_reaches_is_not_explained():
+    place, other = torch.tensor([0.02, 0.03, 0.0]), torch.tensor([0.1, 0.05, 0.0])
+    named = name_counterpart(place, other, plate_symmetries(), probability=0.4, tolerance=0.01)
+    assert named.symmetry is None
+    assert str(named).startswith("also at (0.1 0.05 0) m, with 40 %: no known symmetry")
+
+
+def test_any_turn_is_found_for_a_round_object():
+    turns = Symmetries((RotationalSymmetry(axis(2), torch.zeros(3).double(), None, 0.1, 0.0),), (), 0.005, 0.38, 1.0)
+    place, other = torch.tensor([0.1, 0.0, 0.05]), torch.tensor([0.0, 0.1, 0.05])
+    named = name_counterpart(place, other, turns, probability=0.4, tolerance=0.01)
+    assert named.angle == pytest.approx(math.pi / 2, abs=0.02)
+
+
+def test_images_of_places_hold_the_places_first():
+    places = torch.tensor([[0.02, 0.03, 0.0]], dtype=torch.float64)
+    found = images(places, plate_symmetries())
+    assert found.shape == (4, 3)
+    torch.testing.assert_close(found[0], places[0])
+    expected = {(round(x, 6), round(y, 6)) for x in (0.02, PLATE.length - 0.02) for y in (0.03, PLATE.width - 0.03)}
+    assert {(round(x, 6), round(y, 6)) for x, y, _ in found.tolist()} == expected
