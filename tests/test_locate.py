@@ -124,7 +124,7 @@ def held(found: ContactMap, contact: torch.Tensor) -> bool:
 
 @pytest.mark.parametrize(
     ("taps", "noise_db", "posterior", "cosine"),
-    [(None, -20.0, 0.01, 0.01), (60, -40.0, 0.02, 0.04), (25, -20.0, 0.05, 0.09)],
+    [(None, -20.0, 0.01, 0.01), (60, -40.0, 0.02, 0.04), (12, -20.0, 0.09, 0.14)],
     ids=str,
 )
 def test_a_blow_is_found_and_the_region_holds_it(taps, noise_db, posterior, cosine):
@@ -136,7 +136,7 @@ def test_a_blow_is_found_and_the_region_holds_it(taps, noise_db, posterior, cosi
     assert sum(missed(each, each.best, contact) for each, contact in pairs) / 40 < cosine
     coverage = sum(held(each, contact) for each, contact in pairs) / 40
     assert 0.8 <= coverage <= 1.0
-    assert sum(float(each.region().double().mean()) for each in found) / 40 < 0.1
+    assert sum(float(each.region().double().mean()) for each in found) / 40 < 0.4
     assert all(abs(float(each.probability.sum()) - 1.0) < 1e-9 for each in found)
 
 
@@ -149,6 +149,7 @@ def test_force_polarity_and_onset_do_not_matter():
     assert turned.force == pytest.approx(-300.0 * found.force, rel=1e-3)
     late = locator.locate(impacts.sounds[0][3:])
     assert missed(late, late.most_probable, impacts.contacts[0]) < 0.02
+    assert late.explained > 0.9
     # The paper's distance knows of no shift: a sixth of a millisecond takes its answer away.
     assert float(late.distance.min()) > 0.1 > float(found.distance.min())
 
@@ -236,10 +237,11 @@ def test_modes_beneath_noise_count_for_little():
 
 
 def test_short_sounds_suffice_although_modes_cannot_be_told_apart():
-    impacts, locator = struck(15, seed=8), Locator.of(true_field())
+    impacts, locator = struck(15, seed=8), locator_of()
     for sound, contact in zip(impacts.sounds, impacts.contacts, strict=True):
-        found = locator.locate(sound[:540])
+        found = locator.locate(sound[:400])
         assert missed(found, found.most_probable, contact) < 0.03
+        assert found.explained > 0.9
 
 
 def test_areas_and_other_points_count():

@@ -32,6 +32,7 @@ def test_every_blow_is_found_where_and_when_it_fell(strengths, locator):
     assert [round(seconds, 3) for seconds, _ in found] == pytest.approx(starts, abs=2e-3)
     for (_, each), contact in zip(found, contacts, strict=True):
         assert missed(each, each.most_probable, contact) < 0.05
+        assert each.explained > 0.85
 
 
 def test_what_rings_on_is_carried_over_a_blow():

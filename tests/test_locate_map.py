@@ -8,7 +8,7 @@ from avmsf.errors import LocationError
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
 from avmsf.simulate.plate import plate_surface_points
 from avmsf.tasks.contactmap import ContactMap
-from avmsf.tasks.counterparts import images, name_counterpart
+from avmsf.tasks.counterparts import name_counterpart
 from avmsf.tasks.locator import Locator
 from test_locate import PLATE, TrueGains, field_of, struck
 
@@ -98,12 +98,3 @@ def test_any_turn_is_found_for_a_round_object():
     place, other = torch.tensor([0.1, 0.0, 0.05]), torch.tensor([0.0, 0.1, 0.05])
     named = name_counterpart(place, other, turns, probability=0.4, tolerance=0.01)
     assert named.angle == pytest.approx(math.pi / 2, abs=0.02)
-
-
-def test_images_of_places_hold_the_places_first():
-    places = torch.tensor([[0.02, 0.03, 0.0]], dtype=torch.float64)
-    found = images(places, plate_symmetries())
-    assert found.shape == (4, 3)
-    torch.testing.assert_close(found[0], places[0])
-    expected = {(round(x, 6), round(y, 6)) for x in (0.02, PLATE.length - 0.02) for y in (0.03, PLATE.width - 0.03)}
-    assert {(round(x, 6), round(y, 6)) for x, y, _ in found.tolist()} == expected

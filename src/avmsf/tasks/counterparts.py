@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
@@ -72,16 +71,3 @@ def _images(
     for rotation in symmetries.rotations:
         for angle in rotation.angles(_ANGLES)[1:]:
             yield rotation, angle, rotation.turn(row, angle)[0]
-
-
-def images(places: Float[Tensor, "places 3"], symmetries: Symmetries, *, angles: int = 36) -> Float[Tensor, "images 3"]:
-    """Return places and all that one symmetry makes of each: where else a blow would sound the same.
-
-    Turned about an axis that allows any angle in `angles` even steps. Rows of the places themselves come first.
-    """
-    found = [places]
-    found += [mirror.reflect(places) for mirror in symmetries.mirrors]
-    found += [
-        rotation.turn(places, angle) for rotation in symmetries.rotations for angle in rotation.angles(angles)[1:]
-    ]
-    return torch.cat(found)

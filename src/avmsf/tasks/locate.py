@@ -46,8 +46,8 @@ def locate(
 def judge_fit(found: ContactMap) -> list[str]:
     """Return a word of doubt where an object's modes explain little of a sound; LocationError where it is too little.
 
-    The thresholds come of simulated plates and mugs: modes explain nine tenths and more of their own object's sounds,
-    and of others', with dozens of modes each, a tenth to a quarter.
+    The thresholds come of simulated plates and mugs: modes explain nine tenths and more of their own object's sounds
+    (half where the noise is 10 dB louder), and of others', with dozens of modes each, a tenth, .3 at most.
     """
     share = f"the modes of this object explain {100 * found.modal:.0f} % of the sound"
     if found.modal < STRANGE:
