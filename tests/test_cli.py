@@ -105,6 +105,18 @@ def test_every_public_name_is_there_and_no_other() -> None:
         avmsf.fitt  # noqa: B018
 
 
+def test_output_that_nobody_reads_any_more_ends_quietly(field: Path) -> None:
+    main_of = "import sys; from avmsf.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", main_of, "show", str(field), "--json"]
+    run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert run.stdout is not None
+    run.stdout.close()
+    _, told = run.communicate(timeout=300)
+    assert b"Traceback" not in told
+    assert b"BrokenPipe" not in told
+    assert run.returncode == 141
+
+
 def test_the_version_is_the_packages(capsys: Streams) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.strip() == avmsf.__version__

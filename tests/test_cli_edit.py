@@ -9,15 +9,17 @@ import pytest
 import soundfile
 import torch
 
-from avmsf.cli import main, steering
+from avmsf.cli import edit, main, steering
 from avmsf.cli.edit import parse, run
 from avmsf.errors import AvmsfError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
+from avmsf.field.thinplategains import ThinPlateGains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
-from avmsf.simulate.material import CERAMIC, GLASS, WOOD
+from avmsf.simulate.material import CERAMIC, GLASS, STEEL, WOOD
 from avmsf.tasks.edits import EDITS
+from avmsf.tasks.materialstatistics import MaterialStatistics
 from avmsf.tasks.recast import RATIO_ONLY, rayleigh_damping, recast
 from avmsf.tasks.retune import retune
 from made_fields import FIELDS, places
@@ -108,8 +110,17 @@ def test_sliders_follow_the_material_and_call_modes_by_their_old_frequencies(fie
     levels = [0.0, -math.inf, 0.0, 0.0, 6.0]
     expected = retune(recast(ceramic(), CERAMIC, WOOD), pitch=1.2, decay=0.5, brightness_db=3.0, gains_db=levels)
     expect_same(new, expected)
-    with pytest.raises(AvmsfError, match="--mode-db 1000: no mode is there, the nearest is at 850 Hz"):
-        edited(field, "--mode-db", "1000", "3")
+    for option in ("--mode-db", "--mode-pitch", "--mode-decay"):
+        with pytest.raises(AvmsfError, match=f"{option} 1000: no mode is there, the nearest is at 850 Hz"):
+            edited(field, option, "1000", "3")
+
+
+def test_single_modes_have_a_pitch_and_a_decay_of_their_own(field: Path) -> None:
+    words = ["--pitch", "1.2", "--mode-pitch", "850", "0.5", "--mode-pitch", "2300", "1.5", "--mode-decay", "1300", "4"]
+    factors = {"pitch": [1.2, 0.6, 1.2, 1.2, 1.2 * 1.5], "decay": [1.0, 1.0, 4.0, 1.0, 1.0]}
+    expect_same(edited(field, *words), retune(ceramic(), **factors))
+    expect_same(edited(field, "--mode-decay", "390", "2"), retune(ceramic(), decay=[2.0, 1.0, 1.0, 1.0, 1.0]))
+    expect_same(edited(field, "--mode-pitch", "390", "2"), retune(ceramic(), pitch=[2.0, 1.0, 1.0, 1.0, 1.0]))
 
 
 def test_silent_modes_are_said(field: Path, capsys: Streams) -> None:
@@ -152,11 +163,59 @@ def test_towards_a_recording_and_an_interrupted_edit_goes_on(
     assert not field.with_name("part.safetensors").exists()
     preview, rate = soundfile.read(field.with_name("part.safetensors.preview.wav"))
     assert (len(preview), rate) == (2400, RATE)
+    state = field.with_name("part.safetensors.checkpoint")
+    kept = state.read_bytes()
+    edited(field, "--pitch", "2", name="part")
+    assert state.read_bytes() == kept
     steps = []
     monkeypatch.setattr(steering.SteerBar, "show", lambda bar, progress: steps.append(progress.step))
     expect_same(edited(field, *words, name="part"), whole)
     assert steps == [3, 4]
     assert not list(field.parent.glob("*.preview.wav")) + list(field.parent.glob("*.checkpoint"))
+
+
+def test_towards_a_materials_sound(field: Path, capsys: Streams) -> None:
+    quick = ["--steps", "2", "--contacts", "2", "--preview-every", "0"]
+    wood = edited(field, "--like-material", "Wood", *quick, name="wood")
+    assert "taken to be of ceramic" in capsys.readouterr().err
+    (told,) = wood.origin.report[EDITS]
+    assert (told["edit"], told["reference"]) == ("steer", "wood")
+    ringing = wood.bank.damping / ceramic().bank.damping
+    assert float(ringing.median()) > 3.0
+    # What it is of is what it was made before, and what is made of it before is what the sound is led on from.
+    common = MaterialStatistics.recast(recast(ceramic(), GLASS, WOOD), WOOD, STEEL)
+    heard = common.reference(samples=2400, sample_rate=RATE, seed=3).describe()
+    words = ["--from", "glass", "--material", "wood", "--pitch", "1", "--like-material", "steel", "--seed", "3"]
+    both = edited(field, *words, *quick, name="both")
+    assert [each["edit"] for each in both.origin.report[EDITS]] == ["recast", "steer"]
+    assert {name: both.origin.report[EDITS][1][name] for name in heard} == heard
+    assert main(["show", str(field.with_name("both.safetensors"))]) == 0
+    out = capsys.readouterr().out
+    assert "edited     recast, from glass to wood, law displacement" in out
+    assert "edited     steer, towards 'steel', pitch " in out
+    assert ", steps 2" in out
+    assert "preview_every" not in out
+
+
+def test_edits_are_shown_by_what_they_did(field: Path, capsys: Streams) -> None:
+    words = ["--from", "ceramic", "--material", "wood", "--size", "2", "--alpha", "4000", "--pitch", "10"]
+    edited(field, *words, "--mode-db", "850", "-inf", "--mode-db", "2300", "6", "--mode-decay", "1300", "4")
+    assert main(["show", str(field.with_name("new.safetensors"))]) == 0
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if "edited" in line]
+    law = "law displacement, modes damped too much to ring: "
+    assert lines == [
+        f"edited     recast, from ceramic to wood with alpha changed, size 2, {law}2",
+        "edited     retune, pitch 10, decay 1 to 4 by mode, gains_db 0 to 6 by mode, 1 muted, "
+        "modes beyond half the sample rate: 1",
+    ]
+
+
+def test_the_loudest_place_is_that_of_both_parts_of_the_gains(field: Path) -> None:
+    values = torch.zeros(3, 5, 2, dtype=torch.float64)
+    values[0, :, 0], values[1, :, 1] = 1.0, 3.0
+    corners = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], dtype=torch.float64)
+    loud = replace(ceramic(), gain_field=ThinPlateGains(corners.float(), corners, values, 0.0))
+    assert edit._contact(loud, None).tolist() == pytest.approx([0.1, 0.0, 0.0])
 
 
 class Echo:
@@ -167,6 +226,9 @@ class Echo:
 
     def __init__(self, answer: torch.Tensor) -> None:
         self.answer, self.asked = answer, []
+
+    def describe(self) -> dict[str, str]:
+        return {"model": self.name}
 
     def encode(self, waveforms: torch.Tensor) -> torch.Tensor:
         return waveforms
@@ -211,7 +273,9 @@ def test_what_cannot_be_done_is_said_before_any_work(field: Path, capsys: Stream
 
     refused("nothing is asked for: give --material")
     refused("--from is given without anything to lead to", "--from", "wood")
-    refused("found both: edit by one, then by the other", "--prompt", "a bell", "--like", "like.wav")
+    refused("found --prompt and --like: edit by one, then by the other", "--prompt", "a bell", "--like", "like.wav")
+    refused("found --like and --like-material: edit", "--like-material", "wood", "--like", "like.wav")
+    refused("no material is called 'cheese'; there are ceramic, glass", "--like-material", "cheese")
     refused("--prompt is empty: describe the sound", "--prompt", "  ")
     refused("no material is called 'cheese'; there are ceramic, glass", "--material", "cheese")
     refused("young = -1 Pa: expected more than 0", "--from", "ceramic", "--young", "-1")

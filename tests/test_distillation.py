@@ -1,6 +1,7 @@
 """Distilling a diffusion model into targets, on models whose every answer is known."""
 
 import math
+import weakref
 from dataclasses import dataclass, field
 
 import pytest
@@ -32,6 +33,9 @@ class Known:
     dtype: torch.dtype = torch.float32
     batches: list[int] = field(default_factory=list)
     asked: list = field(default_factory=list)
+
+    def describe(self):
+        return {"room": self.room}
 
     def encode(self, waveforms):
         if len(waveforms) > self.room:
@@ -161,6 +165,27 @@ def test_out_of_memory_halves_the_batch_and_says_so():
     small.targets(sounds, 1, seeded())
     with pytest.raises(EditError, match="runs out of memory on cpu with one sound at a time"):
         guide(Gaussian(room=0), batch=1).targets(sounds, 0, seeded())
+
+
+def test_memory_is_freed_before_it_is_asked_for_again(monkeypatch):
+    filled, freed = [], []
+
+    class Filling(Gaussian):
+        def encode(self, waveforms):
+            held = torch.zeros(9)
+            filled.append(weakref.ref(held))
+            return super().encode(waveforms)
+
+    halve = DecoderDistillation._halve
+    monkeypatch.setattr(DecoderDistillation, "_halve", lambda self: freed.append(filled[-1]() is None) or halve(self))
+    sounds = sound_of(ringing_field(seconds=0.1)).expand(2, -1)
+    with pytest.warns(UserWarning, match="batches of 1"):
+        guide(Filling(room=1), batch=2).targets(sounds, 0, seeded())
+    assert freed == [True]
+
+
+def test_what_tells_models_apart_tells_guides_apart():
+    assert guide(Known(room=3)).describe() == guide(Known(room=3)).describe() != guide(Known(room=4)).describe()
 
 
 def test_a_field_is_steered_to_what_the_model_wants():

@@ -1,5 +1,6 @@
 """Doubt: against fields refitted without a contact, draws whose truth is known, and the sounds themselves."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -8,12 +9,16 @@ from torch import Tensor
 
 from avmsf.bench.doubtpictures import draw_band, draw_doubt
 from avmsf.errors import FitError
-from avmsf.field.belief import left_out
+from avmsf.field.belief import beliefs, deviation_of, knows_doubt, left_out, struck_at
 from avmsf.field.doubt import coverage, gain_doubt, spectrum_band, widening
 from avmsf.field.evidence import Regression
 from avmsf.field.modalbasis import ModalBasis, sites_of
+from avmsf.field.scaledgains import ScaledGains
+from avmsf.field.suggest import suggest
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
+from avmsf.tasks.locator import Locator
+from avmsf.tasks.retune import retune
 from believing_field import (
     BANK,
     DOWN,
@@ -217,6 +222,44 @@ def test_bands_hold_what_the_gains_intervals_hold() -> None:
     assert float(band.upper_db[peak] - band.lower_db[peak]) == pytest.approx(float(expected), rel=0.25)
 
 
+@pytest.mark.parametrize("made", [physics_field, spline_field])
+def test_an_edited_field_is_as_sure_of_itself_as_before(made: type) -> None:
+    contacts, others = bar_contacts(30)[:12], bar_contacts(30)[12:]
+    values = drawn_gains(bar_contacts(30), seed=16)
+    field = sound_field(made(contacts, values[:12]))
+    points, same = bar_points()[::5], retune(field)
+    assert knows_doubt(same)
+    assert torch.equal(left_out(same).nan_to_num(), left_out(field).nan_to_num())
+    assert torch.equal(gain_doubt(same, points), gain_doubt(field, points))
+    assert torch.equal(spectrum_band(same, others[0]).upper_db, spectrum_band(field, others[0]).upper_db)
+    maps = [Locator.of(each, points=points).locate(field.render(others[:1])[0]) for each in (field, same)]
+    assert torch.equal(maps[0].probability, maps[1].probability)
+    # Larger and louder, each mode by its own factor: so are the deviations, and what is heard of others' blows.
+    factor = torch.tensor([2.0, 0.5, 8.0, 1.0], dtype=torch.float64)
+    louder = replace(field, gain_field=ScaledGains(field.gain_field, factor, 2.0))
+    assert widening(louder) == widening(field)
+    assert torch.equal(struck_at(louder), 2.0 * struck_at(field))
+    known = deviation_of(field, others) * factor[:, None]
+    torch.testing.assert_close(deviation_of(louder, 2.0 * others), known, rtol=1e-6, atol=0)
+    heard = coverage(louder, 2.0 * others, values[12:] * factor[:, None])
+    assert heard.plain == coverage(field, others, values[12:]).plain
+    weights = ModalBank(BANK.frequency, BANK.damping / factor**2)
+    assert heard.by_energy == pytest.approx(coverage(replace(field, bank=weights), others, values[12:]).by_energy)
+
+
+def test_modes_that_an_edit_has_silenced_are_in_no_doubt() -> None:
+    contacts = bar_contacts(12)
+    gains = physics_field(contacts, drawn_gains(contacts, seed=17))
+    field = replace(sound_field(gains), residual=Residual(torch.zeros(9)))
+    above = retune(field, pitch=[1.0, 1.0, 4.0, 4.0])
+    mute = retune(field, gains_db=[0.0, 0.0, -math.inf, -math.inf])
+    points = bar_points()[::5]
+    assert torch.equal(gain_doubt(above, points), gain_doubt(mute, points))
+    torch.testing.assert_close(
+        spectrum_band(above, points[3]).upper_db, spectrum_band(mute, points[3]).upper_db, rtol=0, atol=1e-9
+    )
+
+
 def test_bands_are_the_same_every_time_and_wider_where_less_is_known() -> None:
     contacts = bar_contacts(80)
     contacts = contacts[contacts[:, 0] < 0.4 * LENGTH]
@@ -257,6 +300,10 @@ def test_what_cannot_be_said_is_refused() -> None:
     field = sound_field(physics_field(contacts, values))
     with pytest.raises(FitError, match=r"level = 1: expected a probability between 0 and 1"):
         spectrum_band(field, contacts[0], level=1.0)
+    with pytest.raises(FitError, match="was edited, and no blow tells more of what nobody can strike"):
+        suggest(retune(field), 1)
+    with pytest.raises(FitError, match="was edited, and no blow"):
+        next(beliefs(retune(field), contacts, None))
     with pytest.raises(FitError, match=r"gains are of shape \(6, 3, 2\): expected 6 contacts, the field's 4 modes"):
         coverage(field, contacts, values[:, :3])
 

@@ -260,7 +260,7 @@ def test_another_plate_is_refused_with_the_number(length):
     locator = locator_of()
     for sound in impacts.sounds:
         assert locator.locate(sound).modal < STRANGE
-        with pytest.raises(LocationError, match=r"explain \d+ % of the sound, of its own recordings they explain far"):
+        with pytest.raises(LocationError, match=r"explain \d+ % of the sound, and 60 % or more of its own"):
             locate(true_field(), sound, locator=locator)
     own = struck(4, seed=6, noise_db=0.0)
     assert all(locator.locate(sound).modal > 2 * STRANGE for sound in own.sounds)

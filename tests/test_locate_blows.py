@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -5,7 +7,7 @@ import torch
 from avmsf.errors import LocationError
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.severalblows import find_blows, locate_blows, still_ringing
-from test_locate import RATE, locator_of, missed, struck, true_field
+from test_locate import PLATE, RATE, locator_of, missed, struck, true_field
 
 
 @pytest.fixture
@@ -59,3 +61,15 @@ def test_noise_holds_no_blows(locator):
     noise = torch.from_numpy(np.random.default_rng(0).standard_normal(18000))
     with pytest.raises(LocationError, match="noise"):
         locate_blows(true_field(), noise, locator=locator)
+
+
+def test_blows_on_another_object_are_left_out_and_refused_where_there_are_no_others(locator):
+    sound, _ = overlapping([0.1, 0.5], [1.0, 1.0], seed=35)
+    other = struck(1, seed=6, plate=replace(PLATE, length=0.4, width=0.31)).sounds[0]
+    begin = round(0.5 * RATE)
+    mixed = sound.clone()
+    mixed[begin:] = 0.0
+    mixed[begin : begin + len(other)] = (other / other.abs().max())[: len(mixed) - begin]
+    assert [round(seconds, 2) for seconds, _ in locate_blows(true_field(), mixed, locator=locator)] == [0.1]
+    with pytest.raises(LocationError, match=r"the blow at 0\.\d+ s: the modes of this object explain \d+ %"):
+        locate_blows(true_field(), torch.cat([torch.zeros(3000), mixed[begin:]]).numpy(), locator=locator)

@@ -98,6 +98,7 @@ def test_an_edited_field_saves_loads_and_is_edited_again(tmp_path):
     assert torch.equal(again.render(contacts), direct.render(contacts))
     entries = again.origin.report["edits"]
     assert [each.get("prompt") for each in entries] == ["wood", None]
+    assert [each["edit"] for each in entries] == ["steer", "steer"]
     assert entries[0]["pitch"] == pytest.approx(0.7)
     assert again.origin.report["gains"] == "made"
 

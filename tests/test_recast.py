@@ -17,8 +17,10 @@ from avmsf.simulate.elastic import elastic_modes
 from avmsf.simulate.material import CERAMIC, GLASS, PLASTIC, STEEL, WOOD, Material
 from avmsf.simulate.plate import Plate, plate_modes, sample_contacts
 from avmsf.simulate.vibration import rayleigh
+from avmsf.tasks.edits import silenced
 from avmsf.tasks.materialguess import guess_materials
 from avmsf.tasks.recast import ACCELERATION, DISPLACEMENT, LAWS, RATIO_ONLY, VELOCITY, recast
+from avmsf.tasks.retune import retune
 
 RATE = 44100.0
 CONTACTS = sample_contacts(Plate(), 8, generator=torch.Generator().manual_seed(0))
@@ -111,7 +113,8 @@ def test_recasting_is_a_fresh_finite_element_solve(size):
     assert float(frequency.max()) < 1e-9
     assert float((found.bank.damping / fresh.bank.damping - 1).abs().max()) < 1e-8
     one, other = gains_of(found, size * places)[0], gains_of(fresh, size * places)[0]
-    assert float((one - other).abs().max() / other.abs().max()) < SMALL_FLOAT
+    # Of each mode by itself, for high ones move less: shapes of a second solve agree to some 1e-6.
+    assert float(((one - other).abs().amax(0) / other.abs().amax(0)).max()) < SMALL_FLOAT
 
 
 @pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
@@ -168,7 +171,7 @@ def test_modes_beyond_half_the_sample_rate_are_silent_reported_and_come_back():
     expect_same(recast(found, OTHER, PLASTIC), field, CONTACTS)
 
 
-def test_modes_without_a_tone_are_mute_and_named():
+def test_modes_without_a_tone_are_mute_and_named_and_stay_where_they_are():
     field = plate_field(GLASS)
     lossy = replace(GLASS, name="felt", alpha=4000.0)
     omega = torch.hypot(2 * math.pi * field.bank.frequency, field.bank.damping)
@@ -177,9 +180,26 @@ def test_modes_without_a_tone_are_mute_and_named():
     found = recast(field, GLASS, lossy)
     assert torch.equal(gains_of(found, CONTACTS).abs().amax((0, 1)) == 0, dead)
     told = found.origin.report["edits"][-1]
-    assert told["overdamped_hertz"] == pytest.approx((omega[dead] / (2 * math.pi)).tolist())
+    assert told["overdamped_hertz"] == field.bank.frequency[dead].tolist()
     assert f"{int(dead.sum())} of {len(dead)} modes are damped beyond" in told["remarks"][0]
     assert bool(torch.isfinite(found.render(CONTACTS)).all())
+    back = recast(found, lossy, GLASS)
+    for name in ("frequency", "damping"):
+        before = getattr(field.bank, name)
+        assert torch.equal(getattr(found.bank, name)[dead], before[dead])
+        torch.testing.assert_close(getattr(back.bank, name), before, rtol=1e-13, atol=0)
+    before, after = gains_of(field, CONTACTS), gains_of(back, CONTACTS)
+    torch.testing.assert_close(after, torch.where(dead, 0.0, before), rtol=1e-6, atol=0)
+    assert back.origin.report["edits"][-1]["remarks"] == []
+
+
+def test_a_mute_mode_is_none_that_a_lower_pitch_brings_back():
+    found = recast(plate_field(GLASS), GLASS, replace(GLASS, alpha=4e5))
+    high = retune(found, pitch=1e3)
+    assert not bool(high.audible.any())
+    assert high.origin.report["edits"][-1]["silent_hertz"] == []
+    assert not bool(silenced(high).any())
+    assert recast(high, GLASS, replace(GLASS, alpha=4e9)).origin.report["edits"][-1]["overdamped_hertz"] == []
 
 
 def test_another_poissons_ratio_is_said_with_what_it_would_do_to_a_plate():

@@ -1,6 +1,7 @@
 """Recordings and materials as what a field shall sound like."""
 
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import soundfile
 import torch
 
 from avmsf.errors import EditError
+from avmsf.field.gainfield import Gains
 from avmsf.modal.bank import ModalBank
 from avmsf.simulate.material import CERAMIC, WOOD
 from avmsf.tasks.clips import lasting, level, levelled, resampled
@@ -16,7 +18,7 @@ from avmsf.tasks.materialstatistics import MaterialStatistics
 from avmsf.tasks.modaledit import ModalEdit, Struck
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.startsearch import heard_spectrum
-from ringing_field import RATE, ringing_field, sound_of
+from ringing_field import RATE, SameGains, ringing_field, sound_of
 
 
 def write(path: Path, sound: torch.Tensor, *, rate: float = RATE, before: int = 0) -> Path:
@@ -43,6 +45,14 @@ def test_a_recording_begins_at_its_onset_at_the_fields_rate(tmp_path):
     torch.testing.assert_close(found, heard_spectrum(sound_of(field)[:, :3990]), rtol=0, atol=2e-3)
 
 
+def test_references_are_told_apart_by_every_sample():
+    sounds = 1e-7 * sound_of(ringing_field())
+    other = sounds.clone()
+    other[0, [5, 6]] = other[0, [6, 5]]
+    described = [Reference.of(each, sample_rate=RATE).describe() for each in (sounds, sounds.clone(), other)]
+    assert described[0] == described[1] != described[2]
+
+
 def test_several_clips_each_sound_has_its_nearest(tmp_path):
     pitches = (0.6, 1.0, 1.7)
     for pitch in pitches:
@@ -67,13 +77,23 @@ def test_where_a_clip_ends_nothing_is_asked():
     torch.testing.assert_close(targets[:, :900], early[:, :900])
 
 
-@pytest.mark.parametrize(("pitch", "decay"), [(0.5, 4.0), (1.6, 0.5), (1.0, 10.0)])
-def test_the_start_finds_a_common_change(pitch, decay):
-    reference = Reference.of(sound_of(ringing_field(pitch=pitch, decay=decay)), sample_rate=RATE)
+@pytest.mark.parametrize(
+    ("pitch", "decay", "samples"),
+    [(0.5, 4.0, 4000), (1.6, 0.5, 4000), (1.0, 10.0, 4000), (1.6, 0.5, 800), (1.0, 4.0, 400)],
+)
+def test_the_start_finds_a_common_change(pitch, decay, samples):
+    # Clips of 800 and 400 samples end while they ring: of what comes later, nothing is known.
+    reference = Reference.of(sound_of(ringing_field(pitch=pitch, decay=decay))[:, :samples], sample_rate=RATE)
     found = reference.start(struck())
     # Bands are a 24th of an octave, 3 %; decays are searched to a factor of 64^(1/32), 14 %.
     assert found.pitch_factor == pytest.approx(pitch, rel=0.04)
     assert found.decay_factor == pytest.approx(decay, rel=0.35)
+
+
+def test_the_start_stays_within_its_range():
+    # A hundredth of the damping is out of reach.
+    reference = Reference.of(sound_of(ringing_field(decay=1e-2, seconds=0.1)), sample_rate=RATE)
+    assert reference.start(struck(seconds=0.1)).decay_factor == pytest.approx(1 / 64)
 
 
 def test_the_start_of_what_is_there_already():
@@ -186,6 +206,37 @@ def test_statistics_of_a_folder(tmp_path):
         MaterialStatistics.of_recordings(noise, sample_rate=RATE)
     with pytest.raises(EditError, match="expected modes of every object, found none"):
         MaterialStatistics.of_modes([], [], name="nothing")
+
+
+def test_statistics_of_objects_that_do_not_fit():
+    bank, ones = ringing_field().bank, torch.ones(6)
+    for gains, words in (
+        ([ones], "gains of all 2 objects, found those of 1"),
+        ([ones, torch.ones(5)], r"each of the 6 modes of object 1 \(counted from 0\), found 5"),
+        ([ones, 0 * ones], r"not all zero, of object 1 \(counted from 0\), found silence"),
+        ([math.nan * ones, ones], "finite gains, not all zero, of object 0 .* found others"),
+    ):
+        with pytest.raises(EditError, match=words):
+            MaterialStatistics.of_modes([bank, bank], gains, name="things")
+
+
+@dataclass(frozen=True, eq=False)
+class Ahead(SameGains):
+    """Gains of which a part is a quarter of a period ahead."""
+
+    quadrature: torch.Tensor
+
+    def at(self, contacts, directions=None) -> Gains:
+        return Gains(self.gains.expand(len(contacts), -1), self.quadrature.expand(len(contacts), -1))
+
+
+def test_a_modes_size_does_not_depend_on_its_phase():
+    field, turn = ringing_field(), torch.linspace(0.0, 1.5, 6)
+    gains = field.gain_field.gains
+    turned = replace(field, gain_field=Ahead(gains * torch.cos(turn), gains * torch.sin(turn)))
+    own, other = (MaterialStatistics.recast(each, CERAMIC, WOOD) for each in (field, turned))
+    torch.testing.assert_close(other.frequency, own.frequency)
+    assert other.brightness == pytest.approx(own.brightness, rel=1e-5)
 
 
 def test_an_edit_starts_where_nothing_moves_alone():

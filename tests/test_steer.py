@@ -9,7 +9,7 @@ import torch
 from avmsf.errors import EditError
 from avmsf.tasks.clips import level
 from avmsf.tasks.modaledit import ModalEdit
-from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT
+from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, SEARCHED
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.steer import Guide, SteerConfig, steer
 from ringing_field import RATE, SameGains, ringing_field, sound_of
@@ -106,6 +106,26 @@ def test_independent_modes_have_nothing_in_common():
     assert made.origin.report["edits"][-1]["parameters"] == "independent"
 
 
+@pytest.mark.parametrize(("parameters", "pitch"), [(INDEPENDENT, 1.0), (SEARCHED, 0.5)])
+def test_what_does_not_move_stays_where_it_begins(parameters, pitch):
+    class Proposing(Towards):
+        def start(self, struck):
+            return ModalEdit.none(struck.bank, pitch=math.log(0.5), decay=math.log(2.0))
+
+    guide = Proposing(sound_of(ringing_field(pitch=0.5)))
+    made, seen = trace(ringing_field(), guide, config=replace(QUICK, steps=2, preview_every=0), parameters=parameters)
+    assert (seen[-1].pitch, seen[-1].decay) == (pytest.approx(pitch), pytest.approx(1 / pitch))
+    # Two steps of single modes are a 25th at most.
+    ratio = made.bank.frequency / ringing_field().bank.frequency
+    torch.testing.assert_close(ratio, torch.full_like(ratio, pitch), rtol=0.05, atol=0)
+    assert not torch.allclose(ratio, torch.full_like(ratio, pitch), rtol=1e-3)
+
+
+def test_the_largest_seed_is_one():
+    made, _ = trace(ringing_field(), towards(), config=replace(QUICK, steps=1, preview_every=0, seed=2**40))
+    assert bool(torch.isfinite(made.bank.frequency).all())
+
+
 def test_stiffness_keeps_modes_together():
     def spread(stiffness: float) -> float:
         guide = Towards(sound_of(ringing_field()).roll(1) + sound_of(ringing_field(pitch=1.03)))
@@ -157,6 +177,8 @@ def test_a_checkpoint_of_another_edit_is_refused_by_name(tmp_path):
         steer(ringing_field(pitch=1.1), guide, config=QUICK, checkpoint=place)
     with pytest.raises(EditError, match="another guide"):
         steer(ringing_field(), towards(pitch=1.03), config=QUICK, checkpoint=place)
+    # How often previews come changes nothing.
+    steer(ringing_field(), guide, config=replace(QUICK, preview_every=3), checkpoint=place)
     with pytest.raises(EditError, match="another settings"):
         steer(ringing_field(), guide, config=replace(QUICK, steps=13), checkpoint=place)
     place.write_bytes(place.read_bytes()[:100])
@@ -190,6 +212,8 @@ def test_a_silent_field_is_refused():
         ({"modes": 0}, "modes = 0"),
         ({"seconds": -1.0}, "seconds = -1"),
         ({"fft_sizes": (1023,)}, "fft_sizes"),
+        ({"seed": 2**70}, f"seed = {2**70}: expected at most {2**40}"),
+        ({"seconds": 0.04}, r"seconds = 0\.04: expected at least 0\.046, what a window of 2048 samples"),
     ],
 )
 def test_settings_that_cannot_be_meant(settings, words):

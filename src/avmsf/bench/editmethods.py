@@ -20,7 +20,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extract import HighResolution, extract_sounds
 from avmsf.simulate.material import MATERIALS
 from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation
-from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, Parameterisation
+from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, SEARCHED, Parameterisation
 from avmsf.tasks.recast import recast
 from avmsf.tasks.steer import Guide, SteerConfig, steer
 
@@ -126,11 +126,15 @@ class Generation:
 
 
 def towards_reference(config: Mapping[str, Any] | None = None) -> tuple[EditMethod, ...]:
-    """Return the methods of the protocol without words: as it was, unconstrained, ours, and the laws of elasticity."""
+    """Return the methods of the protocol without words.
+
+    As it was; every mode by itself, from there and from where our search ends; ours; and the laws of elasticity.
+    """
     settings = config or {}
     return (
         Untouched(),
         Steered("unconstrained", _reference, INDEPENDENT, settings),
+        Steered("searched", _reference, SEARCHED, settings),
         Steered("hierarchical", _reference, HIERARCHICAL, settings),
         Recast(),
     )

@@ -1,5 +1,6 @@
 """The command `avmsf`: one module a verb, and what happens around all of them."""
 
+import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -31,6 +32,8 @@ VERBS = {
     "demo": "Go all the way on a built-in example: images, Gaussians, features, a field, sounds, pictures.",
 }
 """Each verb's module in this package, and the first sentence of its help."""
+CLOSED = 141
+"""The exit code that shells give a command whose output nobody reads any more."""
 INTERRUPTED = 130
 """The exit code that shells give a command ended by Ctrl-C."""
 
@@ -56,6 +59,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except AvmsfError as error:
             print(f"avmsf {words[0]}: {' '.join(str(error).split())}", file=sys.stderr)
             return 2
+        except BrokenPipeError:
+            # Whoever read the output has closed it, as `head` does; Python would complain again when it flushes.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return CLOSED
         except KeyboardInterrupt:
             print(f"avmsf {words[0]}: interrupted", file=sys.stderr)
             return INTERRUPTED

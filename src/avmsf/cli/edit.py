@@ -23,7 +23,7 @@ from avmsf.cli.writing import Level, OutputError, expect_writable, write_sound
 from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
-from avmsf.tasks.edits import EDITS
+from avmsf.tasks.edits import EDITS, muted, silenced
 from avmsf.tasks.retune import retune
 
 MODES, SPECTROGRAMS, BEFORE, AFTER = "modes.png", "spectrograms.png", "before.wav", "after.wav"
@@ -48,32 +48,53 @@ class Sliders:
     """Tilt of the spectrum about its middle, dB an octave."""
     mode_db: Annotated[tyro.conf.UseAppendAction[tuple[tuple[float, float], ...]], tyro.conf.arg(metavar="HZ DB")] = ()
     """Raise the mode of this frequency, as the field has it before the edit, by so many dB; -inf mutes it."""
+    mode_pitch: Annotated[
+        tyro.conf.UseAppendAction[tuple[tuple[float, float], ...]], tyro.conf.arg(metavar="HZ FACTOR")
+    ] = ()
+    """Factor on the frequency of the mode that is called by this one, beside --pitch."""
+    mode_decay: Annotated[
+        tyro.conf.UseAppendAction[tuple[tuple[float, float], ...]], tyro.conf.arg(metavar="HZ FACTOR")
+    ] = ()
+    """Factor on the time in which the mode of this frequency dies away, beside --decay."""
 
     @property
     def asked(self) -> bool:
         """Whether anything changes."""
-        return (self.pitch, self.decay, self.brightness) != (1.0, 1.0, 0.0) or bool(self.mode_db)
+        single = self.mode_db or self.mode_pitch or self.mode_decay
+        return (self.pitch, self.decay, self.brightness) != (1.0, 1.0, 0.0) or bool(single)
 
     def apply(self, field: SoundField, *, named: Float[Tensor, " modes"]) -> SoundField:
         """Return the retuned field; modes are called by the frequencies `named`, Hz."""
         levels = torch.zeros(len(named), dtype=torch.float64)
+        pitch, decay = torch.full_like(levels, self.pitch), torch.full_like(levels, self.decay)
         for frequency, level in self.mode_db:
-            row = int((named - frequency).abs().argmin())
-            if not abs(float(named[row]) - frequency) <= _NEAR * float(named[row]):
-                raise EditError(
-                    f"--mode-db {frequency:g}: no mode is there, the nearest is at {float(named[row]):.5g} Hz; "
-                    "`avmsf show` lists them"
-                )
-            levels[row] += level
-        return retune(field, pitch=self.pitch, decay=self.decay, brightness_db=self.brightness, gains_db=levels)
+            levels[_called(frequency, named, "--mode-db")] += level
+        for option, values, given in (
+            ("--mode-pitch", pitch, self.mode_pitch),
+            ("--mode-decay", decay, self.mode_decay),
+        ):
+            for frequency, factor in given:
+                values[_called(frequency, named, option)] *= factor
+        return retune(field, pitch=pitch, decay=decay, brightness_db=self.brightness, gains_db=levels)
+
+
+def _called(frequency: float, named: Float[Tensor, " modes"], option: str) -> int:
+    """Return the row of the mode that is called by a frequency. Raises EditError where there is none."""
+    row = int((named - frequency).abs().argmin())
+    if not abs(float(named[row]) - frequency) <= _NEAR * float(named[row]):
+        raise EditError(
+            f"{option} {frequency:g}: no mode is there, the nearest is at {float(named[row]):.5g} Hz; `avmsf show` "
+            "lists them"
+        )
+    return row
 
 
 @dataclass(frozen=True)
 class Options:
     """Give a field another material, size, pitch or decay, or lead it towards words or a recording.
 
-    First the material, then the sliders, then the words or the recording. Where on the object a mode is loud stays, so
-    the edited field renders and locates like any other.
+    First the material, then the sliders, then the words, the recording or what a material sounds like. Where on the
+    object a mode is loud stays, so the edited field renders and locates like any other.
     """
 
     field: tyro.conf.Positional[Path]
@@ -109,8 +130,9 @@ def run(options: Options) -> int:
         say(f"avmsf edit: interrupted; give the same command again to go on {where}")
         return INTERRUPTED
     save(new, options.output)
-    for ending in ("checkpoint", "preview.wav"):
-        beside(options.output, ending).unlink(missing_ok=True)
+    if options.steering.asked:
+        for ending in ("checkpoint", "preview.wav"):
+            beside(options.output, ending).unlink(missing_ok=True)
     edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
     before, after = HeardModes.of(old), HeardModes.of(new)
     screen = console(errors=options.json)
@@ -127,7 +149,7 @@ def run(options: Options) -> int:
                 "output": str(options.output),
                 "capture": new.origin.capture,
                 "edits": edits,
-                "silent_modes": int((~new.audible).sum()),
+                "silent_modes": int(silenced(new).sum()),
                 "modes": _rows(before, after),
             }
         )
@@ -136,24 +158,28 @@ def run(options: Options) -> int:
 
 def _edited(options: Options, field: SoundField) -> SoundField:
     named = field.bank.frequency
-    if options.change.asked:
-        field = options.change.apply(field)
+    needed = options.change.asked or options.steering.like_material is not None
+    old = options.change.made_of(field) if needed else None
+    if options.change.asked and old is not None:
+        field, old = options.change.apply(field, old=old), options.change.target(old)
     if options.sliders.asked:
         field = options.sliders.apply(field, named=named)
     if options.steering.asked:
-        field = options.steering.apply(field, output=options.output)
+        field = options.steering.apply(field, output=options.output, old=old)
     return field
 
 
 def _expect(options: Options) -> None:
     """Raise before any work for what cannot be done or written."""
     options.steering.expect_one()
-    if options.change.old is not None and not options.change.asked:
-        raise EditError("--from is given without anything to lead to: add --material, --size or a constant")
+    if options.change.old is not None and not (options.change.asked or options.steering.like_material):
+        raise EditError(
+            "--from is given without anything to lead to: add --material, --size, a constant or --like-material"
+        )
     if not (options.change.asked or options.sliders.asked or options.steering.asked):
         raise EditError(
-            "nothing is asked for: give --material, --size or a constant of a material, --pitch, --decay, --brightness "
-            "or --mode-db, --prompt or --like"
+            "nothing is asked for: give --material, --size or a constant of a material, --pitch, --decay, "
+            "--brightness, --mode-db, --mode-pitch or --mode-decay, --prompt, --like or --like-material"
         )
     expect_writable(options.output)
     if options.output.exists() and options.field.exists() and options.output.samefile(options.field):
@@ -171,7 +197,11 @@ def _contact(field: SoundField, at: tuple[float, float, float] | None) -> Float[
         return chosen.places[0].double()
     points = field.gain_field.points
     some = points[:: max(1, len(points) // _CANDIDATES)]
-    energy = (field.gains(some).double().square() * field.audible / field.bank.damping).sum(1)
+    known = field.known(some)
+    power = known.mean.double().square()
+    if known.quadrature is not None:
+        power = power + known.quadrature.double().square()
+    energy = (power * field.audible / field.bank.damping).sum(1)
     return some[int(energy.argmax())].double()
 
 
@@ -230,13 +260,13 @@ def _table(before: HeardModes, after: HeardModes) -> Table:
 def _remarks(edits: Sequence[dict[str, Any]], field: SoundField) -> list[str]:
     """Return what the owner of the field should know, a sentence a line."""
     words = [f"note: {remark}" for entry in edits for remark in entry.get("remarks", [])]
-    silent = field.bank.frequency[~field.audible].tolist()
+    silent = field.bank.frequency[silenced(field)].tolist()
     if silent:
         words.append(
             f"note: {len(silent)} of {len(field.bank)} modes lie at or above half the sample rate of "
             f"{field.sample_rate:g} Hz and are silent, from {min(silent):.4g} Hz to {max(silent):.4g} Hz; an edit that "
             "lowers them brings them back"
         )
-    if not bool(field.audible.any()):
+    if not bool((field.audible & ~muted(field)).any()):
         words.append("note: nothing but noise is left of the sound: edit less")
     return words

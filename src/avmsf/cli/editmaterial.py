@@ -54,13 +54,20 @@ class MaterialChange:
         """Whether anything changes."""
         return self.material is not None or self.size != 1.0 or bool(self.constants)
 
-    def apply(self, field: SoundField) -> SoundField:
-        """Return the recast field, with words on what is taken for its old material where that is not given."""
-        old = old_material(field) if self.old is None else material_named(self.old)
+    def made_of(self, field: SoundField) -> Material:
+        """Return what a field is of before the change, with words on how that is known where it is not given."""
+        return old_material(field) if self.old is None else material_named(self.old)
+
+    def target(self, old: Material) -> Material:
+        """Return what an object of `old` comes to be of."""
         new = old if self.material is None else material_named(self.material)
         if self.constants:
             new = replace(new, name=f"{new.name} with {', '.join(self.constants)} changed", **self.constants)
-        return recast(field, old, new, size=self.size, law=LAWS[self.law])
+        return new
+
+    def apply(self, field: SoundField, *, old: Material) -> SoundField:
+        """Return the recast field of an object that is of `old`."""
+        return recast(field, old, self.target(old), size=self.size, law=LAWS[self.law])
 
 
 def old_material(field: SoundField) -> Material:

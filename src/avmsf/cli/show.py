@@ -18,7 +18,7 @@ from avmsf.cli.modes import mode_table
 from avmsf.cli.modetable import levels, mode_rows
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.scores import score_table, score_values
-from avmsf.field.belief import expect_doubt, knows_doubt
+from avmsf.field.belief import knows_doubt, struck_at
 from avmsf.field.doubt import gain_doubt, spectrum_band
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
@@ -147,7 +147,7 @@ def draw_field(
     if knows_doubt(field):
         doubt = gain_doubt(field, points)
         title = f"doubt of {name}"
-        pictures["doubt"] = draw_doubt(points, doubt, title=title, struck=expect_doubt(field).contacts)
+        pictures["doubt"] = draw_doubt(points, doubt, title=title, struck=struck_at(field))
         pictures["spectrum"] = draw_band(spectrum_band(field, points[0]), title=f"{name}: one blow, and its doubt")
     for stem, picture in pictures.items():
         path = folder / f"{stem}.png"
@@ -188,10 +188,36 @@ def _words(values: dict[str, Any]) -> str:
         f"  fitted to  {len(values['trained_on'])} recordings",
     ]
     for edit in report.get("edits", []):
-        told = ", ".join(f"{name} {value}" for name, value in edit.items() if isinstance(value, str | int | float))
-        lines.append(f"  edited     {told}")
+        lines.append(f"  edited     {_edit_words(edit)}")
     if report.get("validated"):
         held = report.get("validation_spectral", {})
         errors = ", ".join(f"{name} {float(error):.3g}" for name, error in held.items())
         lines.append(f"  chosen on  {len(report['validation_contacts'])} validation contacts, spectral error {errors}")
     return "\n".join(lines)
+
+
+def _edit_words(edit: dict[str, Any]) -> str:
+    """Return what an edit did, without what left all as it was."""
+    told = [str(edit.get("edit"))]
+    if "from" in edit:
+        told.append(f"from {edit['from']['name']} to {edit['to']['name']}")
+    told += [f"towards {edit[name]!r}" for name in ("prompt", "reference") if name in edit]
+    usual = {"size": 1.0, "pitch": 1.0, "decay": 1.0, "brightness_db": 0.0, "gains_db": 0.0}
+    told += [f"{name} {_by_mode(edit[name])}" for name, same in usual.items() if edit.get(name, same) != same]
+    told += [f"{name} {edit[name]}" for name in ("law", "negative", "model", "guidance", "steps") if edit.get(name)]
+    for name, what in (
+        ("silent_hertz", "beyond half the sample rate"),
+        ("overdamped_hertz", "damped too much to ring"),
+    ):
+        if edit.get(name):
+            told.append(f"modes {what}: {len(edit[name])}")
+    return ", ".join(told)
+
+
+def _by_mode(values: float | list[float | None] | None) -> str:
+    """Return one value, or the range of those of single modes; None is what is muted."""
+    if not isinstance(values, list):
+        return "-inf" if values is None else f"{values:.4g}"
+    low, high = (min(known), max(known)) if (known := [each for each in values if each is not None]) else (0.0, 0.0)
+    mute = values.count(None)
+    return f"{low:.4g} to {high:.4g} by mode" + (f", {mute} muted" if mute else "")

@@ -1,4 +1,4 @@
-"""An edit towards words or recordings, as the command line has it: its guide, its progress, its previews."""
+"""An edit towards words, recordings or a material's sound on the command line: its guide, progress and previews."""
 
 import sys
 import warnings
@@ -17,7 +17,9 @@ from avmsf.cli.printing import figure, say
 from avmsf.cli.writing import Level, write_sound
 from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
+from avmsf.simulate.material import Material, material_named
 from avmsf.tasks.distillation import DecoderDistillation
+from avmsf.tasks.materialstatistics import MaterialStatistics
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
 from avmsf.tasks.stableaudiofiles import STABLE_AUDIO
@@ -28,7 +30,7 @@ _PREVIEW = Level("peak", -1.0)
 
 @dataclass(frozen=True)
 class Steering:
-    """A descent towards a prompt, or towards recordings; only one of them.
+    """A descent towards a prompt, recordings, or the sound of a material; only one of them.
 
     While it runs, the sound as it stands can be heard beside the output. An interrupted edit leaves its state there;
     the same command goes on from it to the same result.
@@ -39,6 +41,9 @@ class Steering:
     `text`."""
     like: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="WAV|FOLDER")] = ()
     """Lead the sound towards recordings of blows on another object, files or folders of them."""
+    like_material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Lead the sound towards what objects of a material sound like, made up from this object's modes by the laws of
+    elasticity: a pull towards its pitches and rings, where --material follows the laws to the letter."""
     model: str = STABLE_AUDIO
     """Folder that holds a Stable Audio pipeline, or its name on the hub."""
     negative: str | None = None
@@ -58,23 +63,44 @@ class Steering:
     @property
     def asked(self) -> bool:
         """Whether there is anything to lead to."""
-        return self.prompt is not None or bool(self.like)
+        return bool(self._guides)
 
     def expect_one(self) -> None:
-        """Raise `EditError` for both a prompt and recordings, and for an empty prompt: before a model is loaded."""
-        if self.prompt is not None and self.like:
-            raise EditError("expected --prompt or --like, found both: edit by one, then by the other")
+        """Raise before a model is loaded: `EditError` for more than one guide and for an empty prompt.
+
+        Raises `SimulationError` for a material that is not known.
+        """
+        if len(self._guides) > 1:
+            raise EditError(
+                f"expected one of --prompt, --like and --like-material, found {' and '.join(self._guides)}: edit by "
+                "one, then by the other"
+            )
+        if self.like_material is not None:
+            material_named(self.like_material)
         if self.prompt is not None and not self.prompt.strip():
             raise EditError('--prompt is empty: describe the sound, such as "a wooden bowl is hit"')
 
-    def apply(self, field: SoundField, *, output: Path) -> SoundField:
-        """Return the edited field; `output` is where it will be written, and its state and preview lie beside it."""
-        guide = self._guide(field)
+    def apply(self, field: SoundField, *, output: Path, old: Material | None) -> SoundField:
+        """Return the edited field; `output` is where it will be written, and its state and preview lie beside it.
+
+        `old` is what the field is of, needed for `like_material` alone.
+        """
+        guide = self._guide(field, old)
         preview = beside(output, "preview.wav")
         with SteerBar(preview, sample_rate=field.sample_rate) as bar, _remarks_as_notes():
             return steer(field, guide, config=self.config, progress=bar.show, checkpoint=beside(output, "checkpoint"))
 
-    def _guide(self, field: SoundField) -> Guide:
+    @property
+    def _guides(self) -> list[str]:
+        given = {"--prompt": self.prompt is not None, "--like": bool(self.like)}
+        given["--like-material"] = self.like_material is not None
+        return [name for name, present in given.items() if present]
+
+    def _guide(self, field: SoundField, old: Material | None) -> Guide:
+        if self.like_material is not None:
+            assert old is not None
+            common = MaterialStatistics.recast(field, old, material_named(self.like_material))
+            return common.reference(samples=field.samples, sample_rate=field.sample_rate, seed=self.config.seed)
         if self.prompt is None:
             return Reference.read(self.like, sample_rate=field.sample_rate)
         say(f"loading {self.model}")

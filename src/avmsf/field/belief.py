@@ -27,17 +27,25 @@ class Belief:
 def knows_doubt(field: SoundField) -> bool:
     """Return whether the field knows how sure it is of its gains."""
     try:
-        expect_doubt(field)
+        measured_gains(field)
     except FitError:
         return False
     return True
 
 
 def expect_doubt(field: SoundField) -> ModalBasis | ThinPlateGains:
-    """Return the field's gains. Raises FitError where they know no doubt, with the kinds that do."""
-    gains = field.gain_field
-    if isinstance(gains, ScaledGains):
-        raise FitError("the field was edited, and does not know how sure it is: ask the field that it was made from")
+    """Return the field's gains, to learn more of. Raises as `measured_gains`, and for an edited field."""
+    if isinstance(field.gain_field, ScaledGains):
+        raise FitError("the field was edited, and no blow tells more of what nobody can strike: ask the unedited field")
+    return measured_gains(field)
+
+
+def measured_gains(field: SoundField) -> ModalBasis | ThinPlateGains:
+    """Return the gains that the field's doubt rests on: its own, or those that an edited field was made from.
+
+    Raises FitError where they know no doubt, with the kinds that do.
+    """
+    gains = field.gain_field.field if isinstance(field.gain_field, ScaledGains) else field.gain_field
     if not isinstance(gains, ModalBasis | ThinPlateGains):
         raise FitError(
             f"gains of the kind {gains.kind!r} do not know how sure they are; those of {ModalBasis.kind} and of "
@@ -49,18 +57,32 @@ def expect_doubt(field: SoundField) -> ModalBasis | ThinPlateGains:
     return gains
 
 
+def scale_of(field: SoundField) -> Float64[Tensor, " modes"]:
+    """Return the field's gains over those that its doubt rests on: 1, or what an edit has made of each mode."""
+    gains = field.gain_field
+    return gains.scale if isinstance(gains, ScaledGains) else torch.ones(len(field.bank), dtype=torch.float64)
+
+
+def struck_at(field: SoundField) -> Float64[Tensor, "contacts 3"]:
+    """Return the contacts that the gains were fitted to, metres, on the object as it is. Raises as `measured_gains`."""
+    measured = measured_gains(field)
+    gains = field.gain_field
+    return gains.contacts.double() if isinstance(gains, ScaledGains) else measured.contacts.double()
+
+
 def deviation_of(
     field: SoundField, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
 ) -> Float64[Tensor, "contacts modes 2"]:
-    """Return the standard deviation of both parts of the gains, as the field has it. Raises as `expect_doubt`."""
-    deviation = expect_doubt(field).deviation(contacts, directions)
+    """Return the standard deviation of both parts of the gains, as the field has it. Raises as `measured_gains`."""
+    measured_gains(field)
+    deviation = field.gain_field.deviation(contacts, directions)
     assert deviation is not None
     return deviation.double()
 
 
 def energy_of(field: SoundField, gains: Float[Tensor, "contacts modes 2"]) -> Float64[Tensor, " contacts"]:
-    """Return the energy of gains in two parts: the sum over modes of their squares over four times the damping."""
-    return (gains.double().square().sum(2) / (4.0 * field.bank.damping.double())).sum(1)
+    """Return the energy of gains in two parts: the sum over audible modes of squares over four times the damping."""
+    return (gains.double().square().sum(2) * field.audible / (4.0 * field.bank.damping.double())).sum(1)
 
 
 def parts_of(
@@ -78,7 +100,7 @@ def beliefs(
     """Return what is not known of all modes' gains of blows at places.
 
     With physics, of each mode by its likeliest hypothesis; of splines all modes' at once, by kriging. Raises FitError
-    for other gains.
+    for other gains, and for an edited field's.
     """
     gains = expect_doubt(field)
     weights = 1.0 / (4.0 * field.bank.damping.double())
@@ -95,10 +117,10 @@ def left_out(field: SoundField) -> Float64[Tensor, "contacts modes 2"]:
     """Return by how much each contact's gains are missed by all others', over the deviation foretold of that.
 
     The gains as measured with the field's own modes: those that the end-to-end stage moved suit one another too well.
-    Contacts that are doubted have no part, and NaN stands for parts of modes without any gains. Raises FitError for
-    gains that know no doubt.
+    An edit, which scales errors and deviations alike, changes nothing of it. Contacts that are doubted have no part,
+    and NaN stands for parts of modes without any gains. Raises FitError for gains that know no doubt.
     """
-    gains = expect_doubt(field)
+    gains = measured_gains(field)
     tiny = torch.finfo(torch.float64).tiny
     errors, spread = gains.missed()
     scores = errors / spread.clamp_min(tiny)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.errors import FitError
-from avmsf.field.belief import deviation_of, energy_of, expect_doubt, left_out, parts_of
+from avmsf.field.belief import deviation_of, energy_of, left_out, measured_gains, parts_of, scale_of
 from avmsf.field.modalbasis import ModalBasis
 from avmsf.field.soundfield import SoundField
 from avmsf.field.thinplategains import ThinPlateGains
@@ -75,10 +75,10 @@ def gain_doubt(field: SoundField, points: Float[Tensor, "points 3"]) -> Float64[
     is certainty; places that may ring louder than the mean can have more than 1. Raises FitError for gains that know
     no doubt.
     """
-    gains = expect_doubt(field)
     factor = widening(field) / _normal(LEVEL)
-    step = max(1, len(gains.points) // _MAPPED)
-    energy = energy_of(field, parts_of(field, gains.points[::step])).mean()
+    surface = field.gain_field.points
+    step = max(1, len(surface) // _MAPPED)
+    energy = energy_of(field, parts_of(field, surface[::step])).mean()
     doubt = factor**2 * energy_of(field, deviation_of(field, points))
     return (doubt / energy.clamp_min(torch.finfo(torch.float64).tiny)).sqrt()
 
@@ -104,7 +104,7 @@ def spectrum_band(
     generator = torch.Generator().manual_seed(seed)
     drawn = mean + spread * torch.randn(_DRAWS, *mean.shape, generator=generator, dtype=torch.float64)
     spectra = torch.zeros(_DRAWS, field.samples // 2 + 1, dtype=torch.complex128)
-    for modes in torch.split(torch.arange(len(field.bank)), _BATCH):
+    for modes in torch.split(torch.nonzero(field.audible).flatten(), _BATCH):
         spectra += torch.einsum("amd,mdf->af", drawn[:, modes].to(spectra), _spectra(field, modes))
     place = torch.linspace(0, len(field.residual.magnitude) - 1, spectra.shape[1])
     left = place.floor().long().clamp_max(len(field.residual.magnitude) - 2)
@@ -134,16 +134,16 @@ def coverage(
     interval is that of a measured gain, so it holds the scatter of a blow as well as the field's doubt, and is as wide
     as `widening` says. Raises FitError for gains that know no doubt and for gains of other modes.
     """
-    gains = expect_doubt(field)
+    gains, scale = measured_gains(field), scale_of(field).square()[:, None]
     if parts.shape != (len(contacts), len(field.bank), 2):
         raise FitError(
             f"gains are of shape {tuple(parts.shape)}: expected {len(contacts)} contacts, the field's "
             f"{len(field.bank)} modes and 2 parts"
         )
     deviation = deviation_of(field, contacts, directions)
-    spread = (deviation.square() + _scatter(gains)).sqrt()
+    spread = (deviation.square() + scale * _scatter(gains)).sqrt()
     within = (parts - parts_of(field, contacts, directions)).abs() <= widening(field, level=level) * spread
-    energy = (gains.values.square().mean(0) / (4.0 * field.bank.damping.double())[:, None]).expand_as(parts)
+    energy = (scale * gains.values.square().mean(0) / (4.0 * field.bank.damping.double())[:, None]).expand_as(parts)
     return Coverage(float(within.double().mean()), float((within * energy).sum() / energy.sum()))
 
 

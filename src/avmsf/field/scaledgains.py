@@ -46,6 +46,12 @@ class ScaledGains:
         """Points of the object's surface, object frame, metres."""
         return (self.field.points.double() * self.length).float()
 
+    @property
+    def contacts(self) -> Float[Tensor, "contacts 3"]:
+        """Contacts that the gains were fitted to, where they are on this object; none where these are not known."""
+        fitted = getattr(self.field, "contacts", self.field.points[:0])
+        return fitted.double() * self.length
+
     def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
         """Return the scaled gains; the factors on the dampings are the fitted ones."""
         known = self.field.at(contacts.double() / self.length, directions)

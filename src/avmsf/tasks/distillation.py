@@ -48,6 +48,10 @@ class AudioDiffusion(Protocol):
         """Precision of the denoiser."""
         ...
 
+    def describe(self) -> dict[str, Any]:
+        """Return what tells it from other models of its name, its weights, window and precision, as plain values."""
+        ...
+
     def encode(self, waveforms: Float[Tensor, "contacts channels samples"]) -> Float[Tensor, "contacts dim frames"]:
         """Return float32 latents of waveforms, continued by silence to the length that the model works at."""
         ...
@@ -151,6 +155,7 @@ class DecoderDistillation:
             "prompt": self.prompt,
             "negative": self.negative,
             "model": self.model.name,
+            **self.model.describe(),
             "guidance": self.guidance,
             "denoising_steps": self.steps,
             "noise_levels": [self.lowest, self.highest],
@@ -178,8 +183,15 @@ class DecoderDistillation:
                 rows = slice(len(made), len(made) + self.batch)
                 try:
                     made += self._cleaned(heard[rows], level[rows], seeds[rows]).unbind()
+                    continue
                 except torch.OutOfMemoryError as error:
-                    self._halve(error)
+                    if self.batch == 1:
+                        raise EditError(
+                            f"{self.model.name} runs out of memory on {self.model.device} with one sound at a time: "
+                            "give it fewer seconds to work at, free memory there, or choose the device cpu"
+                        ) from error
+                # Not before the error is gone: its traceback holds the tensors that filled the memory.
+                self._halve()
             back = resampled(torch.stack(made), sample_rate=self.model.sample_rate, wanted=self.sample_rate)
             return levelled(lasting(back.to(sounds), sounds.shape[1]), sounds, sample_rate=self.sample_rate)
 
@@ -206,13 +218,8 @@ class DecoderDistillation:
         )
         return model.decode(clean, samples=samples).mean(dim=1).float().cpu()
 
-    def _halve(self, error: torch.OutOfMemoryError) -> None:
-        if self.batch == 1:
-            raise EditError(
-                f"{self.model.name} runs out of memory on {self.model.device} with one sound at a time: give it fewer "
-                "seconds to work at, free memory there, or choose the device cpu"
-            ) from error
-        self.batch = max(1, self.batch // 2)
+    def _halve(self) -> None:
+        self.batch //= 2
         if self.model.device.type == "cuda":
             torch.cuda.empty_cache()
         warnings.warn(

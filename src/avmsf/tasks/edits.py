@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from avmsf.errors import EditError
@@ -28,9 +28,8 @@ def edited(
     """Return the field of other modes, its gains times `scale`, its lengths times `length`.
 
     The modes stay in the order that they had, whatever their frequencies have become, so that mode k is the same before
-    and after. `entry`, plain values, ends the list of edits, with the frequencies of the modes that have moved to half
-    the sample rate or above: these are silent, and stay in the bank for edits that bring them back. Raises `EditError`
-    where a frequency or a damping is not positive, or a number too large.
+    and after. `entry`, plain values, ends the list of edits, with the frequencies of the modes that are `silenced`.
+    Raises `EditError` where a frequency or a damping is not positive, or a number too large.
     """
     for name, values in (("frequency", bank.frequency), ("damping", bank.damping), ("gain factor", scale)):
         fine = torch.isfinite(values) & (values > 0 if name != "gain factor" else True)
@@ -41,7 +40,21 @@ def edited(
                 f"{float(values[row]):g}: expected a finite one{'' if name == 'gain factor' else ' above 0'}; edit less"
             )
     changed = replace(field, bank=bank, gain_field=ScaledGains(field.gain_field, scale, length))
-    silent = bank.frequency[~changed.audible].tolist()
+    silent = bank.frequency[silenced(changed)].tolist()
     listed = [*field.origin.report.get(EDITS, []), {**entry, "silent_hertz": silent}]
     report = {**field.origin.report, EDITS: listed}
     return replace(changed, origin=replace(field.origin, report=report))
+
+
+def muted(field: SoundField) -> Bool[Tensor, " modes"]:
+    """Return which modes edits have taken all gains of: nothing brings these back."""
+    gains = field.gain_field
+    return gains.scale == 0 if isinstance(gains, ScaledGains) else torch.zeros_like(field.audible)
+
+
+def silenced(field: SoundField) -> Bool[Tensor, " modes"]:
+    """Return which modes are silent because they lie at half the sample rate or above.
+
+    They stay in the bank for edits that bring them back.
+    """
+    return ~field.audible & ~muted(field)

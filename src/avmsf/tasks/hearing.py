@@ -17,7 +17,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, LocationError
 from avmsf.field.soundfield import SoundField
 
-Sound = Recording | Float[Tensor, " samples"]
+Sound = Recording | Float[Tensor, " samples"] | Float[np.ndarray, " samples"]
 """A recording, or samples alone."""
 _HELD = 0.9
 """Part of half a sample rate up to which a recording of another rate still holds all of a sound."""
@@ -70,7 +70,7 @@ def hear(
         rate = whole.sample_rate
         notes.append(
             f"{whole.name} holds more than one blow, at {prepared.onset / rate:.3f} s and at {second / rate:.3f} s: "
-            "only the first was located, locate_blows takes them all"
+            "only the first was located; --several, in Python locate_blows, takes them all"
         )
         sound = sound[: max(second - begin, shortest_allowed(rate))]
     at_rate, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
@@ -80,7 +80,7 @@ def hear(
 def as_recording(recording: Sound, field: SoundField, *, sample_rate: float | None = None) -> Recording:
     """Return a recording that can be listened to. Raises LocationError for silence and for what is not finite."""
     if not isinstance(recording, Recording):
-        samples = recording.detach().cpu().double().numpy()
+        samples = torch.as_tensor(recording).detach().cpu().double().numpy()
         rate = field.sample_rate if sample_rate is None else sample_rate
         recording = Recording("the recording", samples[None], rate, "FLOAT")
     elif sample_rate is not None and sample_rate != recording.sample_rate:

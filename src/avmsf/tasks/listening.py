@@ -227,7 +227,7 @@ class Listener:
         sound = ears.heard[start : start + length] - self._modes.hear(earlier, length)
         try:
             found = self.locator.locate(sound.float())
-            found = replace(found, notes=(*found.notes, *judge_fit(found)))
+            found = replace(found, notes=(*found.notes, *judge_fit(found, "the blow")))
         except LocationError as error:
             return replace(ears, strangers=ears.strangers + 1, refusal=str(error)), None
         return ears, Blow(pending.onset / self.rate, found, length / self.rate, 0.0, final)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf.capture.audio import Recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
@@ -40,10 +41,11 @@ def locate(
     heard = hear(recording, field, sample_rate=sample_rate, settings=settings)
     finder = Locator.of(field, points=points, directions=directions) if locator is None else locator
     found = finder.locate(heard.sound, highest=heard.highest, force=force)
-    return replace(found, notes=(*heard.notes, *found.notes, *judge_fit(found)))
+    name = recording.name if isinstance(recording, Recording) else "the recording"
+    return replace(found, notes=(*heard.notes, *found.notes, *judge_fit(found, name)))
 
 
-def judge_fit(found: ContactMap) -> list[str]:
+def judge_fit(found: ContactMap, name: str) -> list[str]:
     """Return a word of doubt where an object's modes explain little of a sound; LocationError where it is too little.
 
     The thresholds come of simulated plates and mugs: modes explain nine tenths and more of their own object's sounds
@@ -52,7 +54,7 @@ def judge_fit(found: ContactMap) -> list[str]:
     share = f"the modes of this object explain {100 * found.modal:.0f} % of the sound"
     if found.modal < STRANGE:
         raise LocationError(
-            f"{share}, of its own recordings they explain far more ({100 * DOUBTFUL:.0f} % and up): is it a recording "
-            "of this object, of a blow, without much noise? Record it again, or choose another field"
+            f"{name}: {share}, and {100 * DOUBTFUL:.0f} % or more of its own recordings: this is another object, no "
+            "blow, or mostly noise. Record it again, or choose another field"
         )
     return [f"{share}: it may be another object's, or hold much else"] if found.modal < DOUBTFUL else []

@@ -50,10 +50,23 @@ class MaterialStatistics:
 
         `gains` holds the size of each mode's. The law of decay is fitted by least squares of the relative error with
         both constants not negative, the brightness by least squares over the logarithms. Raises `EditError` where there
-        are no modes.
+        are no modes, and for an object whose modes are silent or have another number of gains.
         """
         if not banks or any(len(bank) == 0 for bank in banks):
             raise EditError(f"{name}: expected modes of every object, found none: there is nothing to sum up")
+        if len(banks) != len(gains):
+            raise EditError(f"{name}: expected gains of all {len(banks)} objects, found those of {len(gains)}")
+        for row, (bank, size) in enumerate(zip(banks, gains, strict=True)):
+            if len(bank) != len(size):
+                raise EditError(
+                    f"{name}: expected a gain for each of the {len(bank)} modes of object {row} (counted from 0), "
+                    f"found {len(size)}"
+                )
+            if not (bool(torch.isfinite(size).all()) and bool(size.any())):
+                raise EditError(
+                    f"{name}: expected finite gains, not all zero, of object {row} (counted from 0), found "
+                    f"{'others' if bool(size.any()) else 'silence'}: leave the object out"
+                )
         sizes = [size.double().abs() / size.double().abs().sum() for size in gains]
         frequency, damping = (torch.cat([getattr(bank, each) for bank in banks]) for each in ("frequency", "damping"))
         weight = torch.cat(sizes)
@@ -105,7 +118,9 @@ class MaterialStatistics:
         ratio = math.sqrt(new.young / old.young * old.density / new.density)
         points = field.gain_field.points
         rows = torch.linspace(0, len(points) - 1, min(len(points), _POINTS)).long()
-        size = field.gains(points[rows]).square().mean(dim=0).sqrt()
+        known = field.known(points[rows])
+        each = known.mean if known.quadrature is None else torch.hypot(known.mean, known.quadrature)
+        size = each.square().mean(dim=0).sqrt()
         moved = ModalBank(field.bank.frequency * ratio, field.bank.damping)
         found = cls.of_modes([moved], [size], name=new.name)
         return cls(new.name, found.frequency, new.alpha, new.beta, found.brightness)

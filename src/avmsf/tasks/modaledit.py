@@ -81,7 +81,7 @@ class ModalEdit:
             field,
             ModalBank(bank.frequency.detach(), bank.damping.detach()),
             self.scale.detach().exp(),
-            entry={"kind": "steer", "pitch": self.pitch_factor, "decay": self.decay_factor, **(told or {})},
+            entry={"edit": "steer", "pitch": self.pitch_factor, "decay": self.decay_factor, **(told or {})},
         )
 
 

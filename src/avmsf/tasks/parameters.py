@@ -1,7 +1,7 @@
 """What of an edit is free to move, how fast, and what holds it back."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ _QUANTITIES = ("pitch", "shift", "decay", "decay_shift", "scale")
 
 @dataclass(frozen=True)
 class Parameterisation:
-    """Rates are those of Adam, in logarithms a step; 0 keeps a quantity where it starts.
+    """Rates are those of Adam, in logarithms a step, falling to a twentieth; 0 keeps a quantity where it starts.
 
     A quantity of a single mode is held near 0 by half the mean square over modes of its value over its deviation, times
     `stiffness`, in the unit of the loss, which is a relative error.
@@ -41,12 +41,19 @@ class Parameterisation:
     """How far a damping goes by itself."""
     scale_deviation: float = 1.0
     """How far a gain factor goes, the common level aside."""
+    searches: bool = True
+    """Whether it begins where the guide proposes; else the object as it is."""
 
 
 HIERARCHICAL = Parameterisation("hierarchical", 0.02, 0.02, 0.003, 0.01, 0.02, 0.05)
 """The paper's: one pitch and one decay take the object to another material, single modes refine."""
-INDEPENDENT = Parameterisation("independent", 0.0, 0.0, 0.02, 0.02, 0.02, 0.0)
-"""Audio-SDS's own, the paper's baseline: every frequency, damping and gain by itself, nothing in common."""
+INDEPENDENT = Parameterisation("independent", 0.0, 0.0, 0.02, 0.02, 0.02, 0.0, searches=False)
+"""The paper's baseline, after Audio-SDS: every frequency, damping and gain by itself, nothing in common.
+
+The rates are this package's, those at which the common factors move above; Audio-SDS states .05 for its parameters.
+"""
+SEARCHED = replace(INDEPENDENT, name="searched", searches=True)
+"""Every mode by itself, but from where the common factors' search ends: what is left is the hierarchy's own share."""
 
 
 class EditVariables:
@@ -55,7 +62,7 @@ class EditVariables:
     def __init__(self, start: ModalEdit, edited: Int[Tensor, " edited"], parameters: Parameterisation) -> None:
         """Begin at `start`; the modes `edited` move by themselves, the others follow the common factors alone.
 
-        Quantities whose rate is 0 are 0 throughout.
+        Quantities whose rate is 0 stay where they begin.
         """
         self.parameters, self.modes, self.edited = parameters, len(start.shift), edited
         self.values: dict[str, Float64[Tensor, "*edited"]] = {}
@@ -64,7 +71,7 @@ class EditVariables:
             value: Tensor = getattr(start, name).detach().to(edited.device)
             rate = getattr(parameters, f"{name}_rate")
             chosen = value if value.ndim == 0 else value[edited]
-            self.values[name] = chosen.clone().requires_grad_() if rate > 0 else torch.zeros_like(chosen)
+            self.values[name] = chosen.clone().requires_grad_(rate > 0)
             if rate > 0:
                 groups.append({"params": [self.values[name]], "lr": rate, "rate": rate})
         # Targets change from step to step: a long memory of the gradient's square would brake what chance once pushed.

@@ -19,7 +19,7 @@ from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.simulate.material import Material
-from avmsf.tasks.edits import edited
+from avmsf.tasks.edits import edited, muted
 
 
 @dataclass(frozen=True)
@@ -52,27 +52,32 @@ def recast(
 
     The dampings of the field are multiplied by the ratio of what the two materials' Rayleigh laws say, so that what a
     mode has of its own beside the law (its supports, what it radiates) stays in proportion; to give a material to
-    itself changes nothing, and by way of a third one comes to the same. Where neither material damps, dampings stay.
-    Ratios of gains between places stay, the residual too. A place on the new object is `size` times the old one's.
+    itself changes nothing, and by way of a third one comes to the same, unless the third damps a mode beyond critical.
+    Where neither material damps, dampings stay. Ratios of gains between places stay, the residual too. A place on the
+    new object is `size` times the old one's.
 
     What was done is the last entry of `origin.report["edits"]`, with its remarks: modes that have moved to half the
     sample rate or above, which are silent and come back with an edit that lowers them; modes that the new material
-    damps beyond the critical damping, which have no tone and are mute from then on; and another Poisson's ratio, which
-    changes shapes and takes a new solve.
+    damps beyond the critical damping, which have no tone: they are mute from then on, and keep the frequency and the
+    damping that they had; and another Poisson's ratio, which changes shapes and takes a new solve.
 
     Raises `EditError` for a size that is not positive, for an old material without damping where the new one has some,
     and for the reverse, which would ring for ever.
     """
     _expect(old, new, size)
-    omega = torch.hypot(2.0 * math.pi * field.bank.frequency, field.bank.damping)
+    before, mute = field.bank, muted(field)
+    omega = torch.hypot(2.0 * math.pi * before.frequency, before.damping)
     moved = omega * (math.sqrt(new.young / old.young) * math.sqrt(old.density / new.density) / size)
-    damping = field.bank.damping * _rayleigh_ratio(omega, moved, old, new)
-    dead = damping >= moved
-    # A mode without a tone keeps the frequency that it would have undamped: a bank holds no other.
-    angular = torch.where(dead, moved, torch.sqrt((moved.square() - damping.square()).clamp_min(0.0)))
-    bank = ModalBank(angular / (2.0 * math.pi), damping)
+    damping = before.damping * _rayleigh_ratio(omega, moved, old, new)
+    dead = (damping >= moved) & torch.isfinite(damping) & ~mute
+    # Without a tone a mode has no frequency that a bank could hold, and what is mute no place where it would be heard.
+    left = dead | mute
+    angular = torch.where(damping >= moved, moved, torch.sqrt((moved.square() - damping.square()).clamp_min(0.0)))
+    bank = ModalBank(
+        torch.where(left, before.frequency, angular / (2.0 * math.pi)), torch.where(left, before.damping, damping)
+    )
     mass = (new.density / old.density) * size**3
-    scale = (field.bank.frequency / bank.frequency) ** law.frequency / mass**law.mass
+    scale = (before.frequency / bank.frequency) ** law.frequency / mass**law.mass
     entry: dict[str, Any] = {
         "edit": "recast",
         "from": asdict(old),
@@ -82,7 +87,7 @@ def recast(
         "overdamped_hertz": bank.frequency[dead].tolist(),
         "remarks": _remarks(old, new, bank, dead),
     }
-    return edited(field, bank, torch.where(dead, 0.0, scale), entry=entry, length=size)
+    return edited(field, bank, torch.where(left, 0.0, scale), entry=entry, length=size)
 
 
 def rayleigh_damping(omega: Float64[Tensor, " modes"], material: Material) -> Float64[Tensor, " modes"]:

@@ -1,5 +1,6 @@
 """Guides towards sounds that exist: recordings of another object, or sounds as a material makes them."""
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -68,20 +69,24 @@ class Reference:
 
     def describe(self) -> dict[str, Any]:
         """Return what tells it from other guides, as plain values."""
-        marks = [round(float(clip.double().square().sum()), 12) for clip in self.clips]
-        return {"reference": self.name, "lengths": list(self.lengths), "energies": marks}
+        digest = hashlib.sha256(self.clips.detach().cpu().contiguous().numpy().tobytes()).hexdigest()
+        return {"reference": self.name, "lengths": list(self.lengths), "samples_sha256": digest}
 
     def start(self, struck: Struck) -> ModalEdit:
         """Return the common pitch and decay with which the field comes nearest, from a search over both."""
-        return search_start(struck, lambda sounds: self._nearest(sounds))
+        return search_start(struck, self._nearest)
 
     def targets(
         self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator
     ) -> Float[Tensor, "contacts samples"]:
-        """Return the nearest clip of each sound."""
-        return self._nearest(sounds)
+        """Return the nearest clip of each sound, which goes on as the sound itself where the clip ends."""
+        targets, share = self._nearest(sounds)
+        return share * targets + (1 - share) * sounds
 
-    def _nearest(self, sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, "contacts samples"]:
+    def _nearest(
+        self, sounds: Float[Tensor, "contacts samples"]
+    ) -> tuple[Float[Tensor, "contacts samples"], Float[Tensor, "contacts samples"]]:
+        """Return the nearest clip of each sound, and its share in the target: 1, and falling to 0 before its end."""
         samples = sounds.shape[1]
         clips = lasting(self.clips, samples).to(sounds)
         distance = torch.cdist(heard_spectrum(sounds), heard_spectrum(clips), p=1.0)
@@ -90,8 +95,7 @@ class Reference:
         ends = torch.tensor(self.lengths, device=sounds.device)[chosen, None]
         fade = max(1, round(_FADE * self.sample_rate))
         share = ((ends - torch.arange(samples, device=sounds.device)) / fade).clamp(0.0, 1.0).to(sounds)
-        share = torch.where(ends >= samples, torch.ones_like(share), share)
-        return share * targets + (1 - share) * sounds
+        return targets, torch.where(ends >= samples, torch.ones_like(share), share)
 
 
 def wav_files(paths: str | Path | Sequence[str | Path]) -> list[Path]:

@@ -21,6 +21,7 @@ from avmsf.modal.synthesis import synthesise
 from avmsf.tasks.amplitudes import Extractor
 from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.hearing import Sound, as_recording, at_field_rate, describe
+from avmsf.tasks.locate import judge_fit
 from avmsf.tasks.locator import Locator
 
 _BEFORE = 0.005
@@ -44,7 +45,8 @@ def locate_blows(
 
     Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `hear`; `locator` saves making the
     field's anew. What rang before a blow is fitted by the object's modes, carried on as they decay, and subtracted.
-    Blows closer than 30 ms are not told apart. Raises LocationError as `hear`, and where no blow can be located.
+    Blows that are none on this object are left out, and blows closer than 30 ms are not told apart. Raises
+    LocationError as `hear`, and where no blow can be located.
     """
     chosen = CaptureSettings() if settings is None else settings
     whole = as_recording(recording, field, sample_rate=sample_rate)
@@ -67,12 +69,14 @@ def locate_blows(
         own = resampled[start : min(end, start + field.samples)].double()
         if number:
             own = own - still_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
+        seconds = onset / whole.sample_rate
         try:
             located = finder.locate(own.float(), highest=highest)
+            doubts = judge_fit(located, f"{whole.name}, the blow at {seconds:.3f} s")
         except LocationError as error:
             refused.append(error)
             continue
-        found.append((onset / whole.sample_rate, replace(located, notes=(*notes, *remark, *located.notes))))
+        found.append((seconds, replace(located, notes=(*notes, *remark, *located.notes, *doubts))))
     if not found:
         raise refused[0]
     return found

@@ -8,6 +8,7 @@ that a pipeline with another scheduler of that family is taken at its word.
 import math
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from torch import Tensor, nn
 
 from avmsf.errors import EditError
 from avmsf.tasks.clips import lasting
-from avmsf.tasks.stableaudiofiles import STABLE_AUDIO, load_pipeline
+from avmsf.tasks.stableaudiofiles import STABLE_AUDIO, digest, load_pipeline
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +70,19 @@ class StableAudio:
 
         On CUDA and in bfloat16 where there is a GPU, else on the CPU in float32, unless told. Raises `EditError` where
         diffusers is missing, where the model is neither here nor to be downloaded (its licence has to be accepted
-        first), and for a folder that holds another model or a part of one.
+        first), for a folder that holds another model or a part of one, and for a device that is not there or whose
+        memory does not hold the model.
         """
-        place = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        place = _device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
         precision = dtype or (torch.bfloat16 if place.type == "cuda" else torch.float32)
         pipeline, name = load_pipeline(source, precision)
-        return cls(pipeline.to(place), name=name, seconds=seconds)
+        try:
+            pipeline = pipeline.to(place)
+        except torch.OutOfMemoryError as error:
+            raise EditError(
+                f"{name} does not fit into the memory of {place}: free memory there, or choose the device cpu"
+            ) from error
+        return cls(pipeline, name=name, seconds=seconds)
 
     @property
     def sample_rate(self) -> float:
@@ -95,6 +103,14 @@ class StableAudio:
     def dtype(self) -> torch.dtype:
         """Precision of the denoiser."""
         return next(self._denoiser.parameters()).dtype
+
+    def describe(self) -> dict[str, Any]:
+        """Return a digest of its weights and configurations, the frames that it works at, and its precision."""
+        return {"weights_sha256": self._digest, "frames": self._frames, "precision": str(self.dtype)}
+
+    @cached_property
+    def _digest(self) -> str:
+        return digest(self.pipeline)
 
     @property
     def _denoiser(self) -> nn.Module:
@@ -216,6 +232,20 @@ class StableAudio:
             silence = torch.zeros(1, self.channels, (2 * self._reach + 1) * self._hop)
             self._silence = self._encoded(silence)[:, :, self._reach : self._reach + 1]
         return self._silence
+
+
+def _device(name: str | torch.device) -> torch.device:
+    """Return a device on which tensors can be made. Raises `EditError`."""
+    try:
+        place = torch.device(name)
+        torch.empty(1, device=place)
+    except (RuntimeError, AssertionError) as error:  # AssertionError: PyTorch was built without it
+        raise EditError(
+            f"device = {name}: expected one that PyTorch can use here, such as cpu, or cuda with an NVIDIA GPU, its "
+            f"driver and free memory; found {str(error).splitlines()[0] if str(error) else type(error).__name__}: "
+            "choose cpu"
+        ) from error
+    return place
 
 
 def _reach(strides: list[int]) -> int:

@@ -1,5 +1,6 @@
 """Where Stable Audio's weights are: a folder, the hub's cache, or the hub; and what to do where they are not."""
 
+import hashlib
 import json
 import warnings
 from importlib.util import find_spec
@@ -19,6 +20,10 @@ _CLASS, _INDEX = "StableAudioPipeline", "model_index.json"
 _NETWORKS: Final = ("vae", "text_encoder", "projection_model", "transformer")
 _PARTS: Final = (*_NETWORKS, "tokenizer", "scheduler")
 _PRECONDITIONING: Final = ("precondition_inputs", "precondition_noise", "precondition_outputs")
+_SAMPLED = 64
+"""Numbers of each weight that a digest looks at, evenly spaced."""
+_ON_SAVING: Final = ("architectures", "dtype", "torch_dtype", "transformers_version")
+"""Settings that transformers adds when it saves: they say nothing that the weights do not."""
 _SECONDS = 5.0
 """How long to wait for the hub's first word."""
 
@@ -59,6 +64,24 @@ def load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
             "again"
         )
     return pipeline, name
+
+
+def digest(pipeline: Any) -> str:
+    """Return what tells a pipeline from others wherever its files are: of its settings and samples of its weights."""
+    found = hashlib.sha256()
+    for part in (*_NETWORKS, "scheduler"):
+        config = getattr(pipeline, part).config
+        settings = config if isinstance(config, dict) else config.to_dict()
+        # Those that begin with an underscore name the folder and the libraries' versions.
+        plain = {name: each for name, each in settings.items() if not name.startswith("_") and name not in _ON_SAVING}
+        found.update(f"{part} {json.dumps(plain, sort_keys=True, default=str)}".encode())
+    for part in _NETWORKS:
+        for name, weight in getattr(pipeline, part).state_dict().items():
+            rows = torch.linspace(0, weight.numel() - 1, min(weight.numel(), _SAMPLED), dtype=torch.float64).long()
+            sampled = weight.flatten()[rows.to(weight.device)].cpu().double()
+            found.update(f"{part} {name} {weight.dtype} {tuple(weight.shape)}".encode())
+            found.update(sampled.numpy().tobytes())
+    return found.hexdigest()
 
 
 def _is_name(source: str | Path) -> bool:

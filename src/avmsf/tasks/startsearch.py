@@ -4,7 +4,8 @@ Modes are sparse: between one that is there and one that is wanted a third of an
 has no slope. So the pitch comes from optimal transport, which in one dimension is a match of quantiles: a common factor
 on all frequencies moves the quantiles of the spectrum along a logarithmic axis by one step, and the best of them is the
 mean or median difference of two spectra's. A grid over the smoothed spectra's overlap proposes one more. The decay is
-searched on a grid for each proposal, and the loss that will be descended chooses.
+searched on a grid for each proposal, and the loss that will be descended chooses. Only what a target says counts:
+beyond its end there is the rendered sound itself, and the longer that rang, the smaller a relative error would be.
 """
 
 import math
@@ -18,6 +19,10 @@ from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.modal.spectra import scaled_fft_size
 from avmsf.tasks.modaledit import ModalEdit, Struck
 
+Wanted = Callable[
+    [Float[Tensor, "contacts samples"]], tuple[Float[Tensor, "contacts samples"], Float[Tensor, "contacts samples"]]
+]
+"""Gives what sounds are to be pulled towards, and the weight of each sample, 0 where nothing is asked, at most 1."""
 _OCTAVES = 9
 """Of the band that is looked at, down from half the sample rate."""
 _PER_OCTAVE = 24
@@ -50,13 +55,8 @@ def heard_spectrum(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, "
     return amplitude / amplitude.sum(dim=1, keepdim=True).clamp_min(torch.finfo(amplitude.dtype).tiny)
 
 
-def search_start(
-    struck: Struck, wanted: Callable[[Float[Tensor, "contacts samples"]], Float[Tensor, "contacts samples"]]
-) -> ModalEdit:
-    """Return the edit by a common pitch and decay alone with the least spectral error.
-
-    `wanted` gives what sounds are to be pulled towards, as a guide's targets.
-    """
+def search_start(struck: Struck, wanted: Wanted) -> ModalEdit:
+    """Return the edit by a common pitch and decay alone, up to 8 and 64 times either way, of least spectral error."""
     struck = struck.first(_STRUCK)
     best = (math.inf, 0.0, 0.0)
     for pitch in _pitches(struck, wanted):
@@ -68,17 +68,16 @@ def search_start(
             for each in around:
                 tried.setdefault(round(each, 9), _error(struck, wanted, pitch, each))
             decay, step = min(tried, key=lambda each: tried[each]), step / 2
-            around = [decay - step, decay + step]
+            around = [max(-_MOST_DECAY, decay - step), min(_MOST_DECAY, decay + step)]
         best = min(best, (tried[decay], pitch, decay))
     return ModalEdit.none(struck.bank, pitch=best[1], decay=best[2])
 
 
-def _pitches(
-    struck: Struck, wanted: Callable[[Float[Tensor, "contacts samples"]], Float[Tensor, "contacts samples"]]
-) -> list[float]:
+def _pitches(struck: Struck, wanted: Wanted) -> list[float]:
     """Return proposals of log alpha: that of no change, and those by quantiles and overlap."""
     sounds = struck.sounds(ModalEdit.none(struck.bank))
-    own, aim = (heard_spectrum(each).mean(dim=0) for each in (sounds, wanted(sounds)))
+    targets, weight = wanted(sounds)
+    own, aim = (heard_spectrum(weight * each).mean(dim=0) for each in (sounds, targets))
     differences = (_quantiles(aim) - _quantiles(own)).clamp(-_MOST, _MOST)
     # Moved by whole bands along the logarithmic axis, spectra overlap more or less.
     most = round(_MOST / math.log(2.0) * _PER_OCTAVE)
@@ -97,15 +96,11 @@ def _quantiles(spectrum: Float[Tensor, " bands"]) -> Float[Tensor, " quantiles"]
     return band.to(spectrum) * (math.log(2.0) / _PER_OCTAVE)
 
 
-def _error(
-    struck: Struck,
-    wanted: Callable[[Float[Tensor, "contacts samples"]], Float[Tensor, "contacts samples"]],
-    pitch: float,
-    decay: float,
-) -> float:
+def _error(struck: Struck, wanted: Wanted, pitch: float, decay: float) -> float:
     sounds = struck.sounds(ModalEdit.none(struck.bank, pitch=pitch, decay=decay))
     if float(sounds.abs().max()) == 0.0:
         return math.inf
     sizes = [scaled_fft_size(size, sample_rate=struck.sample_rate) for size in _FFT_SIZES]
-    target = spectral_target(wanted(sounds), fft_sizes=sizes, hops=[size // 4 for size in sizes])
-    return float(spectral_loss(sounds, target)) / len(sizes)
+    targets, weight = wanted(sounds)
+    target = spectral_target(weight * targets, fft_sizes=sizes, hops=[size // 4 for size in sizes])
+    return float(spectral_loss(weight * sounds, target)) / len(sizes)

@@ -29,6 +29,8 @@ _LISTENED = 2000
 _SPOILT = 20
 """Steps in a row without a usable target after which there is no hope."""
 _CHECKPOINT_SECONDS = 30.0
+_LARGEST_SEED = 1 << 40
+"""A step's own seed, a million times as large, still fits into 64 bits."""
 
 
 @runtime_checkable
@@ -68,7 +70,7 @@ class SteerConfig:
     fft_sizes: tuple[int, ...] = (2048, 1024, 512, 256)
     """Resolutions of the loss, samples at 44.1 kHz; frames are a quarter of each apart."""
     seed: int = 0
-    """Of all chance: places, noise levels, noise."""
+    """Of all chance: places, noise levels, noise; at most 2^40."""
     preview_every: int = 50
     """Steps between previews that can be listened to; 0 for none."""
 
@@ -76,10 +78,18 @@ class SteerConfig:
         for name, least in (("steps", 1), ("contacts", 1), ("modes", 1), ("preview_every", 0), ("seed", 0)):
             if getattr(self, name) < least:
                 raise EditError(f"{name} = {getattr(self, name)}: expected {least} or more")
+        if self.seed > _LARGEST_SEED:
+            raise EditError(f"seed = {self.seed}: expected at most {_LARGEST_SEED}: choose a smaller number")
         if self.seconds is not None and not 0 < self.seconds < math.inf:
             raise EditError(f"seconds = {self.seconds:g}: expected more than 0")
         if not self.fft_sizes or any(size < 4 or size % 4 for size in self.fft_sizes):
             raise EditError(f"fft_sizes = {self.fft_sizes}: expected multiples of 4, such as 2048, 1024, 512, 256")
+        longest = max(self.fft_sizes) / 44100
+        if self.seconds is not None and self.seconds < longest:
+            raise EditError(
+                f"seconds = {self.seconds:g}: expected at least {longest:.2g}, what a window of {max(self.fft_sizes)} "
+                "samples at 44.1 kHz hears: compare more of the sounds, or leave the largest of fft_sizes out"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +161,13 @@ class _Steering:
         self.step, self.spoilt = 0, 0
         self.whole = True
         """False while parameters are being moved: an interruption then leaves a state that nothing can go on from."""
-        self.asked = asked(field, probes, guide.describe(), {**asdict(config), **asdict(parameters)})
+        settings = {**asdict(config), **asdict(parameters)}
+        # How often one listens changes nothing.
+        del settings["preview_every"]
+        self.asked = asked(field, probes, guide.describe(), settings)
         state = None if checkpoint is None else read_steering(checkpoint, wanted=self.asked)
-        start = guide.start(self.probes) if state is None else ModalEdit.none(self.probes.bank)
+        searching = state is None and parameters.searches
+        start = guide.start(self.probes) if searching else ModalEdit.none(self.probes.bank)
         self.variables = EditVariables(start, self.probes.loudest(config.modes), parameters)
         if state is not None:
             self.variables.resume(state["variables"])
