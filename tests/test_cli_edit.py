@@ -11,6 +11,7 @@ import torch
 
 from avmsf.cli import edit, main, steering
 from avmsf.cli.edit import parse, run
+from avmsf.cli.editmaterial import old_material
 from avmsf.errors import AvmsfError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
@@ -88,12 +89,20 @@ def test_constants_stand_in_place_of_the_tables(field: Path) -> None:
     expect_same(other, recast(ceramic(), CERAMIC, replace(GLASS, density=5000.0)))
 
 
+def test_materials_that_damp_alike_are_both_named(capsys: Streams) -> None:
+    high = ceramic()
+    frequency = torch.linspace(5000, 9000, len(high.bank), dtype=torch.float64)
+    damping = 0.5 * (CERAMIC.alpha + CERAMIC.beta * (2 * torch.pi * frequency).square())
+    assert old_material(replace(high, bank=ModalBank(frequency, damping))).name == "ceramic"
+    assert "and iron fits as well (1.0" in capsys.readouterr().err
+
+
 def test_the_old_material_is_told_by_the_dampings_or_the_last_edit(field: Path, capsys: Streams) -> None:
     wood = edited(field, "--material", "wood", name="wood")
     assert wood.origin.report[EDITS][0]["from"]["name"] == "ceramic"
-    assert "taken to be of ceramic: half of its modes have that material's damping within a factor of 1.1" in (
-        capsys.readouterr().err
-    )
+    told = capsys.readouterr().err
+    assert "taken to be of ceramic: half of its modes have that material's damping within a factor of 1.1" in told
+    assert "fits as well" not in told
     edited(field.with_name("wood.safetensors"), "--pitch", "1.5", name="high")
     back = edited(field.with_name("high.safetensors"), "--material", "ceramic", name="back")
     assert back.origin.report[EDITS][2]["from"]["name"] == "wood"

@@ -14,6 +14,8 @@ from avmsf.tasks.edits import EDITS
 from avmsf.tasks.materialguess import guess_materials
 from avmsf.tasks.recast import LAWS, recast
 
+_CLOSE = 1.2
+"""How much farther off the second-best material may be and still be as likely."""
 _KEEPING = ("recast", "retune")
 """Edits that leave no doubt what a field is made of."""
 
@@ -86,9 +88,11 @@ def old_material(field: SoundField) -> Material:
             f"nearest, which half of them miss by a factor of {figure(best.off)} or more: say what the object is of, "
             "as --from ceramic"
         )
+    close = second.off < _CLOSE * best.off
+    alike = f", and {second.material.name} fits as well ({figure(second.off)}), with which the loudness would differ"
     say(
         f"the object is taken to be of {best.material.name}: half of its modes have that material's damping within a "
-        f"factor of {figure(best.off)} (next: {second.material.name}, {figure(second.off)}); say --from where you know"
+        f"factor of {figure(best.off)}{alike if close else ''}; say --from where you know"
     )
     return best.material
 

@@ -136,6 +136,7 @@ def run(options: Options) -> int:
     screen = console(errors=options.json)
     if test is not None:
         title = f"{len(test)} contacts not trained on, {len(train)} trained on; lower is better"
+        say(f"not trained on: {', '.join(test.names)}")
         screen.print(score_table(title, scores))
     for words in suspect_words(fitted):
         screen.print(words, soft_wrap=True)
