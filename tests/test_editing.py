@@ -51,7 +51,6 @@ from plate_field import plate_impacts
 # The benchmarks are no part of the package, and `python -m benchmarks` finds them from the repository's root alone.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import editing as benchmark
-from benchmarks.step import peak_gigabytes
 
 RATE = 16000.0
 QUICK = {"steps": 3, "contacts": 2, "fft_sizes": (512, 128)}
@@ -354,12 +353,3 @@ def test_the_benchmark_has_the_keys_that_are_asked_for(monkeypatch, tmp_path, ca
     assert [name for name, value in figures.items() if not math.isfinite(value)] == ["edit.spectral_physics"]
     assert "hierarchical, all" in capsys.readouterr().out
     assert len(json.loads((tmp_path / "scores.json").read_text(encoding="utf-8"))["scores"]) == 15
-
-
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux lets a process forget its peak")
-def test_memory_is_that_of_the_benchmark_alone():
-    # A hundred megabytes held and given back before are nobody's; forty held since are.
-    np.ones(100_000_000, dtype=np.uint8)
-    before = benchmark._forget_peak()
-    np.ones(40_000_000, dtype=np.uint8)
-    assert peak_gigabytes() * 1e3 - before == pytest.approx(40, abs=15)
