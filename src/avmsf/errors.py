@@ -43,3 +43,15 @@ class DatasetError(AvmsfError):
 
 class SimulationError(AvmsfError):
     """A shape, a material or a setting from which no sounding object can be computed."""
+
+
+class ExportError(AvmsfError):
+    """A field cannot be written in another tool's format, or another tool's file cannot be read."""
+
+
+class StudioError(AvmsfError):
+    """The page's server cannot start, or was asked for what it does not do."""
+
+
+class PlayerError(AvmsfError):
+    """No sound can be played here, or not as asked."""
