@@ -1,4 +1,4 @@
-"""`python -m benchmarks field`, `extract`, `speed`, `scene`, `proof`, `settings`, `suggest` or `tasks`."""
+"""`python -m benchmarks field`, `extract`, `speed`, `scene`, `proof`, `settings`, `suggest`, `physics` or `tasks`."""
 
 import argparse
 import sys
@@ -8,7 +8,7 @@ from types import ModuleType
 
 from avmsf.capture import CaptureWarning
 from avmsf.errors import AvmsfError
-from benchmarks import extract, field, proof, scene, settings, speed, suggest, tasks
+from benchmarks import extract, field, physics, proof, scene, settings, speed, suggest, tasks
 from benchmarks.material import MissingDataError
 from benchmarks.report import Options, show
 
@@ -20,6 +20,7 @@ BENCHMARKS: dict[str, ModuleType] = {
     "proof": proof,
     "settings": settings,
     "suggest": suggest,
+    "physics": physics,
     "tasks": tasks,
 }
 

@@ -1,27 +1,16 @@
 """What a field believes of gains together: how uncertain they are at places, and how that hangs together."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.errors import FitError
-from avmsf.field.modalbasis import ModalBasis
+from avmsf.field.doubtedgains import Belief, DoubtedGains
+from avmsf.field.kinds import FITTED
 from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import SoundField
-from avmsf.field.thinplategains import ThinPlateGains
-
-
-@dataclass(frozen=True, eq=False)
-class Belief:
-    """What is not known of the gains of one mode, or of several that differ by a factor."""
-
-    covariance: Float64[Tensor, "places places"]
-    """Between gains at places, as energy: summed over both parts of the gains, over four times the damping."""
-    scatter: float
-    """What one more blow has of its own, likewise."""
 
 
 def knows_doubt(field: SoundField) -> bool:
@@ -33,26 +22,23 @@ def knows_doubt(field: SoundField) -> bool:
     return True
 
 
-def expect_doubt(field: SoundField) -> ModalBasis | ThinPlateGains:
+def expect_doubt(field: SoundField) -> DoubtedGains:
     """Return the field's gains, to learn more of. Raises as `measured_gains`, and for an edited field."""
     if isinstance(field.gain_field, ScaledGains):
         raise FitError("the field was edited, and no blow tells more of what nobody can strike: ask the unedited field")
     return measured_gains(field)
 
 
-def measured_gains(field: SoundField) -> ModalBasis | ThinPlateGains:
+def measured_gains(field: SoundField) -> DoubtedGains:
     """Return the gains that the field's doubt rests on: its own, or those that an edited field was made from.
 
     Raises FitError where they know no doubt, with the kinds that do.
     """
     gains = field.gain_field.field if isinstance(field.gain_field, ScaledGains) else field.gain_field
-    if not isinstance(gains, ModalBasis | ThinPlateGains):
-        raise FitError(
-            f"gains of the kind {gains.kind!r} do not know how sure they are; those of {ModalBasis.kind} and of "
-            f"{ThinPlateGains.kind}s do: fit with one of these"
-        )
-    places = gains.sites.sites if isinstance(gains, ThinPlateGains) else torch.unique(gains.contacts, dim=0)
-    if len(places) < 2:
+    if not isinstance(gains, DoubtedGains):
+        known = " and ".join(kind for kind, fitted in FITTED.items() if hasattr(fitted, "beliefs"))
+        raise FitError(f"gains of the kind {gains.kind!r} do not know how sure they are; {known} do: fit with these")
+    if gains.places < 2:
         raise FitError("gains from a single place say nothing of how sure they are elsewhere: strike a second place")
     return gains
 
@@ -102,15 +88,8 @@ def beliefs(
     With physics, of each mode by its likeliest hypothesis; of splines all modes' at once, by kriging. Raises FitError
     for other gains, and for an edited field's.
     """
-    gains = expect_doubt(field)
     weights = 1.0 / (4.0 * field.bank.damping.double())
-    if isinstance(gains, ModalBasis):
-        for weight, (covariance, scatter) in zip(weights.tolist(), gains.posteriors(places, directions), strict=True):
-            yield Belief(weight * covariance, weight * scatter)
-    else:
-        variance = gains.sites.field_variance(gains.values.flatten(1)).reshape(-1, 2).sum(1)
-        noise = gains.noise.square().mean(0).sum(1)
-        yield Belief(float((variance * weights).sum()) * gains.sites.covariance(places), float((noise * weights).sum()))
+    return expect_doubt(field).beliefs(places, directions, weights=weights)
 
 
 def left_out(field: SoundField) -> Float64[Tensor, "contacts modes 2"]:
@@ -120,10 +99,4 @@ def left_out(field: SoundField) -> Float64[Tensor, "contacts modes 2"]:
     An edit, which scales errors and deviations alike, changes nothing of it. Contacts that are doubted have no part,
     and NaN stands for parts of modes without any gains. Raises FitError for gains that know no doubt.
     """
-    gains = measured_gains(field)
-    tiny = torch.finfo(torch.float64).tiny
-    errors, spread = gains.missed()
-    scores = errors / spread.clamp_min(tiny)
-    if isinstance(gains, ModalBasis):
-        return torch.where(gains.regression.silent, torch.nan, scores)[gains.trusted]
-    return scores
+    return measured_gains(field).left_out()

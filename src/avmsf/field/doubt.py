@@ -10,9 +10,8 @@ from torch import Tensor
 
 from avmsf.errors import FitError
 from avmsf.field.belief import deviation_of, energy_of, left_out, measured_gains, parts_of, scale_of
-from avmsf.field.modalbasis import ModalBasis
+from avmsf.field.doubtedgains import DoubtedGains
 from avmsf.field.soundfield import SoundField
-from avmsf.field.thinplategains import ThinPlateGains
 from avmsf.modal.synthesis import synthesise_phased
 
 LEVEL = 0.9
@@ -147,11 +146,9 @@ def coverage(
     return Coverage(float(within.double().mean()), float((within * energy).sum() / energy.sum()))
 
 
-def _scatter(gains: ModalBasis | ThinPlateGains) -> Float64[Tensor, "modes 2"]:
+def _scatter(gains: DoubtedGains) -> Float64[Tensor, "modes 2"]:
     """Return the variance that a blow has of its own, where it is no blow that is doubted."""
-    noise = gains.noise.square()
-    trusted = gains.regression.doubt <= 1.0 if isinstance(gains, ModalBasis) else torch.ones(len(noise)).bool()
-    return noise[trusted].mean(0)
+    return gains.noise.square()[gains.trusted].mean(0)
 
 
 def _spectra(field: SoundField, modes: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int
 from torch import Tensor
 
+from avmsf.field.doubtedgains import Belief
 from avmsf.field.elasticpoints import ElasticPoints
 from avmsf.field.evidence import Regression
 from avmsf.field.gainfield import Gains
@@ -83,15 +84,31 @@ class ModalBasis:
         shapes, used = self.surface.along(contacts, directions)
         return self.regression.kernel(shapes, self._remainder(contacts, used), width, remainder)
 
-    def posteriors(
-        self, places: Float64[Tensor, "places 3"], directions: Float64[Tensor, "places 3"] | None
-    ) -> Iterator[tuple[Float64[Tensor, "places places"], float]]:
-        """Return what `Regression.posterior` does of each mode in turn, for blows at places along unit vectors."""
-        shapes, used = self.surface.along(places, directions)
+    @property
+    def places(self) -> int:
+        """Contacts that are not in the same place as another."""
+        return len(torch.unique(self.contacts, dim=0))
+
+    def ways(
+        self, places: Float[Tensor, "places 3"], directions: Float[Tensor, "places 3"] | None
+    ) -> Float64[Tensor, "places 3"]:
+        """Return the directions as unit vectors, or those straight into the surface."""
+        return self.surface.along(places, directions)[1]
+
+    def beliefs(
+        self,
+        places: Float64[Tensor, "places 3"],
+        ways: Float64[Tensor, "places 3"] | None,
+        *,
+        weights: Float64[Tensor, " modes"],
+    ) -> Iterator[Belief]:
+        """Return what is not known of each mode in turn, by its likeliest hypothesis."""
+        shapes, used = self.surface.along(places, ways)
         among = remainder_kernel(places, used, places, used, reach=REACH * self.surface.size)
         across = self._remainder(places, used)
-        for mode in range(self.values.shape[1]):
-            yield self.regression.posterior(mode, shapes, across, among)
+        for mode, weight in enumerate(weights.tolist()):
+            covariance, scatter = self.regression.posterior(mode, shapes, across, among)
+            yield Belief(weight * covariance, weight * scatter)
 
     @property
     def trusted(self) -> Bool[Tensor, " contacts"]:
@@ -106,10 +123,12 @@ class ModalBasis:
         """Return the same field, which judges itself by these gains."""
         return replace(self, measured=measured)
 
-    def missed(self) -> tuple[Float64[Tensor, "contacts modes 2"], Float64[Tensor, "contacts modes 2"]]:
-        """Return by how much all others' gains miss each contact's, and the deviation foretold of that."""
+    def left_out(self) -> Float64[Tensor, "trusted modes 2"]:
+        """Return each trusted contact's errors over their foretold deviations, judged by the measured gains."""
         errors, spread = self.regression.left_out
-        return (errors if self.measured is None else errors + self.measured - self.values), spread
+        missed = errors if self.measured is None else errors + self.measured - self.values
+        scores = missed / spread.clamp_min(torch.finfo(torch.float64).tiny)
+        return torch.where(self.regression.silent, torch.nan, scores)[self.trusted]
 
     def with_values(self, values: Float64[Tensor, "contacts modes 2"]) -> "ModalBasis":
         """Return the field of other gains, with hypotheses as likely as before."""

@@ -10,6 +10,7 @@ from torch import Tensor
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField, Gains
 from avmsf.modal.bank import ModalBank
+from avmsf.modal.pulse import ForcePulse
 from avmsf.modal.residual import Residual, shape_noise
 from avmsf.modal.synthesis import synthesise_phased
 
@@ -85,21 +86,31 @@ class SoundField:
         directions: Float[Tensor, "contacts 3"] | None = None,
         force: float = 1.0,
         samples: int | None = None,
+        pulse: ForcePulse | None = None,
     ) -> Float[Tensor, "contacts samples"]:
         """Return the sound of a blow at each contact, along `directions` as in `gains`, times `force`.
 
         `force` in newtons where the recordings were divided by theirs, else relative to an average one of them. Of
         `samples` samples, or as long as the training sounds. The noise is one draw, the same at every contact and in
         every call, so that a contact's sound depends on nothing else. Modes that are not `audible` are silent.
+
+        `pulse` is what a softer hammer adds to the recorded blows' own pulses, in which the modes answer it; it has
+        the same impulse, however long it is. The noise, which is no answer of the object, heeds the force alone.
         """
         length = self.samples if samples is None else samples
-        generator = torch.Generator().manual_seed(self.origin.config.seed)
-        noise = shape_noise(self.residual.magnitude, contacts=1, samples=length, generator=generator)
+        noise = self.noise(samples)
         parts = []
         for rows in torch.split(torch.arange(len(contacts)), _BATCH):
             known = self.known(contacts[rows], directions=None if directions is None else directions[rows])
-            parts.append(self._modes(known, length))
+            modes = self._modes(known, length)
+            parts.append(modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate))
         return force * (torch.cat(parts) + noise)
+
+    def noise(self, samples: int | None = None) -> Float[Tensor, " samples"]:
+        """Return the noise that every blow of force 1 brings along; `samples` as in `render`."""
+        generator = torch.Generator().manual_seed(self.origin.config.seed)
+        length = self.samples if samples is None else samples
+        return shape_noise(self.residual.magnitude, contacts=1, samples=length, generator=generator)[0]
 
     def _modes(self, known: Gains, samples: int) -> Float[Tensor, "contacts samples"]:
         damping = self.bank.damping if known.damping is None else self.bank.damping * known.damping

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import FitError
-from avmsf.field.belief import Belief, beliefs, energy_of, expect_doubt, parts_of
-from avmsf.field.modalbasis import ModalBasis
+from avmsf.field.belief import beliefs, energy_of, expect_doubt, parts_of
+from avmsf.field.doubtedgains import Belief, DoubtedGains
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.points import farthest_points
 
@@ -83,9 +83,7 @@ def suggest(
         )
     kept = _weighed(chosen_from, allowed, max(MOST, count))
     chosen_from, allowed = chosen_from[kept], allowed[kept]
-    along = None
-    if isinstance(gains, ModalBasis):
-        _, along = gains.surface.along(chosen_from, None if directions is None else directions[kept])
+    along = gains.ways(chosen_from, None if directions is None else directions[kept])
     places = points if candidates is None else torch.cat([points, chosen_from])
     ways = _ways(gains, points, along, candidates is None)
     ledger = _Ledger(beliefs(field, places, ways), len(points), len(chosen_from))
@@ -149,15 +147,11 @@ class _Ledger:
 
 
 def _ways(
-    gains: object, points: Tensor, along: Float64[Tensor, "candidates 3"] | None, alike: bool
+    gains: DoubtedGains, points: Tensor, along: Float64[Tensor, "candidates 3"] | None, alike: bool
 ) -> Float64[Tensor, "places 3"] | None:
     """Return the directions of the blows at the points and at candidates beside them."""
-    if along is None or not isinstance(gains, ModalBasis):
-        return None
-    if alike:
-        return along
-    _, straight = gains.surface.along(points, None)
-    return torch.cat([straight, along])
+    straight = None if alike else gains.ways(points, None)
+    return along if straight is None or along is None else torch.cat([straight, along])
 
 
 def _weighed(

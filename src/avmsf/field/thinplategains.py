@@ -1,6 +1,6 @@
 """Gains as thin-plate splines over the training contacts: the field that reads positions alone."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int
 from torch import Tensor
 
+from avmsf.field.doubtedgains import Belief
 from avmsf.field.gainfield import Gains
 from avmsf.field.records import count_of, like
 from avmsf.field.thinplate import SplineSites, fit_spline
@@ -84,15 +85,36 @@ class ThinPlateGains:
         """Return the same splines, which judge themselves by these gains."""
         return replace(self, measured=measured)
 
-    def missed(self) -> tuple[Float64[Tensor, "sites modes 2"], Float64[Tensor, "sites modes 2"]]:
-        """Return by how much all others' gains miss those of each site, and the deviation foretold of that."""
+    @property
+    def places(self) -> int:
+        """Sites of the splines, each of contacts in one place."""
+        return len(self.sites.sites)
+
+    def ways(self, places: Float[Tensor, "places 3"], directions: Float[Tensor, "places 3"] | None) -> None:
+        """Return None: all blows count as if they came from one side."""
+        return
+
+    def beliefs(
+        self,
+        places: Float64[Tensor, "places 3"],
+        ways: Float64[Tensor, "places 3"] | None,
+        *,
+        weights: Float64[Tensor, " modes"],
+    ) -> Iterator[Belief]:
+        """Return what is not known of all modes at once, by kriging: they differ by a factor."""
+        variance = self.sites.field_variance(self.values.flatten(1)).reshape(-1, 2).sum(1)
+        noise = self.noise.square().mean(0).sum(1)
+        yield Belief(float((variance * weights).sum()) * self.sites.covariance(places), float((noise * weights).sum()))
+
+    def left_out(self) -> Float64[Tensor, "sites modes 2"]:
+        """Return each site's errors over their foretold deviations, judged by the measured gains."""
         flat = self.values.flatten(1)
         errors = self.sites.left_out(flat)
         single = torch.diagonal(self.sites.inverse)[: len(errors)].abs()
         spread = (self.sites.field_variance(flat) / single[:, None]).sqrt()
         if self.measured is not None:
             errors = errors + self.sites.means(self.measured.flatten(1) - flat)
-        return errors.reshape(len(errors), -1, 2), spread.reshape(len(errors), -1, 2)
+        return (errors / spread.clamp_min(torch.finfo(torch.float64).tiny)).reshape(len(errors), -1, 2)
 
     def with_values(self, values: Float64[Tensor, "contacts modes 2"]) -> "ThinPlateGains":
         """Return the same splines through other gains."""
