@@ -16,6 +16,8 @@ from avmsf.cli.printing import say
 from avmsf.cli.writing import Coding, Level, OutputError, expect_writable, write_sound
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
+from avmsf.modal.pulse import ForcePulse, PulseShape
+from avmsf.simulate.hammer import LONGEST
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 
@@ -42,6 +44,10 @@ class Options:
     """What the contacts' coordinates count. A field itself is in metres, whatever its capture's unit was."""
     force: float = 1.0
     """Peak force of the blow, newtons, where the field knows forces; else relative to an average recorded blow."""
+    contact_time: float = 0.0
+    """How long a softer mallet stays on the object, seconds, with the same impulse: 0.002 is felt. 0: the recorded."""
+    pulse: PulseShape = "half-sine"
+    """How its force rises and falls. half-sine: a linear contact. hertz: two round bodies that flatten each other."""
     seconds: float | None = None
     """Length of the sounds; that of the training sounds where it is not given."""
     normalise: Literal["none", "peak"] = "none"
@@ -77,7 +83,7 @@ def run(options: Options) -> int:
         say(f"note: the recordings' forces are not known, so {options.force:g} counts in average recorded blows")
     if round(field.sample_rate) != field.sample_rate:
         say(f"note: wav files hold whole sample rates: {round(field.sample_rate)} for {field.sample_rate:g} Hz")
-    sounds = render_sounds(field, contacts.places, force=options.force, seconds=options.seconds)
+    sounds = render_sounds(field, contacts.places, force=options.force, seconds=options.seconds, pulse=_pulse(options))
     sounds = sounds * Level(options.normalise, options.level_db).factor(sounds)
     peak = float(sounds.abs().max())
     if options.coding == "float32" and peak > 1:
@@ -93,15 +99,29 @@ def run(options: Options) -> int:
 
 
 def render_sounds(
-    field: SoundField, places: Float[Tensor, "contacts 3"], *, force: float, seconds: float | None
+    field: SoundField,
+    places: Float[Tensor, "contacts 3"],
+    *,
+    force: float,
+    seconds: float | None,
+    pulse: ForcePulse | None = None,
 ) -> Float[Tensor, "contacts samples"]:
     """Render blows of `force` for `seconds`; raises `OutputError` for a time that holds no sample."""
     if seconds is None:
-        return field.render(places, force=force)
+        return field.render(places, force=force, pulse=pulse)
     samples = round(seconds * field.sample_rate) if math.isfinite(seconds) else 0
     if samples < 1:
         raise OutputError(f"--seconds is {seconds:g}; expected a time above 0")
-    return field.render(places, force=force, samples=samples)
+    return field.render(places, force=force, samples=samples, pulse=pulse)
+
+
+def _pulse(options: Options) -> ForcePulse | None:
+    if not 0 <= options.contact_time <= LONGEST:
+        raise OutputError(
+            f"--contact-time is {options.contact_time:g}; expected seconds from 0 to {LONGEST:g}: beyond that a blow "
+            "is a push"
+        )
+    return ForcePulse(options.contact_time, options.pulse) if options.contact_time else None
 
 
 def _paths(output: Path, contacts: Contacts) -> list[Path]:

@@ -1,0 +1,64 @@
+"""The force of a blow over its contact time: a soft hammer stays long and leaves the high modes alone."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from scipy.special import betainc
+from torch import Tensor
+
+PulseShape = Literal["half-sine", "hertz"]
+_EXPONENTS: dict[str, float] = {"half-sine": 1.0, "hertz": 1.5}
+
+
+@dataclass(frozen=True)
+class ForcePulse:
+    """A blow's force over time, of unit impulse: zero before the contact, a power of a half sine, zero after."""
+
+    contact_time: float
+    """How long hammer and object touch, seconds; 0 is the blow as it was recorded."""
+    shape: PulseShape = "half-sine"
+    """half-sine: a linear contact. hertz: sin^1.5, two curved bodies that flatten each other (Hertz 1881)."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.contact_time < math.inf:
+            raise ValueError(f"contact_time is {self.contact_time}; expected seconds, 0 or more")
+        if self.shape not in _EXPONENTS:
+            raise ValueError(f"shape is {self.shape!r}; expected one of {', '.join(_EXPONENTS)}")
+
+    def samples(self, sample_rate: float) -> Float64[Tensor, " samples"]:
+        """Return the part of the impulse that falls into each sample's time; their sum is 1.
+
+        A contact shorter than a sample (sample rate in Hz) is one sample of 1, and nothing jumps as it grows longer.
+        """
+        count = max(1, math.ceil(self.contact_time * sample_rate))
+        if count == 1:
+            return torch.ones(1, dtype=torch.float64)
+        ends = np.minimum(np.arange(count + 1) / (self.contact_time * sample_rate), 1.0)
+        return torch.from_numpy(np.diff(_impulse_until(ends, _EXPONENTS[self.shape])))
+
+    def soften(
+        self, sounds: Float[Tensor, "contacts samples"], *, sample_rate: float
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return what is heard of this blow where a blow of one sample gives `sounds`: their causal convolution.
+
+        As long as `sounds`, of their dtype; made in float64.
+        """
+        pulse = self.samples(sample_rate).to(sounds.device)
+        if len(pulse) == 1:
+            return sounds
+        length = sounds.shape[1] + len(pulse) - 1
+        spectrum = torch.fft.rfft(sounds.double(), n=length) * torch.fft.rfft(pulse, n=length)
+        return torch.fft.irfft(spectrum, n=length)[:, : sounds.shape[1]].to(sounds.dtype)
+
+
+def _impulse_until(time: Float64[np.ndarray, " times"], exponent: float) -> Float64[np.ndarray, " times"]:
+    """Return the integral of sin(pi t)^exponent from 0 to each time, over that from 0 to 1.
+
+    With s = sin^2 it is an incomplete beta function, rising to the middle and mirrored about it.
+    """
+    rising = betainc((exponent + 1) / 2, 0.5, np.sin(np.pi * time) ** 2) / 2
+    return np.where(time <= 0.5, rising, 1.0 - rising)
