@@ -1,0 +1,188 @@
+"""What the exports weigh and how near their own readers come to the field, and what the player sounds at once."""
+
+import json
+import math
+import resource
+import shutil
+import struct
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from avmsf.export.faust import write_faust
+from avmsf.export.gltf import write_gltf
+from avmsf.export.modaldemo import read_demo, write_demo
+from avmsf.export.player import Blow, Player, measure_capacity
+from avmsf.export.sampledfield import SampledField
+from avmsf.export.universal import write_universal
+from avmsf.export.wavgrid import Grid, write_grid
+from benchmarks.report import Options, Report, Table, show, tell
+
+DRIVER = Path(__file__).resolve().parents[1] / "tests" / "export" / "faust_driver.c"
+CONVENTIONS = (
+    "a field of 128 modes from 80 Hz to 15 kHz that ring for .1 to 1 s, drawn at random at 1000 points, 44.1 kHz, 3 s; "
+    "sines and no noise for glTF and the demo, whose formats hold no other, phases and noise for Faust and player.",
+    "errors: largest difference between what an independent reader of the file sounds like and SampledField.render, "
+    "over the loudest sample of each blow, the worst of several. glTF and the demo hold frequencies as float32, which "
+    "is most of theirs; Faust compiled in double precision, single: as it compiles unless told otherwise.",
+    "voices: sets of 128 resonators, none culled, that one core rings in real time in blocks of 256 samples; blows: "
+    "how many a second ring in one set, where dampings are the same everywhere.",
+)
+
+
+def figures() -> dict[str, float]:
+    """Measure, print the table, and return every figure under its key."""
+    options = Options(tuple(PARTS))
+    report = measure(options)
+    show(report, options, name="studioexports")
+    return dict(report.figures)
+
+
+def measure(options: Options) -> Report:
+    """Return both parts' figures."""
+    points, seconds = (20, 0.2) if options.quick_look else (1000, 3.0)
+    report = Report(CONVENTIONS)
+    for part in options.parts or tuple(PARTS):
+        report += PARTS[part](drawn_field(points, seconds=seconds))
+    return report
+
+
+def drawn_field(points: int, *, modes: int = 128, seconds: float, rate: float = 44100.0) -> SampledField:
+    """Return a field with phases and noise, drawn at random."""
+    draw = torch.Generator().manual_seed(0)
+    places = torch.randn(points, 3, generator=draw)
+    normals = torch.nn.functional.normalize(places, dim=1)
+    frequency = 80 * (15_000 / 80) ** torch.linspace(0, 1, modes, dtype=torch.float64)
+    return SampledField(
+        0.1 * normals,
+        normals,
+        frequency,
+        6.9 * 10 ** torch.rand(modes, generator=draw, dtype=torch.float64),
+        torch.randn(points, modes, generator=draw),
+        0.5 * torch.randn(points, modes, generator=draw),
+        0.02 * torch.randn(round(seconds * rate), generator=draw),
+        rate,
+        name="drawn",
+    )
+
+
+def _exports(field: SampledField) -> Report:
+    plain = replace(field, cosine=torch.zeros_like(field.cosine), noise=torch.zeros_like(field.noise))
+    rows = field.spread(4)
+    found: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        tell("studio: exports")
+        weights = {
+            "gltf": write_gltf(plain, place / "field.glb"),
+            "demo": write_demo(plain, place / "demo"),
+            "wavs": write_grid(field.take(field.spread(16)), place / "wavs", Grid(16)),
+            "uff": write_universal(field, place / "field.uff"),
+        }
+        found["export.gltf_error"] = _worst(_gltf_sounds(place / "field.glb", plain, rows), plain, rows)
+        demo = read_demo(place / "demo").field
+        back = replace(demo, sine=demo.cosine, cosine=torch.zeros_like(demo.cosine))
+        found["export.demo_error"] = _worst(back.render(rows).double().numpy(), plain, rows)
+        few = field.take(field.spread(64))
+        weights["faust"] = write_faust(few, place / "field.dsp")
+        found |= _faust(few, place)
+    for name, written in weights.items():
+        found[f"export.{name}_megabytes"] = written.size / 1e6
+    title = f"exports of {len(field)} points ({len(few)} for Faust, 16 for wavs), {len(field.frequency)} modes"
+    table: list[list[str | float]] = [
+        [name, _error(found, name), written.size / 1e6] for name, written in weights.items()
+    ]
+    return Report(tables=(Table(title, ("format", "error", "MB"), table),), figures=found)
+
+
+def _error(found: dict[str, float], name: str) -> float:
+    return found.get(f"export.{name}_error", math.nan)
+
+
+def _worst(heard: np.ndarray, field: SampledField, rows: torch.Tensor) -> float:
+    true = field.render(rows).double().numpy()
+    return float((np.abs(heard - true).max(1) / np.abs(true).max(1)).max())
+
+
+def _gltf_sounds(path: Path, field: SampledField, rows: torch.Tensor) -> np.ndarray:
+    """Return what the draft says of an impulse into the surface, read by container, accessors and formula alone."""
+    content = path.read_bytes()
+    (length,) = struct.unpack_from("<I", content, 12)
+    document = json.loads(content[20 : 20 + length])
+    model = document["extensions"]["KHR_audio_rigid_bodies"]["modalModels"][0]
+
+    def numbers(name: str) -> np.ndarray:
+        accessor = document["accessors"][model[name]]
+        view = document["bufferViews"][accessor["bufferView"]]
+        values = np.frombuffer(content, "<f4", view["byteLength"] // 4, 28 + length + view["byteOffset"])
+        return values.astype(np.float64)
+
+    frequency, decay = numbers("frequencies"), numbers("decayRates")
+    shapes = numbers("shapes").reshape(len(frequency), -1, 3)
+    times = np.arange(field.samples) / field.sample_rate
+    sounds = np.zeros((len(rows), field.samples))
+    for m in range(len(frequency)):
+        wave = np.exp(-decay[m] * times) * np.sin(2 * np.pi * frequency[m] * times)
+        for number, row in enumerate(rows.tolist()):
+            push = float(shapes[m, row] @ -field.normals[row].double().numpy())
+            sounds[number] += 2 * np.pi * frequency[m] * push * wave
+    return sounds
+
+
+def _faust(field: SampledField, place: Path) -> dict[str, float]:
+    """Return the compiled program's error in both precisions and how long Faust took; nothing where it is missing."""
+    if shutil.which("faust") is None or shutil.which("gcc") is None:
+        tell("studio: no faust or no gcc here, its error is not measured")
+        return {}
+    found = {}
+    for key, flag, real in (("faust_error", "-double", "double"), ("faust_error_single", "-single", "float")):
+        begun = time.process_time() + _children()
+        source, program = place / "field.c", place / "field"
+        subprocess.run(["faust", "-lang", "c", flag, "-a", DRIVER, "-o", source, place / "field.dsp"], check=True)
+        found["export.faust_seconds"] = time.process_time() + _children() - begun
+        subprocess.run(["gcc", "-O1", "-w", f"-DREAL={real}", "-o", program, source, "-lm"], check=True)
+        row = len(field) - 1
+        words = [f"{field.sample_rate:.0f}", str(field.samples), str(row), "1", "0", "0"]
+        heard = np.frombuffer(subprocess.run([program, *words], check=True, capture_output=True).stdout)
+        found[f"export.{key}"] = _worst(heard[None], field, torch.tensor([row]))
+    return found
+
+
+def _children() -> float:
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+
+
+def _player(field: SampledField) -> Report:
+    tell("studio: player")
+    capacity = measure_capacity(field)
+    player = Player(field, level=1.0)
+    blows = [Blow(row, 1.0, 97 * number) for number, row in enumerate(field.spread(8).tolist())]
+    heard = np.concatenate([np.array(block) for block in _unlimited(player, blows, field.samples)])
+    true = np.zeros(field.samples)
+    for blow in blows:
+        sound = field.render(torch.tensor([blow.row]))[0].double().numpy()
+        true[blow.start :] += sound[: field.samples - blow.start]
+    # The noise of the first blow fades at its end.
+    kept = field.samples - round(0.01 * field.sample_rate)
+    found = {
+        "player.voices": float(capacity.voices),
+        "player.blows_per_second": capacity.blows,
+        "player.render_error": float(np.abs(heard - true)[:kept].max() / np.abs(true).max()),
+    }
+    rows: list[list[str | float]] = [[name.removeprefix("player."), value] for name, value in found.items()]
+    return Report(tables=(Table("player, 128 modes, one core", ("what", "figure"), rows),), figures=found)
+
+
+def _unlimited(player: Player, blows: list[Blow], samples: int) -> list[np.ndarray]:
+    for blow in blows:
+        player.strike(blow)
+    return [player.render(min(256, samples - begin), limit=False) for begin in range(0, samples, 256)]
+
+
+PARTS: dict[str, Callable[[SampledField], Report]] = {"exports": _exports, "player": _player}

@@ -1,0 +1,228 @@
+"""`avmsf export`: a field in the formats of other tools."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+import tyro
+
+from avmsf.capture.folder import read_capture, settings_of
+from avmsf.capture.surface import find_surface_file
+from avmsf.capture.texturedmesh import read_textured_mesh
+from avmsf.cli.printing import figure, say
+from avmsf.cli.render import METRES
+from avmsf.errors import ExportError
+from avmsf.export.bundle import MOST_POINTS
+from avmsf.export.faust import write_faust
+from avmsf.export.gltf import Look, write_gltf
+from avmsf.export.modaldemo import SCENE, Precision, is_demo, read_demo, write_demo
+from avmsf.export.objectfile import read_object
+from avmsf.export.sampledfield import SampledField, spread_rows
+from avmsf.export.universal import write_universal
+from avmsf.export.wavgrid import Grid, Layer, write_grid
+from avmsf.export.webpage import write_webpage
+from avmsf.export.written import Written, write_file
+from avmsf.field.soundfield import SoundField
+from avmsf.field.store import load
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.ply import read_splats
+from avmsf.scene.start import ZEROTH
+
+Format = Literal["web", "gltf", "faust", "avmsf-demo", "wavs", "uff"]
+_POINTS = {"web": MOST_POINTS, "gltf": 2000, "faust": 64, "avmsf-demo": 10_000, "wavs": 16, "uff": 1000}
+"""Points that are written unless others are asked for: as many as the format's tools take without effort."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Write a field for other tools.
+
+    web: a page on which it is struck, a folder for any static host or one .html file. gltf: a .glb that any viewer
+    shows, with the draft extension KHR_audio_rigid_bodies. faust: a .dsp with controls, or a .lib without. avmsf-demo:
+    the layout of the paper's own demo. wavs: a grid of blows with a table and an SFZ instrument, for samplers. uff: the
+    universal file format, for modal analysis. What a format cannot hold is said.
+    """
+
+    field: tyro.conf.Positional[Path]
+    """Field file, as `avmsf fit` writes it; or a folder in the layout of the paper's demo."""
+    to: Format
+    """What is written."""
+    output: Path
+    """Where: a folder, or a file for gltf (.glb), faust (.dsp or .lib), uff (.uff), a page in one file (.html)."""
+    object: Path | None = None
+    """What is shown: a mesh, or Gaussians as a .ply. Without it the capture's surface, or else the field's points."""
+    object_unit: Literal["m", "cm", "mm", "in", "ft"] = "m"
+    """What the coordinates of the object's mesh count."""
+    capture: Path | None = None
+    """Capture folder: its surface is shown, and on a page its recorded strikes stand beside the model's."""
+    points: int | None = None
+    """Most contacts that are written, spread over the object; as the format's tools like it where it is not given."""
+    force: bool = False
+    """Write over files that no export wrote. Files of other names are left alone."""
+    forces: tuple[float, ...] = (1.0,)
+    """wavs: forces of the layers, from soft to hard, in newtons where the field knows forces, else relative."""
+    contact_times: tuple[float, ...] = (0.0,)
+    """wavs: how long the hammer of each layer touches, seconds; one for all, or as many as forces."""
+    seconds: float | None = None
+    """wavs: length of the sounds; that of the training sounds where it is not given."""
+    noise: bool = True
+    """faust: with --no-noise, the modes alone."""
+    functions: int = 16
+    """uff: points whose frequency response functions are written beside the mode shapes."""
+    variant: str | None = None
+    """avmsf-demo: name of the sound among those of one object, to write ("original") or to read."""
+    precision: Precision = "float32"
+    """avmsf-demo: how gains are written."""
+    rate: float | None = None
+    """Samples per second, Hz, of a field in the demo's layout, which does not say."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return tyro.cli(Options, prog="avmsf export", args=words)
+
+
+def run(options: Options) -> int:
+    """Read, write, and say how large it is and what it lacks."""
+    if options.points is not None and options.points < 1:
+        raise ExportError(f"--points is {options.points}; expected 1 or more")
+    field = _read(options)
+    written = _WRITERS[options.to](field, options)
+    for remark in written.remarks:
+        say(f"note: {remark}")
+    if written.error:
+        say(
+            f"note: waveforms differ from the field's by up to {figure(100 * written.error, 2)} % of its loudest sample"
+        )
+    largest = max(written.sizes, key=lambda path: written.sizes[path])
+    files = f"{len(written.sizes)} files, the largest {largest.name}" if len(written.sizes) > 1 else "one file"
+    print(f"wrote {options.output}: {options.to}, {written.size / 1e6:.3g} MB, {files}")
+    return 0
+
+
+def _read(options: Options) -> SoundField | SampledField:
+    if options.field.is_dir():
+        if not is_demo(options.field):
+            raise ExportError(
+                f"{options.field}: expected a field file, or a folder in the layout of the paper's demo, found another "
+                "folder: name the .safetensors that avmsf fit wrote"
+            )
+        variant = None if options.to == "avmsf-demo" else options.variant
+        return read_demo(options.field, variant=variant, sample_rate=options.rate).field
+    return load(options.field)
+
+
+def _sampled(field: SoundField | SampledField, options: Options) -> SampledField:
+    most = options.points or _POINTS[options.to]
+    if isinstance(field, SoundField):
+        sampled, held = SampledField.of(field, limit=most), len(field.gain_field.points)
+    else:
+        sampled, held = field if len(field) <= most else field.take(field.spread(most)), len(field)
+    if len(sampled) < held and options.points is None:
+        say(f"note: {len(sampled)} of the field's {held} contacts are written; --points asks for others")
+    return sampled
+
+
+def _object(options: Options) -> tuple[Path | None, float]:
+    """Return the file that shows the object, and what its coordinates count in metres."""
+    if options.object is not None or options.capture is None:
+        return options.object, METRES[options.object_unit]
+    settings = settings_of(options.capture)
+    return find_surface_file(options.capture, settings), settings.surface_metres
+
+
+def _gaussians(path: Path | None, metres: float, field: SampledField) -> GaussianCloud | None:
+    """Return the file's Gaussians, which are in metres; None for a mesh, whose coordinates count `metres`."""
+    if path is None or path.suffix.lower() != ".ply":
+        return None
+    if read_object(path, field.points, metres=metres).kind != "gaussians":
+        return None
+    return read_splats(path)
+
+
+def _web(field: SoundField | SampledField, options: Options) -> Written:
+    source, metres = _object(options)
+    return write_webpage(
+        field,
+        options.output,
+        object=source,
+        metres=metres,
+        strikes=None if options.capture is None else read_capture(options.capture).impacts,
+        limit=options.points or _POINTS["web"],
+        force=options.force,
+    )
+
+
+def _gltf(field: SoundField | SampledField, options: Options) -> Written:
+    sampled = _sampled(field, options)
+    source, metres = _object(options)
+    cloud = _gaussians(source, metres, sampled)
+    if cloud is not None and source is not None:
+        colors = (0.5 + ZEROTH * cloud.harmonics[:, 0]).clamp(0.0, 1.0)
+        normals = sampled.normals[sampled.nearest(cloud.centers)]
+        look = Look(cloud.centers, torch.zeros(0, 3, dtype=torch.int64), normals, colors)
+        written = write_gltf(sampled, options.output, look=look, force=options.force)
+        beside = options.output.with_suffix(".gaussians.ply")
+        copied = write_file(beside, source.read_bytes(), force=options.force or beside.is_file())
+        return Written({**written.sizes, **copied}, written.remarks, written.error)
+    shown = None if source is None else Look.of_mesh(read_textured_mesh(source, metres=metres))
+    return write_gltf(sampled, options.output, look=shown, force=options.force)
+
+
+def _faust(field: SoundField | SampledField, options: Options) -> Written:
+    return write_faust(_sampled(field, options), options.output, noise=options.noise, force=options.force)
+
+
+def _demo(field: SoundField | SampledField, options: Options) -> Written:
+    source = options.field / SCENE if options.field.is_dir() and options.object is None else options.object
+    most = options.points or _POINTS["avmsf-demo"]
+    sampled = _sampled(field, options)
+    cloud = _gaussians(source, METRES[options.object_unit], sampled)
+    if cloud is not None and isinstance(field, SoundField):
+        if len(cloud) > most:
+            cloud = cloud.take(spread_rows(cloud.centers, most))
+        sampled = SampledField.of(field, cloud.centers)
+    elif cloud is not None:
+        cloud = cloud.take(_rows_of(cloud, sampled))
+    return write_demo(
+        sampled,
+        options.output,
+        cloud=cloud,
+        variant=options.variant or "original",
+        precision=options.precision,
+        force=options.force,
+    )
+
+
+def _rows_of(cloud: GaussianCloud, sampled: SampledField) -> torch.Tensor:
+    """Return the Gaussian nearest to each of the field's points."""
+    return torch.cat([(cloud.centers - point).norm(dim=1).argmin()[None] for point in sampled.points])
+
+
+def _wavs(field: SoundField | SampledField, options: Options) -> Written:
+    forces, times = options.forces, options.contact_times
+    if len(times) == 1:
+        times = times * len(forces)
+    if not forces or len(times) != len(forces):
+        raise ExportError(
+            f"expected a contact time for each force, or one for all, found {len(forces)} forces and {len(times)} times"
+        )
+    layers = tuple(Layer(force, each) for force, each in zip(forces, times, strict=True))
+    sampled = _sampled(field, options)
+    return write_grid(sampled, options.output, Grid(len(sampled), layers, options.seconds), force=options.force)
+
+
+def _uff(field: SoundField | SampledField, options: Options) -> Written:
+    return write_universal(_sampled(field, options), options.output, functions=options.functions, force=options.force)
+
+
+_WRITERS: dict[str, Callable[[SoundField | SampledField, Options], Written]] = {
+    "web": _web,
+    "gltf": _gltf,
+    "faust": _faust,
+    "avmsf-demo": _demo,
+    "wavs": _wavs,
+    "uff": _uff,
+}

@@ -1,0 +1,1 @@
+"""What carries a field into the tools that people use."""

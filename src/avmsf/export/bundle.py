@@ -1,0 +1,177 @@
+"""A field as a page reads it: `manifest.json`, its tensors in `field.bin`, the object, and the measured strikes.
+
+The manifest says where in `field.bin` each tensor lies, little endian and row by row: points, normals, frequency,
+damping, sine, noise, and cosine unless all of it is zero. Times and frequencies are float64, for a float32 frequency
+is out of phase after a second; amplitudes are float32. Strikes are float32 wav files in the field's own unit.
+"""
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import soundfile
+from jaxtyping import Shaped
+
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.surface import Surface
+from avmsf.errors import ExportError
+from avmsf.export.objectfile import ObjectFile, read_object
+from avmsf.export.sampledfield import SampledField
+from avmsf.export.written import Written, write_folder
+from avmsf.field.soundfield import SoundField
+
+FORMAT = 1
+"""Number of this format; it grows with every change that older pages could not read."""
+MOST_POINTS = 20_000
+"""Contacts that a page gets unless more are asked for: 128 modes at each are 20 MB."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """A page's data, in memory."""
+
+    manifest: Mapping[str, Any]
+    files: Mapping[str, bytes]
+    """Content by relative path, all but the manifest."""
+    remarks: tuple[str, ...] = ()
+    """What the page shows less of than there is, a sentence each."""
+
+
+def make_bundle(
+    field: SoundField | SampledField,
+    *,
+    object: Path | Surface | None = None,
+    metres: float = 1.0,
+    strikes: Impacts | None = None,
+    limit: int = MOST_POINTS,
+    live: Mapping[str, Any] | None = None,
+) -> Bundle:
+    """Return a field's bundle, at no more than `limit` contacts.
+
+    `object` is shown for it: a mesh whose coordinates count `metres` each, Gaussians, or the contacts alone. `strikes`
+    are measured ones to compare with, `live` what a server behind the page offers. Raises `ExportError`.
+    """
+    remarks: tuple[str, ...] = ()
+    if isinstance(field, SoundField):
+        count, sampled = len(field.gain_field.points), SampledField.of(field, limit=limit)
+    else:
+        count, sampled = len(field), field if len(field) <= limit else field.take(field.spread(limit))
+    if len(sampled) < count:
+        remarks = (f"{len(sampled):,} of the field's {count:,} contacts are kept, spread evenly",)
+    if len(sampled.frequency) == 0:
+        raise ExportError("expected a mode that can be heard, found none below half the sample rate: nothing to strike")
+    shown = read_object(object, sampled.points, metres=metres)
+    content, tensors = _packed(_tensors(sampled))
+    files = {"field.bin": content}
+    if shown.name is not None:
+        files[shown.name] = shown.content
+    records, sounds = _strikes(strikes, sampled)
+    manifest = _manifest(sampled, tensors, shown, records, live)
+    return Bundle(manifest, {**files, **sounds}, remarks + shown.remarks)
+
+
+def write_bundle(
+    field: SoundField | SampledField,
+    folder: str | Path,
+    *,
+    object: Path | Surface | None = None,
+    metres: float = 1.0,
+    strikes: Impacts | None = None,
+    limit: int = MOST_POINTS,
+    live: Mapping[str, Any] | None = None,
+    force: bool = False,
+) -> Written:
+    """Write a field's bundle as a folder, whole or not at all; the arguments are those of `make_bundle`.
+
+    A bundle that is there is replaced. Raises `ExportError` for another folder that is not empty, unless with `force`.
+    """
+    bundle = make_bundle(field, object=object, metres=metres, strikes=strikes, limit=limit, live=live)
+    sizes = write_folder(
+        Path(folder), lambda place: write_files(bundle.files, place), dict(bundle.manifest), force=force
+    )
+    return Written(sizes, bundle.remarks)
+
+
+def write_files(files: Mapping[str, bytes], folder: Path) -> None:
+    """Write each file under its relative path."""
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+
+
+def _tensors(field: SampledField) -> dict[str, Shaped[np.ndarray, "..."]]:
+    # Javascript reads numbers only from a multiple of their size: those of eight bytes come first.
+    named: dict[str, Shaped[np.ndarray, ...]] = {
+        "frequency": field.frequency.numpy(),
+        "damping": field.damping.numpy(),
+        "points": field.points.float().numpy(),
+        "normals": field.normals.numpy(),
+        "sine": field.sine.numpy(),
+        "noise": field.noise.numpy(),
+    }
+    return {**named, "cosine": field.cosine.numpy()} if bool(field.cosine.any()) else named
+
+
+def _packed(tensors: Mapping[str, Shaped[np.ndarray, "..."]]) -> tuple[bytes, dict[str, Any]]:
+    content, records = bytearray(), {}
+    for name, tensor in tensors.items():
+        records[name] = {
+            "file": "field.bin",
+            "offset": len(content),
+            "dtype": tensor.dtype.name,
+            "shape": list(tensor.shape),
+        }
+        content += np.ascontiguousarray(tensor, dtype=tensor.dtype.newbyteorder("<")).tobytes()
+    return bytes(content), records
+
+
+def _strikes(strikes: Impacts | None, field: SampledField) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
+    if strikes is None:
+        return [], {}
+    if strikes.sample_rate != field.sample_rate:
+        raise ExportError(
+            f"expected strikes at the field's {field.sample_rate:g} Hz, found {strikes.sample_rate:g} Hz: name the "
+            "capture that the field was fitted to"
+        )
+    records, files = [], {}
+    for row, name in enumerate(strikes.names):
+        path, memory = f"strikes/{row + 1:03d}.wav", io.BytesIO()
+        soundfile.write(memory, strikes.sounds[row].float().numpy(), round(field.sample_rate), "FLOAT", format="WAV")
+        files[path] = memory.getvalue()
+        records.append(
+            {
+                "name": name,
+                "contact": strikes.contacts[row].tolist(),
+                "direction": None if strikes.directions is None else strikes.directions[row].tolist(),
+                "sound": path,
+            }
+        )
+    return records, files
+
+
+def _manifest(
+    field: SampledField,
+    tensors: dict[str, Any],
+    shown: ObjectFile,
+    strikes: list[dict[str, Any]],
+    live: Mapping[str, Any] | None,
+) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "package": version("avmsf"),
+        "name": field.name,
+        "sampleRate": field.sample_rate,
+        "samples": field.samples,
+        "perNewton": field.per_newton,
+        "modes": len(field.frequency),
+        "points": len(field),
+        "damping": "shared" if field.shared_damping else "perContact",
+        "tensors": tensors,
+        "object": {"kind": shown.kind, "file": shown.name},
+        "strikes": strikes,
+        "live": None if live is None else dict(live),
+    }

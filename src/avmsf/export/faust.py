@@ -1,0 +1,145 @@
+"""A field as a Faust program: a bank of resonators with the contact, the force and the hammer's softness as controls.
+
+The text needs no library of Faust's. A blow adds, over its contact time, its point's amplitudes to resonators that go
+on ringing, p[n] = z p[n-1] + (sine + i cosine) x[n] with z = exp((-d + 2 pi i f) / rate), of which the imaginary part
+is heard: at any sample rate, and in single precision without drift, which two-pole filters at low frequencies have.
+"""
+
+import re
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.errors import ExportError
+from avmsf.export.sampledfield import SampledField
+from avmsf.export.written import Written, generator, write_file
+
+SUFFIXES = (".dsp", ".lib")
+_ROW = 8
+"""Numbers in a line of text."""
+MOST_NUMBERS = 150_000
+"""In all tables together: Faust took half a minute for as many, in 128 modes."""
+
+
+def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, force: bool = False) -> Written:
+    """Write a `.dsp` with controls, or a `.lib` without them, by the path's ending.
+
+    Without `noise` only the modes sound. Raises `ExportError` for another ending, and for more numbers than Faust
+    compiles in reasonable time.
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        found = repr(path.suffix) if path.suffix else "no ending"
+        raise ExportError(f"{path}: expected a name that ends in .dsp or .lib, found {found}")
+    with_noise = noise and bool(field.noise.any())
+    text = faust_library(field, noise=with_noise)
+    if path.suffix == ".dsp":
+        text += _CONTROLS
+    remarks = [
+        "blows ring into each other in one bank, without voices; their force is half a sine over the contact time"
+    ]
+    if not field.shared_damping:
+        remarks.append("dampings belong to the point last struck, and what rings from before takes them on")
+    if noise and with_noise:
+        remarks.append("the noise starts anew with every blow")
+    elif field.noise.any():
+        remarks.append("the noise beside the modes is left out")
+    return Written(write_file(path, text.encode(), force=force), tuple(remarks))
+
+
+def faust_library(field: SampledField, *, noise: bool) -> str:
+    """Return the definitions, of which `strike(contact, force, contactTime, gate)` is the sound."""
+    points, modes = field.sine.shape
+    phased = bool(field.cosine.any())
+    numbers = points * modes * (1 + phased + (not field.shared_damping)) + noise * field.samples
+    if numbers > MOST_NUMBERS:
+        raise ExportError(
+            f"expected at most {MOST_NUMBERS} numbers, which Faust compiles in seconds, found {numbers}: {points} "
+            f"points with {modes} modes{f' and {field.samples} samples of noise' if noise else ''}; ask for fewer "
+            "points, or leave the noise out"
+        )
+    name = re.sub(r'["\\\x00-\x1f]', "", field.name) or "object"
+    parts = [
+        f"// {name}: {modes} modes at {points} points, as exported by {generator()}",
+        f'declare name "{name}";',
+        f"points = {points};\nrecordedRate = {float(field.sample_rate)!r};",
+        _BASE.strip(),
+        f"noiseDraw = {_waveform(field.noise)};" if noise else "",
+        _NOISE.format(samples=field.samples).strip() if noise else "noise(since) = 0.0;",
+        _bank(field),
+        _STRIKE.strip(),
+    ]
+    return "\n".join(part for part in parts if part) + "\n"
+
+
+def _bank(field: SampledField) -> str:
+    """Return the resonators side by side, each with its mode's numbers, which the contact chooses from."""
+    # A table a mode: of one table for all modes Faust made as many copies in its mind, and took minutes.
+    lines = []
+    for k, frequency in enumerate(field.frequency.tolist()):
+        damping = repr(float(field.damping[k])) if field.shared_damping else _at_contact(field.damping[:, k])
+        sine, cosine = _at_contact(field.sine[:, k]), _at_contact(field.cosine[:, k])
+        lines.append(f"  resonator({frequency!r}, {damping},\n    {sine},\n    {cosine})")
+    return "bank(contact) = _ <:\n" + ",\n".join(lines) + "\n  :> _;"
+
+
+def _at_contact(values: Float[Tensor, " points"]) -> str:
+    if bool((values == values[0]).all()):
+        return _number(float(values[0]))
+    return f"({_waveform(values)}, contact : rdtable)"
+
+
+def _waveform(values: Float[Tensor, " numbers"]) -> str:
+    words = [_number(value) for value in values.tolist()]
+    rows = (", ".join(words[start : start + _ROW]) for start in range(0, len(words), _ROW))
+    return "waveform{" + ",\n    ".join(rows) + "}"
+
+
+def _number(value: float) -> str:
+    word = f"{value:.9g}"
+    # A number without a point would make the table one of whole numbers.
+    return word if any(mark in word for mark in ".en") else f"{word}.0"
+
+
+_BASE = """
+SR = min(192000.0, max(1.0, fconstant(int fSamplingFreq, <math.h>)));
+PI = 3.14159265358979323846;
+resonator(frequency, damping, sine, cosine) = (step ~ (_, _)) : !, _ with {
+  decay = exp(0.0 - damping / SR);
+  turn = 2.0 * PI * frequency / SR;
+  zr = decay * cos(turn);
+  zi = decay * sin(turn);
+  heard = frequency < 0.5 * SR;
+  step(re, im, x) = zr * re - zi * im + heard * sine * x, zr * im + zi * re + heard * cosine * x;
+};
+// Samples since the gate opened, from 1 on; 0 before the first blow.
+sinceBlow(gate) = count ~ _ with {
+  struck = (gate > 0) & (gate' <= 0);
+  count(before) = select2(struck, min(before + (before > 0), 1073741824), 1);
+};
+// The part of half a sine that falls into each sample's time; all parts together are 1.
+pulse(contactTime, since) = (since > 0) * sin((from + to) * PI / 2.0) * sin((to - from) * PI / 2.0) with {
+  length = max(contactTime * SR, 1.0);
+  from = min(max(since - 1, 0) / length, 1.0);
+  to = min(since / length, 1.0);
+};
+"""
+_NOISE = """
+noise(since) = (since > 0) * (place < {samples}) * (noiseDraw, int(min(place, {samples} - 1)) : rdtable) with {{
+  place = max(since - 1, 0) * (recordedRate / SR);
+}};
+"""
+_STRIKE = """
+strike(contact, force, contactTime, gate) = force * pulse(contactTime, since) : bank(contact) : +(force * noise(since))
+with {
+  since = sinceBlow(gate);
+};
+"""
+_CONTROLS = """
+process = strike(
+  int(nentry("contact", 0, 0, points - 1, 1)),
+  hslider("force", 1, 0, 100, 0.001),
+  hslider("contactTime[unit:s]", 0, 0, 0.02, 0.0001),
+  button("gate"));
+"""

@@ -1,0 +1,215 @@
+"""A field as a `.glb` that any viewer shows, with its modes in the draft extension `KHR_audio_rigid_bodies`.
+
+The draft (seen in 2026, not ratified) sounds an impulse j at a point as the sum over modes of 2 pi f (shape . j)
+exp(-d t) sin(2 pi f t). Here an impulse of 1 N s straight into the surface is a blow of force 1, so a shape is minus
+the normal times the gain over 2 pi f. The draft leaves the absolute level to who plays it. It knows sines alone, one
+damping a mode, and no noise; what that leaves out lies in `extras`, where a reader that knows of it finds the rest.
+"""
+
+import json
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, Shaped
+from torch import Tensor
+
+from avmsf.capture.texturedmesh import TexturedMesh
+from avmsf.errors import ExportError
+from avmsf.export.onephase import deviation, importance, shared_dampings, signed_amplitudes
+from avmsf.export.sampledfield import SampledField
+from avmsf.export.written import Written, generator, write_file
+
+EXTENSION = "KHR_audio_rigid_bodies"
+_FLOAT, _UNSIGNED = 5126, 5125
+_POINTS, _TRIANGLES = 0, 4
+_VERTICES, _INDICES = 34962, 34963
+_GREY = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a viewer shows: triangles with colours, or the field's points."""
+
+    vertices: Float[Tensor, "vertices 3"]
+    """Object frame, metres."""
+    faces: Int[Tensor, "faces 3"]
+    """Rows of `vertices`; none for points."""
+    normals: Float[Tensor, "vertices 3"]
+    """Unit vectors out of the object."""
+    colors: Float[Tensor, "vertices 3"] | None = None
+    """Red, green, blue as displayed (sRGB), 0 to 1; None for grey."""
+
+    @classmethod
+    def of_points(cls, sampled: SampledField) -> "Look":
+        """Return the field's points."""
+        return cls(sampled.points, torch.zeros(0, 3, dtype=torch.int64), sampled.normals)
+
+    @classmethod
+    def of_mesh(cls, mesh: TexturedMesh) -> "Look":
+        """Return a mesh, whose corners keep their own normals and colours where these differ between faces.
+
+        Textures become colours of the corners.
+        """
+        corners = torch.cat([mesh.vertices[mesh.faces], mesh.normals, _corner_colors(mesh)], dim=2).reshape(-1, 9)
+        table, rows = np.unique(corners.numpy(), axis=0, return_inverse=True)
+        kept = torch.from_numpy(table).float()
+        return cls(kept[:, :3], torch.from_numpy(rows.reshape(-1, 3)), kept[:, 3:6], kept[:, 6:])
+
+
+def write_gltf(sampled: SampledField, path: str | Path, *, look: Look | None = None, force: bool = False) -> Written:
+    """Write the object, or its points, and one modal model, the modes that matter most first.
+
+    Raises `ExportError` for a name that does not end in .glb, and a field without modes.
+    """
+    path = Path(path)
+    if path.suffix != ".glb":
+        raise ExportError(
+            f"{path}: expected a name that ends in .glb, found {repr(path.suffix) if path.suffix else 'no ending'}"
+        )
+    if not len(sampled.frequency):
+        raise ExportError("expected a field with modes that sound below half the sample rate, found none to export")
+    damping = shared_dampings(sampled)
+    order = importance(sampled, damping)
+    gains = signed_amplitudes(sampled)
+    content = _glb(_document(sampled, look or Look.of_points(sampled), order, gains, damping))
+    sizes = write_file(path, content, force=force)
+    error = deviation(sampled, sine=gains, cosine=None, damping=damping)
+    return Written(sizes, _remarks(sampled), error)
+
+
+@dataclass
+class _Buffer:
+    """The binary part, and the records that say where in it everything lies."""
+
+    content: bytes = b""
+    views: list[dict[str, Any]] = field(default_factory=list)
+    accessors: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, values: Shaped[np.ndarray, "..."], *, bounds: bool = False, target: int | None = None) -> int:
+        """Append numbers and return their accessor: float32 or uint32, in threes where there are two axes."""
+        whole = values.dtype.kind in "iu"
+        packed = np.ascontiguousarray(values, dtype="<u4" if whole else "<f4")
+        view = {"buffer": 0, "byteOffset": len(self.content), "byteLength": packed.nbytes}
+        self.views.append(view if target is None else view | {"target": target})
+        self.content += packed.tobytes()
+        record: dict[str, Any] = {
+            "bufferView": len(self.views) - 1,
+            "componentType": _UNSIGNED if whole else _FLOAT,
+            "count": len(packed),
+            "type": "VEC3" if packed.ndim == 2 else "SCALAR",
+        }
+        if bounds:
+            record |= {"min": packed.min(0).tolist(), "max": packed.max(0).tolist()}
+        self.accessors.append(record)
+        return len(self.accessors) - 1
+
+
+def _document(
+    sampled: SampledField,
+    look: Look,
+    order: Int[Tensor, " modes"],
+    gains: Float[Tensor, "points modes"],
+    damping: Float[Tensor, " modes"],
+) -> tuple[dict[str, Any], bytes]:
+    buffer = _Buffer()
+    frequency = sampled.frequency[order]
+    shapes = -sampled.normals.double()[None] * (gains.double()[:, order] / (2 * math.pi * frequency)).T[:, :, None]
+    model = {
+        "name": sampled.name or "object",
+        "frequencies": buffer.add(frequency.numpy()),
+        "decayRates": buffer.add(damping[order].numpy()),
+        "positions": buffer.add(sampled.points.numpy(), bounds=True),
+        "shapes": buffer.add(shapes.reshape(-1, 3).numpy()),
+        "extras": _extras(sampled, order, buffer),
+    }
+    primitive: dict[str, Any] = {
+        "attributes": {
+            "POSITION": buffer.add(look.vertices.numpy(), bounds=True, target=_VERTICES),
+            "NORMAL": buffer.add(torch.nn.functional.normalize(look.normals, dim=1).numpy(), target=_VERTICES),
+        },
+        "mode": _TRIANGLES if len(look.faces) else _POINTS,
+        "material": 0,
+    }
+    if look.colors is not None:
+        primitive["attributes"]["COLOR_0"] = buffer.add(_linear(look.colors).numpy(), target=_VERTICES)
+    if len(look.faces):
+        primitive["indices"] = buffer.add(look.faces.reshape(-1).numpy(), target=_INDICES)
+    shade = 1.0 if look.colors is not None else float(_linear(torch.tensor(_GREY)))
+    surface = {"baseColorFactor": [shade] * 3 + [1.0], "metallicFactor": 0.0, "roughnessFactor": 0.6}
+    document = {
+        "asset": {"version": "2.0", "generator": generator()},
+        "extensionsUsed": [EXTENSION],
+        "extensions": {EXTENSION: {"modalModels": [model]}},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": model["name"], "mesh": 0, "extensions": {EXTENSION: {"modalModel": 0}}}],
+        "meshes": [{"name": model["name"], "primitives": [primitive]}],
+        "materials": [{"pbrMetallicRoughness": surface, "doubleSided": True}],
+        "accessors": buffer.accessors,
+        "bufferViews": buffer.views,
+        "buffers": [{"byteLength": len(buffer.content)}],
+    }
+    return document, buffer.content
+
+
+def _extras(sampled: SampledField, order: Int[Tensor, " modes"], buffer: _Buffer) -> dict[str, Any]:
+    """Return what the draft has no place for; arrays as accessors, mode-major like the shapes."""
+    extras: dict[str, Any] = {
+        "generator": generator(),
+        "sampleRate": sampled.sample_rate,
+        "samples": sampled.samples,
+        "perNewton": sampled.per_newton,
+        "impulse": "1 N s against the normal is a blow of force 1",
+    }
+    if sampled.cosine.any():
+        extras["sine"] = buffer.add(sampled.sine[:, order].T.reshape(-1).numpy())
+        extras["cosine"] = buffer.add(sampled.cosine[:, order].T.reshape(-1).numpy())
+    if not sampled.shared_damping:
+        extras["decayRates"] = buffer.add(sampled.damping[:, order].T.reshape(-1).numpy())
+    if sampled.noise.any():
+        extras["noise"] = buffer.add(sampled.noise.numpy())
+    return {"avmsf": extras}
+
+
+def _glb(document: tuple[Mapping[str, Any], bytes]) -> bytes:
+    """Return the container: a header and two chunks, each a multiple of four bytes long."""
+    text = json.dumps(document[0], separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    content = document[1] + b"\0" * (-len(document[1]) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(content), b"BIN\0") + content
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def _remarks(sampled: SampledField) -> tuple[str, ...]:
+    remarks = ["the draft's absolute level is left to the player: an impulse of 1 N s is a blow of force 1 here"]
+    if sampled.cosine.any():
+        remarks.append("every mode starts as a sine, of the loudness that it has in the field; phases are in extras")
+    if not sampled.shared_damping:
+        remarks.append("each mode has one damping, its mean by energy; those of each point are in extras")
+    if sampled.noise.any():
+        remarks.append("the noise beside the modes is in extras alone")
+    return tuple(remarks)
+
+
+def _linear(colors: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+    """Return colours as light, as glTF holds vertex colours, of colours as displayed (IEC 61966-2-1)."""
+    return torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+
+
+def _corner_colors(mesh: TexturedMesh) -> Float[Tensor, "faces 3 3"]:
+    """Return each corner's colour times that of its texture there."""
+    colors = mesh.colors.clone()
+    for number, texture in enumerate(mesh.textures):
+        chosen = mesh.materials == number
+        height, width = texture.shape[:2]
+        across, up = mesh.coordinates[chosen].unbind(2)
+        column = (across.remainder(1.0) * width).long().clamp(max=width - 1)
+        row = ((1.0 - up.remainder(1.0)) * height).long().clamp(0, height - 1)
+        colors[chosen] *= texture[row, column].float() / 255.0
+    return colors

@@ -1,0 +1,146 @@
+"""The object itself, for a page to show: a mesh, Gaussians, or nothing but the field's points."""
+
+import math
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+from trimesh.visual import ColorVisuals
+
+from avmsf.capture.surface import Surface
+from avmsf.errors import ExportError
+from avmsf.scene.ply import read_splats
+
+MOST_FACES = 200_000
+"""Triangles that a browser turns smoothly and picks quickly; a mesh of more is reduced."""
+MOST_READ = 5_000_000
+"""Triangles of a mesh that is still read."""
+MOST_BYTES = 1 << 30
+_MESHES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
+_ALIKE = 3.0
+"""Factor between the sizes of object and field beyond which they are not in one unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectFile:
+    """What a page loads beside the field."""
+
+    kind: Literal["mesh", "gaussians", "points"]
+    name: str | None = None
+    """What the file is called; None for points, which the field itself holds."""
+    content: bytes = b""
+    remarks: tuple[str, ...] = ()
+    """What differs from the file that was given, a sentence each."""
+
+
+def read_object(
+    source: Path | Surface | None, points: Float[Tensor, "points 3"], *, metres: float = 1.0, most: int = MOST_FACES
+) -> ObjectFile:
+    """Return an object for a field at `points`: a mesh as `.glb`, Gaussians as they are, or None.
+
+    A file's coordinates count `metres` each; Gaussians are in metres. Meshes of more than `most` triangles are reduced.
+    Raises `ExportError` for a file that is missing, no mesh, huge, or plainly not in the field's unit.
+    """
+    if source is None:
+        return ObjectFile("points")
+    if isinstance(source, Surface):
+        mesh = trimesh.Trimesh(source.vertices.numpy(), source.faces.numpy(), process=False)
+        return _shown(trimesh.Scene([mesh]), points, "the surface", most)
+    if not source.is_file():
+        raise ExportError(f"{source}: expected a mesh or a .ply of Gaussians, found no such file: check the name")
+    size = source.stat().st_size
+    if size > MOST_BYTES:
+        raise ExportError(
+            f"{source}: expected a mesh of at most {MOST_BYTES >> 20} MiB, found {size >> 20}: reduce it first"
+        )
+    if source.suffix.lower() == ".ply" and _holds_gaussians(source):
+        _expect_alike(read_splats(source).centers.numpy(), points, str(source))
+        return ObjectFile("gaussians", "object.ply", source.read_bytes())
+    scene = _read_mesh(source)
+    scene.apply_scale(metres)  # type: ignore[no-untyped-call]
+    return _shown(scene, points, str(source), most)
+
+
+def _holds_gaussians(path: Path) -> bool:
+    with path.open("rb") as file:
+        header, _, _ = file.read(1 << 16).partition(b"end_header")
+    return b"scale_0" in header and b"rot_0" in header
+
+
+def _read_mesh(path: Path) -> trimesh.Scene:
+    if path.suffix.lower() not in _MESHES:
+        raise ExportError(f"{path}: expected a mesh ({', '.join(_MESHES)}), found {path.suffix or 'no ending'}")
+    try:
+        scene = trimesh.load_scene(path, process=False)
+    except Exception as error:  # trimesh's readers raise whatever their format's parsing raises
+        raise ExportError(f"{path}: expected a mesh, found a file that cannot be read as one: {error}") from error
+    return scene
+
+
+def _shown(scene: trimesh.Scene, points: Float[Tensor, "points 3"], what: str, most: int) -> ObjectFile:
+    meshes = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    faces = sum(len(mesh.faces) for mesh in meshes)
+    if not meshes:
+        return ObjectFile("points", remarks=(f"{what} has no triangles, so the field's own points are shown",))
+    if faces > MOST_READ:
+        raise ExportError(f"{what}: expected at most {MOST_READ:,} triangles, found {faces:,}: reduce the mesh first")
+    places = np.concatenate([np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes])
+    if not np.isfinite(places).all():
+        raise ExportError(f"{what}: expected finite coordinates, found NaN or infinity: export the mesh again")
+    _expect_alike(places, points, what)
+    if faces <= most:
+        return ObjectFile("mesh", "object.glb", _as_glb(scene))
+    reduced = trimesh.Scene([_reduced(mesh, most / faces, what) for mesh in meshes])
+    left = sum(len(mesh.faces) for mesh in reduced.geometry.values())
+    remark = f"{what} has {faces:,} triangles, too many for a browser: {left:,} are shown, without its textures"
+    return ObjectFile("mesh", "object.glb", _as_glb(reduced), (remark,))
+
+
+def _as_glb(scene: trimesh.Scene) -> bytes:
+    content = scene.export(file_type="glb")  # type: ignore[no-untyped-call]
+    assert isinstance(content, bytes)
+    return content
+
+
+def _reduced(mesh: trimesh.Trimesh, share: float, what: str) -> trimesh.Trimesh:
+    try:
+        simplify = import_module("fast_simplification").simplify
+    except ImportError as error:
+        raise ExportError(
+            f"{what}: has too many triangles for a browser, and reducing it needs fast-simplification: "
+            "pip install 'avmsf[fem]', or reduce the mesh first"
+        ) from error
+    # Faces without shared corners cannot be merged, and many files have no others.
+    merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    merged.merge_vertices(merge_tex=True, merge_norm=True)
+    target = max(4, math.floor(share * len(mesh.faces)))
+    vertices, faces = simplify(np.asarray(merged.vertices, np.float32), np.asarray(merged.faces), target_count=target)
+    small = trimesh.Trimesh(vertices, faces, process=False)
+    if isinstance(mesh.visual, ColorVisuals) and mesh.visual.kind == "vertex":
+        _, rows = cKDTree(mesh.vertices).query(vertices)
+        small.visual = ColorVisuals(small, vertex_colors=mesh.visual.vertex_colors[rows])
+    return small
+
+
+def _expect_alike(places: Float[np.ndarray, "places 3"], points: Float[Tensor, "points 3"], what: str) -> None:
+    """Raise `ExportError` for an object that is not about as large as the field and where it is."""
+    own = points.double().numpy()
+    size, expected = np.ptp(places, axis=0), np.ptp(own, axis=0)
+    ratio = float(np.linalg.norm(size) / max(float(np.linalg.norm(expected)), 1e-12))
+    apart = float(np.linalg.norm(places.min(axis=0) + size / 2 - own.min(axis=0) - expected / 2))
+    if not 1 / _ALIKE < ratio < _ALIKE:
+        raise ExportError(
+            f"{what}: expected an object as large as the field's, {np.linalg.norm(expected):.3g} m, found one "
+            f"{ratio:.4g} times as large: say what its coordinates count, or name the field's own object"
+        )
+    if apart > float(np.linalg.norm(expected)):
+        raise ExportError(
+            f"{what}: expected the object where the field's points are, found its middle {apart:.3g} m away: name a "
+            "file in the frame of the capture"
+        )

@@ -1,0 +1,216 @@
+"""A sound field as a table of points: all that is needed to strike it where there is neither Python nor its network."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Float64, Int
+from torch import Tensor
+
+from avmsf.errors import ExportError
+from avmsf.export.normals import outward_normals
+from avmsf.field.gainfield import GainField, Gains
+from avmsf.field.modalbasis import ModalBasis
+from avmsf.field.scaledgains import ScaledGains
+from avmsf.field.soundfield import SoundField
+from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.synthesis import synthesise
+from avmsf.scene.points import farthest_points, nearest_points
+
+_BATCH = 1024
+"""Points sampled at once, which bounds the memory."""
+_RENDERED = 32
+"""Blows rendered at once."""
+_DRAWN = 4
+"""Points that thinning chooses among, for each that it keeps: farthest points of all of a million take too long."""
+
+
+@dataclass(frozen=True, eq=False)
+class SampledField:
+    """Blows straight into the surface at some points, phases resolved.
+
+    A blow of force 1 at a point sounds as the sum over modes of exp(-d t) (sine sin(2 pi f t) + cosine cos(2 pi f t)),
+    and the noise.
+    """
+
+    points: Float[Tensor, "points 3"]
+    """Where the gains are known, object frame, metres."""
+    normals: Float32[Tensor, "points 3"]
+    """Unit vectors out of the object there; a blow goes the other way."""
+    frequency: Float64[Tensor, " modes"]
+    """Hz, all below half the sample rate."""
+    damping: Float64[Tensor, "*points modes"]
+    """1/s; one row a point where it depends on the place, else no such axis."""
+    sine: Float32[Tensor, "points modes"]
+    """Signed amplitudes of the sines, in the unit of the training sounds."""
+    cosine: Float32[Tensor, "points modes"]
+    """Signed amplitudes of the cosines; zero where all modes start as sines."""
+    noise: Float32[Tensor, " samples"]
+    """What is heard beside the modes: the very draw that `SoundField.render` adds."""
+    sample_rate: float
+    """Samples per second of the training sounds, Hz."""
+    per_newton: bool = False
+    """Whether force counts newtons; else a blow of force 1 is an average recorded one."""
+    name: str = ""
+    """What the object is called."""
+    origin: dict[str, Any] = field(default_factory=dict)
+    """Where the field comes from, as plain values."""
+
+    @classmethod
+    def of(
+        cls,
+        sound_field: SoundField,
+        points: Float[Tensor, "points 3"] | None = None,
+        normals: Float[Tensor, "normals 3"] | None = None,
+        *,
+        limit: int | None = None,
+    ) -> "SampledField":
+        """Return the field at `points` (object frame, metres), or at its own; at most `limit` of them, spread evenly.
+
+        `normals` point out of the object; where they are not given they are those that the field's physics holds, or
+        else are judged from how the points lie. Raises `ExportError` for points that are none, or not finite.
+        """
+        places = sound_field.gain_field.points if points is None else points
+        _expect_places(places, normals, limit)
+        if limit is not None and len(places) > limit:
+            rows = spread_rows(places, limit)
+            places, normals = places[rows], None if normals is None else normals[rows]
+        if normals is None:
+            normals = _known_normals(sound_field.gain_field, places)
+        if normals is None:
+            normals = outward_normals(places)
+        heard = torch.nonzero(sound_field.audible).flatten()
+        known = [sound_field.known(part) for part in torch.split(places, _BATCH)]
+        along, ahead = torch.cos(sound_field.phase), torch.sin(sound_field.phase)
+        sines, cosines = [], []
+        for part in known:
+            mean = part.mean.double()
+            quadrature = torch.zeros_like(mean) if part.quadrature is None else part.quadrature.double()
+            sines.append((mean * along - quadrature * ahead)[:, heard].float())
+            cosines.append((mean * ahead + quadrature * along)[:, heard].float())
+        damping = sound_field.bank.damping[heard]
+        factors = [part.damping[:, heard] for part in known if part.damping is not None]
+        origin = sound_field.origin
+        return cls(
+            places.detach(),
+            torch.nn.functional.normalize(normals.float(), dim=1),
+            sound_field.bank.frequency[heard],
+            damping * torch.cat(factors) if factors else damping,
+            torch.cat(sines),
+            torch.cat(cosines),
+            sound_field.noise().float(),
+            sound_field.sample_rate,
+            origin.per_newton,
+            origin.capture,
+            {
+                "capture": origin.capture,
+                "trained_on": list(origin.trained_on),
+                "gain_field": sound_field.gain_field.kind,
+            },
+        )
+
+    @property
+    def samples(self) -> int:
+        """Length of the training sounds."""
+        return len(self.noise)
+
+    @property
+    def shared_damping(self) -> bool:
+        """Whether the dampings are the same everywhere."""
+        return self.damping.ndim == 1
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def nearest(self, places: Float[Tensor, "places 3"]) -> Int[Tensor, " places"]:
+        """Return the row of the point nearest to each place (object frame, metres)."""
+        return nearest_points(self.points, places)[:, 0]
+
+    def spread(self, count: int) -> Int[Tensor, " chosen"]:
+        """Return `count` rows, or all where there are fewer, spread as far apart as they go."""
+        return spread_rows(self.points, min(count, len(self)))
+
+    def take(self, rows: Int[Tensor, " chosen"]) -> "SampledField":
+        """Return the field at some of its points alone."""
+        return replace(
+            self,
+            points=self.points[rows],
+            normals=self.normals[rows],
+            damping=self.damping if self.shared_damping else self.damping[rows],
+            sine=self.sine[rows],
+            cosine=self.cosine[rows],
+        )
+
+    def damping_at(self, rows: Int[Tensor, " chosen"]) -> Float64[Tensor, "chosen modes"]:
+        """Return the dampings at some points, 1/s."""
+        return self.damping.expand(len(rows), -1) if self.shared_damping else self.damping[rows]
+
+    def render(
+        self,
+        rows: Int[Tensor, " contacts"],
+        *,
+        force: float = 1.0,
+        samples: int | None = None,
+        pulse: ForcePulse | None = None,
+    ) -> Float32[Tensor, "contacts samples"]:
+        """Return what `SoundField.render` does for blows at the points of some rows.
+
+        Of `samples` samples, or as long as the training sounds, behind whose end there is no noise.
+        """
+        length = self.samples if samples is None else samples
+        noise = torch.nn.functional.pad(self.noise, (0, max(0, length - self.samples)))[:length]
+        parts = []
+        for chosen in torch.split(rows, _RENDERED):
+            modes = synthesise(
+                self.sine[chosen],
+                self.frequency,
+                self.damping if self.shared_damping else self.damping[chosen],
+                samples=length,
+                sample_rate=self.sample_rate,
+                quadrature=self.cosine[chosen],
+            )
+            parts.append(modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate))
+        return force * (torch.cat(parts) + noise)
+
+
+def spread_rows(points: Float[Tensor, "points 3"], count: int) -> Int[Tensor, " chosen"]:
+    """Return `count` rows of the points, each as far as it can be from those before it."""
+    drawn = torch.arange(len(points))
+    if len(points) > _DRAWN * count:
+        drawn = torch.from_numpy(np.sort(np.random.default_rng(0).permutation(len(points))[: _DRAWN * count]))
+    return drawn[farthest_points(points[drawn], count)]
+
+
+def _expect_places(
+    places: Float[Tensor, "points 3"], normals: Float[Tensor, "normals 3"] | None, limit: int | None
+) -> None:
+    finite = bool(torch.isfinite(places).all()) and (normals is None or bool(torch.isfinite(normals).all()))
+    if len(places) == 0 or not finite:
+        found = "none" if len(places) == 0 else "some that are NaN or infinite"
+        raise ExportError(
+            f"expected points of the object's surface as finite numbers, found {found}: name a mesh or a cloud of the "
+            "object, or fit the field to features that lie on its surface"
+        )
+    if normals is not None and normals.shape != places.shape:
+        raise ExportError(
+            f"expected a normal for each of {len(places)} points, found {len(normals)}: give them in pairs"
+        )
+    if limit is not None and limit < 1:
+        raise ExportError(f"expected to keep 1 point or more, found a limit of {limit}: ask for some")
+
+
+def _resolved(known: Gains, phase: Float64[Tensor, " modes"]) -> Float64[Tensor, "points modes 2"]:
+    """Return the amplitudes of sines and cosines of what starts with `phase` and a quarter of a period ahead."""
+    mean = known.mean.double()
+    quadrature = torch.zeros_like(mean) if known.quadrature is None else known.quadrature.double()
+    along, ahead = torch.cos(phase), torch.sin(phase)
+    return torch.stack([mean * along - quadrature * ahead, mean * ahead + quadrature * along], dim=2)
+
+
+def _known_normals(gain_field: GainField, places: Float[Tensor, "points 3"]) -> Float64[Tensor, "points 3"] | None:
+    if isinstance(gain_field, ScaledGains):
+        return _known_normals(gain_field.field, places.double() / gain_field.length)
+    if isinstance(gain_field, ModalBasis):
+        return -gain_field.surface.along(places, None)[1]
+    return None

@@ -1,0 +1,193 @@
+"""A field in the universal file format, which modal-analysis programs read: nodes, mode shapes, response functions.
+
+Data set 2411 holds the points, 55 the shape of each mode along the normals, 58 the frequency response functions of some
+of the points. Numbers of data set 55 have six digits, as the format sets them; those of 58 are in double precision.
+"""
+
+import contextlib
+import io
+import math
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Complex128, Float64
+from torch import Tensor
+
+from avmsf.errors import ExportError
+from avmsf.export.onephase import shared_dampings
+from avmsf.export.sampledfield import SampledField
+from avmsf.export.written import Written, generator, write_file
+
+_NORMAL_MODE, _COMPLEX_MODE = 2, 3
+_TRANSLATION = 2
+_RESPONSE = 4
+_MOST_LINES = 1 << 16
+"""Frequencies of a response function, at most."""
+
+
+def write_universal(field: SampledField, path: str | Path, *, functions: int = 16, force: bool = False) -> Written:
+    """Write points, modes, and the response functions of `functions` points, spread as far apart as they go.
+
+    Where all modes start as sines, shapes are real: normal modes with undamped frequency and damping ratio. Else they
+    are the residues of the complex eigenvalues -d + 2 pi i f. Raises `ExportError` for a name that does not end in .uff
+    or .unv, and where pyuff is missing.
+    """
+    path = Path(path)
+    if path.suffix not in (".uff", ".unv"):
+        found = repr(path.suffix) if path.suffix else "no ending"
+        raise ExportError(f"{path}: expected a name that ends in .uff or .unv, found {found}")
+    pyuff = _pyuff()
+    damping = shared_dampings(field)
+    sets = [_header(field), _units(), _nodes(field)]
+    sets += [_mode(field, mode, damping) for mode in range(len(field.frequency))]
+    rows = field.spread(functions) if functions else torch.zeros(0, dtype=torch.int64)
+    frequencies = response_frequencies(field)
+    sets += [_function(field, row, frequencies) for row in rows.tolist()]
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / "field.uff"
+        # What pyuff prints and warns of concerns its own writing, and says nothing that the caller can act on.
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            pyuff.UFF(str(place)).write_sets(sets, mode="overwrite")
+        content = place.read_bytes()
+    remarks = ["frequencies, dampings and shapes have six digits in data set 55, as the format sets them"]
+    if not field.shared_damping:
+        remarks.append("each mode has one damping, its mean by energy; the response functions have each point's own")
+    if field.noise.any():
+        remarks.append("the noise beside the modes is left out")
+    return Written(write_file(path, content, force=force), tuple(remarks))
+
+
+def response_frequencies(field: SampledField) -> Float64[np.ndarray, " lines"]:
+    """Return where response functions are given, Hz: from 0 to about half the rate, as finely as sounds allow."""
+    lines = max(2, min(field.samples // 2 + 1, _MOST_LINES))
+    # The format has six digits for the step, from which readers count.
+    step = float(f"{0.5 * field.sample_rate / (lines - 1):.5e}")
+    return step * np.arange(lines)
+
+
+def response(
+    field: SampledField, row: int, frequencies: Float64[np.ndarray, " lines"]
+) -> Complex128[np.ndarray, " lines"]:
+    """Return the Laplace transform of a blow's modes at 2 pi i times the frequencies (Hz): sound over impulse.
+
+    Of sine exp(-d t) sin(w t) + cosine exp(-d t) cos(w t) it is (sine w + cosine (s + d)) / ((s + d)^2 + w^2).
+    """
+    place = torch.tensor([row])
+    damping = field.damping_at(place)[0].numpy()
+    turning = 2 * math.pi * field.frequency.numpy()
+    sine, cosine = field.sine[row].double().numpy(), field.cosine[row].double().numpy()
+    total = np.zeros(len(frequencies), dtype=np.complex128)
+    for k in range(len(turning)):
+        shifted = 2j * math.pi * frequencies + damping[k]
+        total += (sine[k] * turning[k] + cosine[k] * shifted) / (shifted**2 + turning[k] ** 2)
+    return total
+
+
+def _header(field: SampledField) -> dict[str, Any]:
+    words = {"model_name": field.name[:80] or "object", "description": "modal sound field", "program": generator()}
+    times = dict.fromkeys(("date_db_created", "time_db_created", "date_db_saved", "time_db_saved"), "")
+    # No times, so that the same field gives the same file.
+    versions = {"version_db1": 0, "version_db2": 0, "file_type": 0}
+    return {"type": 151, "db_app": "avmsf", "date_db_written": "", "time_db_written": "", **words, **times, **versions}
+
+
+def _units() -> dict[str, Any]:
+    factors = {"length": 1.0, "force": 1.0, "temp": 1.0, "temp_offset": 0.0}
+    return {"type": 164, "units_code": 1, "units_description": "SI: meter, newton", "temp_mode": 1, **factors}
+
+
+def _nodes(field: SampledField) -> dict[str, Any]:
+    places = field.points.double().numpy()
+    zeros = np.zeros(len(field), dtype=int)
+    along = {"x": places[:, 0], "y": places[:, 1], "z": places[:, 2]}
+    return {
+        "type": 2411,
+        "node_nums": np.arange(1, len(field) + 1),
+        "def_cs": zeros,
+        "disp_cs": zeros,
+        "color": zeros,
+        **along,
+    }
+
+
+def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) -> dict[str, Any]:
+    frequency, rate = float(field.frequency[mode]), float(damping[mode])
+    record: dict[str, Any] = {
+        "type": 55,
+        "id1": field.name[:80] or "object",
+        "id2": f"mode {mode + 1}: {frequency:.9g} Hz, exp(-{rate:.9g} t)",
+        "id4": "shape along the normals",
+        "id5": "NONE",
+        "model_type": 1,
+        "data_ch": _TRANSLATION,
+        "spec_data_type": 0,
+        "load_case": 0,
+        "mode_n": mode + 1,
+        "node_nums": np.arange(1, len(field) + 1),
+    }
+    if field.cosine.any():
+        # sine sin + cosine cos = 2 Re(residue exp(i w t)).
+        values = 0.5 * (field.cosine[:, mode].double().numpy() - 1j * field.sine[:, mode].double().numpy())
+        kind = {
+            "analysis_type": _COMPLEX_MODE,
+            "id3": "residues: sound = 2 Re sum shape exp(eig t)",
+            "eig": complex(-rate, 2 * math.pi * frequency),
+            "modal_a": 1.0 + 0.0j,
+            "modal_b": 0.0 + 0.0j,
+        }
+    else:
+        values = field.sine[:, mode].double().numpy()
+        undamped = math.hypot(frequency, rate / (2 * math.pi))
+        kind = {
+            "analysis_type": _NORMAL_MODE,
+            "id3": "amplitudes: sound = sum shape exp(-d t) sin",
+            "freq": undamped,
+            "modal_m": 1.0,
+            "modal_damp_vis": rate / (2 * math.pi * undamped),
+            "modal_damp_his": 0.0,
+        }
+    normals = field.normals.double().numpy()
+    return record | kind | {f"r{axis + 1}": values * normals[:, axis] for axis in range(3)}
+
+
+def _function(field: SampledField, row: int, frequencies: Float64[np.ndarray, " lines"]) -> dict[str, Any]:
+    # The direction is the axis nearest to the blow's, which goes against the normal.
+    blow = -field.normals[row].double()
+    axis = int(blow.abs().argmax())
+    direction = (axis + 1) * (1 if float(blow[axis]) > 0 else -1)
+    return {
+        "type": 58,
+        "binary": 1,
+        "func_type": _RESPONSE,
+        "id1": f"sound over impulse, point {row + 1} struck against its normal",
+        "rsp_ent_name": "MICROPHONE",
+        "rsp_node": 0,
+        "rsp_dir": 0,
+        "ref_ent_name": "POINT",
+        "ref_node": row + 1,
+        "ref_dir": direction,
+        "abscissa_spacing": 1,
+        "x": frequencies,
+        "data": response(field, row, frequencies),
+        "abscissa_spec_data_type": 18,
+        "abscissa_axis_lab": "Frequency",
+        "abscissa_axis_units_lab": "Hz",
+        "ordinate_spec_data_type": 15 if field.per_newton else 1,
+        "ordinate_axis_lab": "Sound",
+        "orddenom_spec_data_type": 13,
+        "orddenom_axis_lab": "Force",
+        "orddenom_axis_units_lab": "N" if field.per_newton else "NONE",
+    }
+
+
+def _pyuff() -> Any:
+    try:
+        import pyuff
+    except ImportError as error:
+        raise ExportError("the universal file format needs pyuff: run pip install 'avmsf[uff]'") from error
+    return pyuff

@@ -1,0 +1,143 @@
+"""A grid of blows as wav files, with a table of them and an SFZ instrument, for samplers."""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import soundfile
+from jaxtyping import Float32
+from torch import Tensor
+
+from avmsf.errors import ExportError
+from avmsf.export.sampledfield import SampledField
+from avmsf.export.written import Written, write_folder
+from avmsf.modal.pulse import ForcePulse, PulseShape
+
+TABLE, INSTRUMENT, SOUNDS = "strikes.csv", "instrument.sfz", "sounds"
+_WHERE = ("x", "y", "z", "nx", "ny", "nz")
+_HOW = ("force", "contact_time", "midi_note", "velocity_low", "velocity_high")
+COLUMNS = ("file", *_WHERE, *_HOW, "seconds", "peak_db", "row")
+HIGHEST_NOTE = 127
+LOWEST_NOTE = 36
+"""MIDI note of the first contact: C2, where drum maps begin."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """How hard the contacts are struck, for one range of a keyboard's velocities."""
+
+    force: float = 1.0
+    """Newtons where the field knows forces, else relative to an average recorded blow."""
+    contact_time: float = 0.0
+    """How long hammer and object touch, seconds; 0 is the blow as it was recorded."""
+    shape: PulseShape = "hertz"
+    """Course of the force over that time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Which blows are written."""
+
+    contacts: int = 16
+    """How many contacts, spread as far apart as they go, one MIDI note each."""
+    layers: tuple[Layer, ...] = (Layer(),)
+    """From soft to hard; each contact is struck once for each."""
+    seconds: float | None = None
+    """Length of the sounds; that of the training sounds where it is not given."""
+    level_db: float = -1.0
+    """Peak of the loudest sound of all, dB below full scale; the others keep their ratio to it."""
+
+
+def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None, *, force: bool = False) -> Written:
+    """Write a float32 wav for every contact and layer, the table and the instrument.
+
+    All sounds are scaled by one factor, which the manifest names as `scale`. Raises `ExportError` for no layers, more
+    contacts than MIDI has notes, and settings that are not positive.
+    """
+    grid = Grid() if grid is None else grid
+    _expect(grid)
+    rate = round(field.sample_rate)
+    if rate != field.sample_rate or rate < 1:
+        raise ExportError(f"expected a whole sample rate, as wav files hold, found {field.sample_rate:g} Hz")
+    rows = field.spread(grid.contacts)
+    samples = field.samples if grid.seconds is None else max(1, round(grid.seconds * rate))
+    sounds = [
+        field.render(rows, force=layer.force, samples=samples, pulse=ForcePulse(layer.contact_time, layer.shape))
+        for layer in grid.layers
+    ]
+    peak = max(float(each.abs().max()) for each in sounds)
+    scale = 10 ** (grid.level_db / 20) / peak if peak > 0 else 1.0
+    edges = np.linspace(0, HIGHEST_NOTE + 1, len(grid.layers) + 1).round().astype(int)
+    records = []
+    for place, row in enumerate(rows.tolist()):
+        for number, layer in enumerate(grid.layers):
+            sound = scale * sounds[number][place]
+            where = [f"{value:.9g}" for value in (*field.points[row].tolist(), *field.normals[row].tolist())]
+            range_ = (max(1, int(edges[number])), int(edges[number + 1]) - 1)
+            loudest = float(sound.abs().max())
+            note = LOWEST_NOTE + place
+            name = f"{SOUNDS}/{place + 1:03d}-{number + 1}.wav"
+            level = f"{20 * math.log10(loudest):.2f}" if loudest > 0 else "-inf"
+            blow = [f"{layer.force:g}", f"{layer.contact_time:g}", note, *range_, f"{samples / rate:.6g}", level, row]
+            records.append((sound, [name, *where, *blow]))
+
+    def fill(place: Path) -> None:
+        (place / SOUNDS).mkdir()
+        for sound, record in records:
+            (place / str(record[0])).write_bytes(_wav(sound, rate))
+        (place / TABLE).write_text(_table([record for _, record in records]))
+        (place / INSTRUMENT).write_text(_instrument(field.name, [record for _, record in records]))
+
+    manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
+    sizes = write_folder(Path(folder), fill, manifest, force=force)
+    return Written(sizes, (f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {grid.level_db:g} dB",))
+
+
+def _expect(grid: Grid) -> None:
+    most = HIGHEST_NOTE + 1 - LOWEST_NOTE
+    if not 1 <= grid.contacts <= most:
+        raise ExportError(
+            f"expected 1 to {most} contacts, one MIDI note each from {LOWEST_NOTE}, found {grid.contacts}"
+        )
+    if not 1 <= len(grid.layers) <= HIGHEST_NOTE:
+        raise ExportError(f"expected 1 to {HIGHEST_NOTE} layers of forces, found {len(grid.layers)}: name some")
+    for layer in grid.layers:
+        if not (math.isfinite(layer.force) and layer.force > 0):
+            raise ExportError(f"expected forces above 0, found {layer.force:g}")
+        if not 0 <= layer.contact_time < 1:
+            raise ExportError(f"expected contact times from 0 to 1 s, found {layer.contact_time:g}")
+    if grid.seconds is not None and not (math.isfinite(grid.seconds) and grid.seconds > 0):
+        raise ExportError(f"expected sounds of more than 0 s, found {grid.seconds:g}")
+    if not (math.isfinite(grid.level_db) and grid.level_db <= 0):
+        raise ExportError(f"expected a level of 0 dB or below, found {grid.level_db:g}")
+
+
+def _wav(sound: Float32[Tensor, " samples"], rate: int) -> bytes:
+    memory = io.BytesIO()
+    soundfile.write(memory, sound.numpy(), rate, subtype="FLOAT", format="WAV")
+    return memory.getvalue()
+
+
+def _table(records: Sequence[Sequence[object]]) -> str:
+    memory = io.StringIO()
+    writer = csv.writer(memory, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows(records)
+    return memory.getvalue()
+
+
+def _instrument(name: str, records: Sequence[Sequence[object]]) -> str:
+    """Return an SFZ instrument that plays each contact at its note and each layer at its velocities."""
+    # The velocity chooses the layer and moves the level within it as in the recordings: amplitude by its square.
+    lines = [f"// {name or 'object'}, as exported by avmsf", "<global> loop_mode=one_shot amp_veltrack=100"]
+    for record in records:
+        cells = dict(zip(COLUMNS, record, strict=True))
+        lines.append(
+            f"<region> sample={cells['file']} key={cells['midi_note']} lovel={cells['velocity_low']} "
+            f"hivel={cells['velocity_high']}"
+        )
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,109 @@
+"""The studio's page with one field in it: a folder for any static host, or a single file.
+
+A single file holds the page's modules as data in its import map, and everything else as base64 that the modules turn
+into blobs: a browser loads no second file from beside a page that was opened from a disk. three and spark come from
+where the page's import map says, which is a public host.
+"""
+
+import base64
+import json
+import re
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.surface import Surface
+from avmsf.errors import ExportError
+from avmsf.export.bundle import MOST_POINTS, Bundle, make_bundle, write_files
+from avmsf.export.sampledfield import SampledField
+from avmsf.export.written import Written, generator, write_file, write_folder
+from avmsf.field.soundfield import SoundField
+
+_IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
+_STYLE = re.compile(r'<link\b[^>]*\bhref="(?:\./)?page/(\w+\.css)"[^>]*>')
+_START = re.compile(r'<script type="module" src="(?:\./)?page/(\w+\.js)"[^>]*></script>')
+_IMPORTED = re.compile(r"""(\bfrom\s*|\bimport\s*\(\s*|\bimport\s+)(["'])\./(\w+\.js)\2""")
+_TYPES = {
+    ".json": "application/json",
+    ".js": "text/javascript",
+    ".wav": "audio/wav",
+    ".glb": "model/gltf-binary",
+    ".ply": "application/octet-stream",
+    ".bin": "application/octet-stream",
+}
+
+
+def write_webpage(
+    field: SoundField | SampledField,
+    output: str | Path,
+    *,
+    object: Path | Surface | None = None,
+    metres: float = 1.0,
+    strikes: Impacts | None = None,
+    limit: int = MOST_POINTS,
+    force: bool = False,
+) -> Written:
+    """Write a page on which the field is struck: one file where `output` ends in .html, else a folder.
+
+    The arguments are those of `make_bundle`, whose errors are raised; what is there and no export's is kept unless with
+    `force`.
+    """
+    output = Path(output)
+    bundle = make_bundle(field, object=object, metres=metres, strikes=strikes, limit=limit)
+    if output.suffix.lower() in (".html", ".htm"):
+        return Written(write_file(output, single_file(bundle).encode(), force=force), bundle.remarks)
+    content = {**page_files(), **bundle.files}
+    sizes = write_folder(output, lambda place: write_files(content, place), dict(bundle.manifest), force=force)
+    return Written(sizes, bundle.remarks)
+
+
+def page_files() -> dict[str, bytes]:
+    """Return the studio's page by relative path: index.html, and all else under page/."""
+    folder = files("avmsf") / "studio" / "page"
+    found = {each.name: each.read_bytes() for each in folder.iterdir() if each.is_file()}
+    names = sorted(name for name in found if name.endswith((".js", ".css")))
+    return {"index.html": found["index.html"], **{f"page/{name}": found[name] for name in names}}
+
+
+def single_file(bundle: Bundle, page: Mapping[str, bytes] | None = None) -> str:
+    """Return the page with a bundle, styles and modules inside it. `page` is that of `page_files` unless given."""
+    page = page_files() if page is None else page
+    html = page["index.html"].decode()
+    modules = {name.removeprefix("page/"): each.decode() for name, each in page.items() if name.endswith(".js")}
+    imports = {f"avmsf/{name}": _data_url(_bare(source)) for name, source in modules.items()}
+    html = _once(_IMPORT_MAP, html, lambda found: found[1] + _with_imports(found[2], imports) + found[3], "import map")
+    html = _STYLE.sub(lambda found: f"<style>\n{page[f'page/{found[1]}'].decode()}</style>", html)
+    carried = {"manifest.json": json.dumps(bundle.manifest).encode(), "page/bank.js": page["page/bank.js"]}
+    inlined = {name: _carried(name, content) for name, content in {**carried, **bundle.files}.items()}
+    begin = (
+        f"<!-- {generator()} -->\n<script>globalThis.avmsfInlined = {json.dumps(inlined)};</script>\n"
+        '<script type="module">import "avmsf/{name}";</script>'
+    )
+    return _once(_START, html, lambda found: begin.replace("{name}", found[1]), "script that starts the page")
+
+
+def _bare(source: str) -> str:
+    """Return a module that asks the import map for its neighbours: data has no place that `./` could start from."""
+    return _IMPORTED.sub(r"\1\2avmsf/\3\2", source)
+
+
+def _with_imports(words: str, imports: Mapping[str, str]) -> str:
+    known: dict[str, Any] = json.loads(words)
+    return json.dumps({**known, "imports": {**known.get("imports", {}), **imports}})
+
+
+def _data_url(source: str) -> str:
+    return f"data:text/javascript;base64,{base64.b64encode(source.encode()).decode()}"
+
+
+def _carried(name: str, content: bytes) -> dict[str, str]:
+    return {"type": _TYPES[Path(name).suffix], "base64": base64.b64encode(content).decode()}
+
+
+def _once(pattern: re.Pattern[str], text: str, change: Any, what: str) -> str:
+    changed, count = pattern.subn(change, text)
+    if count != 1:
+        raise ExportError(f"index.html: expected one {what}, found {count}: install avmsf again, its page is damaged")
+    return changed

@@ -1,0 +1,127 @@
+"""What an export leaves behind: whole files or folders, never over what is not its own, and a word on what is lost."""
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+from avmsf.errors import ExportError
+from avmsf.files import write_whole
+
+MANIFEST = "manifest.json"
+_READ = 4096
+"""Bytes at a file's beginning in which its maker is looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Written:
+    """What was written, and how near it comes to the field."""
+
+    sizes: Mapping[Path, int]
+    """Bytes of each file."""
+    remarks: tuple[str, ...] = ()
+    """What the format cannot hold, a sentence each."""
+    error: float = 0.0
+    """Largest difference between what the file sounds like and `SampledField.render`, over the loudest sample."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files."""
+        return sum(self.sizes.values())
+
+
+def generator() -> str:
+    """Return what files say of who made them."""
+    return f"avmsf {version('avmsf')}"
+
+
+def write_file(path: Path, content: bytes, *, force: bool = False) -> dict[Path, int]:
+    """Write one file in one step; return its size. Raises `ExportError` where another program's file lies there.
+
+    A file is one of ours if its first kilobytes hold the word `generator` begins with.
+    """
+    if path.is_dir():
+        raise ExportError(f"{path}: expected the name of a file, found a folder: name a file in it")
+    if path.exists() and not force and not _made_here(path):
+        raise _foreign(path, "a file that no export wrote")
+    write_whole(path, lambda place: place.write_bytes(content), raising=ExportError)
+    return {path: len(content)}
+
+
+def write_folder(
+    folder: Path, fill: Callable[[Path], None], manifest: Mapping[str, object], *, force: bool = False
+) -> dict[Path, int]:
+    """Let `fill` write files into a temporary folder, add the manifest, and put it all in place; return the sizes.
+
+    The manifest lists the files, by which a folder of ours is known again and replaced as a whole. Into any other that
+    holds something files are put only with `force`, each in one step, and none is removed. Raises `ExportError`.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ExportError(f"{folder}: expected a folder, or a name that is free, found a file: choose another")
+    ours = not folder.exists() or not any(folder.iterdir()) or _folder_made_here(folder)
+    if not ours and not force:
+        raise _foreign(folder, "a folder with files that no export wrote")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
+        try:
+            fill(temporary)
+            names = sorted(str(path.relative_to(temporary)) for path in temporary.rglob("*") if path.is_file())
+            content = {"generator": generator(), **manifest, "files": [*names, MANIFEST]}
+            (temporary / MANIFEST).write_text(json.dumps(content, indent=1) + "\n")
+            sizes = {folder / name: (temporary / name).stat().st_size for name in [*names, MANIFEST]}
+            _place(temporary, folder, whole=ours)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    except OSError as error:
+        raise ExportError(
+            f"{folder}: cannot be written ({error.strerror or error}): free some space or choose another place"
+        ) from error
+    return sizes
+
+
+def _place(temporary: Path, folder: Path, *, whole: bool) -> None:
+    mask = os.umask(0)
+    os.umask(mask)
+    temporary.chmod(0o777 & ~mask)
+    if not whole:
+        for path in sorted(temporary.rglob("*")):
+            if path.is_file():
+                place = folder / path.relative_to(temporary)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(path, place)
+        return
+    if folder.exists():
+        # A folder cannot be exchanged for another in one step: the old one stands aside until the new one is there.
+        aside = temporary.with_suffix(".old")
+        os.replace(folder, aside)
+        os.replace(temporary, folder)
+        shutil.rmtree(aside)
+    else:
+        os.replace(temporary, folder)
+
+
+def _made_here(path: Path) -> bool:
+    with path.open("rb") as file:
+        return b"avmsf" in file.read(_READ)
+
+
+def _folder_made_here(folder: Path) -> bool:
+    """Return whether all that lies in a folder is what one of our manifests lists."""
+    try:
+        manifest = json.loads((folder / MANIFEST).read_text())
+        listed = set(manifest["files"]) if manifest["generator"].startswith("avmsf ") else set()
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return False
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} <= listed
+
+
+def _foreign(path: Path, what: str) -> ExportError:
+    return ExportError(
+        f"{path}: expected a free name or an earlier export, found {what}: choose another name, or add --force to "
+        "write over files of the same names"
+    )

@@ -1,0 +1,223 @@
+"""What a page reads is the field, and the object beside it; read back by hand."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+import trimesh
+
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.surface import Surface
+from avmsf.errors import AvmsfError, ExportError
+from avmsf.export.bundle import make_bundle, write_bundle
+from avmsf.export.objectfile import read_object
+from avmsf.export.sampledfield import SampledField
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.ply import write_splats
+from struck_table import RATE, struck_table
+
+
+def tensors(folder: Path) -> dict[str, np.ndarray]:
+    """Read the tensors as a stranger would."""
+    manifest = json.loads((folder / "manifest.json").read_text())
+    found = {}
+    for name, record in manifest["tensors"].items():
+        count = int(np.prod(record["shape"]))
+        kind = np.dtype(record["dtype"]).newbyteorder("<")
+        values = np.frombuffer((folder / record["file"]).read_bytes(), kind, count, record["offset"])
+        found[name] = values.reshape(record["shape"])
+    return found
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_tensors_are_the_tables_to_the_last_bit(tmp_path: Path, shared: bool) -> None:
+    table = struck_table(shared=shared)
+    written = write_bundle(table, tmp_path / "page")
+    found = tensors(tmp_path / "page")
+    for name in ("points", "normals", "frequency", "damping", "sine", "cosine", "noise"):
+        expected = getattr(table, name).numpy()
+        assert found[name].dtype == expected.dtype
+        assert np.array_equal(found[name], expected), name
+    manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
+    assert manifest["damping"] == ("shared" if shared else "perContact")
+    assert (manifest["modes"], manifest["points"], manifest["samples"]) == (40, 6, 48_000)
+    assert (manifest["sampleRate"], manifest["perNewton"], manifest["name"]) == (RATE, True, "ball")
+    assert manifest["object"] == {"kind": "points", "file": None}
+    assert (manifest["strikes"], manifest["live"]) == ([], None)
+    assert written.size == sum(path.stat().st_size for path in (tmp_path / "page").rglob("*") if path.is_file())
+
+
+def test_numbers_lie_where_javascript_can_read_them(tmp_path: Path) -> None:
+    """At multiples of their size, whatever the sizes of what comes before."""
+    write_bundle(struck_table(shared=False, points=5, modes=3, seconds=0.0300625), tmp_path / "page")
+    records = json.loads((tmp_path / "page" / "manifest.json").read_text())["tensors"]
+    assert records["noise"]["shape"] == [481]
+    for name, record in records.items():
+        assert record["offset"] % np.dtype(record["dtype"]).itemsize == 0, name
+
+
+def test_sines_alone_need_no_cosines(tmp_path: Path) -> None:
+    table = struck_table(shared=True)
+    write_bundle(replace(table, cosine=torch.zeros_like(table.cosine)), tmp_path / "page")
+    assert "cosine" not in tensors(tmp_path / "page")
+
+
+def test_fewer_contacts_are_kept_with_a_word(tmp_path: Path) -> None:
+    written = write_bundle(struck_table(shared=False, points=50), tmp_path / "page", limit=10)
+    assert tensors(tmp_path / "page")["damping"].shape == (10, 40)
+    assert written.remarks == ("10 of the field's 50 contacts are kept, spread evenly",)
+
+
+def test_strikes_are_heard_as_they_were_recorded(tmp_path: Path) -> None:
+    sounds = 3.0 * torch.randn(2, 500, generator=torch.Generator().manual_seed(0))
+    contacts = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], dtype=torch.float64)
+    strikes = Impacts(contacts, sounds, RATE, ("a.wav", "../b.wav"), directions=-contacts.float() * 10)
+    write_bundle(struck_table(shared=True), tmp_path / "page", strikes=strikes, live={"revision": 1})
+    manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
+    assert [each["name"] for each in manifest["strikes"]] == ["a.wav", "../b.wav"]
+    assert [each["sound"] for each in manifest["strikes"]] == ["strikes/001.wav", "strikes/002.wav"]
+    assert manifest["strikes"][1]["contact"] == [0.0, 0.1, 0.0]
+    assert manifest["strikes"][1]["direction"] == [0.0, -1.0, 0.0]
+    assert manifest["live"] == {"revision": 1}
+    for row, each in enumerate(manifest["strikes"]):
+        sound, rate = soundfile.read(tmp_path / "page" / each["sound"], dtype="float32")
+        assert rate == RATE
+        assert np.array_equal(sound, sounds[row].numpy())
+
+
+def test_strikes_of_another_rate_are_refused() -> None:
+    strikes = Impacts(torch.zeros(1, 3), torch.zeros(1, 5), 8000.0, ("a.wav",))
+    with pytest.raises(ExportError, match="expected strikes at the field's 16000 Hz, found 8000 Hz"):
+        make_bundle(struck_table(shared=True), strikes=strikes)
+
+
+def test_a_bundle_is_replaced_and_nothing_else_is(tmp_path: Path) -> None:
+    folder = tmp_path / "page"
+    write_bundle(struck_table(shared=True), folder, object=ball_surface())
+    write_bundle(struck_table(shared=False), folder)
+    assert sorted(path.name for path in folder.iterdir()) == ["field.bin", "manifest.json"]
+    assert tensors(folder)["damping"].ndim == 2
+    (folder / "mine.txt").write_text("kept")
+    with pytest.raises(ExportError, match="expected a free name or an earlier export"):
+        write_bundle(struck_table(shared=True), folder)
+    assert (folder / "mine.txt").read_text() == "kept"
+    assert [path.name for path in tmp_path.iterdir()] == ["page"]
+
+
+def test_a_field_of_which_nothing_is_heard_is_refused() -> None:
+    table = struck_table(shared=True)
+    silent = replace(
+        table,
+        frequency=table.frequency[:0],
+        damping=table.damping[:0],
+        sine=table.sine[:, :0],
+        cosine=table.cosine[:, :0],
+    )
+    with pytest.raises(ExportError, match="expected a mode that can be heard"):
+        make_bundle(silent)
+
+
+def ball_surface(radius: float = 0.1, divisions: int = 2) -> Surface:
+    mesh = trimesh.creation.icosphere(subdivisions=divisions, radius=radius)
+    return Surface(torch.from_numpy(mesh.vertices).float(), torch.from_numpy(mesh.faces).long())
+
+
+def ball_points(count: int = 300) -> torch.Tensor:
+    return struck_table(shared=True, points=count, modes=1).points
+
+
+def ball_table() -> SampledField:
+    return struck_table(shared=True, points=300, modes=2, seconds=0.1)
+
+
+def test_a_surface_becomes_a_glb_of_the_same_triangles(tmp_path: Path) -> None:
+    surface = ball_surface()
+    write_bundle(ball_table(), tmp_path / "page", object=surface)
+    loaded = trimesh.load_mesh(tmp_path / "page" / "object.glb", process=False)
+    np.testing.assert_allclose(loaded.vertices, surface.vertices.numpy(), rtol=0, atol=1e-7)
+    assert np.array_equal(loaded.faces, surface.faces.numpy())
+
+
+@pytest.mark.parametrize("ending", ["obj", "ply", "stl", "glb"])
+def test_a_mesh_file_in_millimetres_is_shown_in_metres(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"ball.{ending}"
+    trimesh.creation.icosphere(subdivisions=2, radius=100.0).export(path)
+    shown = read_object(path, ball_points(), metres=1e-3)
+    (tmp_path / "shown.glb").write_bytes(shown.content)
+    loaded = trimesh.load_mesh(tmp_path / "shown.glb", process=False)
+    np.testing.assert_allclose(np.linalg.norm(loaded.vertices, axis=1), 0.1, rtol=1e-5)
+    with pytest.raises(ExportError, match=r"found one \d+ times as large: say what its coordinates count"):
+        read_object(path, ball_points())
+
+
+def test_colours_of_a_mesh_are_kept(tmp_path: Path) -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
+    mesh.visual.vertex_colors = np.r_["1", np.arange(42)[:, None] * [1, 2, 3], np.full((42, 1), 255)].astype(np.uint8)
+    mesh.export(tmp_path / "ball.ply")
+    (tmp_path / "shown.glb").write_bytes(read_object(tmp_path / "ball.ply", ball_points()).content)
+    loaded = trimesh.load_mesh(tmp_path / "shown.glb", process=False)
+    assert np.array_equal(loaded.visual.vertex_colors, mesh.visual.vertex_colors)
+
+
+def test_a_mesh_of_too_many_triangles_is_reduced_with_a_word() -> None:
+    pytest.importorskip("fast_simplification", reason="needs avmsf[fem]")
+    surface = ball_surface(divisions=4)
+    shown = read_object(surface, ball_points(), most=1000)
+    (mesh,) = trimesh.load_scene(trimesh.util.wrap_as_stream(shown.content), file_type="glb").dump()
+    assert 500 < len(mesh.faces) <= 1000
+    assert float(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.1).max()) < 0.005
+    assert shown.remarks == (
+        f"the surface has 5,120 triangles, too many for a browser: {len(mesh.faces):,} are shown, without its textures",
+    )
+
+
+def test_gaussians_are_kept_as_they_are(tmp_path: Path) -> None:
+    points = ball_points()
+    count = len(points)
+    cloud = GaussianCloud(
+        points,
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(count, 4),
+        torch.full((count, 3), -5.0),
+        torch.zeros(count),
+        torch.zeros(count, 1, 3),
+    )
+    write_splats(cloud, tmp_path / "ball.ply")
+    write_bundle(ball_table(), tmp_path / "page", object=tmp_path / "ball.ply")
+    assert (tmp_path / "page" / "object.ply").read_bytes() == (tmp_path / "ball.ply").read_bytes()
+    manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
+    assert manifest["object"] == {"kind": "gaussians", "file": "object.ply"}
+    (tmp_path / "short.ply").write_bytes((tmp_path / "ball.ply").read_bytes()[:-100])
+    with pytest.raises(AvmsfError, match=r"short\.ply"):
+        read_object(tmp_path / "short.ply", points)
+
+
+def test_points_without_triangles_are_the_fields_own(tmp_path: Path) -> None:
+    trimesh.PointCloud(ball_points().numpy()).export(tmp_path / "ball.ply")
+    shown = read_object(tmp_path / "ball.ply", ball_points())
+    assert (shown.kind, shown.name) == ("points", None)
+    assert "has no triangles" in shown.remarks[0]
+
+
+def test_objects_that_are_none_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = ball_points()
+    with pytest.raises(ExportError, match="found no such file"):
+        read_object(tmp_path / "none.obj", points)
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(ExportError, match=r"expected a mesh \(.obj"):
+        read_object(tmp_path / "notes.txt", points)
+    (tmp_path / "torn.glb").write_bytes(b"glTF\x02\x00")
+    with pytest.raises(ExportError, match="cannot be read as one"):
+        read_object(tmp_path / "torn.glb", points)
+    with pytest.raises(ExportError, match="found its middle 5 m away"):
+        read_object(replace(ball_surface(), vertices=ball_surface().vertices + torch.tensor([5.0, 0, 0])), points)
+    monkeypatch.setattr("avmsf.export.objectfile.MOST_READ", 300)
+    with pytest.raises(ExportError, match="expected at most 300 triangles, found 320"):
+        read_object(ball_surface(), points)
+    (tmp_path / "huge.stl").touch()
+    monkeypatch.setattr("avmsf.export.objectfile.MOST_BYTES", -1)
+    with pytest.raises(ExportError, match="expected a mesh of at most"):
+        read_object(tmp_path / "huge.stl", points)

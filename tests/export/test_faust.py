@@ -1,0 +1,128 @@
+"""The Faust program is compiled by Faust and a C compiler, and sounds as the field."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from avmsf.errors import ExportError
+from avmsf.export.faust import faust_library, write_faust
+from avmsf.export.sampledfield import SampledField
+from avmsf.modal.pulse import ForcePulse
+from made_tables import POINTS, RATE, SAMPLES, apart, table
+
+DRIVER = Path(__file__).with_name("faust_driver.c")
+BLOCK = 64
+compiled = pytest.mark.skipif(
+    shutil.which("faust") is None or shutil.which("gcc") is None, reason="needs Debian's faust and gcc"
+)
+
+
+def sounded(
+    path: Path, *blows: tuple[float, float, float, int], rate=RATE, samples=SAMPLES, real="double"
+) -> np.ndarray:
+    """Return the program's sound of blows: contact, force, contact time, and a start at a block's beginning."""
+    source, program = path.with_suffix(".c"), path.with_suffix(".run")
+    precision = "-double" if real == "double" else "-single"
+    subprocess.run(
+        ["faust", "-lang", "c", precision, "-a", str(DRIVER), "-o", str(source), str(path)], check=True, timeout=60
+    )
+    subprocess.run(["gcc", "-O1", "-w", f"-DREAL={real}", "-o", str(program), str(source), "-lm"], check=True)
+    words = [str(value) for blow in blows for value in blow]
+    printed = subprocess.run([str(program), f"{rate:.0f}", str(samples), *words], check=True, capture_output=True)
+    return np.frombuffer(printed.stdout)
+
+
+def struck(field: SampledField, row: int, **settings: object) -> np.ndarray:
+    return field.render(torch.tensor([row]), **settings)[0].double().numpy()
+
+
+@compiled
+@pytest.mark.parametrize(
+    ("phased", "spatial", "noisy"), [(False, False, False), (True, False, True), (True, True, True)]
+)
+def test_every_kind_of_field_sounds_as_rendered(tmp_path, phased, spatial, noisy):
+    field = table(phased=phased, spatial=spatial, noisy=noisy)
+    write_faust(field, tmp_path / "thing.dsp")
+    heard = sounded(tmp_path / "thing.dsp", (4, 0.5, 0.0, 0))
+    assert apart(heard, struck(field, 4, force=0.5)) < 2e-6
+
+
+@compiled
+def test_blows_ring_into_each_other_each_with_its_hammer(tmp_path):
+    field = table(phased=True)
+    write_faust(field, tmp_path / "thing.dsp")
+    later, soft = 5 * BLOCK, 0.0017
+    heard = sounded(tmp_path / "thing.dsp", (0, 1.0, 0.0, 0), (POINTS - 1, 2.0, soft, later))
+    true = struck(field, 0)
+    true[later:] += struck(field, POINTS - 1, force=2.0, pulse=ForcePulse(soft))[: SAMPLES - later]
+    assert apart(heard, true) < 2e-6
+    # In single precision, as Faust compiles unless told otherwise, no drift shows.
+    single = sounded(tmp_path / "thing.dsp", (0, 1.0, 0.0, 0), (POINTS - 1, 2.0, soft, later), real="float")
+    assert apart(single, true) < 2e-4
+
+
+@compiled
+def test_another_sample_rate_changes_neither_pitch_nor_decay(tmp_path):
+    field = table()
+    write_faust(field, tmp_path / "thing.dsp")
+    twice = sounded(tmp_path / "thing.dsp", (3, 1.0, 0.0, 0), rate=2 * RATE, samples=2 * SAMPLES)
+    assert apart(twice[::2], struck(field, 3)) < 2e-6
+    # At 6 kHz the mode at 3300 Hz would alias to 2700 Hz, and is silent.
+    lower = sounded(tmp_path / "thing.dsp", (3, 1.0, 0.0, 0), rate=6000, samples=1200)
+    sine = field.sine.clone()
+    sine[:, 3] = 0
+    silent = SampledField(
+        field.points, field.normals, field.frequency, field.damping, sine, field.cosine, torch.zeros(1200), 6000.0
+    )
+    assert apart(lower, struck(silent, 3)) < 2e-6
+
+
+@compiled
+def test_the_library_holds_the_same_sound_without_controls(tmp_path):
+    field = table(phased=True)
+    write_faust(field, tmp_path / "thing.lib")
+    assert "process" not in (tmp_path / "thing.lib").read_text()
+    (tmp_path / "mine.dsp").write_text(
+        'mine = library("thing.lib");\nprocess = mine.strike(6, 1, 0, button("gate"));\n'
+    )
+    assert apart(sounded(tmp_path / "mine.dsp", (0, 1.0, 0.0, 0)), struck(field, 6)) < 2e-6
+
+
+@compiled
+def test_silence_before_the_first_blow(tmp_path):
+    write_faust(table(noisy=True), tmp_path / "thing.dsp")
+    heard = sounded(tmp_path / "thing.dsp", (1, 1.0, 0.0, 3 * BLOCK))
+    assert not heard[: 3 * BLOCK].any()
+    assert heard[3 * BLOCK :].any()
+
+
+def test_losses_are_said(tmp_path):
+    words = " ".join(write_faust(table(spatial=True, noisy=True), tmp_path / "a.dsp").remarks)
+    assert "dampings belong to the point last struck" in words
+    assert "the noise starts anew" in words
+    words = " ".join(write_faust(table(noisy=True), tmp_path / "b.dsp", noise=False).remarks)
+    assert "the noise beside the modes is left out" in words
+    assert "noiseDraw" not in (tmp_path / "b.dsp").read_text()
+
+
+def test_the_name_cannot_break_out_of_its_string():
+    field = table()
+    named = SampledField(
+        field.points, field.normals, field.frequency, field.damping, field.sine, field.cosine, field.noise, RATE,
+        name='a"; process = _; // \n b\\',
+    )  # fmt: skip
+    lines = faust_library(named, noise=False).splitlines()
+    assert lines[1] == 'declare name "a; process = _; //  b";'
+    assert not any(re.match(r"\s*process", line) for line in lines)
+
+
+def test_too_many_numbers_and_other_endings_are_refused(tmp_path):
+    with pytest.raises(ExportError, match=r"found \d+: 40000 points with 4 modes; ask for fewer points"):
+        write_faust(table(points=40_000), tmp_path / "thing.dsp")
+    with pytest.raises(ExportError, match=r"\.dsp or \.lib, found '\.cpp'"):
+        write_faust(table(), tmp_path / "thing.cpp")

@@ -1,0 +1,177 @@
+"""The .glb is read back by hand, as the container's and the draft's texts say, and sounds as the field."""
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from avmsf.capture.texturedmesh import TexturedMesh
+from avmsf.errors import ExportError
+from avmsf.export.gltf import Look, write_gltf
+from made_tables import MODES, POINTS, apart, summed, table
+
+KINDS = {5126: "<f4", 5125: "<u4"}
+WIDTHS = {"SCALAR": 1, "VEC3": 3}
+
+
+def read(path: Path) -> tuple[dict, list[np.ndarray]]:
+    content = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", content)
+    assert (magic, version, length) == (b"glTF", 2, len(content))
+    size, kind = struct.unpack_from("<I4s", content, 12)
+    assert kind == b"JSON"
+    assert size % 4 == 0
+    document = json.loads(content[20 : 20 + size])
+    rest, kind = struct.unpack_from("<I4s", content, 20 + size)
+    assert kind == b"BIN\0"
+    data = content[28 + size :]
+    assert len(data) == rest
+    arrays = []
+    for accessor in document["accessors"]:
+        view = document["bufferViews"][accessor["bufferView"]]
+        count = accessor["count"] * WIDTHS[accessor["type"]]
+        layout = np.dtype(KINDS[accessor["componentType"]])
+        assert view["byteLength"] == count * layout.itemsize
+        assert view["byteOffset"] % 4 == 0
+        values = np.frombuffer(data, layout, count, view["byteOffset"])
+        arrays.append(values.reshape(-1, 3) if accessor["type"] == "VEC3" else values)
+    return document, arrays
+
+
+def modal(document: dict, arrays: list[np.ndarray]) -> dict[str, np.ndarray]:
+    node = document["nodes"][0]["extensions"]["KHR_audio_rigid_bodies"]["modalModel"]
+    model = document["extensions"]["KHR_audio_rigid_bodies"]["modalModels"][node]
+    return {name: arrays[model[name]] for name in ("frequencies", "decayRates", "positions", "shapes")}
+
+
+def struck(model: dict[str, np.ndarray], point: int, impulse: np.ndarray) -> np.ndarray:
+    """Return the draft's sound of an impulse: mode-major shapes, 2 pi f of the radiation."""
+    points = len(model["positions"])
+    amplitudes = [
+        2 * np.pi * float(f) * float(model["shapes"][m * points + point].astype(float) @ impulse)
+        for m, f in enumerate(model["frequencies"])
+    ]
+    return summed(amplitudes, np.zeros(MODES), model["frequencies"], model["decayRates"])
+
+
+@pytest.mark.parametrize("force", [1.0, 3.0])
+def test_an_impulse_into_the_surface_sounds_as_the_blow(tmp_path, force):
+    field = table()
+    written = write_gltf(field, tmp_path / "thing.glb")
+    model = modal(*read(tmp_path / "thing.glb"))
+    for point in range(POINTS):
+        heard = struck(model, point, -force * field.normals[point].double().numpy())
+        true = field.render(torch.tensor([point]), force=force)[0]
+        # Frequencies are float32 there: 3300 Hz to 1e-4 Hz, which is a phase of 1e-4 after .2 s.
+        assert apart(heard, true) < 3e-4
+    assert written.error < 1e-6
+    assert written.size == (tmp_path / "thing.glb").stat().st_size
+
+
+def test_a_glancing_impulse_is_fainter_by_its_cosine(tmp_path):
+    field = table()
+    write_gltf(field, tmp_path / "thing.glb")
+    model = modal(*read(tmp_path / "thing.glb"))
+    normal = field.normals[2].double().numpy()
+    along = np.cross(normal, [0.3, 0.5, -0.2])
+    along /= np.linalg.norm(along)
+    straight = struck(model, 2, -normal)
+    assert apart(struck(model, 2, -0.5 * normal + along), 0.5 * straight) < 1e-5
+
+
+def test_the_modes_that_matter_most_come_first(tmp_path):
+    field = table()
+    write_gltf(field, tmp_path / "thing.glb")
+    model = modal(*read(tmp_path / "thing.glb"))
+    shapes = model["shapes"].reshape(MODES, POINTS, 3).astype(float)
+    gains = np.linalg.norm(shapes, axis=2) * 2 * np.pi * model["frequencies"][:, None]
+    energies = (gains**2).sum(1) / model["decayRates"]
+    assert (np.diff(energies) < 0).all()
+
+
+def test_what_the_draft_cannot_hold_is_said_and_lies_in_extras(tmp_path):
+    field = table(phased=True, spatial=True, noisy=True)
+    written = write_gltf(field, tmp_path / "thing.glb")
+    words = " ".join(written.remarks)
+    assert "starts as a sine" in words
+    assert "one damping" in words
+    assert "noise" in words
+    document, arrays = read(tmp_path / "thing.glb")
+    model = modal(document, arrays)
+    extras = document["extensions"]["KHR_audio_rigid_bodies"]["modalModels"][0]["extras"]["avmsf"]
+    rows = [arrays[extras[name]].reshape(MODES, POINTS)[:, 5] for name in ("sine", "cosine", "decayRates")]
+    whole = summed(rows[0], rows[1], model["frequencies"], rows[2]) + arrays[extras["noise"]]
+    assert apart(whole, field.render(torch.tensor([5]))[0]) < 3e-4
+    plain = [struck(model, row, -field.normals[row].double().numpy()) for row in field.spread(8).tolist()]
+    true = field.render(field.spread(8)).double().numpy()
+    assert written.error == pytest.approx(apart(plain, true), rel=0.01)
+    # As loud as it was: every mode's amplitude is that of its sine and cosine together.
+    size = np.linalg.norm(model["shapes"].reshape(MODES, POINTS, 3).astype(float), axis=2)
+    size *= 2 * np.pi * model["frequencies"][:, None]
+    expected = np.hypot(arrays[extras["sine"]], arrays[extras["cosine"]]).reshape(MODES, POINTS)
+    np.testing.assert_allclose(size, expected, rtol=1e-5)
+
+
+def test_viewers_show_the_mesh_or_the_points(tmp_path):
+    box = trimesh.creation.box((0.2, 0.1, 0.3))
+    vertices, faces = torch.from_numpy(np.array(box.vertices)).float(), torch.from_numpy(np.array(box.faces))
+    red = torch.zeros(len(faces), 3, 3)
+    red[..., 0] = 1.0
+    write_gltf(table(), tmp_path / "mesh.glb", look=Look.of_mesh(TexturedMesh.build(vertices, faces, colors=red)))
+    shown = trimesh.load(tmp_path / "mesh.glb", process=False).dump()[0]
+    assert len(shown.faces) == 12
+    assert shown.volume == pytest.approx(0.2 * 0.1 * 0.3, rel=1e-5)
+    document, arrays = read(tmp_path / "mesh.glb")
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    assert arrays[attributes["COLOR_0"]].tolist()[0] == [1.0, 0.0, 0.0]
+    assert len(arrays[attributes["POSITION"]]) == 24
+    np.testing.assert_allclose(np.linalg.norm(arrays[attributes["NORMAL"]], axis=1), 1.0, atol=1e-6)
+    bounds = document["accessors"][attributes["POSITION"]]
+    np.testing.assert_allclose([bounds["min"], bounds["max"]], [[-0.1, -0.05, -0.15], [0.1, 0.05, 0.15]], atol=1e-7)
+    assert "extensionsRequired" not in document
+    assert document["extensionsUsed"] == ["KHR_audio_rigid_bodies"]
+    field = table()
+    write_gltf(field, tmp_path / "points.glb")
+    cloud = trimesh.load(tmp_path / "points.glb", process=False).dump()[0]
+    np.testing.assert_allclose(cloud.vertices, field.points.numpy(), atol=1e-7)
+
+
+def test_a_texture_becomes_the_corners_colours():
+    picture = torch.zeros(2, 2, 3, dtype=torch.uint8)
+    picture[0, 0, 1] = 255  # the upper left is green, all else black
+    mesh = TexturedMesh.build(
+        torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+        torch.tensor([[0, 1, 2]]),
+        coordinates=torch.tensor([[[0.1, 0.1], [0.9, 0.1], [0.1, 0.9]]]),
+        textures=[picture],
+    )
+    look = Look.of_mesh(mesh)
+    upper = int((look.vertices[:, 1] == 1).nonzero()[0])
+    assert look.colors[upper].tolist() == [0.0, 1.0, 0.0]
+    assert look.colors.sum() == 1.0
+
+
+def test_another_ending_and_anothers_file_are_refused(tmp_path):
+    with pytest.raises(ExportError, match=r"ends in \.glb, found '\.obj'"):
+        write_gltf(table(), tmp_path / "thing.obj")
+    (tmp_path / "theirs.glb").write_bytes(b"glTF of someone else")
+    with pytest.raises(ExportError, match="add --force"):
+        write_gltf(table(), tmp_path / "theirs.glb")
+    assert (tmp_path / "theirs.glb").read_bytes() == b"glTF of someone else"
+    write_gltf(table(), tmp_path / "theirs.glb", force=True)
+    write_gltf(table(), tmp_path / "theirs.glb")
+    assert [path.name for path in tmp_path.iterdir()] == ["theirs.glb"]
+
+
+def test_a_field_without_modes_is_refused(tmp_path):
+    field = table()
+    empty = type(field)(
+        field.points, field.normals, field.frequency[:0], field.damping[:0], field.sine[:, :0], field.cosine[:, :0],
+        field.noise, field.sample_rate,
+    )  # fmt: skip
+    with pytest.raises(ExportError, match="found none to export"):
+        write_gltf(empty, tmp_path / "thing.glb")

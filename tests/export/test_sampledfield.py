@@ -1,0 +1,142 @@
+"""A table of points sounds as the field that it was made from."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from avmsf.errors import ExportError
+from avmsf.export.normals import outward_normals
+from avmsf.export.sampledfield import SampledField
+from avmsf.field.config import FitConfig
+from avmsf.field.scaledgains import ScaledGains
+from avmsf.field.soundfield import Origin, SoundField
+from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.residual import Residual
+from made_fields import BANK, FIELDS, physics, places, spline
+
+RATE, SAMPLES = 8000.0, 3000
+
+
+def sounding(name: str, *, phase: float = 0.0, scaled: bool = False) -> SoundField:
+    gains = FIELDS[name]()
+    if scaled:
+        gains = ScaledGains(gains, torch.linspace(0.5, 2.0, len(BANK), dtype=torch.float64), length=1.25)
+    magnitude = torch.linspace(0.02, 0.0, 33)
+    origin = Origin("plate", ("a.wav",), per_newton=True, config=FitConfig(seed=7))
+    return SoundField(
+        BANK, gains, torch.full((len(BANK),), phase, dtype=torch.float64), Residual(magnitude), RATE, SAMPLES, origin
+    )
+
+
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize(
+    ("phase", "scaled", "pulse"),
+    [(0.0, False, None), (0.7, False, ForcePulse(1e-3, "hertz")), (0.7, True, None)],
+)
+def test_a_blow_sounds_as_the_fields(name, phase, scaled, pulse):
+    sound_field = sounding(name, phase=phase, scaled=scaled)
+    table = SampledField.of(sound_field)
+    rows = torch.tensor([0, 17, 149])
+    expected = sound_field.render(table.points[rows], force=2.5, pulse=pulse)
+    error = (table.render(rows, force=2.5, pulse=pulse) - expected).abs().max() / expected.abs().max()
+    assert float(error) < 1e-5
+    assert table.shared_damping == (name != "attention with dampings")
+
+
+def test_the_formula_holds_in_plain_sums():
+    """Of amplitudes, dampings and noise as they lie in the table, without the package's synthesis."""
+    sound_field = sounding("attention with dampings", phase=0.4)
+    table = SampledField.of(sound_field, limit=20)
+    row = 11
+    times = torch.arange(SAMPLES, dtype=torch.float64) / RATE
+    sound = table.noise.double().clone()
+    for mode, (frequency, damping) in enumerate(zip(table.frequency, table.damping[row], strict=True)):
+        angle = 2 * torch.pi * frequency * times
+        swing = table.sine[row, mode] * torch.sin(angle) + table.cosine[row, mode] * torch.cos(angle)
+        sound += torch.exp(-damping * times) * swing
+    expected = sound_field.render(table.points[[row]])[0].double()
+    torch.testing.assert_close(sound, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
+
+
+def test_modes_above_half_the_rate_are_left_out():
+    sound_field = replace(sounding("spline"), sample_rate=2700.0)
+    table = SampledField.of(sound_field)
+    assert table.frequency.tolist() == BANK.frequency[:3].tolist()
+    expected = sound_field.render(table.points[:3])
+    torch.testing.assert_close(table.render(torch.arange(3)), expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_normals_of_physics_are_its_own(scaled):
+    table = SampledField.of(sounding("physics", scaled=scaled))
+    torch.testing.assert_close(table.normals, -physics().surface.inward)
+
+
+def test_given_points_and_normals_are_kept():
+    chosen = places(5, seed=9)
+    normals = torch.tensor([[0.0, 0.0, 2.0]]).expand(5, 3)
+    table = SampledField.of(sounding("spline"), chosen, normals)
+    assert torch.equal(table.points, chosen)
+    torch.testing.assert_close(table.normals, normals / 2)
+    assert table.name == "plate"
+    assert table.per_newton
+    assert table.origin["trained_on"] == ["a.wav"]
+
+
+def test_fewer_points_are_spread_out_and_are_the_fields_own():
+    table = SampledField.of(sounding("spline"), limit=12)
+    own = spline().points
+    assert len(table) == 12
+    assert bool((table.points[:, None] == own).all(2).any(1).all())
+    # Of 150 points, twelve at random lie closer: a plate of .24 x .17 m holds twelve about 6 cm apart.
+    apart = torch.cdist(table.points, table.points) + torch.eye(12)
+    assert float(apart.min()) > 0.04
+
+
+def test_taking_rows_and_finding_them():
+    table = SampledField.of(sounding("attention with dampings"))
+    few = table.take(table.spread(9))
+    assert few.nearest(few.points).tolist() == list(range(9))
+    rows = table.nearest(few.points)
+    torch.testing.assert_close(few.render(torch.arange(9)), table.render(rows))
+    torch.testing.assert_close(few.damping_at(torch.arange(9)), table.damping_at(rows))
+
+
+def ball(count: int) -> torch.Tensor:
+    drawn = torch.randn(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    return torch.nn.functional.normalize(drawn, dim=1)
+
+
+def test_normals_of_a_ball_and_of_a_bowl_point_outwards():
+    out = ball(2000)
+    assert float((outward_normals(out) * out).sum(1).min()) > 0.9
+    bowl = out[out[:, 2] < -0.3]
+    assert float((outward_normals(bowl) * bowl).sum(1).median()) > 0.95
+
+
+def test_parts_that_do_not_touch_each_have_their_outside():
+    out = ball(600)
+    far = torch.tensor([5.0, 0.0, 0.0])
+    assert float((outward_normals(torch.cat([out, out + far])) * torch.cat([out, out])).sum(1).min()) > 0.8
+
+
+def test_two_points_have_normals_away_from_their_middle():
+    normals = outward_normals(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 3.0]]))
+    assert normals.tolist() == [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]
+
+
+@pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.tensor([[0.0, 0.0, torch.nan]])])
+def test_points_that_are_none_are_refused(points):
+    with pytest.raises(ExportError, match="expected points of the object's surface"):
+        SampledField.of(sounding("spline"), points)
+
+
+def test_normals_of_other_points_are_refused():
+    with pytest.raises(ExportError, match="a normal for each of 5 points, found 4"):
+        SampledField.of(sounding("spline"), places(5, seed=9), torch.ones(4, 3))
+
+
+def test_a_limit_of_none_is_refused():
+    with pytest.raises(ExportError, match="limit of 0"):
+        SampledField.of(sounding("spline"), limit=0)

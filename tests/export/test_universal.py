@@ -1,0 +1,108 @@
+"""The universal file is read back by pyuff and by its columns, and sounds as the field."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from avmsf.errors import ExportError
+from avmsf.export.universal import response, response_frequencies, write_universal
+from made_tables import MODES, POINTS, RATE, SAMPLES, apart, summed, table
+
+pyuff = pytest.importorskip("pyuff", reason="needs pip install 'avmsf[uff]'")
+
+
+def sets(path, kind):
+    return [each for each in pyuff.UFF(str(path)).read_sets() if each["type"] == kind]
+
+
+def test_nodes_and_real_shapes_come_back(tmp_path):
+    field = table()
+    write_universal(field, tmp_path / "thing.uff")
+    (nodes,) = sets(tmp_path / "thing.uff", 2411)
+    places = np.stack([nodes[axis] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(places, field.points.numpy(), rtol=1e-7)
+    assert [int(number) for number in nodes["node_nums"]] == list(range(1, POINTS + 1))
+    modes = sets(tmp_path / "thing.uff", 55)
+    assert len(modes) == MODES
+    frequency, damping, gains = [], [], []
+    for mode in modes:
+        assert mode["analysis_type"] == 2
+        damping.append(mode["modal_damp_vis"] * 2 * math.pi * mode["freq"])
+        frequency.append(mode["freq"] * math.sqrt(1 - mode["modal_damp_vis"] ** 2))
+        shape = np.stack([mode["r1"], mode["r2"], mode["r3"]], axis=1)
+        gains.append((shape * field.normals.numpy()).sum(1))
+    np.testing.assert_allclose(frequency, field.frequency, rtol=6e-6)
+    np.testing.assert_allclose(damping, field.damping, rtol=2e-5)
+    np.testing.assert_allclose(np.array(gains).T, field.sine, atol=2e-5)
+
+
+def test_complex_shapes_are_residues(tmp_path):
+    field = table(phased=True)
+    write_universal(field, tmp_path / "thing.uff")
+    times, total = np.arange(SAMPLES) / RATE, np.zeros(SAMPLES)
+    for mode in sets(tmp_path / "thing.uff", 55):
+        assert mode["analysis_type"] == 3
+        residue = sum(mode[f"r{axis + 1}"][5] * float(field.normals[5, axis]) for axis in range(3))
+        total += 2 * np.real(residue * np.exp(mode["eig"] * times))
+    # Six digits of a frequency of 3300 Hz are .005 Hz, or .006 radians after .2 s.
+    assert apart(total, field.render(torch.tensor([5]))[0]) < 5e-3
+
+
+def test_responses_are_the_transforms_of_the_sounds(tmp_path):
+    """By a plain sum over a sound that dies away inside it, sampled far above its modes."""
+    field = table(phased=True)
+    quick = replace(field, frequency=field.frequency / 20, damping=field.damping * 4)
+    rate = 1e6
+    sound = summed(quick.sine[2], quick.cosine[2], quick.frequency, quick.damping, samples=400_000, rate=rate)
+    times = np.arange(len(sound)) / rate
+    weights = np.full(len(sound), 1 / rate)
+    weights[0] /= 2
+    for line in (0.0, 20.0, 54.0, 160.0):
+        expected = (sound * weights * np.exp(-2j * np.pi * line * times)).sum()
+        (found,) = response(quick, 2, np.array([line]))
+        assert abs(found - expected) < 1e-5 * abs(expected)
+    write_universal(field, tmp_path / "thing.uff", functions=3)
+    functions = sets(tmp_path / "thing.uff", 58)
+    assert len(functions) == 3
+    lines = response_frequencies(field)
+    for each in functions:
+        np.testing.assert_allclose(each["data"], response(field, each["ref_node"] - 1, lines), rtol=1e-12)
+        np.testing.assert_allclose(each["x"], lines, rtol=1e-12)
+        blow = -field.normals[each["ref_node"] - 1]
+        axis = abs(each["ref_dir"]) - 1
+        assert axis == int(blow.abs().argmax())
+        assert np.sign(each["ref_dir"]) == np.sign(float(blow[axis]))
+
+
+def test_one_damping_a_mode_is_said_to_be_a_mean(tmp_path):
+    field = table(spatial=True, noisy=True)
+    words = " ".join(write_universal(field, tmp_path / "thing.unv", functions=0).remarks)
+    assert "mean by energy" in words
+    assert "noise" in words
+    assert not sets(tmp_path / "thing.unv", 58)
+    energy = field.sine.double().square()
+    mode = sets(tmp_path / "thing.unv", 55)[1]
+    expected = float((energy * field.damping).sum(0)[1] / energy.sum(0)[1])
+    assert mode["modal_damp_vis"] * 2 * math.pi * mode["freq"] == pytest.approx(expected, rel=2e-5)
+
+
+def test_the_same_field_gives_the_same_file(tmp_path):
+    for name in ("a.uff", "b.uff"):
+        write_universal(table(), tmp_path / name)
+    assert (tmp_path / "a.uff").read_bytes() == (tmp_path / "b.uff").read_bytes()
+    # Its own file is written again without being asked.
+    write_universal(table(phased=True), tmp_path / "a.uff")
+
+
+def test_without_pyuff_it_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pyuff", None)
+    with pytest.raises(ExportError, match=r"pip install 'avmsf\[uff\]'"):
+        write_universal(table(), tmp_path / "thing.uff")
+
+
+def test_another_ending_is_refused(tmp_path):
+    with pytest.raises(ExportError, match=r"\.uff or \.unv, found no ending"):
+        write_universal(table(), tmp_path / "thing")

@@ -1,0 +1,99 @@
+"""A sampler's grid: every wav is the blow that its row of the table says."""
+
+import csv
+import itertools
+import re
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from avmsf.errors import ExportError
+from avmsf.export.wavgrid import Grid, Layer, write_grid
+from avmsf.modal.pulse import ForcePulse
+from made_tables import RATE, SAMPLES, apart, table
+
+LAYERS = (Layer(0.25, 0.002), Layer(1.0, 0.0005), Layer(3.0))
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "strikes.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_every_row_is_its_blow(tmp_path):
+    field = table(phased=True, noisy=True)
+    write_grid(field, tmp_path / "grid", Grid(5, LAYERS, level_db=-3.0))
+    found = rows(tmp_path / "grid")
+    assert len(found) == 15
+    truths, sounds = [], []
+    for row in found:
+        sound, rate = soundfile.read(tmp_path / "grid" / row["file"])
+        place = torch.tensor([[float(row[axis]) for axis in "xyz"]])
+        point = field.nearest(place)
+        assert float((field.points[point] - place).abs().max()) < 1e-6
+        assert [float(row[axis]) for axis in ("nx", "ny", "nz")] == pytest.approx(field.normals[point][0].tolist())
+        pulse = ForcePulse(float(row["contact_time"]), "hertz")
+        truths.append(field.render(point, force=float(row["force"]), pulse=pulse)[0].numpy())
+        sounds.append(sound)
+        assert (rate, len(sound), float(row["seconds"])) == (RATE, SAMPLES, SAMPLES / RATE)
+        assert float(row["peak_db"]) == pytest.approx(20 * np.log10(np.abs(sound).max()), abs=0.01)
+    loudest = max(np.abs(each).max() for each in truths)
+    assert apart(sounds, 10 ** (-3 / 20) / loudest * np.array(truths)) < 1e-6
+
+
+def test_contacts_lie_apart_and_have_a_note_each(tmp_path):
+    write_grid(table(), tmp_path / "grid", Grid(6, LAYERS))
+    found = rows(tmp_path / "grid")
+    assert Counter(row["midi_note"] for row in found) == {str(note): 3 for note in range(36, 42)}
+    assert len({(row["x"], row["y"], row["z"]) for row in found}) == 6
+    ranges = [(int(row["velocity_low"]), int(row["velocity_high"])) for row in found[:3]]
+    assert ranges[0][0] == 1
+    assert ranges[-1][1] == 127
+    assert all(upper[0] == lower[1] + 1 for lower, upper in itertools.pairwise(ranges))
+
+
+def test_the_instrument_plays_every_file_at_its_key(tmp_path):
+    write_grid(table(), tmp_path / "grid", Grid(4, LAYERS))
+    text = (tmp_path / "grid" / "instrument.sfz").read_text()
+    regions = re.findall(r"<region> sample=(\S+) key=(\d+) lovel=(\d+) hivel=(\d+)", text)
+    expected = [(r["file"], r["midi_note"], r["velocity_low"], r["velocity_high"]) for r in rows(tmp_path / "grid")]
+    assert regions == expected
+    assert all((tmp_path / "grid" / name).is_file() for name, *_ in regions)
+
+
+def test_lengths_are_as_asked(tmp_path):
+    write_grid(table(noisy=True), tmp_path / "long", Grid(1, seconds=0.5))
+    assert soundfile.info(tmp_path / "long" / "sounds" / "001-1.wav").frames == 4000
+
+
+def test_more_contacts_than_points_are_all_points(tmp_path):
+    write_grid(table(), tmp_path / "grid", Grid(50))
+    assert len(rows(tmp_path / "grid")) == len(table())
+
+
+@pytest.mark.parametrize(
+    ("grid", "words"),
+    [
+        (Grid(0), "expected 1 to 92 contacts"),
+        (Grid(93), "one MIDI note each from 36, found 93"),
+        (Grid(layers=()), "layers of forces, found 0"),
+        (Grid(layers=(Layer(-1.0),)), "forces above 0, found -1"),
+        (Grid(layers=(Layer(contact_time=2.0),)), "contact times from 0 to 1 s, found 2"),
+        (Grid(seconds=0.0), "sounds of more than 0 s"),
+        (Grid(level_db=6.0), "0 dB or below, found 6"),
+    ],
+)
+def test_bad_settings_are_refused(tmp_path, grid, words):
+    with pytest.raises(ExportError, match=words):
+        write_grid(table(), tmp_path / "grid", grid)
+    assert not (tmp_path / "grid").exists()
+
+
+def test_a_rate_that_no_wav_holds_is_refused(tmp_path):
+    with pytest.raises(ExportError, match=r"whole sample rate, as wav files hold, found 8000\.5 Hz"):
+        write_grid(replace(table(), sample_rate=8000.5), tmp_path / "grid")

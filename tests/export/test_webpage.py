@@ -1,0 +1,73 @@
+"""The page as a folder and as one file, without a browser; `tests/studio` opens both."""
+
+import base64
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from avmsf.errors import ExportError
+from avmsf.export.bundle import make_bundle
+from avmsf.export.webpage import page_files, single_file, write_webpage
+from struck_table import struck_table
+
+PAGE = {
+    "index.html": b"""<head><link rel="stylesheet" href="page/style.css">
+<script type="importmap">{"imports": {"three": "https://host/three.js"}}</script>
+<script type="module" src="page/main.js"></script></head>""",
+    "page/style.css": b"p { color: red }",
+    "page/main.js": b"""import { a } from "./a.js";\nconst b = await import( './b.js' );\nimport "three";\n""",
+    "page/a.js": b"export const a = new URL('./a.js', import.meta.url);",
+    "page/b.js": b'export * from "./a.js";',
+    "page/bank.js": b"",
+}
+
+
+def imports_of(html: str) -> dict[str, str]:
+    return json.loads(re.search(r'<script type="importmap">(.*?)</script>', html)[1])["imports"]
+
+
+def source_of(url: str) -> str:
+    return base64.b64decode(url.removeprefix("data:text/javascript;base64,")).decode()
+
+
+def test_one_file_holds_all_that_lay_beside_the_page() -> None:
+    bundle = make_bundle(struck_table(shared=True))
+    html = single_file(bundle, PAGE)
+    imports = imports_of(html)
+    assert imports["three"] == "https://host/three.js"
+    assert source_of(imports["avmsf/main.js"]) == (
+        """import { a } from "avmsf/a.js";\nconst b = await import( 'avmsf/b.js' );\nimport "three";\n"""
+    )
+    assert source_of(imports["avmsf/b.js"]) == 'export * from "avmsf/a.js";'
+    # An address is no import.
+    assert source_of(imports["avmsf/a.js"]) == PAGE["page/a.js"].decode()
+    assert "<style>\np { color: red }</style>" in html
+    assert 'import "avmsf/main.js";' in html
+    assert "page/" not in re.sub(r"avmsfInlined = .*", "", html)
+    inlined = json.loads(re.search(r"avmsfInlined = (.*?);</script>", html)[1])
+    assert json.loads(base64.b64decode(inlined["manifest.json"]["base64"])) == bundle.manifest
+    assert base64.b64decode(inlined["field.bin"]["base64"]) == bundle.files["field.bin"]
+
+
+def test_a_page_without_its_import_map_is_told() -> None:
+    torn = {**PAGE, "index.html": b"<p>"}
+    with pytest.raises(ExportError, match="expected one import map, found 0"):
+        single_file(make_bundle(struck_table(shared=True)), torn)
+
+
+def test_both_forms_are_written_whole_and_kept_from_others(tmp_path: Path) -> None:
+    table = struck_table(shared=True)
+    written = write_webpage(table, tmp_path / "site")
+    found = {str(path.relative_to(tmp_path / "site")) for path in (tmp_path / "site").rglob("*") if path.is_file()}
+    assert found == {*page_files(), "field.bin", "manifest.json"}
+    assert set(written.sizes) == {tmp_path / "site" / name for name in found}
+    single = tmp_path / "ball.html"
+    for _ in range(2):
+        assert write_webpage(table, single).sizes == {single: single.stat().st_size}
+    other = tmp_path / "mine.html"
+    other.write_text("mine")
+    with pytest.raises(ExportError, match="expected a free name or an earlier export"):
+        write_webpage(table, other)
+    assert other.read_text() == "mine"

@@ -1,0 +1,81 @@
+"""Exports are whole or absent, and never write over what is not theirs."""
+
+import json
+
+import pytest
+
+from avmsf.errors import ExportError
+from avmsf.export.written import Written, write_file, write_folder
+
+
+def fill(*names):
+    def write(place):
+        for name in names:
+            (place / name).parent.mkdir(parents=True, exist_ok=True)
+            (place / name).write_text(name)
+
+    return write
+
+
+def listed(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def test_a_folder_lists_its_files_and_their_sizes(tmp_path):
+    sizes = write_folder(tmp_path / "out", fill("b.txt", "in/a.txt"), {"name": "x"})
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert manifest["files"] == ["b.txt", "in/a.txt", "manifest.json"]
+    assert manifest["name"] == "x"
+    assert manifest["generator"].startswith("avmsf ")
+    assert Written(sizes).size == sum(path.stat().st_size for path in (tmp_path / "out").rglob("*") if path.is_file())
+
+
+def test_an_earlier_export_is_replaced_as_a_whole(tmp_path):
+    write_folder(tmp_path / "out", fill("old.txt", "both.txt"), {})
+    write_folder(tmp_path / "out", fill("both.txt"), {})
+    assert listed(tmp_path / "out") == ["both.txt", "manifest.json"]
+    assert listed(tmp_path) == ["out/both.txt", "out/manifest.json"]
+
+
+def test_a_strangers_file_in_it_protects_a_folder(tmp_path):
+    write_folder(tmp_path / "out", fill("a.txt"), {})
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    with pytest.raises(ExportError, match="a folder with files that no export wrote: choose another name, or add"):
+        write_folder(tmp_path / "out", fill("b.txt"), {})
+    assert listed(tmp_path / "out") == ["a.txt", "manifest.json", "notes.txt"]
+    write_folder(tmp_path / "out", fill("b.txt"), {}, force=True)
+    assert (tmp_path / "out" / "notes.txt").read_text() == "mine"
+    assert listed(tmp_path / "out") == ["a.txt", "b.txt", "manifest.json", "notes.txt"]
+
+
+def test_an_empty_folder_is_free(tmp_path):
+    (tmp_path / "out").mkdir()
+    write_folder(tmp_path / "out", fill("a.txt"), {})
+    assert listed(tmp_path / "out") == ["a.txt", "manifest.json"]
+
+
+def test_what_fails_half_way_leaves_all_as_it_was(tmp_path):
+    write_folder(tmp_path / "out", fill("a.txt"), {})
+
+    def fail(place):
+        (place / "b.txt").write_text("half")
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(ExportError, match="No space left on device"):
+        write_folder(tmp_path / "out", fail, {})
+    assert listed(tmp_path) == ["out/a.txt", "out/manifest.json"]
+
+
+def test_files_and_folders_are_told_apart(tmp_path):
+    (tmp_path / "file").write_text("avmsf")
+    with pytest.raises(ExportError, match="expected a folder, or a name that is free, found a file"):
+        write_folder(tmp_path / "file", fill("a.txt"), {}, force=True)
+    with pytest.raises(ExportError, match="expected the name of a file, found a folder"):
+        write_file(tmp_path, b"avmsf", force=True)
+
+
+@pytest.mark.parametrize("text", ["", "not json", "[]", '{"files": ["a.txt"]}', '{"generator": "other", "files": []}'])
+def test_anothers_manifest_is_no_licence(tmp_path, text):
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(ExportError, match="no export wrote"):
+        write_folder(tmp_path, fill("a.txt"), {})

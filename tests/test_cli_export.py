@@ -1,0 +1,162 @@
+"""`avmsf export`: every format from a field file, what it says, and what it refuses."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+import trimesh
+
+from avmsf.cli import main
+from avmsf.export.modaldemo import read_demo
+from avmsf.export.sampledfield import SampledField
+from avmsf.field.config import FitConfig
+from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.store import load, save
+from avmsf.modal.residual import Residual
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.ply import read_splats, write_splats
+from made_fields import BANK, SIDES, spline
+
+Streams = pytest.CaptureFixture[str]
+RATE, SAMPLES = 8000.0, 1200
+
+
+@pytest.fixture(scope="module")
+def field_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("field") / "plate.safetensors"
+    phase = torch.linspace(0, 0.5, len(BANK), dtype=torch.float64)
+    noise = Residual(torch.full((9,), 1e-3))
+    save(SoundField(BANK, spline(), phase, noise, RATE, SAMPLES, Origin("plate", config=FitConfig(seed=1))), path)
+    return path
+
+
+def test_a_mesh_goes_into_the_glb(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    trimesh.creation.box([1000 * side for side in SIDES]).export(tmp_path / "plate.stl")
+    words = ["--object", str(tmp_path / "plate.stl"), "--object-unit", "mm", "--points", "20"]
+    assert main(["export", str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb"), *words]) == 0
+    out, err = capsys.readouterr()
+    assert f"wrote {tmp_path / 'a.glb'}: gltf, " in out
+    assert "every mode starts as a sine" in err
+    assert "% of its loudest sample" in err
+    shown = trimesh.load(tmp_path / "a.glb", process=False).dump()[0]
+    assert shown.extents == pytest.approx(SIDES, rel=1e-5)
+
+
+def gaussians(path: Path) -> GaussianCloud:
+    points = spline().points[:40]
+    draw = torch.Generator().manual_seed(0)
+    color = torch.rand(40, 1, 3, generator=draw)
+    cloud = GaussianCloud(
+        points, torch.ones(40, 4), torch.full((40, 3), -6.0), torch.rand(40, generator=draw), color
+    )  # fmt: skip
+    write_splats(cloud, path)
+    return cloud
+
+
+def test_gaussians_lie_beside_the_glb(field_file: Path, tmp_path: Path) -> None:
+    gaussians(tmp_path / "plate.ply")
+    words = ["export", str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb")]
+    assert main([*words, "--object", str(tmp_path / "plate.ply")]) == 0
+    assert (tmp_path / "a.gaussians.ply").read_bytes() == (tmp_path / "plate.ply").read_bytes()
+    shown = trimesh.load(tmp_path / "a.glb", process=False).dump()[0]
+    assert len(shown.vertices) == 40
+    assert len(np.unique(np.asarray(shown.colors), axis=0)) > 30
+    assert main([*words, "--object", str(tmp_path / "plate.ply")]) == 0
+
+
+def test_the_demo_goes_out_in_and_out_again(field_file: Path, tmp_path: Path) -> None:
+    cloud = gaussians(tmp_path / "plate.ply")
+    first, again = tmp_path / "demo", tmp_path / "again"
+    words = ["--to", "avmsf-demo", "--output", str(first), "--object", str(tmp_path / "plate.ply")]
+    assert main(["export", str(field_file), *words]) == 0
+    demo = read_demo(first)
+    torch.testing.assert_close(demo.field.points, cloud.centers)
+    true = SampledField.of(load(field_file), cloud.centers)
+    torch.testing.assert_close(demo.field.cosine.abs(), torch.hypot(true.sine, true.cosine))
+    words = ["--to", "avmsf-demo", "--output", str(again), "--points", "11", "--variant", "glass"]
+    assert main(["export", str(first), *words]) == 0
+    assert json.loads((again / "manifest.json").read_text())["variants"] == ["glass"]
+    short = read_demo(again)
+    rows = [int((cloud.centers - point).norm(dim=1).argmin()) for point in short.field.points]
+    assert len(set(rows)) == 11
+    torch.testing.assert_close(short.field.cosine, demo.field.cosine[rows])
+    torch.testing.assert_close(read_splats(again / "scene.ply").harmonics, cloud.harmonics[rows])
+
+
+def test_a_demo_is_read_into_any_other_format(field_file: Path, tmp_path: Path) -> None:
+    assert main(["export", str(field_file), "--to", "avmsf-demo", "--output", str(tmp_path / "demo")]) == 0
+    words = ["--to", "wavs", "--output", str(tmp_path / "wavs"), "--points", "3"]
+    assert main(["export", str(tmp_path / "demo"), *words]) == 0
+    demo = read_demo(tmp_path / "demo").field
+    with (tmp_path / "wavs" / "strikes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 3
+    scale = json.loads((tmp_path / "wavs" / "manifest.json").read_text())["scale"]
+    for row in rows:
+        point = demo.nearest(torch.tensor([[float(row[axis]) for axis in "xyz"]]))
+        sound, _ = soundfile.read(tmp_path / "wavs" / row["file"])
+        np.testing.assert_allclose(sound, scale * demo.render(point)[0].numpy(), atol=1e-6)
+
+
+def test_wavs_have_the_layers_asked_for(field_file: Path, tmp_path: Path) -> None:
+    words = ["export", str(field_file), "--to", "wavs", "--output", str(tmp_path / "w"), "--points", "2"]
+    assert main([*words, "--forces", "0.5", "2", "--contact-times", "0.001", "0", "--seconds", "0.05"]) == 0
+    with (tmp_path / "w" / "strikes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["force"], row["contact_time"]) for row in rows] == [("0.5", "0.001"), ("2", "0")] * 2
+    assert soundfile.info(tmp_path / "w" / rows[0]["file"]).frames == 400
+
+
+@pytest.mark.parametrize(("to", "name"), [("faust", "a.dsp"), ("faust", "a.lib"), ("uff", "a.uff")])
+def test_other_formats_say_their_size(to: str, name: str, field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    words = ["export", str(field_file), "--to", to, "--output", str(tmp_path / name), "--points", "5"]
+    assert main(words) == 0
+    size = (tmp_path / name).stat().st_size
+    assert f"{to}, {size / 1e6:.3g} MB, one file" in capsys.readouterr().out
+    # Its own is written again.
+    assert main(words) == 0
+
+
+def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    words = ["export", str(field_file), "--to", "web", "--points", "30"]
+    for name in ("page", "page", "page.html"):
+        assert main([*words, "--output", str(tmp_path / name)]) == 0
+    manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
+    assert (manifest["points"], manifest["modes"]) == (30, len(BANK))
+    assert (tmp_path / "page" / "index.html").is_file()
+    assert b"<html" in (tmp_path / "page.html").read_bytes()
+    assert "page: web, " in capsys.readouterr().out
+
+
+def refused(words: list[str], capsys: Streams) -> str:
+    assert main(["export", *words]) == 2
+    return capsys.readouterr().err
+
+
+def test_what_cannot_be_exported_is_said(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    field, out = str(field_file), str(tmp_path / "out")
+    assert "expected 1 or more" in refused([field, "--to", "wavs", "--output", out, "--points", "0"], capsys)
+    assert "found another folder" in refused([str(tmp_path), "--to", "wavs", "--output", out], capsys)
+    words = [field, "--to", "wavs", "--output", out, "--forces", "1", "2", "3", "--contact-times", "0", "0"]
+    assert "found 3 forces and 2 times" in refused(words, capsys)
+    words = [field, "--to", "gltf", "--output", str(tmp_path / "a.glb"), "--object", str(tmp_path / "none.obj")]
+    assert "there is no such mesh file" in refused(words, capsys)
+    (tmp_path / "a.dsp").write_text("theirs")
+    words = [field, "--to", "faust", "--output", str(tmp_path / "a.dsp"), "--points", "3"]
+    assert "add --force" in refused(words, capsys)
+    assert main(["export", *words, "--force"]) == 0
+
+
+def test_a_captures_surface_is_shown(field_file: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    trimesh.creation.box([100 * side for side in SIDES]).export(folder / "surface.ply")
+    (folder / "capture.toml").write_text('surface_unit = "cm"\n')
+    words = ["export", str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb"), "--capture", str(folder)]
+    assert main(words) == 0
+    shown = trimesh.load(tmp_path / "a.glb", process=False).dump()[0]
+    assert shown.extents == pytest.approx(SIDES, rel=1e-5)
