@@ -65,6 +65,10 @@ class DoubtedGains(GainField, Protocol):
         """Return what is not known of the gains of blows at places, of modes whose squares count by `weights`."""
         ...
 
+    def without(self, contacts: Bool[Tensor, " contacts"]) -> "DoubtedGains":
+        """Return the field as if these contacts' gains were not known; what it learnt of its settings stays."""
+        ...
+
     def left_out(self) -> Float64[Tensor, "sites modes 2"]:
         """Return by how much all others' gains miss each trusted contact's, over the deviation foretold of that.
 

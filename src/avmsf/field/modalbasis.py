@@ -17,6 +17,8 @@ from avmsf.field.records import count_of, like
 
 REACH = 0.15
 """Length of the remainder's kernel over the object's size, the diagonal of the box around it."""
+_UNHEARD = 1e8
+"""Factor on the noise's variance of contacts that shall say nothing."""
 _HYPOTHESES = len(WIDTHS) * len(REMAINDERS) * len(NOISES)
 
 
@@ -86,8 +88,8 @@ class ModalBasis:
 
     @property
     def places(self) -> int:
-        """Contacts that are not in the same place as another."""
-        return len(torch.unique(self.contacts, dim=0))
+        """Contacts that say something and are not in the same place as another."""
+        return len(torch.unique(self.contacts[self.regression.doubt < _UNHEARD], dim=0))
 
     def ways(
         self, places: Float[Tensor, "places 3"], directions: Float[Tensor, "places 3"] | None
@@ -122,6 +124,11 @@ class ModalBasis:
     def judged_by(self, measured: Float64[Tensor, "contacts modes 2"]) -> "ModalBasis":
         """Return the same field, which judges itself by these gains."""
         return replace(self, measured=measured)
+
+    def without(self, contacts: Bool[Tensor, " contacts"]) -> "ModalBasis":
+        """Return the field to which these contacts say nothing: so doubtful are they made."""
+        doubt = torch.where(contacts, _UNHEARD, self.regression.doubt)
+        return replace(self, regression=replace(self.regression, doubt=doubt))
 
     def left_out(self) -> Float64[Tensor, "trusted modes 2"]:
         """Return each trusted contact's errors over their foretold deviations, judged by the measured gains."""

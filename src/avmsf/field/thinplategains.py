@@ -106,6 +106,12 @@ class ThinPlateGains:
         noise = self.noise.square().mean(0).sum(1)
         yield Belief(float((variance * weights).sum()) * self.sites.covariance(places), float((noise * weights).sum()))
 
+    def without(self, contacts: Bool[Tensor, " contacts"]) -> "ThinPlateGains":
+        """Return splines as smooth through the other contacts."""
+        kept = ~contacts
+        measured = None if self.measured is None else self.measured[kept]
+        return replace(self, contacts=self.contacts[kept], values=self.values[kept], measured=measured)
+
     def left_out(self) -> Float64[Tensor, "sites modes 2"]:
         """Return each site's errors over their foretold deviations, judged by the measured gains."""
         flat = self.values.flatten(1)

@@ -2,31 +2,24 @@
 
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
-from statistics import NormalDist
+from functools import cached_property
 
 import torch
 from jaxtyping import Complex64, Complex128, Float, Float32, Float64
 from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
-from avmsf.field.belief import knows_doubt
-from avmsf.field.doubt import LEVEL, widening
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.tasks.amplitudes import Amplitudes, Extractor
 from avmsf.tasks.contactmap import ContactMap as ContactMap
+from avmsf.tasks.foretelling import foretell, patches, unknown, widened
+from avmsf.tasks.heed import heed_of
 from avmsf.tasks.posterior import Force, Foretold, Judgement, judge
 from avmsf.tasks.slack import contacts_of, spread_by
 
-_BATCH = 2048
-"""Points whose gains are asked for at once."""
-_NEIGHBOURS = 8
-"""Of a point, by which it is told how gains vary about it."""
-_PATCH = 1.0 / 9.0
-"""Variance over a square of surface around a point, over the mean square difference from the squares about it."""
 _KEPT_LENGTHS = 8
 """Lengths of sounds whose equations are kept."""
 
@@ -72,12 +65,13 @@ class Locator:
         """
         places = (field.gain_field.points if points is None else points).detach().cpu()
         _expect_points(places, directions, areas)
-        gains, variance, dampings = _foretell(field, places, directions)
+        gains, dampings = foretell(field, places, directions)
+        variance = unknown(field, places, directions, factor=widened(field))
         return cls(
             field,
             places.float(),
             gains,
-            variance + _patches(places, gains),
+            variance + patches(places, gains),
             dampings,
             torch.ones(len(places), dtype=torch.float64) if areas is None else areas.detach().cpu().double(),
             spread_by(places, contacts=contacts_of(field)),
@@ -104,7 +98,8 @@ class Locator:
         found = judge(length.foretold, values, noise, force=length.scaled(force))
         row = int(torch.argmax(found.log_likelihood))
         explained = length.explained(amplitudes, found, row)
-        probability = torch.softmax(found.trust(explained) * found.log_likelihood + self.areas.log(), 0)
+        trust = found.trust(explained, heed=self.heed)
+        probability = torch.softmax(trust * found.log_likelihood + self.areas.log(), 0)
         if self.slack is not None:
             probability = torch.from_numpy(self.slack @ probability.numpy())
         return ContactMap(
@@ -115,6 +110,11 @@ class Locator:
             amplitudes.explained,
             float(found.force[row]) / length.unit,
         )
+
+    @cached_property
+    def heed(self) -> float:
+        """Factor on what modes tell beside one another: as much as the field's own strikes, left out, bear out."""
+        return heed_of(self.field)
 
     def _expect_sound(self, sound: Float[Tensor, " samples"]) -> None:
         rate = self.field.sample_rate
@@ -205,44 +205,6 @@ class _Length:
         own = extractor.mixing @ self.foretold.gains[row].to(torch.complex128) * turned * found.force[row].sign()
         both = torch.cat([own.real, own.imag])
         return amplitudes.part(float(2.0 * both @ amplitudes.products - both @ extractor.gram @ both))
-
-
-def _foretell(
-    sound_field: SoundField, points: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"] | None
-) -> tuple[Complex64[Tensor, "points modes"], Float32[Tensor, "points modes"], Float32[Tensor, "points modes"] | None]:
-    """Return gains, the variance of what the field does not know of them, and factors on dampings."""
-    doubtful = knows_doubt(sound_field) and len(getattr(sound_field.gain_field, "contacts", ())) > 2
-    factor = widening(sound_field) / NormalDist().inv_cdf(0.5 + LEVEL / 2.0) if doubtful else 1.0
-    turned = torch.polar(torch.ones_like(sound_field.phase), sound_field.phase).to(torch.complex64)
-    gains, variances, dampings = [], [], []
-    for rows in torch.split(torch.arange(len(points)), _BATCH):
-        places, along = points[rows], None if directions is None else directions[rows]
-        known = sound_field.known(places, directions=along)
-        ahead = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
-        gains.append(torch.complex(known.mean.float(), ahead.float()) * turned)
-        with torch.no_grad():
-            deviation = sound_field.gain_field.deviation(places, along)
-        variances.append(
-            torch.zeros_like(known.mean.float()) if deviation is None else (factor * deviation).square().sum(2).float()
-        )
-        if known.damping is not None:
-            dampings.append(known.damping.float())
-    return torch.cat(gains), torch.cat(variances), torch.cat(dampings) if dampings else None
-
-
-def _patches(
-    points: Float[Tensor, "points 3"], gains: Complex64[Tensor, "points modes"]
-) -> Float32[Tensor, "points modes"]:
-    """Return the variance of gains over the patch of surface that each point stands for."""
-    count = min(_NEIGHBOURS, len(points) - 1)
-    total = torch.zeros(gains.shape)
-    if count < 1:
-        return total
-    places = points.double().numpy()
-    _, rows = cKDTree(places).query(places, k=count + 1)
-    for near in torch.from_numpy(rows[:, 1:].T.copy()):
-        total += (gains[near] - gains).abs().square()
-    return total * (_PATCH / count)
 
 
 def _seen_through(

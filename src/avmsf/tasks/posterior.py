@@ -28,7 +28,8 @@ BETWEEN = (1.6, 0.35, 0.07, 0.015)
 INDEPENDENT = (0.25, 0.4)
 """What a mode tells where fields err, over what it would tell if every mode erred for itself: of a field that explains
 nothing of a sound even at its best point, and of one that explains all of it. Measured on plates, with splines and
-with physics: so the 90 % region holds nine blows in ten."""
+with physics: so the 90 % region holds nine blows in ten. Where a field has strikes of its own they have the last word
+(`avmsf.tasks.heed`)."""
 SHIFT = 5e-4
 """How far the onset may be off, seconds, either way."""
 SHIFT_DEVIATION = 2e-4
@@ -84,10 +85,16 @@ class Judgement:
     noisy: float
     """Which part of the errors is noise, 0 to 1."""
 
-    def trust(self, explained: float) -> float:
-        """Return what the log likelihood counts for, where the likeliest point explains that part of the sound."""
+    def trust(self, explained: float, *, heed: float = 1.0) -> float:
+        """Return what the log likelihood counts for, where the likeliest point explains that part of the sound.
+
+        `heed` is a factor on `INDEPENDENT` for one field, as `avmsf.tasks.heed` measures it.
+        """
         least, most = INDEPENDENT
-        return self.noisy + (1.0 - self.noisy) * (least + (most - least) * explained)
+        together = min(1.0, heed * (least + (most - least) * explained))
+        # Noise errs in every mode by itself. Not the arithmetic mean: where modes of a field that errs tell a twentieth
+        # of their number, a tenth of noise would make that a seventh.
+        return together ** (1.0 - self.noisy)
 
 
 def judge(

@@ -1,0 +1,120 @@
+"""How much a field's modes tell of a place where it errs: its own strikes, each left out in turn, are asked.
+
+How far the errors of modes hang together depends on what is wrong with a field: a body that is nearly the object's errs
+in all modes at once, splines between few contacts err in each mode by itself. No constant serves both. But every field
+that knows its doubt can foretell each of its own strikes from the others, and their places are known: so much is made
+of the likelihood that these places are as probable as they can be (the logarithmic score, which is best for the
+probabilities that are true).
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Float32, Float64, Int64
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avmsf.field.belief import measured_gains
+from avmsf.field.doubtedgains import DoubtedGains
+from avmsf.field.soundfield import SoundField
+from avmsf.scene.points import farthest_points
+from avmsf.tasks.foretelling import foretell, judges_itself, patches, unknown, widened
+from avmsf.tasks.posterior import Foretold, judge
+from avmsf.tasks.slack import areas_of, contacts_of, spread_by
+
+_STRIKES = 12
+"""Strikes that are left out, at most: those farthest apart."""
+_POINTS = 300
+"""Points of the surface that these are looked for at, beside their own."""
+_TRIED = torch.logspace(-2.0, 0.6, 27, dtype=torch.float64)
+_BEFOREHAND = 1.0
+"""Standard deviation of the factor's logarithm before any strike is asked: e times as much or as little."""
+_SAME = 1e-6
+"""Distance over the object's size within which two strikes are in one place."""
+_NOISE = 1e-10
+"""Variance of the measured gains' own errors over the strongest one's square: they are taken as they are."""
+
+
+def heed_of(field: SoundField) -> float:
+    """Return the factor on `posterior.INDEPENDENT` that a field's own strikes bear out best, .01 to 4.
+
+    1 where the field has too few strikes to tell, or does not know how sure it is.
+    """
+    if not judges_itself(field):
+        return 1.0
+    gains = measured_gains(field)
+    fitted = replace(field, gain_field=gains)
+    strikes = _strikes(gains)
+    points = gains.points.double()
+    near = torch.from_numpy(cKDTree(points.numpy()).query(gains.contacts[strikes].numpy())[1])
+    spread = farthest_points(points, min(_POINTS, len(points)))
+    rows = torch.unique(torch.cat([spread, near]))
+    truths = torch.searchsorted(rows, near)
+    places, factor = gains.points[rows], widened(fitted)
+    about = patches(gains.points, foretell(fitted, gains.points, None)[0])[rows]
+    prior = areas_of(places).clamp_min(1e-300).log() if len(places) > 2 else torch.zeros(len(places)).double()
+    slack = spread_by(places, contacts=contacts_of(fitted))
+    turned = torch.polar(torch.ones_like(field.phase), field.phase)
+    score = -0.5 * (_TRIED.log() / _BEFOREHAND).square()
+    for strike, truth in zip(strikes.tolist(), truths.tolist(), strict=True):
+        left = gains.without(_same_place(gains, strike))
+        if left.places < 2:
+            continue
+        heard = torch.view_as_complex(gains.values[strike].double().contiguous()) * turned
+        loudest = float(heard.abs().max())
+        if loudest == 0.0:
+            continue
+        known = _foretold(replace(field, gain_field=left), places, about, factor=factor)
+        found = judge(known, heard, torch.full(heard.shape, _NOISE * loudest**2, dtype=torch.float64))
+        row = int(found.log_likelihood.argmax())
+        explained = _explained(known.gains[row].to(heard), heard, 1.0 / (4.0 * field.bank.damping.double()))
+        trusts = torch.tensor([found.trust(explained, heed=heed) for heed in _TRIED.tolist()], dtype=torch.float64)
+        score += _log_score(trusts[:, None] * found.log_likelihood + prior, truth, slack)
+    return float(_TRIED[int(score.argmax())])
+
+
+def _strikes(gains: DoubtedGains) -> Int64[Tensor, " strikes"]:
+    """Return the rows of the contacts that are left out."""
+    trusted = torch.nonzero(gains.trusted).flatten()
+    if len(trusted) <= _STRIKES:
+        return trusted
+    return trusted[farthest_points(gains.contacts[trusted], _STRIKES)]
+
+
+def _same_place(gains: DoubtedGains, strike: int) -> Tensor:
+    """Return which contacts are where one is."""
+    size = (gains.points.amax(0) - gains.points.amin(0)).double().norm()
+    return (gains.contacts - gains.contacts[strike]).norm(dim=1) <= _SAME * size
+
+
+def _foretold(
+    field: SoundField,
+    places: Float[Tensor, "points 3"],
+    about: Float32[Tensor, "points modes"],
+    *,
+    factor: float,
+) -> Foretold:
+    """Return what a field foretells of places whose gains vary by `about` around them."""
+    gains, _ = foretell(field, places, None)
+    power = gains.abs().square()
+    usual = power.mean(0)
+    usual = usual.clamp_min(max(1e-8 * float(usual.max()), torch.finfo(torch.float32).tiny))
+    variance = unknown(field, places, None, factor=factor) + about
+    return Foretold(gains, power, variance, usual, field.bank.frequency.double())
+
+
+def _explained(foretold: Tensor, heard: Tensor, weights: Float64[Tensor, " modes"]) -> float:
+    """Return the part of the energy of what was heard that gains explain at their best force."""
+    own = float((weights * foretold.abs().square()).sum())
+    match = float((weights * (heard.conj() * foretold).real).sum())
+    whole = float((weights * heard.abs().square()).sum())
+    return 0.0 if own == 0.0 else min(1.0, match**2 / own / whole)
+
+
+def _log_score(logs: Float64[Tensor, "tried points"], truth: int, slack: csr_array | None) -> Float64[Tensor, " tried"]:
+    """Return the logarithm of the probability of the true point under each of several posteriors."""
+    probability = torch.softmax(logs, 1)
+    if slack is not None:
+        probability = torch.from_numpy((slack @ probability.numpy().T).T)
+    return probability[:, truth].clamp_min(1e-300).log()
