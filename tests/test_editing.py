@@ -51,6 +51,7 @@ from plate_field import plate_impacts
 # The benchmarks are no part of the package, and `python -m benchmarks` finds them from the repository's root alone.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import editing as benchmark
+from benchmarks import realimpact_editing
 
 RATE = 16000.0
 QUICK = {"steps": 3, "contacts": 2, "fft_sizes": (512, 128)}
@@ -194,6 +195,37 @@ def test_recorded_objects_are_those_there_are():
     assert len(found[0].bank) > 3
     with pytest.raises(EvaluationError, match="plates holds none of the 26 objects whose materials are known"):
         recorded_objects(Recorded("59_stand"))
+
+
+def test_the_protocol_of_recorded_objects_runs_without_words(tmp_path, monkeypatch):
+    names = [*_named("ceramic")[:1], *_named("wood")[:7]]
+    made = tuple(replace(struck(REALIMPACT_26[name]), name=name) for name in names)
+    monkeypatch.setattr(realimpact_editing, "open_dataset", lambda folder: Recorded(*names))
+    monkeypatch.setattr(realimpact_editing, "recorded_objects", lambda dataset: made)
+    monkeypatch.setattr(realimpact_editing, "RECORDED_TRANSITIONS", RECORDED_TRANSITIONS[:1])
+    laid_out = MaterialSpace.of
+    # Without UMAP, which takes its time to compile.
+    monkeypatch.setattr(
+        MaterialSpace,
+        "of",
+        lambda *told, **more: replace(laid_out(*told, **more), stored=np.zeros((8, 2), dtype=np.float32)),
+    )
+    monkeypatch.setattr(MaterialSpace, "distance", MaterialSpace.plain_distance)
+    report = realimpact_editing.measure_recorded(tmp_path, steps=1, record=tmp_path / "scores.json")
+    record = json.loads((tmp_path / "scores.json").read_text())
+    assert {(each["object"], each["source"], each["target"]) for each in record["scores"]} == {
+        (names[0], "ceramic", "wood")
+    }
+    assert {each["method"] for each in record["scores"]} == {"before", "unconstrained", "searched", "hierarchical"}
+    assert report.figures["realimpact.spectral_before"] > report.figures["realimpact.spectral_hierarchical"] > 0
+    assert "94_GlassGoblet" in report.conventions[1]
+    monkeypatch.setattr(realimpact_editing, "open_dataset", lambda folder: Recorded(*names[:3]))
+    with pytest.raises(EvaluationError, match="holds 3 of the 26 objects whose materials are known, expected at least"):
+        realimpact_editing.measure_recorded(tmp_path)
+
+
+def _named(material: str) -> list[str]:
+    return [name for name, own in REALIMPACT_26.items() if own == material]
 
 
 def test_every_transition_has_two_prompts_for_every_object():
