@@ -1,4 +1,5 @@
-"""`python -m benchmarks field`, `extract`, `speed`, `scene`, `proof`, `settings`, `suggest`, `physics` or `tasks`."""
+"""`python -m benchmarks field`, `extract`, `speed`, `scene`, `proof`, `settings`, `suggest`, `physics`, `tasks` or
+`studio`."""
 
 import argparse
 import sys
@@ -8,7 +9,7 @@ from types import ModuleType
 
 from avmsf.capture import CaptureWarning
 from avmsf.errors import AvmsfError
-from benchmarks import extract, field, physics, proof, scene, settings, speed, suggest, tasks
+from benchmarks import extract, field, physics, proof, scene, settings, speed, studio, suggest, tasks
 from benchmarks.material import MissingDataError
 from benchmarks.report import Options, show
 
@@ -22,6 +23,7 @@ BENCHMARKS: dict[str, ModuleType] = {
     "suggest": suggest,
     "physics": physics,
     "tasks": tasks,
+    "studio": studio,
 }
 
 
