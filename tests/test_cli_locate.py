@@ -79,8 +79,8 @@ def test_a_blow_is_found_drawn_and_told(place: Place, tmp_path: Path, capsys: St
     assert blow["recording"] == hit
     assert blow["explained"] > 0.98
     assert blow["region"]["level"] == 0.9
-    # Few modes tell little, and what they tell counts for a part: see `INDEPENDENT`.
-    assert 0.0 < blow["region"]["share"] < 0.6
+    # The field's own contacts, left out, are badly foretold by the others: the region is as wide as that makes it.
+    assert 0.0 < blow["region"]["share"] < 0.7
     assert f"{hit}: struck at (" in err
     assert "of the surface; the field explains" in err
     assert (tmp_path / "maps" / "hit.png").read_bytes().startswith(b"\x89PNG")

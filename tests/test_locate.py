@@ -136,7 +136,7 @@ def test_a_blow_is_found_and_the_region_holds_it(taps, noise_db, posterior, cosi
     assert sum(missed(each, each.best, contact) for each, contact in pairs) / 40 < cosine
     coverage = sum(held(each, contact) for each, contact in pairs) / 40
     assert 0.8 <= coverage <= 1.0
-    assert sum(float(each.region().double().mean()) for each in found) / 40 < 0.4
+    assert sum(float(each.region().double().mean()) for each in found) / 40 < 0.5
     assert all(abs(float(each.probability.sum()) - 1.0) < 1e-9 for each in found)
 
 

@@ -146,9 +146,7 @@ def test_gains_without_doubt_are_refused_with_those_that_have_it() -> None:
     modes = plate_extraction(impacts)
     network = Attention().start(gain_case(impacts, plate_features(), modes, QUICK), SHARED)
     field = replace(sound_field(network.finished(torch.arange(len(modes.bank)))), bank=modes.bank)
-    with pytest.raises(
-        FitError, match=r"'attention' do not know how sure they are; spline and physics do"
-    ):
+    with pytest.raises(FitError, match=r"'attention' do not know how sure they are; spline and physics do"):
         suggest(field)
 
 

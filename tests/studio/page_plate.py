@@ -1,0 +1,114 @@
+"""A plate in closed form and the page that shows it, as a folder to be served."""
+
+import math
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import trimesh
+
+from avmsf.capture.impacts import Impacts
+from avmsf.export.bundle import write_bundle
+from avmsf.export.sampledfield import SampledField
+from avmsf.scene.ply import write_splats
+from avmsf.scene.start import StartPoints, starting_cloud
+from avmsf.studio.modules import MODULES_VARIABLE, PINNED, find_modules, with_local_modules
+
+PAGE = Path(__file__).resolve().parents[2] / "src" / "avmsf" / "studio" / "page"
+SIDES = (0.24, 0.16, 0.02)
+WAVES = ((1, 0), (0, 1), (1, 1), (2, 0), (2, 1), (3, 1))
+"""Half waves along and across the plate, one pair a mode."""
+ACROSS, ALONG = 21, 31
+"""Contacts on each of both large faces."""
+RATE = 16_000.0
+
+
+def plate_table(*, pitch: float = 1.0) -> SampledField:
+    """Return a plate struck on a regular grid: cosines whose pitches are 400 Hz apart, all in sine phase."""
+    x, y = torch.meshgrid(
+        torch.linspace(-0.5, 0.5, ALONG) * SIDES[0], torch.linspace(-0.5, 0.5, ACROSS) * SIDES[1], indexing="ij"
+    )
+    face = torch.stack([x.flatten(), y.flatten(), torch.full((ALONG * ACROSS,), SIDES[2] / 2)], dim=1)
+    points = torch.cat([face, face * torch.tensor([1.0, 1.0, -1.0])])
+    normals = torch.zeros_like(points)
+    normals[:, 2] = points[:, 2].sign()
+    order = torch.arange(1, len(WAVES) + 1, dtype=torch.float64)
+    return SampledField(
+        points,
+        normals,
+        400.0 * order * pitch,
+        4.0 * order,
+        plate_shapes(points) / order.float(),
+        torch.zeros(len(points), len(WAVES)),
+        torch.zeros(8000),
+        RATE,
+        name="Plate",
+    )
+
+
+def plate_shapes(points: torch.Tensor) -> torch.Tensor:
+    """Return each mode's shape, at most 1."""
+    along, across = (points[:, axis] / SIDES[axis] + 0.5 for axis in (0, 1))
+    return torch.stack([(math.pi * a * along).cos() * (math.pi * b * across).cos() for a, b in WAVES], dim=1)
+
+
+def plate_strikes(table: SampledField, rows: tuple[int, ...] = (100, 500)) -> Impacts:
+    """Return recordings of blows at some contacts, which are the model's own sounds."""
+    return Impacts(
+        contacts=table.points[list(rows)].double(),
+        sounds=table.render(torch.tensor(rows)),
+        sample_rate=table.sample_rate,
+        names=tuple(f"{row:03d}.wav" for row in rows),
+    )
+
+
+def plate_object(kind: str, folder: Path) -> Path | None:
+    """Write what shows the plate: a mesh of twelve triangles, Gaussians, or nothing."""
+    if kind == "points":
+        return None
+    path = folder / f"{kind}.ply"
+    if kind == "mesh":
+        trimesh.creation.box(SIDES).export(path)
+        return path
+    points = plate_table().points
+    normals = torch.zeros_like(points)
+    normals[:, 2] = points[:, 2].sign()
+    start = StartPoints(points, torch.full_like(points, 0.6), normals)
+    write_splats(starting_cloud(start, degree=0, scale=1.0, opacity=0.95, flatness=0.2), path)
+    return path
+
+
+def lay_out(folder: Path, table: SampledField, modules: Path, **bundle: Any) -> Path:
+    """Write the page with a field, and three and spark beside it."""
+    write_bundle(table, folder, **bundle)
+    page = (PAGE / "index.html").read_text(encoding="utf-8")
+    (folder / "index.html").write_text(with_local_modules(page), encoding="utf-8")
+    shutil.copytree(PAGE, folder / "page")
+    (folder / "modules").symlink_to(modules)
+    return folder
+
+
+def page_modules(cache: Path) -> Path:
+    """Return a node_modules with three and spark: the environment's, the user's, or one that npm brings; or skip."""
+    named = os.environ.get(MODULES_VARIABLE)
+    found = Path(named) if named else find_modules()
+    if found is not None:
+        return found
+    npm = shutil.which("npm")
+    if npm is None:
+        pytest.skip(f"no three and spark: install npm, or name a node_modules in {MODULES_VARIABLE}")
+    wanted = [f"{name}@{version}" for name, version in PINNED.items()]
+    done = subprocess.run(
+        [npm, "install", "--prefix", str(cache), "--ignore-scripts", "--no-audit", "--no-fund", *wanted],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    if done.returncode != 0:
+        pytest.skip(f"no three and spark: npm could not fetch them: {done.stderr.strip()[-200:]}")
+    return cache / "node_modules"

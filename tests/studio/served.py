@@ -1,0 +1,98 @@
+"""The real server in a thread, asked over a socket, so that nothing tidies up what the tests send."""
+
+import http.client
+import json
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+
+from avmsf.studio.guard import LARGEST_UPLOAD, Guard, new_token
+from avmsf.studio.opening import Opened
+from avmsf.studio.routes import make_app
+from avmsf.studio.server import _listening
+from avmsf.studio.studio import Studio, StudioConfig
+
+
+@dataclass(frozen=True)
+class Answer:
+    status: int
+    headers: Mapping[str, str]
+    content: bytes
+
+    @property
+    def words(self) -> Any:
+        return json.loads(self.content)
+
+
+@dataclass(frozen=True, eq=False)
+class Served:
+    studio: Studio
+    port: int
+    token: str
+
+    def ask(
+        self,
+        method: str,
+        place: str,
+        body: bytes | Mapping[str, Any] | None = None,
+        *,
+        headers: Mapping[str, str] | None = None,
+        whole: bool = False,
+    ) -> Answer:
+        """Send one request under the token, or with `whole` to the path as it is."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        path = place if whole else f"/{self.token}/{place}"
+        content = json.dumps(body).encode() if isinstance(body, Mapping) else body
+        try:
+            connection.request(method, path, content, dict(headers or {}))
+            answer = connection.getresponse()
+            return Answer(answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read())
+        finally:
+            connection.close()
+
+    def get(self, place: str) -> Answer:
+        return self.ask("GET", place)
+
+    def manifest(self) -> Any:
+        return self.get("manifest.json").words
+
+    def events(self, job: str, *, after: str | None = None) -> list[Any]:
+        headers = {} if after is None else {"Last-Event-ID": after}
+        text = self.ask("GET", f"jobs/{job}/events", headers=headers).content.decode()
+        return [json.loads(part.partition("data: ")[2]) for part in text.split("\n\n") if part]
+
+
+@contextmanager
+def served(
+    opened: Opened, folder: Path, *, config: StudioConfig | None = None, largest: int = LARGEST_UPLOAD
+) -> Iterator[Served]:
+    folder.mkdir(exist_ok=True)
+    studio = Studio(opened, folder, config)
+    token = new_token()
+    with _listening(0) as listener:
+        port = listener.getsockname()[1]
+        app = Guard(make_app(studio), token=token, port=port, largest=largest)
+        quiet = uvicorn.Config(app, log_level="critical", access_log=False, timeout_graceful_shutdown=1)
+        server = uvicorn.Server(quiet)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+        thread.start()
+        try:
+            _wait_until(lambda: server.started or not thread.is_alive())
+            yield Served(studio, port, token)
+        finally:
+            server.should_exit = True
+            thread.join(20)
+        assert not thread.is_alive()
+
+
+def _wait_until(done: Any, seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)

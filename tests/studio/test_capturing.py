@@ -1,0 +1,290 @@
+"""Capture mode: what it writes is an ordinary capture folder, whole after every step, and nothing is written twice."""
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+from opened_plate import blow, wav
+
+from avmsf.capture import check, read_capture
+from avmsf.errors import AvmsfError, CaptureError
+from avmsf.studio import capturing
+from avmsf.studio.capturing import Place, StrikeBook
+from avmsf.studio.refusal import RefusedError
+from capture_folder import fill, ring
+
+DOWN = (0.0, 0.0, -2.0)
+
+
+def key(number: int) -> str:
+    return f"strike-{number:04d}"
+
+
+def book(folder: Path) -> StrikeBook:
+    folder.mkdir(parents=True, exist_ok=True)
+    return StrikeBook(folder)
+
+
+def place(x: float, *, direction: tuple[float, float, float] | None = DOWN) -> Place:
+    return Place((x, 0.25, -1e-3), direction)
+
+
+def table(folder: Path) -> list[list[str]]:
+    with open(folder / "impacts.csv", newline="") as file:
+        return list(csv.reader(file))
+
+
+def test_strikes_become_a_capture_that_reads_back(tmp_path: Path) -> None:
+    strikes = book(tmp_path)
+    assert strikes.describe()["strikes"] == []
+    for number in range(3):
+        added = strikes.add(blow(number), place(0.1 * number), key=key(number))
+        assert (added["row"], added["file"]) == (number, f"{number + 1:03d}.wav")
+        assert added["onset_seconds"] == pytest.approx(0.1, abs=1e-3)
+        assert (added["clipped"], added["warnings"]) == (0, [])
+    capture = read_capture(tmp_path)
+    assert torch.equal(capture.impacts.contacts[:, 0], torch.tensor([0.0, 0.1, 0.2], dtype=torch.float64))
+    assert capture.impacts.directions is not None
+    assert torch.equal(capture.impacts.directions[1], torch.tensor([0.0, 0.0, -1.0]))
+    assert (tmp_path / "002.wav").read_bytes() == blow(1)
+    told = strikes.describe()
+    assert told["ready"]
+    assert told["problems"] == []
+    assert told["strikes"][2]["contact"] == (0.2, 0.25, -0.001)
+
+
+def test_the_judgement_is_that_of_check(tmp_path: Path) -> None:
+    clipped = np.clip(6 * ring(before=0.1), -1.0, 1.0)
+    recordings = {"a.wav": ring(before=0.1), "b.wav": clipped, "c.wav": ring(noise=0.2, before=0.1)}
+    folder = fill(tmp_path / "filled", replace=recordings)
+    told = book(folder).describe()["strikes"]
+    for found, expected in zip(told, check(folder).recordings, strict=True):
+        assert found["warnings"] == list(expected.problems)
+        assert found["peak_db"] == expected.peak_db
+        judged = book(folder).judge((folder / expected.file).read_bytes())
+        for name in ("readable", "seconds", "sample_rate", "peak_db", "clipped", "onset_seconds"):
+            assert judged[name] == found[name]
+    assert told[1]["clipped"] > 10
+    assert "turn the gain down" in told[1]["warnings"][0]
+
+
+def test_judging_writes_nothing(tmp_path: Path) -> None:
+    book(tmp_path).judge(blow())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_retry_writes_nothing_twice(tmp_path: Path) -> None:
+    strikes = book(tmp_path)
+    first = strikes.add(blow(), place(0.1), key=key(0))
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert strikes.add(blow(), place(0.1), key=key(0)) == first
+    # A server that was started anew knows it as well.
+    assert StrikeBook(tmp_path).add(blow(), place(0.1), key=key(0)) == first
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert strikes.add(blow(), place(0.1), key=key(1))["file"] == "002.wav"
+
+
+@pytest.mark.parametrize("broken", ["_write_recording", "_write_table"])
+def test_what_broke_off_is_finished_by_the_retry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str) -> None:
+    strikes = book(tmp_path)
+    strikes.add(blow(1), place(0.3), key=key(1))
+
+    def fail(*arguments: object) -> None:
+        raise OSError("the power went")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(StrikeBook, broken, fail)
+        with pytest.raises(OSError, match="power"):
+            strikes.add(blow(), place(0.1), key=key(0))
+    assert len(table(tmp_path)) == 2
+    again = StrikeBook(tmp_path).add(blow(), place(0.1), key=key(0))
+    assert again["file"] == "002.wav"
+    assert [row[0] for row in table(tmp_path)] == ["file", "001.wav", "002.wav"]
+    assert sorted(path.name for path in tmp_path.glob("*.wav")) == ["001.wav", "002.wav"]
+
+
+def test_one_key_is_one_strike(tmp_path: Path) -> None:
+    strikes = book(tmp_path)
+    strikes.add(blow(), place(0.1), key=key(0))
+    for content, where in ((blow(1), place(0.1)), (blow(), place(0.2))):
+        with pytest.raises(RefusedError, match="used for another strike") as refused:
+            strikes.add(content, where, key=key(0))
+        assert refused.value.status == 409
+    for bad in ("", "short", "x" * 200, "with spaces and\n"):
+        with pytest.raises(RefusedError, match="Idempotency-Key: expected 8 to 128"):
+            strikes.add(blow(), place(0.1), key=bad)
+    assert len(table(tmp_path)) == 2
+
+
+def test_redoing_keeps_the_row_and_the_recording_before(tmp_path: Path) -> None:
+    strikes = book(tmp_path)
+    for number in range(2):
+        strikes.add(blow(number), place(0.1 * number), key=key(number))
+    rows = table(tmp_path)
+    redone = strikes.redo("001.wav", blow(7))
+    assert redone["row"] == 0
+    assert (tmp_path / "001.wav").read_bytes() == blow(7)
+    assert table(tmp_path) == rows
+    [kept] = (tmp_path / ".avmsf" / "removed").iterdir()
+    assert kept.read_bytes() == blow(0)
+    with pytest.raises(CaptureError, match="not a sound file"):
+        strikes.redo("001.wav", b"hello")
+    assert (tmp_path / "001.wav").read_bytes() == blow(7)
+
+
+def test_what_is_taken_out_is_kept_aside_and_its_number_not_given_again(tmp_path: Path) -> None:
+    strikes = book(tmp_path)
+    for number in range(3):
+        strikes.add(blow(number), place(0.1 * number), key=key(number))
+    strikes.remove("003.wav")
+    assert [row[0] for row in table(tmp_path)[1:]] == ["001.wav", "002.wav"]
+    assert not (tmp_path / "003.wav").exists()
+    [kept] = (tmp_path / ".avmsf" / "removed").iterdir()
+    assert kept.read_bytes() == blow(2)
+    with pytest.raises(RefusedError, match=r"003\.wav was taken out again"):
+        strikes.add(blow(2), place(0.2), key=key(2))
+    strikes.remove("001.wav")
+    with pytest.raises(RefusedError, match=r"003\.wav was taken out again"):
+        strikes.add(blow(2), place(0.2), key=key(2))
+    assert strikes.add(blow(3), place(0.3), key=key(3))["file"] == "004.wav"
+    for file in ("002.wav", "004.wav"):
+        strikes.remove(file)
+    assert not (tmp_path / "impacts.csv").exists()
+    assert strikes.describe()["strikes"] == []
+
+
+@pytest.mark.parametrize("file", ["004.wav", "../a.wav", "/etc/passwd", "capture.toml", "impacts.csv", ""])
+def test_only_recordings_of_the_table_can_be_touched(tmp_path: Path, file: str) -> None:
+    folder = fill(tmp_path / "filled", settings="seconds = 0.3")
+    (tmp_path / "a.wav").write_bytes(blow())
+    for act in (lambda: book(folder).remove(file), lambda: book(folder).redo(file, blow())):
+        with pytest.raises(RefusedError, match=r"expected a recording of impacts\.csv"):
+            act()
+    assert (tmp_path / "a.wav").read_bytes() == blow()
+
+
+def test_a_link_out_of_the_folder_is_neither_read_nor_written(tmp_path: Path) -> None:
+    folder = fill(tmp_path / "filled")
+    outside = tmp_path / "outside.wav"
+    outside.write_bytes(blow(5))
+    (folder / "a.wav").unlink()
+    (folder / "a.wav").symlink_to(outside)
+    strikes = book(folder)
+    told = strikes.describe()["strikes"][0]
+    assert not told["readable"]
+    assert "outside the capture folder" in told["warnings"][0]
+    assert [strike.file for strike in strikes.strikes()] == ["b.wav", "c.wav"]
+    with pytest.raises(RefusedError, match="outside the capture folder"):
+        strikes.redo("a.wav", blow())
+    with pytest.raises(RefusedError, match="outside the capture folder"):
+        strikes.remove("a.wav")
+    assert outside.read_bytes() == blow(5)
+
+
+def test_a_table_of_the_users_own_keeps_its_unit_columns_and_order(tmp_path: Path) -> None:
+    header, rows = "Name;file;z;x;y", ("first;a.wav;0;0,1;0", "second;b.wav;0;0;20", "third;c.wav;30;0;0")
+    folder = fill(tmp_path / "filled", header=header, rows=rows, settings='unit = "cm"')
+    added = book(folder).add(blow(3), Place((0.11, 0.02, 0.3)), key=key(0))
+    assert added["contact"] == pytest.approx((0.11, 0.02, 0.3), abs=1e-15)
+    text = (folder / "impacts.csv").read_text().splitlines()
+    assert text[1] == "first;a.wav;0;0,1;0"
+    assert text[4].split(";")[:2] == ["", "001.wav"]
+    assert [float(cell) for cell in text[4].split(";")[2:]] == pytest.approx([30, 11, 2], abs=1e-12)
+
+
+def test_every_row_has_what_the_table_has_columns_for(tmp_path: Path) -> None:
+    strikes = book(tmp_path)
+    strikes.add(blow(), place(0.1), key=key(0))
+    with pytest.raises(RefusedError, match="every row has a direction and this strike has none"):
+        strikes.add(blow(), place(0.2, direction=None), key=key(1))
+    forced = book(tmp_path / "forced")
+    forced.add(blow(), Place((0.1, 0.0, 0.0), None, 12.5), key=key(0))
+    with pytest.raises(RefusedError, match="every row has a force"):
+        forced.add(blow(), place(0.2, direction=None), key=key(1))
+    assert table(tmp_path / "forced")[1] == ["001.wav", "0.10000000000000001", "0", "0", "12.5"]
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        ({}, "expected the contact as x, y and z"),
+        ({"x": "1", "y": "2"}, "z: expected a number, found 'none'"),
+        ({"x": "=HYPERLINK()", "y": "0", "z": "0"}, "x: expected a number, found '=HYPERLINK"),
+        ({"x": "nan", "y": "0", "z": "0"}, "x: expected a number, found 'nan'"),
+        ({"x": "1e9", "y": "0", "z": "0"}, "within 100 m of the origin"),
+        ({"x": "0", "y": "0", "z": "0", "nx": "1"}, "ny: expected a number"),
+        ({"x": "0", "y": "0", "z": "0", "nx": "0", "ny": "0", "nz": "0"}, "found the zero vector"),
+        ({"x": "0", "y": "0", "z": "0", "newtons": "-3"}, "a peak force above 0, found -3"),
+    ],
+)
+def test_places_are_numbers_and_nothing_else(query: dict[str, str], message: str) -> None:
+    with pytest.raises(RefusedError, match=message) as refused:
+        Place.read(query)
+    assert refused.value.status == 400
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "not a sound file"),
+        (b"RIFF\x00\x00\x00\x00WAVE", "not a sound file"),
+        (b"<html>", "not a sound file"),
+        (wav(np.zeros(4000)), "silent"),
+        (wav(ring(0.01)), "too short"),
+        (wav(np.full(4000, np.nan)), "not finite"),
+        (wav(np.stack([ring(seed=0), ring(seed=1)], axis=1)), "2 different channels"),
+        (blow()[:60], "no samples|not a sound file|too short"),
+    ],
+)
+def test_a_recording_that_cannot_be_used_is_refused_in_words(tmp_path: Path, content: bytes, message: str) -> None:
+    strikes = book(tmp_path)
+    for act in (lambda: strikes.judge(content), lambda: strikes.add(content, place(0.1), key=key(0))):
+        with pytest.raises(CaptureError, match=message):
+            act()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_rate_is_refused_at_once(tmp_path: Path) -> None:
+    strikes = book(tmp_path)
+    strikes.add(blow(), place(0.1), key=key(0))
+    with pytest.raises(CaptureError, match="expected 8000 Hz, as the 1 recordings before, found 16000 Hz"):
+        strikes.judge(wav(ring(rate=16000), rate=16000))
+    # Where it is the only one it may change.
+    assert strikes.redo("001.wav", wav(ring(rate=16000), rate=16000))["sample_rate"] == 16000
+
+
+def test_another_format_becomes_a_wav_of_the_same_samples(tmp_path: Path) -> None:
+    sound = np.round(ring(before=0.1) * 32768) / 32768
+    book(tmp_path).add(wav(sound, subtype="PCM_16", kind="FLAC"), place(0.1), key=key(0))
+    content = (tmp_path / "001.wav").read_bytes()
+    assert content[:4] == b"RIFF"
+    samples, rate = soundfile.read(io.BytesIO(content))
+    assert rate == 8000
+    assert np.array_equal(samples, sound)
+
+
+def test_a_broken_table_is_left_alone(tmp_path: Path) -> None:
+    folder = fill(tmp_path / "filled", rows=("a.wav,1,2",))
+    before = (folder / "impacts.csv").read_bytes()
+    for act in (
+        lambda: book(folder).describe(),
+        lambda: book(folder).add(blow(), place(0.1), key=key(0)),
+        lambda: book(folder).remove("a.wav"),
+    ):
+        with pytest.raises(AvmsfError, match="3 cells where the header has 4"):
+            act()
+    assert (folder / "impacts.csv").read_bytes() == before
+
+
+def test_a_journal_that_was_damaged_costs_no_recording(tmp_path: Path) -> None:
+    strikes = book(tmp_path)
+    strikes.add(blow(), place(0.1), key=key(0))
+    (tmp_path / ".avmsf" / capturing.JOURNAL).write_text("{")
+    assert strikes.add(blow(1), place(0.2), key=key(1))["file"] == "002.wav"
+    assert (tmp_path / "001.wav").read_bytes() == blow()
+    assert json.loads((tmp_path / ".avmsf" / capturing.JOURNAL).read_text())[key(1)]["file"] == "002.wav"

@@ -1,0 +1,157 @@
+"""Jobs: what is heard of them, that one runs at a time, and that nothing of them is left."""
+
+import asyncio
+import sys
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from avmsf.errors import CaptureError
+from avmsf.studio.jobs import Job, Jobs
+from avmsf.studio.refusal import RefusedError
+
+
+def script(text: str) -> tuple[str, ...]:
+    start = "import json, os, subprocess, sys, time\ndef say(**event): print(json.dumps(event), flush=True)\n"
+    return (sys.executable, "-c", start + text)
+
+
+async def same(result: Any) -> Any:
+    return {"taken": result}
+
+
+def run(text: str, *, finish: Callable[[Any], Awaitable[Any]] = same) -> list[Any]:
+    async def all_events() -> list[Any]:
+        job = Job("test", {"task": "x", "size": 3}, finish, script(text))
+        task = asyncio.create_task(job.run())
+        events = [event async for _, event in job.listen()]
+        await task
+        return events
+
+    return asyncio.run(all_events())
+
+
+def test_events_come_in_order_and_the_result_last() -> None:
+    text = "task = json.loads(input())\nfor n in range(task['size']): say(stage='count', done=n)\nsay(result={'n': 3})"
+    counted = [{"stage": "count", "done": number} for number in range(3)]
+    assert run(text) == [*counted, {"taken": {"n": 3}}]
+
+
+def test_what_libraries_print_is_no_event() -> None:
+    assert run("print('Loading weights: 100%'); print('[1, 2]'); say(result={})") == [{"taken": {}}]
+
+
+def test_a_job_that_fails_says_why() -> None:
+    assert run("say(error='expected two strikes, found one')") == [{"error": "expected two strikes, found one"}]
+    [last] = run("raise MemoryError('no more')")
+    assert last["error"] == "test ended with status 1 and no result: MemoryError: no more"
+    [killed] = run("os.kill(os.getpid(), 9)")
+    assert killed["error"] == "test ended with status -9 and no result: it said nothing"
+
+
+def test_a_result_that_cannot_be_used_is_an_error() -> None:
+    async def refuse(result: Any) -> Any:
+        raise CaptureError("the field\n cannot be read")
+
+    assert run("say(result={})", finish=refuse) == [{"error": "the field cannot be read"}]
+
+
+def test_who_comes_later_hears_what_was_missed() -> None:
+    async def listen() -> tuple[list[Any], list[Any]]:
+        job = Job("test", {}, same, script("for n in range(4): say(done=n)\nsay(result={})"))
+        await job.run()
+        whole = [number async for number, _ in job.listen()]
+        return whole, [number async for number, _ in job.listen(after=3)]
+
+    assert asyncio.run(listen()) == ([0, 1, 2, 3, 4], [3, 4])
+
+
+def alive(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+CHILDREN = (
+    "child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
+    "say(processes=[os.getpid(), child.pid])\n"
+)
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are looked up in /proc")
+@pytest.mark.parametrize("stubborn", ["", "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"])
+def test_cancelling_ends_all_processes(stubborn: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avmsf.studio.jobs._GRACE", 0.3)
+
+    async def cancel() -> list[Any]:
+        jobs = Jobs()
+        job = jobs.start("test", {}, same, script(f"{stubborn}{CHILDREN}time.sleep(60)"))
+        async for _ in job.listen():
+            break
+        await job.cancel()
+        return job.events
+
+    begun = time.monotonic()
+    first, last = asyncio.run(cancel())
+    assert time.monotonic() - begun < 5
+    assert last == {"stage": "cancelled", "words": "stopped"}
+    time.sleep(0.05)
+    assert not any(alive(process) for process in first["processes"])
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are looked up in /proc")
+def test_closing_ends_what_runs() -> None:
+    async def close() -> list[Any]:
+        jobs = Jobs()
+        job = jobs.start("test", {}, same, script(f"{CHILDREN}time.sleep(60)"))
+        async for _ in job.listen():
+            break
+        await jobs.close()
+        return job.events
+
+    first, last = asyncio.run(close())
+    assert last["stage"] == "cancelled"
+    time.sleep(0.05)
+    assert not any(alive(process) for process in first["processes"])
+
+
+def test_one_job_runs_at_a_time() -> None:
+    async def start_two() -> None:
+        jobs = Jobs()
+        first = jobs.start("reconstruct", {}, same, script("time.sleep(60)"))
+        with pytest.raises(RefusedError, match="reconstruct is under way") as refused:
+            jobs.start("lead the sound", {}, same, script(""))
+        assert (refused.value.status, refused.value.more) == (409, {"job": first.identifier})
+        assert jobs.current is first
+        await first.cancel()
+        second = jobs.start("lead the sound", {}, same, script("say(result={})"))
+        assert [event async for _, event in second.listen()] == [{"taken": {}}]
+        assert jobs.current is None
+        with pytest.raises(RefusedError, match="no such job"):
+            jobs.named("another")
+
+    asyncio.run(start_two())
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are looked up in /proc")
+def test_a_worker_ends_where_its_server_was_killed() -> None:
+    source = "from avmsf.studio.lifeline import end_with_server\nimport os, time, threading\n"
+    source += "threading.Thread(target=end_with_server).start()\nprint(os.getpid(), flush=True)\ntime.sleep(60)"
+    command = [sys.executable, "-c", source]
+
+    async def orphan() -> int:
+        process = await asyncio.create_subprocess_exec(
+            *command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, start_new_session=True
+        )
+        assert process.stdin is not None
+        assert process.stdout is not None
+        number = int(await process.stdout.readline())
+        process.stdin.close()
+        return await asyncio.wait_for(process.wait(), 5) if alive(number) else -9
+
+    assert asyncio.run(orphan()) == -9

@@ -1,0 +1,591 @@
+"""The page in a browser: what is clicked is struck, what is painted is true, and nothing is lost or overwritten."""
+
+import base64
+import contextlib
+import io
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+from page_plate import RATE, SIDES, lay_out, page_modules, plate_object, plate_shapes, plate_strikes, plate_table
+
+from avmsf.export.sampledfield import SampledField
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page, Request, Route
+
+SPACING = SIDES[0] / 30
+"""Between neighbouring contacts, metres."""
+FIELD_ABILITIES = ["locate", "edit", "save", "like"]
+LIVE = {"revision": 1, "undo": False, "abilities": FIELD_ABILITIES, "mode": "field", "rows": [0, 1, 2, 3, 4, 5]}
+LIVE_CAPTURE = {"revision": 1, "undo": False, "abilities": ["capture", "reconstruct"], "mode": "capture", "job": None}
+Serve = Callable[..., str]
+Open = Callable[..., "Page"]
+
+
+@pytest.fixture(scope="session")
+def modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return page_modules(tmp_path_factory.mktemp("npm"))
+
+
+@pytest.fixture(scope="session")
+def site(serve: Callable[[Path], str], modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Serve:
+    """Return a function that gives the address of the plate's page; the same one twice for the same wishes."""
+    known: dict[str, str] = {}
+
+    def address(kind: str = "points", *, strikes: bool = False, live: dict[str, Any] | None = None) -> str:
+        name = repr((kind, strikes, live))
+        if name not in known:
+            folder = tmp_path_factory.mktemp("page")
+            table = plate_table()
+            shown = plate_object(kind, tmp_path_factory.mktemp("object"))
+            measured = plate_strikes(table) if strikes else None
+            known[name] = serve(lay_out(folder / "site", table, modules, object=shown, strikes=measured, live=live))
+        return known[name]
+
+    return address
+
+
+@contextlib.contextmanager
+def visiting(browser: "Browser", site: Serve) -> Iterator[Open]:
+    """Yield a function that opens the plate's page in a browser of its own, after `before(page)`."""
+    with contextlib.ExitStack() as opened:
+
+        def visit(*, before: Callable[["Page"], Any] | None = None, viewport: Any = None, **wishes: Any) -> "Page":
+            context = browser.new_context(viewport=viewport or {"width": 900, "height": 600})
+            opened.callback(context.close)
+            page = context.new_page()
+            page.set_default_timeout(10_000)
+            if before is not None:
+                before(page)
+            page.goto(site(**wishes))
+            page.evaluate("window.avmsf.ready.then(() => null)")
+            return page
+
+        yield visit
+
+
+@pytest.fixture
+def visit(browser: "Browser", site: Serve) -> Iterator[Open]:
+    with visiting(browser, site) as visit:
+        yield visit
+
+
+@pytest.fixture(scope="module")
+def plain(browser: "Browser", site: Serve) -> Iterator["Page"]:
+    """Return one page of the plate's contacts without a server, for tests that leave nothing behind."""
+    with visiting(browser, site) as visit:
+        yield visit()
+
+
+def on_screen(page: "Page", place: Any) -> tuple[float, float]:
+    where = page.evaluate("(place) => window.avmsf.project(place)", [float(value) for value in place])
+    return where["x"], where["y"]
+
+
+def last_place(page: "Page") -> torch.Tensor:
+    """Return where the last blow fell, metres."""
+    return torch.tensor(page.evaluate("avmsf.studio.view.placeOf(avmsf.studio.last.row)"))
+
+
+def words_on(page: "Page", kind: str = ".word") -> str:
+    return " ".join(page.locator(f"#words {kind}").all_inner_texts())
+
+
+def wav(seconds: float = 0.5) -> bytes:
+    memory = io.BytesIO()
+    time = np.arange(round(seconds * RATE)) / RATE
+    soundfile.write(memory, 0.5 * np.exp(-9 * time) * np.sin(2600 * time), round(RATE), "PCM_16", format="WAV")
+    return memory.getvalue()
+
+
+def upload(name: str = "blow.wav", content: bytes | None = None) -> Any:
+    return {"name": name, "mimeType": "audio/wav", "buffer": wav() if content is None else content}
+
+
+def packed(values: torch.Tensor) -> str:
+    return base64.b64encode(values.float().numpy().astype("<f4").tobytes()).decode()
+
+
+def answer(route: "Route", content: Any, status: int = 200) -> None:
+    route.fulfill(status=status, content_type="application/json", body=json.dumps(content))
+
+
+@pytest.mark.parametrize("kind", ["mesh", "gaussians", "points"])
+def test_a_click_strikes_the_contact_that_it_shows_and_a_mode_is_painted_by_its_gain(visit: Open, kind: str) -> None:
+    page = visit(kind=kind)
+    for place in [(0.0, 0.0, 0.01), (0.09, 0.05, 0.01), (-0.085, -0.045, 0.01)]:
+        page.mouse.click(*on_screen(page, place))
+        # The plate is thinner than contacts are apart, so the wrong face would be as near.
+        assert (last_place(page) - torch.tensor(place)).norm() < SPACING
+    page.mouse.click(30, 550)
+    assert (last_place(page) - torch.tensor(place)).norm() < SPACING, "beside the object nothing is struck"
+    expect_painted(page, kind)
+
+
+def test_dragging_turns_and_does_not_strike(plain: "Page") -> None:
+    page = plain
+    page.click("#look")
+    x, y = on_screen(page, (0.0, 0.0, 0.01))
+    before, before_row = on_screen(page, (0.1, 0.0, 0.01)), page.evaluate("avmsf.studio.last?.row")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 80, y, steps=4)
+    page.mouse.up()
+    assert page.evaluate("avmsf.studio.last?.row") == before_row
+    assert np.hypot(*np.subtract(on_screen(page, (0.1, 0.0, 0.01)), before)) > 20
+
+
+def test_a_longer_press_strikes_harder(plain: "Page") -> None:
+    page = plain
+    page.click("#look")
+    page.mouse.move(*on_screen(page, (0.0, 0.0, 0.01)))
+    forces = []
+    for milliseconds in (0, 600, 1450):
+        page.mouse.down()
+        page.wait_for_timeout(milliseconds)
+        page.mouse.up()
+        forces.append(page.evaluate("avmsf.studio.last.force"))
+    assert forces[0] == 1.0
+    assert 1.5 < forces[1] < 9.0
+    assert forces[2] == 10.0
+
+
+def test_keys_turn_and_strike_what_is_in_the_middle(plain: "Page") -> None:
+    page = plain
+    page.click("#look")
+    page.locator("#stage canvas").focus()
+    before = on_screen(page, (0.1, 0.0, 0.01))
+    page.keyboard.press("Enter")
+    # The eye looks at the plate's middle from 0.75, -1, 0.85, and meets its face on the way.
+    met = torch.tensor([0.75, -1.0, 0.85]) * 0.01 / 0.85
+    assert (last_place(page) - met).norm() < SPACING
+    page.keyboard.press("ArrowRight")
+    assert np.hypot(*np.subtract(on_screen(page, (0.1, 0.0, 0.01)), before)) > 5
+
+
+def expect_painted(page: "Page", kind: str) -> None:
+    page.click("#tab-modes")
+    page.click("tr[data-mode='2']")
+    painted = page.evaluate(
+        "(({ values, colours }) => ({ values: [...values], colours: [...colours] }))(avmsf.painted())"
+    )
+    values, shape = torch.tensor(painted["values"]), plate_shapes(plate_table().points)[:, 2]
+    sign = torch.sign(values @ shape)
+    torch.testing.assert_close(values * sign, shape, atol=1e-6, rtol=0)
+    colours = torch.tensor(painted["colours"]).reshape(-1, 3)
+    # One end of the scale is red, the other blue; and the picture has them where the shape is greatest.
+    high, low = int(values.argmax()), int(values.argmin())
+    assert colours[high, 0] > 1.5 * colours[high, 2]
+    assert colours[low, 2] > 1.5 * colours[low, 0]
+    page.wait_for_timeout(900 if kind == "gaussians" else 150)
+    corner = torch.tensor([0.112, 0.072, 0.01])
+    for turn in (1.0, -1.0):
+        place = corner * torch.tensor([1.0, turn, 1.0])
+        positive = bool(plate_shapes(place[None])[0, 2] * sign > 0)
+        red, blue = pixel(page, *on_screen(page, place))
+        assert (red > blue) == positive
+        assert max(red, blue) > 1.3 * min(red, blue)
+    page.click("#unpaint")
+    assert page.evaluate("avmsf.painted()") is None
+
+
+def pixel(page: "Page", x: float, y: float) -> tuple[float, float]:
+    """Return red and blue of the screen about a place."""
+    from PIL import Image
+
+    shot = page.screenshot(clip={"x": x - 2, "y": y - 2, "width": 4, "height": 4})
+    colours = np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), dtype=float).mean(axis=(0, 1))
+    return float(colours[0]), float(colours[2])
+
+
+def test_the_table_tells_pitch_decay_and_level_at_the_contact(plain: "Page") -> None:
+    page = plain
+    row = page.evaluate("avmsf.strike([-0.12, -0.08, 0.01])")
+    page.click("#tab-modes")
+    cells = [float(text) for text in page.locator("tr[data-mode='3'] td").all_inner_texts()]
+    table = plate_table()
+    level = 20 * float((table.sine[row, 3].abs() / table.sine[row].abs().max()).log10())
+    assert cells == pytest.approx([3, 1600.0, 6.9078 / 16.0, level], abs=0.06)
+    page.click("th[data-column='level'] button")
+    first = page.locator("tbody tr").first.get_attribute("data-mode")
+    assert first == str(int(table.sine[row].abs().argmax()))
+
+
+def test_the_page_renders_what_python_does(plain: "Page") -> None:
+    page = plain
+    row = 40
+    sound = page.evaluate(f"avmsf.renderOffline([{{ row: {row}, force: 2 }}], 0.25).then((sound) => [...sound])")
+    expected = plate_table().render(torch.tensor([row]), force=2.0)[0, : len(sound)]
+    assert (torch.tensor(sound) - expected).abs().max() < 1e-4 * expected.abs().max()
+
+
+def test_a_dropped_recording_is_located_and_painted(visit: Open) -> None:
+    sent: list[bytes] = []
+    table = plate_table()
+    probability = torch.exp(-((table.points - table.points[77]).norm(dim=1) ** 2) / 0.0004)
+    probability /= probability.sum()
+    blow = {
+        "place": table.points[77].tolist(),
+        "row": 77,
+        "probability": packed(probability),
+        "distance": packed(1 - probability),
+        "region": {"level": 0.9, "radius_metres": 0.012, "share": 0.031},
+        "explained": 0.97,
+        "ambiguous": True,
+        "counterparts": [{"place": table.points[300].tolist(), "probability": 0.2, "words": "mirrored"}],
+        "notes": ["Quiet: the answer is less sure."],
+    }
+
+    def locate(route: "Route", request: "Request") -> None:
+        sent.append(request.post_data_buffer or b"")
+        answer(route, {"blows": [blow]})
+
+    page = visit(live=LIVE, before=lambda page: page.route("**/locate", locate))
+    page.evaluate(
+        """(text) => {
+             const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+             const dataTransfer = new DataTransfer();
+             dataTransfer.items.add(new File([bytes], "blow.wav", { type: "audio/wav" }));
+             window.dispatchEvent(new DragEvent("drop", { dataTransfer, cancelable: true }));
+           }""",
+        base64.b64encode(wav()).decode(),
+    )
+    page.wait_for_selector("#sheet-find dl")
+    assert sent == [wav()]
+    values = torch.tensor(page.evaluate("[...avmsf.painted().values]"))
+    expected = 1 + (probability / probability.max()).clamp(min=1e-4).log10() / 4
+    torch.testing.assert_close(values, expected, atol=1e-5, rtol=0)
+    text = page.inner_text("#sheet-find")
+    for words in ("12.0 mm", "3.1 % of the surface", "97 %", "20 %: mirrored", "Quiet: the answer is less sure."):
+        assert words in text
+    box = page.locator(".mark .label", has_text="or here").bounding_box()
+    x, y = on_screen(page, table.points[300])
+    assert box is not None
+    assert abs(box["y"] + box["height"] / 2 - y) < 3
+    assert 0 < box["x"] - x < 30
+
+
+class EditServer:
+    """Answers the page's edits as the studio does, and remembers what it was asked."""
+
+    def __init__(self, page: "Page", first: dict[str, Any], edited: dict[str, Any]) -> None:
+        self.asked: list[tuple[str, dict[str, Any]]] = []
+        self.revision, self.taken = 1, set[str]()
+        self.first, self.edited = first, edited
+        page.route("**/manifest.json", lambda route: answer(route, self.manifest()))
+        page.route("**/edited.bin", lambda route: route.fulfill(body=self.edited["content"]))
+        for what in ("edit", "undo", "save"):
+            page.route(f"**/{what}", self.hear)
+
+    def manifest(self) -> dict[str, Any]:
+        shown = self.first if self.revision == 1 else self.edited["manifest"]
+        return {**shown, "live": {**LIVE, "revision": self.revision, "undo": self.revision > 1}}
+
+    def hear(self, route: "Route", request: "Request") -> None:
+        what, words = request.url.rsplit("/", 1)[1], request.post_data_json
+        self.asked.append((what, words))
+        if words["base"] != self.revision:
+            answer(route, {"error": "expected the last revision", "revision": self.revision}, 409)
+        elif what == "save":
+            name = words["name"]
+            taken, _ = name in self.taken, self.taken.add(name)
+            answer(
+                route, {"error": f"{name} is there: choose another"} if taken else {"file": name}, 409 if taken else 201
+            )
+        else:
+            self.revision = self.revision + 1 if what == "edit" else 1
+            answer(route, {"revision": self.revision, "remarks": []})
+
+
+@pytest.fixture
+def edit_server(site: Serve, tmp_path: Path, modules: Path) -> Callable[["Page"], EditServer]:
+    def bundle_of(table: SampledField, name: str) -> dict[str, Any]:
+        folder = lay_out(tmp_path / name, table, modules)
+        return {
+            "manifest": json.loads((folder / "manifest.json").read_text()),
+            "content": (folder / "field.bin").read_bytes(),
+        }
+
+    first, edited = bundle_of(plate_table(), "first"), bundle_of(plate_table(pitch=1.25), "edited")
+    for tensor in edited["manifest"]["tensors"].values():
+        tensor["file"] = "edited.bin"
+    return lambda page: EditServer(page, first["manifest"], edited)
+
+
+def pitch_of_page(page: "Page") -> float:
+    """Return the first mode's pitch in what the page would play now, Hz."""
+    page.wait_for_function("avmsf.studio.engine.bundle === avmsf.studio.bundle")
+    sound = page.evaluate("avmsf.renderOffline([{ row: 0 }], 0.5).then((sound) => [...sound])")
+    spectrum = np.abs(np.fft.rfft(np.hanning(len(sound)) * np.array(sound)))
+    return float(np.argmax(spectrum[: round(700 * 0.5)]) / 0.5)
+
+
+def test_an_edit_is_heard_undone_and_saved(visit: Open, edit_server: Any) -> None:
+    servers: list[EditServer] = []
+    page = visit(live=LIVE, before=lambda page: servers.append(edit_server(page)))
+    (server,) = servers
+    assert pitch_of_page(page) == pytest.approx(400.0, abs=3)
+    page.click("#tab-edit")
+    page.locator("#sheet-edit .slider", has_text="Pitch").first.locator("input").focus()
+    page.keyboard.press("ArrowRight")
+    page.wait_for_function("avmsf.studio.revision === 2 && avmsf.studio.last !== undefined")
+    what, words = server.asked[0]
+    assert (what, words["base"], words["size"], words["modes"], words["material"]) == ("edit", 1, 1.0, [], None)
+    assert words["pitch"] == pytest.approx(4.0 ** (1 / 200), rel=1e-6)
+    assert pitch_of_page(page) == pytest.approx(500.0, abs=3)
+    page.fill("#sheet-edit input[type=text]", "higher")
+    page.click("text=Save as")
+    page.wait_for_selector("text=Saved: higher")
+    page.click("text=Save as")
+    page.wait_for_selector("text=higher is there: choose another")
+    page.click("#sheet-edit >> text=Undo")
+    page.wait_for_function("avmsf.studio.live.revision === 1")
+    assert pitch_of_page(page) == pytest.approx(400.0, abs=3)
+    assert [what for what, _ in server.asked] == ["edit", "save", "save", "undo"]
+
+
+def test_another_tabs_edit_is_not_overwritten_in_silence(visit: Open, edit_server: Any) -> None:
+    servers: list[EditServer] = []
+    page = visit(live=LIVE, before=lambda page: servers.append(edit_server(page)))
+    (server,) = servers
+    server.revision = 5
+    page.click("#tab-edit")
+    page.select_option("#sheet-edit select >> nth=1", "glass")
+    page.wait_for_selector("text=Another tab changed this field meanwhile")
+    assert [words["base"] for _, words in server.asked] == [1]
+    assert server.revision == 5
+    page.click("text=Put mine in its place")
+    page.wait_for_function("avmsf.studio.revision === 6")
+    assert server.asked[-1][1]["base"] == 5
+    assert server.asked[-1][1]["material"] == {"from": None, "to": "glass"}
+
+
+class CaptureServer:
+    """Answers capture mode as the studio does; `broken` cuts the line after the strike was written."""
+
+    def __init__(self, page: "Page") -> None:
+        self.strikes: dict[str, dict[str, Any]] = {}
+        self.asked: list[tuple[str, str]] = []
+        self.broken = False
+        page.route("**/capture", lambda route: answer(route, self.describe()))
+        page.route("**/capture/check", lambda route: answer(route, self.report()))
+        page.route("**/capture/strikes**", self.hear)
+        page.route("**/capture/strikes/**", self.change)
+        page.route("**/reconstruct", lambda route: answer(route, {"job": "j1"}, 202))
+        page.route("**/jobs/j1/events", self.tell)
+
+    def describe(self) -> dict[str, Any]:
+        return {"folder": "/captures/plate", "strikes": list(self.strikes.values()), "problems": [], "ready": True}
+
+    def report(self, **more: Any) -> dict[str, Any]:
+        report = {"seconds": 0.5, "peak_db": -6.0, "clipped": True, "onset_seconds": 0.004, "warnings": ["clipped"]}
+        return {**report, **more}
+
+    def hear(self, route: "Route", request: "Request") -> None:
+        key = request.headers["idempotency-key"]
+        self.asked.append((request.url.split("?")[1], key))
+        query = dict(part.split("=") for part in request.url.split("?")[1].split("&"))
+        if key not in self.strikes:
+            file = f"{len(self.strikes) + 1:03d}.wav"
+            contact = [float(query[axis]) for axis in "xyz"]
+            self.strikes[key] = self.report(file=file, contact=contact, direction=None, row=0)
+        if self.broken:
+            route.abort()
+        else:
+            answer(route, self.strikes[key], 201)
+
+    def change(self, route: "Route", request: "Request") -> None:
+        self.asked.append((request.method, request.url.rsplit("/", 1)[1]))
+        if request.method == "DELETE":
+            self.strikes = {key: each for key, each in self.strikes.items() if not request.url.endswith(each["file"])}
+        answer(route, {})
+
+    def tell(self, route: "Route") -> None:
+        events = [{"stage": "fit", "done": 3, "total": 9, "words": "loss 0.1"}, {"field": "/captures/plate/field"}]
+        body = "".join(f"id: {number}\ndata: {json.dumps(event)}\n\n" for number, event in enumerate(events))
+        route.fulfill(content_type="text/event-stream", body=body)
+
+
+def take_strike(page: "Page", place: tuple[float, float, float]) -> None:
+    page.mouse.click(*on_screen(page, place))
+    page.set_input_files("#sheet-capture input[type=file]", upload())
+    page.wait_for_selector("#sheet-capture dl")
+
+
+def test_a_capture_is_made_redone_and_reconstructed(visit: Open) -> None:
+    servers: list[CaptureServer] = []
+    page = visit(live=LIVE_CAPTURE, before=lambda page: servers.append(CaptureServer(page)))
+    (server,) = servers
+    assert page.is_disabled("text=● Record")
+    assert page.is_disabled("text=Make the sound field")
+    take_strike(page, (0.04, 0.04, 0.01))
+    text = page.inner_text("#sheet-capture dl")
+    for words in ("-6.0 dB", "the loudest samples are cut off", "at 4.00 ms", "500 ms"):
+        assert words in text
+    assert server.asked == [], "nothing is written before it is kept"
+    page.click("text=Keep it")
+    page.wait_for_selector("text=1 strike")
+    query = dict(part.split("=") for part in server.asked[0][0].split("&"))
+    assert [float(query[axis]) for axis in "xyz"] == pytest.approx([0.04, 0.04, 0.01], abs=SPACING)
+    assert [float(query[f"n{axis}"]) for axis in "xyz"] == pytest.approx([0, 0, -1]), "blows go into the surface"
+    take_strike(page, (-0.04, 0.0, 0.01))
+    page.click("text=Keep it")
+    page.wait_for_selector("text=2 strikes")
+    page.click("[aria-label='Record 001.wav again']")
+    page.set_input_files("#sheet-capture input[type=file]", upload())
+    page.click("text=Put it in place")
+    page.wait_for_function("document.querySelector('#sheet-capture .main').disabled")
+    assert server.asked[-1] == ("PUT", "001.wav")
+    page.click("text=Make the sound field")
+    page.wait_for_selector("text=avmsf studio /captures/plate/field")
+    page.on("dialog", lambda dialog: dialog.accept())
+    page.click("[aria-label='Take 002.wav out']")
+    page.wait_for_selector("text=1 strike")
+    assert server.asked[-1] == ("DELETE", "002.wav")
+
+
+def test_a_recording_outlives_a_broken_connection_and_a_reload(visit: Open) -> None:
+    servers: list[CaptureServer] = []
+    page = visit(live=LIVE_CAPTURE, before=lambda page: servers.append(CaptureServer(page)))
+    (server,) = servers
+    server.broken = True
+    take_strike(page, (0.04, 0.04, 0.01))
+    page.click("text=Keep it")
+    page.wait_for_selector("text=The recording is not lost")
+    assert page.locator("text=A recording waits for the server").count() == 1
+    page.reload()
+    page.wait_for_selector("text=A recording waits for the server")
+    server.broken = False
+    page.click("text=Send again")
+    page.wait_for_selector("text=1 strike")
+    assert page.locator("text=A recording waits for the server").count() == 0
+    assert len({key for _, key in server.asked}) == 1, "sent again under the same key"
+    assert len(server.asked) >= 2
+    assert len(server.strikes) == 1
+
+
+def test_the_microphone_records_what_is_heard(visit: Open) -> None:
+    sent: list[bytes] = []
+
+    def locate(route: "Route", request: "Request") -> None:
+        sent.append(request.post_data_buffer or b"")
+        answer(route, {"blows": []})
+
+    def before(page: "Page") -> None:
+        page.route("**/locate", locate)
+        page.add_init_script(
+            """navigator.mediaDevices.getUserMedia = async () => {
+                 const context = new AudioContext();
+                 const sine = new OscillatorNode(context, { frequency: 500 });
+                 const heard = new MediaStreamAudioDestinationNode(context, { channelCount: 1 });
+                 sine.connect(heard);
+                 sine.start();
+                 return heard.stream;
+               };"""
+        )
+
+    page = visit(live=LIVE, before=before)
+    page.click("#tab-find")
+    page.click("text=● Record")
+    page.wait_for_selector("text=blow heard")
+    page.wait_for_timeout(300)
+    page.click("text=■ Stop")
+    page.wait_for_selector("text=No blow was heard in it")
+    samples, rate = soundfile.read(io.BytesIO(sent[0]))
+    assert samples.ndim == 1
+    assert len(samples) > 0.2 * rate
+    spectrum = np.abs(np.fft.rfft(samples[-round(0.2 * rate) :]))
+    assert np.argmax(spectrum) / 0.2 == pytest.approx(500, abs=10)
+
+
+def test_a_measured_strike_is_compared_with_the_model(visit: Open) -> None:
+    page = visit(strikes=True)
+    page.click("#sheet-strike >> text=100.wav")
+    page.wait_for_function("document.getElementById('blow-facts').textContent.includes('recording and model')")
+    assert page.locator(".mark .dot[data-strike]").count() == 2
+    assert page.locator(".mark .dot[data-strike].chosen").count() == 1
+    page.uncheck("text=Mark them on the object")
+    assert page.locator(".mark .dot[data-strike]").count() == 0
+
+
+def test_a_page_without_a_server_offers_nothing_that_needs_one(plain: "Page") -> None:
+    page = plain
+    assert page.locator("#tabs button").all_inner_texts() == ["Strike", "Modes"]
+
+
+def block_webgl(page: "Page") -> None:
+    page.add_init_script(
+        """const get = HTMLCanvasElement.prototype.getContext;
+           HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+             return kind.startsWith("webgl") ? null : get.call(this, kind, ...more);
+           };"""
+    )
+
+
+def block_audio(page: "Page") -> None:
+    page.add_init_script("delete window.AudioContext; delete window.AudioWorkletNode;")
+
+
+@pytest.mark.parametrize(
+    ("before", "said"),
+    [
+        (block_webgl, "This browser shows no 3D"),
+        (lambda page: page.route("**/modules/**", lambda route: route.abort()), "The 3D library could not be loaded"),
+        (block_audio, "There is no sound"),
+    ],
+    ids=["webgl", "three", "audio"],
+)
+def test_what_the_browser_lacks_is_said_and_the_rest_works(visit: Open, before: Any, said: str) -> None:
+    page = visit(before=before)
+    assert said in words_on(page, ".bad")
+    page.click("text=Strike somewhere")
+    assert page.evaluate("avmsf.studio.last.force") == 1
+    page.click("#tab-modes")
+    assert page.locator("tbody tr").count() == 6
+
+
+def test_what_goes_wrong_with_a_recording_is_told(visit: Open) -> None:
+    def before(page: "Page") -> None:
+        page.route("**/locate", lambda route: route.abort())
+        page.add_init_script(
+            "navigator.mediaDevices.getUserMedia = () => Promise.reject(new DOMException('no', 'NotAllowedError'));"
+        )
+
+    page = visit(live=LIVE, before=before)
+    page.click("#tab-find")
+    page.set_input_files("#sheet-find input[type=file]", upload("song.mp3", b"ID3 and so on, no wav"))
+    page.wait_for_selector("text=song.mp3: expected a WAV file")
+    page.set_input_files("#sheet-find input[type=file]", upload())
+    page.wait_for_selector("text=The server does not answer")
+    page.click("text=● Record")
+    page.wait_for_selector("text=does not let this page use the microphone")
+
+
+def test_a_field_without_geometry_is_told(visit: Open) -> None:
+    def empty(page: "Page") -> None:
+        def bend(route: "Route") -> None:
+            manifest = route.fetch().json()
+            for name in ("points", "normals", "sine"):
+                manifest["tensors"][name]["shape"][0] = 0
+            answer(route, {**manifest, "points": 0})
+
+        page.route("**/manifest.json", bend)
+
+    page = visit(before=empty)
+    assert "This field has no geometry" in words_on(page, ".bad")
+
+
+def test_all_fits_on_a_telephone(visit: Open) -> None:
+    page = visit(live=LIVE, viewport={"width": 390, "height": 760})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.mouse.click(*on_screen(page, (0.0, 0.0, 0.01)))
+    assert last_place(page).norm() < 0.02
+    for name in ("modes", "find", "edit"):
+        page.click(f"#tab-{name}")
+        assert page.evaluate("document.getElementById('sheets').scrollWidth") <= 390

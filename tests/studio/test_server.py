@@ -1,0 +1,413 @@
+"""The server as the page uses it: struck, located, edited, recorded, and ended."""
+
+import base64
+import io
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+import trimesh
+from opened_plate import RATE, blow, open_plate, plate_field, wav
+from served import Served, served
+
+from avmsf.cli import main
+from avmsf.errors import AvmsfError, StudioError
+from avmsf.field.store import load, save
+from avmsf.simulate.material import CERAMIC, WOOD
+from avmsf.studio import modules, server, studio
+from avmsf.studio.modules import find_modules, with_local_modules
+from avmsf.studio.opening import Opened, open_target
+from avmsf.studio.routes import PAGE
+from avmsf.studio.server import serve
+from avmsf.tasks.locator import Locator
+from avmsf.tasks.recast import recast
+from avmsf.tasks.severalblows import locate_blows
+from capture_folder import fill, ring
+from plate_capture import fill_plate
+
+
+@pytest.fixture
+def plate(tmp_path: Path) -> Iterator[Served]:
+    with served(open_plate(tmp_path / "opened", "physics"), tmp_path / "files") as running:
+        yield running
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Iterator[Served]:
+    mesh = trimesh.creation.box((0.24, 0.17, 0.004)).subdivide().subdivide()
+    mesh.export(tmp_path / "lid.obj")
+    with served(open_target(tmp_path / "lid.obj"), tmp_path / "files") as running:
+        yield running
+
+
+def tensor(running: Served, manifest: Any, name: str) -> np.ndarray:
+    told = manifest["tensors"][name]
+    content = running.get(told["file"]).content[told["offset"] :]
+    count = int(np.prod(told["shape"]))
+    return np.frombuffer(content, np.dtype(told["dtype"]).newbyteorder("<"), count).reshape(told["shape"])
+
+
+def unpacked(text: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), "<f4")
+
+
+def test_the_page_gets_the_field_that_is_open(plate: Served) -> None:
+    manifest = plate.manifest()
+    assert manifest["live"]["revision"] == 1
+    assert manifest["live"]["rows"] == [0, 1, 2, 3, 4]
+    assert {"locate", "edit", "save"} <= set(manifest["live"]["abilities"])
+    assert "capture" not in manifest["live"]["abilities"]
+    field = plate_field("physics")
+    assert np.array_equal(tensor(plate, manifest, "frequency"), field.bank.frequency.numpy())
+    points = torch.from_numpy(tensor(plate, manifest, "points").copy())
+    time_axis = torch.arange(200) / RATE
+    angle = 2 * torch.pi * field.bank.frequency[:, None] * time_axis
+    atoms = torch.exp(-field.bank.damping[:, None] * time_axis)
+    sine, noise = (torch.from_numpy(tensor(plate, manifest, name).copy()) for name in ("sine", "noise"))
+    cosine = torch.from_numpy(tensor(plate, manifest, "cosine").copy())
+    sounds = sine.double() @ (atoms * angle.sin()) + cosine.double() @ (atoms * angle.cos()) + noise[:200]
+    expected = field.render(points)[:, :200]
+    assert float((sounds - expected).abs().max()) < 1e-5 * float(expected.abs().max())
+
+
+def test_a_recorded_blow_is_located_as_the_task_does(plate: Served) -> None:
+    manifest = plate.manifest()
+    points = torch.from_numpy(tensor(plate, manifest, "points").copy())
+    field = plate_field("physics")
+    for row in (5, 80):
+        sound = torch.cat([torch.zeros(200), field.render(points[row : row + 1])[0]])
+        answer = plate.ask("POST", "locate", wav(sound.numpy()))
+        assert answer.status == 200
+        [found] = answer.words["blows"]
+        [(seconds, expected)] = locate_blows(field, sound, locator=Locator.of(field, points=points))
+        assert (found["row"], found["seconds"]) == (expected.most_probable, seconds)
+        assert np.array_equal(unpacked(found["probability"]), expected.probability.float())
+        assert np.array_equal(unpacked(found["distance"]), expected.distance.float())
+        # The plate's symmetric places sound alike, and all of them as the blow does.
+        assert unpacked(found["distance"])[row] < 0.01
+        assert {found["row"], row} <= set(np.argsort(unpacked(found["distance"]))[:8])
+        assert found["explained"] > 0.95
+
+
+@pytest.mark.parametrize("content", [b"", b"RIFF", b"\x00" * 5000, b"<svg/>", wav(np.zeros(4000)), wav(ring(0.01))])
+def test_what_is_no_recording_is_said_to_be_none(plate: Served, content: bytes) -> None:
+    answer = plate.ask("POST", "locate", content)
+    assert answer.status == 422
+    assert re.search("not a sound file|silent|too short", answer.words["error"])
+    assert plate.get("manifest.json").status == 200
+
+
+def test_an_edit_is_heard_undone_and_saved(plate: Served) -> None:
+    before = plate.manifest()
+    edit = {"base": 1, "material": {"from": "ceramic", "to": "wood"}, "size": 2.0}
+    told = plate.ask("POST", "edit", edit).words
+    assert told["revision"] == 2
+    assert "Poisson's ratio" in told["remarks"][0]
+    after = plate.manifest()
+    expected = recast(plate_field("physics"), CERAMIC, WOOD, size=2.0)
+    assert np.allclose(tensor(plate, after, "frequency"), expected.bank.frequency, rtol=1e-12)
+    # The page shows the object as it was; where a place sounds is on the object as it is now.
+    points = torch.from_numpy(tensor(plate, before, "points").copy())
+    assert np.array_equal(tensor(plate, after, "points"), points)
+    gains = expected.known(2.0 * points.double())
+    assert np.allclose(tensor(plate, after, "sine"), gains.mean, atol=1e-5 * float(gains.mean.abs().max()))
+    assert after["live"]["undo"]
+    assert after["live"]["sliders"]["size"] == 2.0
+    # Who still reads the revision before gets its own numbers.
+    assert np.array_equal(tensor(plate, before, "frequency"), plate_field("physics").bank.frequency)
+
+    saved = plate.ask("POST", "save", {"base": 2, "name": "wooden"})
+    assert saved.status == 201
+    assert torch.equal(load(saved.words["file"]).bank.frequency, expected.bank.frequency)
+    again = plate.ask("POST", "save", {"base": 3, "name": "wooden"})
+    assert again.status == 409
+    assert "stays" in again.words["error"]
+    undone = plate.ask("POST", "undo", {"base": 3}).words
+    assert undone["revision"] == 4
+    assert np.array_equal(tensor(plate, plate.manifest(), "frequency"), plate_field("physics").bank.frequency)
+
+
+def test_a_blow_on_an_edited_object_is_located_in_the_pages_frame(plate: Served) -> None:
+    points = torch.from_numpy(tensor(plate, plate.manifest(), "points").copy())
+    plate.ask("POST", "edit", {"base": 1, "material": {"from": "ceramic"}, "size": 0.8})
+    edited = plate.studio.session.current.expect_field()
+    sound = edited.render(0.8 * points[[33]].double())[0]
+    [found] = plate.ask("POST", "locate", wav(np.concatenate([np.zeros(200), sound.numpy()]))).words["blows"]
+    assert found["row"] == 33
+    assert found["place"] == pytest.approx(points[33].tolist(), abs=1e-7)
+
+
+def test_two_tabs_hear_of_each_other(plate: Served) -> None:
+    assert plate.ask("POST", "edit", {"base": 1, "pitch": 1.5}).status == 200
+    late = plate.ask("POST", "edit", {"base": 1, "pitch": 0.5})
+    assert late.status == 409
+    assert late.words["revision"] == 2
+    assert "another tab has changed the field meanwhile, and nothing was overwritten" in late.words["error"]
+    assert plate.manifest()["live"]["sliders"]["pitch"] == 1.5
+
+
+def test_only_the_last_revisions_are_kept_and_all_can_be_undone(plate: Served) -> None:
+    for number in range(1, 8):
+        plate.ask("POST", "edit", {"base": number, "pitch": 1.0 + 0.01 * number})
+    assert len(list(plate.studio.folder.glob("revision-*"))) <= 5
+    for number in range(8, 15):
+        assert plate.ask("POST", "undo", {"base": number}).status == 200
+    assert np.array_equal(tensor(plate, plate.manifest(), "frequency"), plate_field("physics").bank.frequency)
+
+
+def test_an_edit_that_silences_everything_is_refused(plate: Served) -> None:
+    answer = plate.ask("POST", "edit", {"base": 1, "pitch": 1000.0})
+    assert answer.status == 422
+    assert plate.manifest()["live"]["revision"] == 1
+
+
+def test_words_need_their_model(plate: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "words" not in plate.manifest()["live"]["abilities"]
+    answer = plate.ask("POST", "edit", {"base": 1, "prompt": "a wooden bowl is hit"})
+    assert answer.status == 422
+    assert "pip install 'avmsf[text]'" in answer.words["error"]
+    assert plate.ask("POST", "edit", {"base": 1, "like": "no base64!"}).status == 400
+    monkeypatch.setattr(studio, "find_spec", lambda name: None)
+    assert studio.words_model("folder") is None
+
+
+def test_a_capture_is_made_of_a_mesh(capture: Served, tmp_path: Path) -> None:
+    manifest = capture.manifest()
+    assert manifest["live"]["mode"] == "capture"
+    assert {"capture", "reconstruct"} <= set(manifest["live"]["abilities"])
+    assert manifest["object"]["kind"] == "mesh"
+    assert trimesh.load(io.BytesIO(capture.get("object.glb").content), file_type="glb").bounds is not None
+    points, normals = (tensor(capture, manifest, name) for name in ("points", "normals"))
+    top = (points[:, 2] > 0.0019) & (np.abs(points[:, 0]) < 0.1) & (np.abs(points[:, 1]) < 0.07)
+    assert np.median(normals[top] @ [0, 0, 1.0]) > 0.9
+    assert capture.get("capture").words["strikes"] == []
+    judged = capture.ask("POST", "capture/check", blow())
+    assert judged.status == 200
+    assert judged.words["onset_seconds"] == pytest.approx(0.1, abs=1e-3)
+    for number, place in enumerate(points[np.flatnonzero(top)[:3]].tolist()):
+        query = "x={}&y={}&z={}&nx=0&ny=0&nz=-1".format(*place)
+        headers = {"Idempotency-Key": f"strike-{number:04d}"}
+        for _ in range(2):
+            answer = capture.ask("POST", f"capture/strikes?{query}", blow(number), headers=headers)
+            assert answer.status == 201
+            assert answer.words["contact"] == pytest.approx(place)
+    told = capture.get("capture").words
+    assert [strike["file"] for strike in told["strikes"]] == ["001.wav", "002.wav", "003.wav"]
+    assert told["ready"]
+    assert told["object"] == "surface.obj"
+    assert capture.get("capture/strikes/002.wav").content == blow(1)
+    assert capture.ask("PUT", "capture/strikes/002.wav", blow(9)).words["row"] == 1
+    assert capture.ask("DELETE", "capture/strikes/003.wav").status == 200
+    assert len(capture.get("capture").words["strikes"]) == 2
+    assert (tmp_path / "lid" / "impacts.csv").is_file()
+    for hidden in (
+        "capture/strikes/impacts.csv",
+        "capture/strikes/.avmsf%2Fstudio.json",
+        "capture/strikes/surface.obj",
+    ):
+        assert capture.get(hidden).status == 404
+    assert capture.ask("POST", "capture/strikes?x=1", blow()).status == 400
+    assert capture.ask("POST", "edit", {"base": 1, "pitch": 2.0}).status == 409
+
+
+def test_a_connection_lost_during_a_recording_leaves_nothing_behind(capture: Served, tmp_path: Path) -> None:
+    content, place = blow(), "capture/strikes?x=0&y=0&z=0.002"
+    head = f"POST /{capture.token}/{place} HTTP/1.1\r\nHost: 127.0.0.1:{capture.port}\r\n"
+    with socket.create_connection(("127.0.0.1", capture.port)) as link:
+        link.sendall(f"{head}Idempotency-Key: strike-0001\r\nContent-Length: {len(content)}\r\n\r\n".encode())
+        link.sendall(content[: len(content) // 2])
+    time.sleep(0.2)
+    assert capture.get("capture").words["strikes"] == []
+    assert list((tmp_path / "lid").glob("*.wav")) == []
+    assert capture.ask("POST", place, content, headers={"Idempotency-Key": "strike-0001"}).words["row"] == 0
+
+
+def test_a_reconstruction_needs_two_strikes(capture: Served) -> None:
+    answer = capture.ask("POST", "reconstruct", {})
+    assert answer.status == 409
+    assert "strike more places first" in answer.words["error"]
+    assert capture.get("jobs/unknown/events").status == 404
+    assert capture.ask("DELETE", "jobs/unknown").status == 404
+
+
+def test_a_reconstruction_that_fails_says_why_and_one_can_be_stopped(tmp_path: Path) -> None:
+    folder = fill_plate(tmp_path / "plate")
+    rows = (folder / "impacts.csv").read_text().splitlines()
+    (folder / "impacts.csv").write_text("\n".join([*rows, rows[-1].replace("008.wav", "missing.wav")]) + "\n")
+    with served(open_target(folder), tmp_path / "files") as running:
+        job = running.ask("POST", "reconstruct", {}).words["job"]
+        assert running.manifest()["live"]["job"] == job
+        assert running.ask("POST", "reconstruct", {}).status == 409
+        last = running.events(job)[-1]
+        assert "missing.wav: there is no such file" in last["error"]
+        assert running.events(job, after="0") == running.events(job)[1:]
+        again = running.ask("POST", "reconstruct", {}).words["job"]
+        assert running.ask("DELETE", f"jobs/{again}").words == {"cancelled": again}
+        assert running.events(again)[-1]["stage"] == "cancelled"
+
+
+def test_a_capture_with_a_field_is_struck_and_its_strikes_are_marked(tmp_path: Path) -> None:
+    folder = fill_plate(tmp_path / "plate")
+    (folder / ".avmsf").mkdir()
+    field = plate_field()
+    save(replace(field, samples=4000), folder / ".avmsf" / "field.safetensors")
+    for target in (folder, folder / ".avmsf" / "field.safetensors"):
+        opened = open_target(target)
+        assert (opened.home, opened.capture) == (folder, folder)
+    with served(opened, tmp_path / "files") as running:
+        manifest = running.manifest()
+        assert manifest["live"]["mode"] == "field"
+        assert {"capture", "locate"} <= set(manifest["live"]["abilities"])
+        assert len(manifest["strikes"]) == 8
+        sound = running.get(manifest["strikes"][0]["sound"])
+        assert sound.headers["content-type"] == "audio/wav"
+        assert soundfile.read(io.BytesIO(sound.content))[1] == RATE
+
+
+def test_a_field_without_geometry_says_so(tmp_path: Path) -> None:
+    class Nowhere:
+        def __init__(self, field: object) -> None:
+            self.field = field
+
+        def __getattr__(self, name: str) -> object:
+            return torch.zeros(0, 3) if name == "points" else getattr(self.field, name)
+
+    opened = open_plate(tmp_path / "opened")
+    field = plate_field()
+    bare = replace(field, gain_field=Nowhere(field.gain_field))
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(studio, "load", lambda path: bare)
+        with pytest.raises(StudioError, match="expected the object's geometry, found none: give a mesh"):
+            studio.Studio(opened, tmp_path)
+        mesh = tmp_path / "lid.ply"
+        trimesh.creation.box((0.24, 0.17, 0.004)).export(mesh)
+        (tmp_path / "files").mkdir()
+        shown = studio.Studio(replace(opened, object=mesh), tmp_path / "files").manifest()
+        assert shown["points"] > 1000
+        assert shown["object"]["kind"] == "mesh"
+
+
+def test_what_can_be_opened_and_what_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "note.txt").write_text("hello")
+    mesh = tmp_path / "bowl.stl"
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(mesh)
+    for target, message in (("nothing", "found nothing"), ("empty", "found none of these: put one there")):
+        with pytest.raises(StudioError, match=message):
+            open_target(tmp_path / target)
+    with pytest.raises(StudioError, match="to show, found no such file"):
+        open_target(mesh, object=tmp_path / "none.ply")
+    with pytest.raises(AvmsfError, match="a file of another kind"):
+        studio.Studio(open_target(tmp_path / "note.txt"), tmp_path)
+    opened = open_target(mesh)
+    assert opened == Opened("bowl", (tmp_path / "bowl").resolve(), None, (tmp_path / "bowl").resolve())
+    assert open_target(mesh) == opened
+    assert (tmp_path / "bowl" / "surface.stl").read_bytes() == mesh.read_bytes()
+    trimesh.creation.box((0.2, 0.1, 0.1)).export(mesh)
+    with pytest.raises(StudioError, match=r"has another mesh, surface\.stl"):
+        open_target(mesh)
+    monkeypatch.setattr("avmsf.studio.opening.LARGEST_MESH", 10)
+    with pytest.raises(StudioError, match="expected a mesh of at most"):
+        open_target(mesh)
+
+
+def test_a_port_in_use_is_named_with_a_way_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        taken = other.getsockname()[1]
+        with pytest.raises(StudioError, match=f"port {taken}: expected a free one, .* give --port 0"):
+            serve(open_plate(tmp_path), port=taken, browser=False, tell=print)
+        monkeypatch.setattr(server, "PORT", taken)
+        with server._listening(None) as listener:
+            assert listener.getsockname()[1] != taken
+            assert listener.getsockname()[0] == "127.0.0.1"
+    with pytest.raises(StudioError, match="expected 0 to 65535"):
+        server._listening(70_000)
+
+
+def test_the_page_takes_its_libraries_from_here_where_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv(modules.MODULES_VARIABLE, raising=False)
+    assert find_modules() is None
+    for name, version in modules.PINNED.items():
+        package = tmp_path / "avmsf" / "page" / "node_modules" / name
+        package.mkdir(parents=True)
+        (package / "package.json").write_text(json.dumps({"version": version}))
+    found = find_modules()
+    assert found == tmp_path / "avmsf" / "page" / "node_modules"
+    page = (PAGE / "index.html").read_text()
+    assert "https://cdn" in page
+    local = with_local_modules(page)
+    assert "https://" not in local.partition("importmap")[2].partition("</script>")[0]
+    assert './modules/three/examples/jsm/"' in local
+    (found / "three" / "package.json").write_text(json.dumps({"version": "0.1.0"}))
+    assert find_modules() is None
+    monkeypatch.setenv(modules.MODULES_VARIABLE, str(found))
+    with pytest.raises(StudioError, match=r"expected the folder node_modules with three 0\.187\.0"):
+        find_modules()
+    with pytest.raises(StudioError, match="expected the page to ask for three"):
+        with_local_modules(page.replace("three@0.187.0", "three@0.1.0"))
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    with pytest.raises(StudioError, match="expected npm"):
+        modules.fetch_modules()
+
+
+def test_the_command_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
+    opened = open_plate(tmp_path / "opened")
+    command = [sys.executable, "-c", "import sys; from avmsf.cli import main; sys.exit(main())", "studio"]
+    words = [*command, str(opened.field), "--no-browser", "--port", "0"]
+    environment = {**os.environ, "TMPDIR": str(tmp_path / "temporary")}
+    (tmp_path / "temporary").mkdir()
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, env=environment)
+    assert process.stderr is not None
+    try:
+        line = next(line for line in process.stderr if "http://" in line)
+        address = line.split()[1]
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{32}/", address)
+        with urllib.request.urlopen(f"{address}manifest.json", timeout=20) as answer:
+            assert json.load(answer)["modes"] == 5
+        assert list((tmp_path / "temporary").glob("avmsf-studio-*"))
+        process.send_signal(signal.SIGINT)
+        rest = process.communicate(timeout=20)[1]
+    finally:
+        process.kill()
+    assert process.returncode == 0
+    assert rest == "closed\n"
+    assert list((tmp_path / "temporary").iterdir()) == []
+
+
+def test_the_command_says_what_it_needs(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    assert main(["studio"]) == 2
+    assert "expected a field, a capture folder" in capsys.readouterr().err
+    assert main(["studio", "nothing.safetensors"]) == 2
+    assert "found nothing: check the path" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "avmsf.studio.server", None)
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    del sys.modules["avmsf.studio.server"]
+    monkeypatch.delitem(sys.modules, "avmsf.studio.server", raising=False)
+    assert main(["studio", "nothing.safetensors"]) == 2
+    assert "pip install 'avmsf[studio]'" in capsys.readouterr().err
+
+
+def test_a_folder_of_strikes_alone_is_clicked_where_its_contacts_are(tmp_path: Path) -> None:
+    folder = fill(tmp_path / "bare")
+    with served(open_target(folder), tmp_path / "files") as running:
+        manifest = running.manifest()
+        assert manifest["points"] > 100
+        assert manifest["object"] == {"kind": "points", "file": None}
+        assert len(running.get("capture").words["strikes"]) == 3

@@ -1,0 +1,256 @@
+"""The open field: revisions, what edits make of it, and that nobody's work is overwritten in silence."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from opened_plate import plate_field
+
+from avmsf.errors import EditError, FieldFileError, SimulationError
+from avmsf.export.sampledfield import SampledField
+from avmsf.field.soundfield import SoundField
+from avmsf.field.store import load
+from avmsf.simulate.material import CERAMIC, WOOD
+from avmsf.studio.editing import REST, Sliders
+from avmsf.studio.refusal import RefusedError
+from avmsf.studio.sampling import length_of, resample, sample
+from avmsf.studio.session import Revision, Session, file_name
+from avmsf.tasks.recast import recast
+from avmsf.tasks.retune import retune
+from made_fields import FIELDS
+
+WOODEN = {"material": {"from": "ceramic", "to": "wood"}, "size": 1.5, "pitch": 0.8, "decay": 2.0, "brightness": 1.0}
+
+
+def opened(home: Path) -> tuple[Session, list[Revision]]:
+    shown: list[Revision] = []
+    session = Session(home, shown.append)
+    session.open(plate_field())
+    return session, shown
+
+
+def same(one: SoundField, other: SoundField) -> bool:
+    return all(
+        torch.equal(getattr(one.bank, name), getattr(other.bank, name)) for name in ("frequency", "damping")
+    ) and torch.equal(one.gains(one.gain_field.points), other.gains(other.gain_field.points))
+
+
+def test_sliders_at_rest_are_the_identity() -> None:
+    field = plate_field()
+    assert Sliders.read({"base": 1}) == REST
+    edited, remarks = REST.apply(field)
+    assert edited is field
+    assert remarks == []
+
+
+def test_sliders_do_what_the_tasks_do() -> None:
+    field = plate_field()
+    modes = [{"mode": 1, "db": None}, {"mode": 2, "db": 6.0, "pitch": 1.01, "decay": 0.5}]
+    edited, remarks = Sliders.read({**WOODEN, "modes": modes}).apply(field)
+    pitch = torch.full((5,), 0.8, dtype=torch.float64) * torch.tensor([1, 1, 1.01, 1, 1], dtype=torch.float64)
+    decay = torch.full((5,), 2.0, dtype=torch.float64) * torch.tensor([1, 1, 0.5, 1, 1], dtype=torch.float64)
+    levels = [0.0, -math.inf, 6.0, 0.0, 0.0]
+    wooden = recast(field, CERAMIC, WOOD, size=1.5)
+    assert same(edited, retune(wooden, pitch=pitch, decay=decay, brightness_db=1.0, gains_db=levels))
+    assert any("Poisson's ratio" in words for words in remarks)
+
+
+def test_sliders_are_read_back_from_what_the_page_is_told() -> None:
+    sliders = Sliders.read({**WOODEN, "law": "velocity", "modes": [{"mode": 3, "db": None}]})
+    assert Sliders.read(sliders.to_json()) == sliders
+    assert Sliders.read(REST.to_json()) == REST
+    assert sliders.to_json()["modes"] == [{"mode": 3, "db": None, "pitch": 1.0, "decay": 1.0}]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"pitch": "high"}, "pitch: expected a number, found 'high'"),
+        ({"pitch": float("nan")}, "pitch: expected a number, found nan"),
+        ({"size": True}, "size: expected a number, found True"),
+        ({"modes": {"0": 1}}, "modes: expected a list"),
+        ({"modes": [{"mode": -1}]}, "mode: expected a row counted from 0, found -1"),
+        ({"modes": [{"mode": 0, "level": 3}]}, "a mode: expected mode, db, pitch, decay, found level"),
+        ({"material": "wood"}, "material: expected an object with from, to"),
+        ({"material": {"to": 3}}, 'material "to": expected a name, found 3'),
+        ({"law": "paper"}, "law: expected one of displacement"),
+        ({"louder": 2}, "an edit: expected base, material, .* found louder"),
+    ],
+)
+def test_what_is_no_slider_is_named(words: dict[str, Any], message: str) -> None:
+    with pytest.raises(RefusedError, match=message) as refused:
+        Sliders.read(words)
+    assert refused.value.status == 400
+
+
+def test_edits_that_cannot_be_leave_everything_as_it_was(tmp_path: Path) -> None:
+    session, shown = opened(tmp_path)
+    for words, kind in (
+        ({"pitch": 0.0}, EditError),
+        ({"modes": [{"mode": 5, "db": 1.0}]}, EditError),
+        ({"material": {"from": "ceramic", "to": "cheese"}}, SimulationError),
+    ):
+        with pytest.raises(kind):
+            session.edit(1, Sliders.read(words))
+    assert session.current.number == 1
+    assert len(shown) == 1
+
+
+def test_each_edit_starts_from_the_field_as_it_was_opened(tmp_path: Path) -> None:
+    session, shown = opened(tmp_path)
+    session.edit(1, Sliders(pitch=2.0))
+    edited = session.edit(2, Sliders(pitch=1.5))
+    assert edited.field is not None
+    assert torch.equal(edited.field.bank.frequency, 1.5 * plate_field().bank.frequency)
+    assert [revision.number for revision in shown] == [1, 2, 3]
+
+
+def test_undo_goes_back_under_a_new_number(tmp_path: Path) -> None:
+    session, _ = opened(tmp_path)
+    first = session.edit(1, Sliders(pitch=2.0))
+    session.edit(2, Sliders(decay=0.5))
+    undone = session.undo(3)
+    assert (undone.number, undone.sliders, undone.field) == (4, first.sliders, first.field)
+    assert session.undo(4).sliders == REST
+    assert not session.can_undo
+    with pytest.raises(RefusedError, match="nothing to undo"):
+        session.undo(5)
+
+
+def test_two_tabs_never_overwrite_one_another(tmp_path: Path) -> None:
+    session, _ = opened(tmp_path)
+    session.edit(1, Sliders(pitch=2.0))
+    for late in (
+        lambda: session.edit(1, Sliders(pitch=3.0)),
+        lambda: session.undo(1),
+        lambda: session.save(1, "late"),
+        lambda: session.lead(1, plate_field(), ()),
+    ):
+        with pytest.raises(RefusedError, match="another tab has changed the field") as refused:
+            late()
+        assert (refused.value.status, refused.value.more) == (409, {"revision": 2})
+    assert session.current.sliders.pitch == 2.0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failing_picture_of_a_revision_leaves_the_one_before(tmp_path: Path) -> None:
+    def refuse(revision: Revision) -> None:
+        if revision.number > 1:
+            raise OSError("the disk is full")
+
+    session = Session(tmp_path, refuse)
+    session.open(plate_field())
+    with pytest.raises(OSError, match="full"):
+        session.edit(1, Sliders(pitch=2.0))
+    assert session.current.number == 1
+    assert not session.can_undo
+
+
+def test_what_is_saved_is_what_is_heard_and_the_sliders_rest_from_then_on(tmp_path: Path) -> None:
+    session, _ = opened(tmp_path)
+    edited = session.edit(1, Sliders.read(WOODEN))
+    path, saved = session.save(2, "wooden plate")
+    assert path == tmp_path / "wooden plate.safetensors"
+    assert edited.field is not None
+    assert same(load(path), edited.field)
+    assert (saved.number, saved.sliders, saved.field) == (3, REST, edited.field)
+    twice = session.edit(3, Sliders(pitch=2.0))
+    assert twice.field is not None
+    assert torch.equal(twice.field.bank.frequency, 2.0 * edited.field.bank.frequency)
+
+
+def test_a_file_that_is_there_is_never_overwritten(tmp_path: Path) -> None:
+    session, _ = opened(tmp_path)
+    (tmp_path / "bowl.safetensors").write_text("precious")
+    (tmp_path / "link.safetensors").symlink_to(tmp_path / "elsewhere")
+    for name in ("bowl", "bowl.safetensors", "link"):
+        with pytest.raises(RefusedError, match="is there already") as refused:
+            session.save(1, name)
+        assert refused.value.status == 409
+    assert (tmp_path / "bowl.safetensors").read_text() == "precious"
+    assert not (tmp_path / "elsewhere").exists()
+
+
+def test_a_field_that_cannot_be_written_leaves_no_file(tmp_path: Path) -> None:
+    session = Session(tmp_path, lambda revision: None)
+    field = plate_field()
+    session.open(replace(field, origin=replace(field.origin, report={"loss": math.nan})))
+    with pytest.raises(FieldFileError, match="finite"):
+        session.save(1, "new")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        " ",
+        "../up",
+        "a/b",
+        "a\\b",
+        "/etc/x",
+        ".hidden",
+        "nul",
+        "COM1.txt",
+        "x" * 200,
+        "a\0b",
+        "a\nb",
+        "=1+1",
+        "~",
+        "x.",
+    ],
+)
+def test_names_that_lead_elsewhere_are_refused(name: str) -> None:
+    with pytest.raises(RefusedError, match="expected a name of letters") as refused:
+        file_name(name)
+    assert refused.value.status == 400
+
+
+def test_before_there_is_a_field_nothing_can_be_edited(tmp_path: Path) -> None:
+    session = Session(tmp_path, lambda revision: None)
+    session.open(None)
+    with pytest.raises(RefusedError, match="expected a field, found none yet"):
+        session.edit(1, Sliders(pitch=2.0))
+    session.open(plate_field())
+    assert not session.can_undo
+    session.open(plate_field("physics"))
+    back = session.undo(3)
+    assert back.field is not None
+    assert back.field.gain_field.kind == "spline"
+
+
+@pytest.mark.parametrize("kind", sorted(FIELDS))
+def test_the_table_of_an_edited_field_is_the_one_made_anew(kind: str) -> None:
+    before = plate_field(kind)
+    normals = torch.nn.functional.normalize(before.gain_field.points - before.gain_field.points.mean(0), dim=1)
+    sampled = sample(before, before.gain_field.points, normals)
+    # The highest mode goes beyond half the sample rate, and the next one down is mute.
+    words = {"size": 0.7, "material": {"from": "ceramic", "to": "ceramic"}, "decay": 0.5, "brightness": 2.0}
+    after, _ = Sliders.read({**words, "pitch": 1.3, "modes": [{"mode": 3, "db": None}]}).apply(before)
+    assert length_of(after) == 0.7
+    found = resample(sampled, before, after)
+    assert found is not None
+    expected = SampledField.of(after, before.gain_field.points.double() * 0.7, normals)
+    assert len(expected.frequency) < len(sampled.frequency)
+    assert torch.equal(found.frequency, expected.frequency)
+    assert torch.allclose(found.damping, expected.damping, rtol=1e-6)
+    loudest = float(expected.sine.abs().max())
+    # Gains are float32, and a place that is scaled and scaled back is another one in its last digit.
+    assert float((found.sine - expected.sine).abs().max()) < 1e-5 * loudest
+    assert float((found.cosine - expected.cosine).abs().max()) < 1e-5 * loudest
+    # From one edit to the next, and back to one in which a mute mode sounds: there is no way but to ask the field.
+    other = {**words, "pitch": 1.4, "brightness": 0.0, "modes": [{"mode": 3, "db": None}]}
+    louder, _ = Sliders.read(other).apply(before)
+    twice = resample(found, after, louder)
+    assert twice is not None
+    anew = SampledField.of(louder, before.gain_field.points.double() * 0.7, normals)
+    assert float((twice.sine - anew.sine).abs().max()) < 1e-5 * float(anew.sine.abs().max())
+    muted, _ = Sliders.read({"modes": [{"mode": 3, "db": None}]}).apply(before)
+    silent = resample(sampled, before, muted)
+    assert silent is not None
+    assert resample(silent, muted, before) is None
+    assert resample(found, after, before) is None
+    assert resample(sampled, before, plate_field("attention" if kind != "attention" else "spline")) is None

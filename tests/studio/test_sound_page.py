@@ -1,0 +1,402 @@
+"""The page's modal bank, in a browser: what it renders is what Python renders."""
+
+import base64
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import torch
+
+from avmsf.export.bundle import make_bundle, write_bundle
+from avmsf.export.sampledfield import SampledField
+from avmsf.export.webpage import single_file
+from avmsf.modal.pulse import ForcePulse
+from avmsf.modal.synthesis import synthesise
+from struck_table import RATE, struck_table
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+PAGE = Path(__file__).resolve().parents[2] / "src" / "avmsf" / "studio" / "page"
+BLANK = '<!doctype html><meta charset="utf-8"><script type="importmap">{"imports": {}}</script><title>sound</title>'
+START = '<script type="module" src="page/start.js"></script>'
+"""Loads what the tests call, as the studio's own page does."""
+MODULE = """
+import { loadBundle } from "./bundle.js";
+import { renderOffline, SoundEngine } from "./sound.js";
+import { pulseSamples } from "./pulse.js";
+import { resample } from "./resample.js";
+import { Bank, Limiter } from "./bank.js";
+Object.assign(window, { loadBundle, renderOffline, SoundEngine, pulseSamples, resample, Bank, Limiter });
+window.asText = (samples) => {
+  // Numbers one by one take playwright seconds.
+  const bytes = new Uint8Array(Float32Array.from(samples).buffer);
+  let text = "";
+  for (let at = 0; at < bytes.length; at += 0x8000) text += String.fromCharCode(...bytes.subarray(at, at + 0x8000));
+  return btoa(text);
+};
+window.loaded = loadBundle().then((bundle) => { window.bundle = bundle; });
+"""
+
+
+def lay_out(folder: Path, table: SampledField) -> Path:
+    write_bundle(table, folder)
+    (folder / "page").mkdir()
+    for module in PAGE.glob("*.js"):
+        shutil.copy(module, folder / "page")
+    (folder / "page" / "start.js").write_text(MODULE)
+    (folder / "index.html").write_text(BLANK + START)
+    return folder
+
+
+KINDS = ("shared", "perContact")
+
+
+@pytest.fixture(scope="module")
+def tables() -> dict[str, SampledField]:
+    return {kind: struck_table(shared=kind == "shared") for kind in KINDS}
+
+
+@pytest.fixture(scope="module")
+def pages(
+    tables: dict[str, SampledField], browser: "Browser", serve: Callable[[Path], str], tmp_path_factory: Any
+) -> Iterator[dict[str, "Page"]]:
+    opened = {kind: browser.new_page() for kind in KINDS}
+    for kind, page in opened.items():
+        page.goto(serve(lay_out(tmp_path_factory.mktemp(kind), tables[kind])))
+        page.evaluate("window.loaded")
+    yield opened
+    for page in opened.values():
+        page.close()
+
+
+@pytest.fixture(params=KINDS)
+def kind(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def table(kind: str, tables: dict[str, SampledField]) -> SampledField:
+    return tables[kind]
+
+
+@pytest.fixture
+def page(kind: str, pages: dict[str, "Page"]) -> "Page":
+    return pages[kind]
+
+
+@pytest.fixture
+def any_page(pages: dict[str, "Page"]) -> "Page":
+    """Return one page, for what no damping has a part in."""
+    return pages["shared"]
+
+
+def heard(page: "Page", blows: Sequence[dict[str, Any]], **options: Any) -> np.ndarray:
+    sound = page.evaluate(
+        """async ([blows, seconds, options]) => {
+             const sound = await renderOffline(bundle, blows, seconds ?? undefined, options);
+             return window.asText(sound);
+           }""",
+        [list(blows), options.pop("seconds", None), options],
+    )
+    return numbers(sound)
+
+
+def numbers(text: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), dtype=np.float32).astype(np.float64)
+
+
+def error(found: np.ndarray, expected: torch.Tensor) -> float:
+    """Return the largest difference over the loudest sample."""
+    assert found.shape == tuple(expected.shape)
+    return float(np.abs(found - expected.numpy()).max() / expected.abs().max())
+
+
+@pytest.mark.parametrize(
+    ("blow", "pulse"),
+    [
+        ({"row": 0}, None),
+        ({"row": 3, "force": 40.0}, None),
+        ({"row": 1, "force": 1e-4, "contactTime": 2.3e-3}, ForcePulse(2.3e-3)),
+        ({"row": 2, "force": 2.0, "contactTime": 1e-3, "shape": "hertz"}, ForcePulse(1e-3, "hertz")),
+        ({"row": 2, "force": 2.0, "contactTime": 9e-3, "shape": "hertz"}, ForcePulse(9e-3, "hertz")),
+    ],
+)
+def test_a_blow_is_what_python_renders(page: "Page", table: SampledField, blow: dict[str, Any], pulse: Any) -> None:
+    expected = table.render(torch.tensor([blow["row"]]), force=blow.get("force", 1.0), pulse=pulse)[0]
+    assert error(heard(page, [blow]), expected) < 1e-6
+
+
+def together(table: SampledField, blows: Sequence[tuple[int, float, int]], samples: int) -> torch.Tensor:
+    """Return the sum of blows on rows, of some force, from some sample on."""
+    sound = torch.zeros(samples, dtype=torch.float64)
+    for row, force, frame in blows:
+        one = table.render(torch.tensor([row]), force=force, samples=table.samples)[0].double()
+        sound[frame:] += one[: samples - frame]
+    return sound
+
+
+def test_blows_overlap_from_the_very_sample_on_at_which_they_begin(page: "Page", table: SampledField) -> None:
+    """At the beginning, the end and the middle of blocks of 128 samples, two in one block, two at once."""
+    places = [
+        (0, 1.0, 0),
+        (1, -0.5, 127),
+        (2, 3.0, 128),
+        (3, 1.0, 5003),
+        (4, 0.7, 5010),
+        (5, 1.0, 9000),
+        (0, 1.0, 9000),
+    ]
+    blows = [{"row": row, "force": force, "when": frame / RATE} for row, force, frame in places]
+    assert error(heard(page, blows), together(table, places, table.samples)) < 1e-6
+
+
+def test_sixty_four_blows_sound_at_once(page: "Page", table: SampledField) -> None:
+    places = [(number % 6, 1.0 + number / 64, 400 * number) for number in range(64)]
+    blows = [{"row": row, "force": force, "when": frame / RATE} for row, force, frame in places]
+    assert error(heard(page, blows), together(table, places, table.samples)) < 1e-6
+
+
+@pytest.mark.parametrize("rate", [11_025.0, 44_100.0])
+def test_modes_are_the_same_at_any_sample_rate(page: "Page", table: SampledField, rate: float) -> None:
+    samples = round(rate)
+    found = page.evaluate(
+        """async (rate) => {
+             const tensors = { ...bundle.tensors, noise: new Float32Array(bundle.tensors.noise.length) };
+             return asText(await renderOffline({ ...bundle, tensors }, [{ row: 4 }], 1, { sampleRate: rate }));
+           }""",
+        rate,
+    )
+    kept = table.frequency < rate / 2
+    expected = synthesise(
+        table.sine[4:5, kept],
+        table.frequency[kept],
+        table.damping_at(torch.tensor([4]))[:, kept],
+        samples=samples,
+        sample_rate=rate,
+        quadrature=table.cosine[4:5, kept],
+    )[0]
+    assert error(numbers(found), expected) < 1e-6
+
+
+def test_the_engine_plays_what_is_rendered_and_goes_on_with_another_field(page: "Page", table: SampledField) -> None:
+    """Live messages, on a context that waits for them: a strike, a replacement, silence after its fade."""
+    found, level = page.evaluate(
+        """async (rate) => {
+             const context = new OfflineAudioContext(1, rate, rate);
+             const engine = await SoundEngine.start(bundle, { context });
+             const at = (time, act) => context.suspend(time).then(() => {
+               act();
+               setTimeout(() => context.resume(), 100);
+             });
+             at(128 * 25 / rate, () => engine.node.port.postMessage(
+               { type: "strike", blow: engine.tuned.blow(2, { force: 0.8 }, 0, 1) }));
+             at(128 * 75 / rate, () => engine.replace(bundle));
+             const sound = (await context.startRendering()).getChannelData(0);
+             return [asText(sound), engine.level];
+           }""",
+        RATE,
+    )
+    sound = numbers(found)
+    begin, end = 128 * 25, 128 * 75
+    expected = level * table.render(torch.tensor([2]), force=0.8)[0]
+    assert not sound[:begin].any()
+    assert error(sound[begin:end], expected[: end - begin]) < 1e-6
+    # The replaced field fades within 10 ms, along a cosine.
+    whole = round(0.01 * RATE)
+    fade = 0.5 + 0.5 * np.cos(np.pi * np.arange(whole) / whole)
+    fading = expected[end - begin : end - begin + whole] * torch.from_numpy(fade)
+    assert error(sound[end : end + whole], fading) < 1e-5
+    assert not sound[end + whole :].any()
+
+
+def test_the_loudest_contact_is_brought_to_half_of_full_scale(page: "Page", table: SampledField) -> None:
+    level = page.evaluate("SoundEngine.start(bundle).then((engine) => { engine.close(); return engine.level; })")
+    loudest = float(table.render(torch.arange(6))[:, : round(0.03 * RATE)].abs().max())
+    assert level * loudest == pytest.approx(0.5, rel=0.05)
+
+
+def test_a_click_is_heard_live(any_page: "Page") -> None:
+    any_page.evaluate("""SoundEngine.start(bundle).then((engine) => {
+      window.engine = engine;
+      window.begun = new Promise((resolve) => { engine.onbegin = resolve; });
+      addEventListener("pointerdown", () => engine.strike(0, { force: 2 }), { once: true });
+    })""")
+    any_page.mouse.click(5, 5)
+    any_page.evaluate("begun")
+    any_page.wait_for_function(
+        """() => {
+             const samples = new Float32Array(engine.analyser.fftSize);
+             engine.analyser.getFloatTimeDomainData(samples);
+             return samples.some((value) => Math.abs(value) > 0.1);
+           }"""
+    )
+    any_page.evaluate("engine.close()")
+
+
+BANK = """({ field, blows, seconds, voices }) => {
+  const rate = 16000, frequency = Float64Array.from(field.frequency), noise = Float32Array.from(field.noise);
+  const bank = new Bank({ ...field, frequency, noise }, rate, 128, voices);
+  for (const blow of blows) bank.strike({ force: [1], strength: 1, loudest: 1, damping: null, ...blow });
+  const sound = new Float64Array(128 * Math.ceil(seconds * rate / 128));
+  for (let frame = 0; frame < sound.length; frame += 128) bank.render(sound.subarray(frame, frame + 128), frame);
+  return { sound: Array.from(sound), voices: bank.sounding.length, modes: bank.ringing };
+}"""
+
+
+def test_blows_that_make_room_fade(page: "Page", kind: str) -> None:
+    """Six sines of amplitude one where two may sound: a cut would be a step of up to 1, the sines' own are .04."""
+    damping = [0.5]
+    blow = {"sine": [1.0], "cosine": [0.0], "damping": None if kind == "shared" else damping}
+    field = {"frequency": [100.0], "damping": damping if kind == "shared" else None, "noise": [1.0] * 20_000}
+    field["noise"] = [0.0] if kind == "perContact" else field["noise"]
+    given = {"field": field, "voices": 2, "seconds": 0.5}
+    blows = [{**blow, "frame": 1000 * number + 37} for number in range(6)]
+    found = page.evaluate(BANK, {**given, "blows": blows})
+    sound = np.asarray(found["sound"])
+    steps = np.abs(np.diff(sound))
+    # Each blow's own noise, all ones, sets in with it.
+    steps[[blow["frame"] - 1 for blow in blows]] = 0
+    assert steps.max() < 6 * 2 * np.pi * 100 / RATE + 0.011
+    assert found["voices"] == (2 if kind == "perContact" else 6)
+    if kind == "perContact":
+        assert np.abs(sound[-1600:]).max() < 2.0
+
+
+def test_noise_does_not_break_off(page: "Page", kind: str) -> None:
+    """A draw of ones, which would end in a step of one."""
+    damping = None if kind == "perContact" else [400.0]
+    field = {"frequency": [100.0], "damping": damping, "noise": [1.0] * 3000}
+    blow = {"frame": 0, "sine": [1e-3], "cosine": [0.0], "loudest": 1e-3, "damping": [400.0]}
+    found = page.evaluate(BANK, {"field": field, "voices": 8, "seconds": 0.5, "blows": [blow]})
+    sound = np.asarray(found["sound"])
+    assert np.abs(np.diff(sound)).max() < 0.003
+    np.testing.assert_allclose(sound[1000:3000], 1.0, rtol=0, atol=1e-4)
+    assert not sound[3900:].any()
+    assert found["voices"] == 0
+
+
+def test_what_cannot_be_heard_is_no_longer_computed(page: "Page", kind: str) -> None:
+    """A second of a mode that falls to -120 dB in .35 s, beside one that rings on."""
+    dampings = [40.0, 0.1]
+    blow = {"frame": 0, "sine": [1.0, 1.0], "cosine": [0.0, 0.0], "damping": dampings if kind == "perContact" else None}
+    field = {"frequency": [300.0, 500.0], "damping": dampings if kind == "shared" else None, "noise": [0.0]}
+    given = {"field": field, "voices": 8, "blows": [blow]}
+    assert page.evaluate(BANK, {**given, "seconds": 0.3})["modes"] == 2
+    assert page.evaluate(BANK, {**given, "seconds": 0.4})["modes"] == 1
+    blow["damping"] = [40.0, 40.0] if kind == "perContact" else None
+    field["damping"] = [40.0, 40.0] if kind == "shared" else None
+    found = page.evaluate(BANK, {**given, "seconds": 1})
+    assert (found["modes"], found["voices"]) == (0, 0)
+    assert not any(found["sound"][8000:])
+
+
+def test_the_limiter_leaves_alone_what_fits_and_holds_the_rest(any_page: "Page") -> None:
+    found = any_page.evaluate("""() => {
+      const rate = 16000, limiter = new Limiter(rate);
+      const quiet = new Float64Array(3 * rate), loud = new Float64Array(rate);
+      const sine = (n) => Math.sin(n / 7);
+      for (let n = 0; n < quiet.length; n++) quiet[n] = 0.97 * sine(n);
+      for (let n = 0; n < loud.length; n++) loud[n] = 30 * sine(n);
+      const before = quiet.slice();
+      limiter.hold(quiet, quiet.length);
+      const untouched = quiet.every((value, n) => value === before[n]);
+      limiter.hold(loud, loud.length);
+      const peak = loud.reduce((most, value) => Math.max(most, Math.abs(value)), 0);
+      const last = loud.slice(-200).reduce((most, value) => Math.max(most, Math.abs(value)), 0);
+      const after = before.slice();
+      limiter.hold(after, after.length);
+      return { untouched, peak, last, back: after.slice(-100).every((value, n) => value === before.at(n - 100)) };
+    }""")
+    assert found["untouched"]
+    assert found["peak"] < 0.98 + 1e-12
+    assert found["last"] > 0.9
+    assert found["back"]
+
+
+@pytest.mark.parametrize("shape", ["half-sine", "hertz"])
+@pytest.mark.parametrize("contact_time", [0.0, 3e-5, 1.3e-4, 1e-3, 7.77e-3])
+def test_pulses_are_those_of_python(any_page: "Page", shape: Any, contact_time: float) -> None:
+    """Incomplete beta functions there, numerical integrals here."""
+    found = any_page.evaluate("([time, shape]) => Array.from(pulseSamples(time, 44100, shape))", [contact_time, shape])
+    expected = ForcePulse(contact_time, shape).samples(44_100.0).numpy()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
+
+
+def test_resampling_keeps_a_tone(any_page: "Page") -> None:
+    found = any_page.evaluate("""() => {
+      const tone = Float32Array.from({ length: 4000 }, (_, n) => Math.sin(2 * Math.PI * 1000 * n / 8000));
+      return [resample(tone, 8000, 11000), resample(tone, 8000, 3000)].map((sound) => Array.from(sound));
+    }""")
+    up, down = (np.asarray(sound) for sound in found)
+    assert len(up) == round(4000 * 11_000 / 8000)
+    middle = np.arange(200, len(up) - 200)
+    np.testing.assert_allclose(up[middle], np.sin(2 * np.pi * 1000 * middle / 11_000), rtol=0, atol=1e-3)
+    # 1 kHz is below half of 3 kHz, but hardly.
+    middle = np.arange(100, len(down) - 100)
+    np.testing.assert_allclose(down[middle], np.sin(2 * np.pi * 1000 * middle / 3000), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("blow", "words"),
+    [
+        ({"row": 6}, "there is no contact 6 among 6"),
+        ({"row": 0.5}, "there is no contact 0.5"),
+        ({"row": 0, "contactTime": -1}, "a contact of -1 s"),
+        ({"row": 0, "shape": "box"}, "half-sine or hertz, not box"),
+    ],
+)
+def test_blows_that_are_none_are_refused(any_page: "Page", blow: dict[str, Any], words: str) -> None:
+    said = any_page.evaluate("(blow) => renderOffline(bundle, [blow]).catch((error) => error.message)", blow)
+    assert words in said
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"format": 2}, "expected a field of format 1, found 2"),
+        ({"tensors": {"sine": {"file": "field.bin", "offset": 0, "dtype": "float32", "shape": [10**7]}}}, "cut short"),
+        ({"tensors": {"sine": {"file": "none.bin", "offset": 0, "dtype": "float32", "shape": [1]}}}, "cannot be read"),
+        ({"tensors": {"sine": {"file": "field.bin", "offset": 0, "dtype": "int8", "shape": [1]}}}, "of type int8"),
+    ],
+)
+def test_a_damaged_bundle_is_told(any_page: "Page", change: dict[str, Any], words: str) -> None:
+    any_page.route("**/manifest.json", lambda route: route.fulfill(json={"format": 1, **change}))
+    said = any_page.evaluate("loadBundle().then(() => 'none', (error) => error.message)")
+    any_page.unroute("**/manifest.json")
+    assert words in said
+
+
+def test_half_precision_is_read(any_page: "Page") -> None:
+    halves = np.array([0.0, 1.0, -2.5, 6.1e-5, 1e-7, 65504.0, 0.333], dtype="<f2")
+    manifest = {
+        "format": 1,
+        "tensors": {"sine": {"file": "half.bin", "offset": 0, "dtype": "float16", "shape": [len(halves)]}},
+    }
+    any_page.route("**/manifest.json", lambda route: route.fulfill(json=manifest))
+    any_page.route("**/half.bin", lambda route: route.fulfill(body=halves.tobytes()))
+    found = any_page.evaluate("loadBundle().then(({ tensors }) => Array.from(tensors.sine))")
+    any_page.unroute("**/manifest.json")
+    any_page.unroute("**/half.bin")
+    assert found == halves.astype(np.float64).tolist()
+
+
+def test_a_page_in_one_file_sounds_the_same_from_a_disk(
+    browser: "Browser", table: SampledField, tmp_path: Path
+) -> None:
+    """Opened as a file, where a browser fetches nothing from beside the page."""
+    modules = {f"page/{module.name}": module.read_bytes() for module in PAGE.glob("*.js")}
+    page_files = {**modules, "index.html": (BLANK + START).encode(), "page/start.js": MODULE.encode()}
+    path = tmp_path / "ball.html"
+    path.write_text(single_file(make_bundle(table), page_files))
+    opened = browser.new_page()
+    asked: list[str] = []
+    opened.on("request", lambda request: asked.append(request.url))
+    opened.goto(path.as_uri())
+    opened.evaluate("window.loaded")
+    assert error(heard(opened, [{"row": 1}]), table.render(torch.tensor([1]))[0]) < 1e-6
+    assert not [url for url in asked if not url.startswith(("data:", "blob:", path.as_uri()))]
+    opened.close()
