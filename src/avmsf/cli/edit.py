@@ -23,7 +23,7 @@ from avmsf.cli.writing import Level, OutputError, expect_writable, write_sound
 from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
-from avmsf.tasks.edits import EDITS, muted, silenced
+from avmsf.tasks.edits import EDITS, remarks, silenced
 from avmsf.tasks.retune import retune
 
 MODES, SPECTROGRAMS, BEFORE, AFTER = "modes.png", "spectrograms.png", "before.wav", "after.wav"
@@ -137,8 +137,8 @@ def run(options: Options) -> int:
     before, after = HeardModes.of(old), HeardModes.of(new)
     screen = console(errors=options.json)
     screen.print(_table(before, after))
-    for words in _remarks(edits, new):
-        screen.print(words, soft_wrap=True)
+    for words in remarks(edits, new):
+        screen.print(f"note: {words}", soft_wrap=True)
     if options.pictures is not None:
         _show(options.pictures, (old, contact), (new, options.change.size * contact))
     screen.print(f"wrote {options.output}", soft_wrap=True)
@@ -255,18 +255,3 @@ def _table(before: HeardModes, after: HeardModes) -> Table:
     title = f"{len(rows)} modes" if len(rows) <= _LISTED else f"the {_LISTED} loudest of {len(rows)} modes"
     columns = ["before (Hz)", "after (Hz)", "T60 before (s)", "T60 after (s)", "level (dB)"]
     return table(f"{title}, before and after", columns, cells, words=0)
-
-
-def _remarks(edits: Sequence[dict[str, Any]], field: SoundField) -> list[str]:
-    """Return what the owner of the field should know, a sentence a line."""
-    words = [f"note: {remark}" for entry in edits for remark in entry.get("remarks", [])]
-    silent = field.bank.frequency[silenced(field)].tolist()
-    if silent:
-        words.append(
-            f"note: {len(silent)} of {len(field.bank)} modes lie at or above half the sample rate of "
-            f"{field.sample_rate:g} Hz and are silent, from {min(silent):.4g} Hz to {max(silent):.4g} Hz; an edit that "
-            "lowers them brings them back"
-        )
-    if not bool((field.audible & ~muted(field)).any()):
-        words.append("note: nothing but noise is left of the sound: edit less")
-    return words

@@ -1,23 +1,15 @@
 """Which material an edit starts from and which it leads to, as the command line has it."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import tyro
 
-from avmsf.cli.printing import figure, say
-from avmsf.errors import EditError
+from avmsf.cli.printing import say
 from avmsf.field.soundfield import SoundField
 from avmsf.simulate.material import Material, material_named
-from avmsf.tasks.edits import EDITS
-from avmsf.tasks.materialguess import guess_materials
+from avmsf.tasks.madeof import made_of
 from avmsf.tasks.recast import LAWS, recast
-
-_CLOSE = 1.2
-"""How much farther off the second-best material may be and still be as likely."""
-_KEEPING = ("recast", "retune")
-"""Edits that leave no doubt what a field is made of."""
 
 
 @dataclass(frozen=True)
@@ -73,37 +65,7 @@ class MaterialChange:
 
 
 def old_material(field: SoundField) -> Material:
-    """Return what a field is made of: what it was recast to, or the material whose damping fits its modes best.
-
-    Raises `EditError` where none fits.
-    """
-    known = _recast_to(field.origin.report.get(EDITS, []))
-    if known is not None:
-        say(f"the object is of {known.name}, which it was recast to before")
-        return known
-    best, second, *_ = guess_materials(field.bank)
-    if not best.fits:
-        raise EditError(
-            f"--from is not given, and no material's damping is that of the field's modes: {best.material.name} comes "
-            f"nearest, which half of them miss by a factor of {figure(best.off)} or more: say what the object is of, "
-            "as --from ceramic"
-        )
-    close = second.off < _CLOSE * best.off
-    alike = f", and {second.material.name} fits as well ({figure(second.off)}), with which the loudness would differ"
-    say(
-        f"the object is taken to be of {best.material.name}: half of its modes have that material's damping within a "
-        f"factor of {figure(best.off)}{alike if close else ''}; say --from where you know"
-    )
-    return best.material
-
-
-def _recast_to(edits: Sequence[object]) -> Material | None:
-    """Return the material of the last recast, None where there is none or what followed may have changed it."""
-    for entry in reversed(edits):
-        kind = entry.get("edit") if isinstance(entry, dict) else None
-        if kind not in _KEEPING:
-            return None
-        if kind == "recast":
-            assert isinstance(entry, dict)
-            return Material(**entry["to"])
-    return None
+    """Return what a field is made of, with words on how that is known. Raises `EditError` where no material fits."""
+    known = made_of(field, option="--from")
+    say(known.words)
+    return known.material

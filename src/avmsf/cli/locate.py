@@ -21,18 +21,14 @@ from avmsf.errors import AvmsfError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.scene.symmetry import Symmetries
-from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locate import locate
+from avmsf.tasks.located import describe_blow, symmetries_of
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.severalblows import locate_blows
 
 UNLOCATED = 2
 """The exit code where one of several recordings could not be located."""
-_JUDGED = 600
-"""Points of the object in which symmetries are looked for."""
-_CLOSED = 0.02
-"""Part of the surface that may have its counterpart in a hole: a field's points cover their object."""
 
 
 @dataclass(frozen=True)
@@ -110,11 +106,7 @@ class _Known:
     @cached_property
     def symmetries(self) -> Symmetries | None:
         """The symmetries of the field's points; None where these are too few to tell."""
-        points = self.field.gain_field.points
-        try:
-            return find_symmetries(points, generator=torch.Generator().manual_seed(0), missing=_CLOSED, limit=_JUDGED)
-        except AvmsfError:
-            return None
+        return symmetries_of(self.field)
 
 
 def _blows(
@@ -140,38 +132,8 @@ def _settings(options: Options) -> CaptureSettings | None:
 
 def _describe(name: str, seconds: float | None, contact: ContactMap, known: _Known, level: float) -> dict[str, Any]:
     """Return all that is found out about a blow, as plain values."""
-    region = contact.region(level)
-    others = contact.counterparts(known.symmetries, level) if len(contact.peaks(level)) > 1 else ()
-    return {
-        "recording": name,
-        "seconds": seconds,
-        "place": contact.place.tolist(),
-        "region": {
-            "level": level,
-            "radius_metres": _radius(contact, level),
-            "share": float(region.double().mean()),
-        },
-        "explained": contact.explained,
-        "modes_explain": contact.modal,
-        "force": contact.force,
-        "cosine": {
-            "place": contact.points[contact.best].tolist(),
-            "distance": float(contact.distance[contact.best]),
-        },
-        "ambiguous": bool(others),
-        "counterparts": [
-            {"place": other.place.tolist(), "probability": other.probability, "words": str(other)} for other in others
-        ],
-        "notes": list(contact.notes),
-    }
-
-
-def _radius(contact: ContactMap, level: float) -> float:
-    """Return how far from the likeliest place the blow fell at most, with a probability of `level`, metres."""
-    apart = (contact.points.double() - contact.place.double()).norm(dim=1)
-    order = torch.argsort(apart, stable=True)
-    reached = torch.cumsum(contact.probability[order], 0) >= level * contact.probability.sum()
-    return float(apart[order][int(reached.double().argmax())])
+    symmetries = known.symmetries if len(contact.peaks(level)) > 1 else None
+    return {"recording": name, "seconds": seconds, **describe_blow(contact, symmetries, level)}
 
 
 def _words(values: dict[str, Any]) -> str:

@@ -1,6 +1,6 @@
 """What all edits of a field have in common: other modes, factors on the gains, and a word in the field's report."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -58,3 +58,18 @@ def silenced(field: SoundField) -> Bool[Tensor, " modes"]:
     They stay in the bank for edits that bring them back.
     """
     return ~field.audible & ~muted(field)
+
+
+def remarks(entries: Sequence[Mapping[str, Any]], field: SoundField) -> list[str]:
+    """Return what the owner of an edited field should know of the edits `entries` and of it as it is, in sentences."""
+    words = [remark for entry in entries for remark in entry.get("remarks", [])]
+    silent = field.bank.frequency[silenced(field)].tolist()
+    if silent:
+        words.append(
+            f"{len(silent)} of {len(field.bank)} modes lie at or above half the sample rate of "
+            f"{field.sample_rate:g} Hz and are silent, from {min(silent):.4g} Hz to {max(silent):.4g} Hz; an edit that "
+            "lowers them brings them back"
+        )
+    if not bool((field.audible & ~muted(field)).any()):
+        words.append("nothing but noise is left of the sound: edit less")
+    return words

@@ -1,0 +1,150 @@
+"""What the page's sliders ask for, as one value, and the field that comes of it."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import torch
+
+from avmsf.errors import EditError
+from avmsf.field.soundfield import SoundField
+from avmsf.simulate.material import MATERIALS, material_named
+from avmsf.studio.refusal import RefusedError
+from avmsf.tasks.edits import EDITS, remarks
+from avmsf.tasks.madeof import made_of
+from avmsf.tasks.recast import LAWS, recast
+from avmsf.tasks.retune import retune
+
+_MATERIAL, _MODE = ("from", "to"), ("mode", "db", "pitch", "decay")
+MUTE = -math.inf
+"""Decibels that a mode is muted by; in JSON, where there are no such numbers, null."""
+
+
+@dataclass(frozen=True)
+class ModeChange:
+    """One mode by hand."""
+
+    mode: int
+    """Row in the bank of the field as it was opened, counted from 0."""
+    db: float = 0.0
+    pitch: float = 1.0
+    decay: float = 1.0
+
+
+@dataclass(frozen=True)
+class Sliders:
+    """All sliders of the page; at rest they leave the field as it was opened."""
+
+    material: str | None = None
+    """New material."""
+    old: str | None = None
+    """What the object is of; told by its dampings where it is not given."""
+    size: float = 1.0
+    """The new object's lengths over the old one's."""
+    pitch: float = 1.0
+    decay: float = 1.0
+    """Factor on the times in which modes die away."""
+    brightness: float = 0.0
+    """Decibels an octave."""
+    law: str = "displacement"
+    """What the recordings go with; see `recast`."""
+    modes: tuple[ModeChange, ...] = field(default=())
+
+    @classmethod
+    def read(cls, words: Mapping[str, Any]) -> "Sliders":
+        """Return the sliders of a request. Raises RefusedError (400) that names what is no slider or no number."""
+        known = ("base", "material", "size", "pitch", "decay", "brightness", "law", "modes")
+        _expect_keys(words, known, "an edit")
+        material = words.get("material") or {}
+        _expect_keys(material, _MATERIAL, "material")
+        rows = words.get("modes") or []
+        if not isinstance(rows, list):
+            raise RefusedError(400, f"modes: expected a list, found {rows!r}: reload the page")
+        law = words.get("law", "displacement")
+        if law not in LAWS:
+            raise RefusedError(400, f"law: expected one of {', '.join(LAWS)}, found {law!r}")
+        return cls(
+            _name(material.get("to"), "to"),
+            _name(material.get("from"), "from"),
+            law=law,
+            modes=tuple(_mode(row) for row in rows),
+            **{name: _number(words, name, rest) for name, rest in _RESTS.items()},
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what `read` makes these sliders of."""
+        values = asdict(self)
+        made, old = values.pop("material"), values.pop("old")
+        values["modes"] = [{**row, "db": None if row["db"] == MUTE else row["db"]} for row in values["modes"]]
+        return {"material": {"from": old, "to": made} if made or old else None, **values}
+
+    def apply(self, ground: SoundField) -> tuple[SoundField, list[str]]:
+        """Return the edited field and what its owner should know. Raises EditError and SimulationError as edits do."""
+        edited, words = ground, []
+        if self.material is not None or self.size != 1.0:
+            if self.old is None:
+                known = made_of(ground, option='"from"')
+                old = known.material
+                words.append(known.words)
+            else:
+                old = material_named(self.old)
+            new = old if self.material is None else material_named(self.material)
+            edited = recast(ground, old, new, size=self.size, law=LAWS[self.law])
+        if (self.pitch, self.decay, self.brightness) != (1.0, 1.0, 0.0) or self.modes:
+            edited = self._retuned(edited)
+        entries = edited.origin.report.get(EDITS, [])[len(ground.origin.report.get(EDITS, [])) :]
+        return edited, words + remarks(entries, edited)
+
+    def _retuned(self, recasted: SoundField) -> SoundField:
+        count = len(recasted.bank)
+        levels = torch.zeros(count, dtype=torch.float64)
+        pitch, decay = torch.full_like(levels, self.pitch), torch.full_like(levels, self.decay)
+        for row in self.modes:
+            if row.mode >= count:
+                raise EditError(f"mode {row.mode}: expected a row of the field's {count} modes, counted from 0")
+            levels[row.mode] += row.db
+            pitch[row.mode] *= row.pitch
+            decay[row.mode] *= row.decay
+        return retune(recasted, pitch=pitch, decay=decay, brightness_db=self.brightness, gains_db=levels)
+
+
+REST = Sliders()
+"""Sliders that change nothing."""
+_RESTS = {"size": 1.0, "pitch": 1.0, "decay": 1.0, "brightness": 0.0}
+MATERIAL_NAMES = tuple(MATERIALS)
+"""What the page can offer."""
+
+
+def _mode(row: Any) -> ModeChange:
+    _expect_keys(row, _MODE, "a mode")
+    mode = row.get("mode")
+    if not isinstance(mode, int) or isinstance(mode, bool) or mode < 0:
+        raise RefusedError(400, f"mode: expected a row counted from 0, found {mode!r}: reload the page")
+    mute = "db" in row and row["db"] is None
+    return ModeChange(
+        mode, MUTE if mute else _number(row, "db", 0.0), _number(row, "pitch", 1.0), _number(row, "decay", 1.0)
+    )
+
+
+def _expect_keys(words: Any, known: tuple[str, ...], what: str) -> None:
+    if not isinstance(words, Mapping):
+        raise RefusedError(400, f"{what}: expected an object with {', '.join(known)}, found {words!r}: reload the page")
+    unknown = sorted(set(words) - set(known))
+    if unknown:
+        raise RefusedError(400, f"{what}: expected {', '.join(known)}, found {', '.join(unknown)}: reload the page")
+
+
+def _number(words: Mapping[str, Any], name: str, rest: float) -> float:
+    value = words.get(name, rest)
+    if value is None:
+        return rest
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        raise RefusedError(400, f"{name}: expected a number, found {value!r}")
+    return float(value)
+
+
+def _name(value: Any, what: str) -> str | None:
+    if value is not None and not isinstance(value, str):
+        raise RefusedError(400, f'material "{what}": expected a name, found {value!r}')
+    return value or None

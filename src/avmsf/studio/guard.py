@@ -1,0 +1,153 @@
+"""Who may ask this server what: the secret in the address, the host's name, the page's origin, sizes and paths.
+
+The server listens on this machine alone, but any page that a browser shows can send requests there. One that does not
+know the token is told nothing; a name that was bent to point here is no loopback name; and another page's requests say
+where they come from.
+"""
+
+import json
+import secrets
+from pathlib import Path
+from urllib.parse import quote
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import Request
+from starlette.responses import RedirectResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from avmsf.studio.refusal import RefusedError, response_to
+
+LARGEST_UPLOAD = 64 << 20
+"""Bytes of one request: a minute of stereo sound at 96 kHz, 32 bits."""
+LARGEST_WORDS = 1 << 20
+"""Bytes of one request that holds words and numbers alone."""
+LOOPBACK = ("127.0.0.1", "localhost")
+"""Names under which a browser may know this machine."""
+_HEADERS = {
+    "cache-control": "no-store",
+    "content-security-policy": "frame-ancestors 'none'",
+    "cross-origin-resource-policy": "same-origin",
+    # The token is in the address, and other sites that the page loads its libraries from must not learn it.
+    "referrer-policy": "no-referrer",
+    "x-content-type-options": "nosniff",
+}
+
+
+def new_token() -> str:
+    """Return a secret that nobody guesses, of characters that addresses hold as they are."""
+    return secrets.token_urlsafe(24)
+
+
+class Guard:
+    """Lets requests through to an ASGI application that may come through, without the token in their paths."""
+
+    def __init__(self, app: ASGIApp, *, token: str, port: int, largest: int = LARGEST_UPLOAD) -> None:
+        self.app, self.token, self.largest = app, token, largest
+        self.hosts = frozenset(f"{name}:{port}" for name in LOOPBACK)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer as ASGI applications do; what is neither HTTP nor the server's own beginning and end is closed."""
+        if scope["type"] == "lifespan":
+            await self.app(scope, receive, send)
+            return
+        if scope["type"] != "http":
+            await send({"type": "websocket.close", "code": 1008})
+            return
+        hardened = _hardened(send)
+        try:
+            rest = self._admit(scope)
+        except RefusedError as refusal:
+            await response_to(refusal)(scope, receive, hardened)
+            return
+        if not rest:
+            # Without the last slash the page's relative addresses would lose the token.
+            await RedirectResponse(f"/{self.token}/", 308)(scope, receive, hardened)
+            return
+        inner = {**scope, "path": rest, "raw_path": quote(rest).encode(), "root_path": ""}
+        await self.app(inner, self._bounded(receive), hardened)
+
+    def _admit(self, scope: Scope) -> str:
+        """Return the path behind the token. Raises RefusedError for whatever is not the page's own request."""
+        headers = Headers(scope=scope)
+        hosts = headers.getlist("host")
+        if len(hosts) != 1 or hosts[0].lower() not in self.hosts:
+            raise RefusedError(
+                403, "expected this machine's own name as host, found another: open the address as printed"
+            )
+        if any(each.lower() != f"http://{hosts[0].lower()}" for each in headers.getlist("origin")):
+            raise RefusedError(403, "expected a request of the studio's own page, found another site's")
+        first, slash, rest = scope["path"].removeprefix("/").partition("/")
+        if not secrets.compare_digest(first.encode(), self.token.encode()):
+            raise _nothing_here()
+        # Decoded already, so that %2e%2e is two dots here.
+        if ".." in rest.split("/") or "\\" in rest or "\0" in rest:
+            raise _nothing_here()
+        length = headers.get("content-length", "0")
+        if not length.isdigit() or int(length) > self.largest:
+            raise too_large(self.largest)
+        return f"{slash}{rest}"
+
+    def _bounded(self, receive: Receive) -> Receive:
+        """Return `receive` that raises RefusedError where more comes than may, without waiting for all of it."""
+        taken = 0
+
+        async def receive_bounded() -> Message:
+            nonlocal taken
+            message = await receive()
+            taken += len(message.get("body", b""))
+            if taken > self.largest:
+                raise too_large(self.largest)
+            return message
+
+        return receive_bounded
+
+
+def _hardened(send: Send) -> Send:
+    async def send_hardened(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            for name, value in _HEADERS.items():
+                headers.setdefault(name, value)
+        await send(message)
+
+    return send_hardened
+
+
+def too_large(largest: int) -> RefusedError:
+    """Return what to raise for a request of more than `largest` bytes."""
+    return RefusedError(
+        413, f"expected at most {largest >> 10} KiB in one request, found more: send a shorter recording"
+    )
+
+
+def contained(folder: Path, name: str) -> Path:
+    """Return the file `name` in a folder. Raises RefusedError (404) for none, and for what links lead out of it."""
+    home = folder.resolve()
+    try:
+        path = (home / name).resolve(strict=True)
+        inside = path.is_relative_to(home) and path.is_file()
+    except (OSError, ValueError, RuntimeError) as error:
+        raise _nothing_here() from error
+    if not inside:
+        raise _nothing_here()
+    return path
+
+
+async def read_words(request: Request, *, largest: int = LARGEST_WORDS) -> dict[str, object]:
+    """Return the JSON object of a request. Raises RefusedError for another thing, and for more than `largest` bytes."""
+    body = bytearray()
+    async for part in request.stream():
+        body += part
+        if len(body) > largest:
+            raise too_large(largest)
+    try:
+        words = json.loads(bytes(body))
+    except ValueError as error:
+        raise RefusedError(400, f"expected a JSON object, found what is none ({error}): reload the page") from error
+    if not isinstance(words, dict):
+        raise RefusedError(400, f"expected a JSON object, found {type(words).__name__}: reload the page")
+    return words
+
+
+def _nothing_here() -> RefusedError:
+    return RefusedError(404, "there is nothing at this address")

@@ -1,0 +1,190 @@
+"""Work of minutes, in a process of its own: one at a time, heard of as it goes, ended with the server or before.
+
+The process is `python -m avmsf.studio.worker`. It gets a task as one line of JSON and answers with lines of JSON. Its
+standard input stays open as long as the server lives, so that it ends where the server was killed.
+"""
+
+import asyncio
+import json
+import os
+import secrets
+import signal
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from typing import Any
+
+from avmsf.errors import AvmsfError
+from avmsf.studio.refusal import RefusedError
+
+Event = dict[str, Any]
+Finish = Callable[[Event], Awaitable[Event]]
+CANCELLED = "cancelled"
+"""The stage of the last event of a job that somebody has stopped."""
+WORKER = (sys.executable, "-m", "avmsf.studio.worker")
+_LINE = 1 << 22
+"""Bytes of one line, at most."""
+_GRACE = 3.0
+"""Seconds that a process has to end by itself."""
+_LAST_WORDS = 4000
+"""Characters kept of what a process says on its standard error."""
+
+
+class Job:
+    """One run of the worker, and all that was heard of it."""
+
+    def __init__(self, kind: str, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> None:
+        """Prepare `task` for the worker; `finish` makes of its result the last event, in which "error" may stand."""
+        self.command = command
+        self.identifier, self.kind, self.task, self.finish = secrets.token_hex(8), kind, task, finish
+        self.events: list[Event] = []
+        self.ended = False
+        self.cancelled = False
+        self._heard = asyncio.Condition()
+        self._process: asyncio.subprocess.Process | None = None
+
+    async def run(self) -> None:
+        """Run to the end, whatever that is; the last event says how it went."""
+        try:
+            last = await self._work()
+        except AvmsfError as error:
+            last = {"error": " ".join(str(error).split())}
+        except asyncio.CancelledError:
+            self.cancelled = True
+            last = {"stage": CANCELLED, "words": "stopped"}
+        finally:
+            self._end_process(signal.SIGKILL)
+        await self._tell({"stage": CANCELLED, "words": "stopped"} if self.cancelled else last, last=True)
+
+    async def cancel(self) -> None:
+        """Stop the process, and wait until it has stopped; what it has finished so far stays for the next run."""
+        if self.ended:
+            return
+        self.cancelled = True
+        self._end_process(signal.SIGTERM)
+        for _ in range(round(_GRACE / 0.05)):
+            if self._process is None or self._process.returncode is not None:
+                break
+            await asyncio.sleep(0.05)
+        self._end_process(signal.SIGKILL)
+        async with self._heard:
+            await self._heard.wait_for(lambda: self.ended)
+
+    async def listen(self, *, after: int = 0) -> AsyncIterator[tuple[int, Event]]:
+        """Yield the events from number `after` on, counted from 0, as they come, up to the last."""
+        while True:
+            async with self._heard:
+                while len(self.events) <= after and not self.ended:
+                    await self._heard.wait()
+                new = self.events[after:]
+            for event in new:
+                yield after, event
+                after += 1
+            if self.ended and after >= len(self.events):
+                return
+
+    async def _work(self) -> Event:
+        self._process = process = await asyncio.create_subprocess_exec(
+            *self.command,
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            limit=_LINE,
+            # A group of its own, so that what it starts in turn ends with it, and Ctrl-C reaches the server alone.
+            start_new_session=True,
+        )
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        if self.cancelled:
+            self._end_process(signal.SIGKILL)
+        said = asyncio.create_task(_last_words(process.stderr))
+        result: Event | None = None
+        try:
+            process.stdin.write(json.dumps(self.task).encode() + b"\n")
+            await process.stdin.drain()
+            async for line in process.stdout:
+                event = _understand(line)
+                if event is None:
+                    continue
+                if "result" in event or "error" in event:
+                    result = event
+                else:
+                    await self._tell(event)
+            status = await process.wait()
+        except (BrokenPipeError, ConnectionResetError):
+            status = await process.wait()
+        words = await said
+        if result is None:
+            ending = words.strip().splitlines()[-1:] or ["it said nothing"]
+            return {"error": f"{self.kind} ended with status {status} and no result: {ending[0]}"}
+        return result if "error" in result else await self.finish(result["result"])
+
+    async def _tell(self, event: Event, *, last: bool = False) -> None:
+        async with self._heard:
+            self.events.append(event)
+            self.ended = last
+            self._heard.notify_all()
+
+    def _end_process(self, how: signal.Signals) -> None:
+        process = self._process
+        if process is not None and process.returncode is None:
+            try:
+                os.killpg(process.pid, how)
+            except ProcessLookupError:
+                return
+
+
+class Jobs:
+    """All jobs of a server, one of which runs at most."""
+
+    def __init__(self) -> None:
+        self._jobs: dict[str, Job] = {}
+        self._running: asyncio.Task[None] | None = None
+
+    @property
+    def current(self) -> Job | None:
+        """The job that runs."""
+        return next((job for job in self._jobs.values() if not job.ended), None)
+
+    def start(self, kind: str, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> Job:
+        """Begin a job. Raises RefusedError (409) while another one runs."""
+        current = self.current
+        if current is not None:
+            raise RefusedError(
+                409,
+                f"{current.kind} is under way, and one job runs at a time: wait for it or stop it",
+                job=current.identifier,
+            )
+        job = Job(kind, task, finish, command)
+        self._jobs[job.identifier] = job
+        self._running = asyncio.create_task(job.run())
+        return job
+
+    def named(self, identifier: str) -> Job:
+        """Return a job. Raises RefusedError (404)."""
+        if identifier not in self._jobs:
+            raise RefusedError(404, "there is no such job: start it again")
+        return self._jobs[identifier]
+
+    async def close(self) -> None:
+        """Stop what runs."""
+        if self.current is not None:
+            await self.current.cancel()
+        if self._running is not None:
+            await asyncio.gather(self._running, return_exceptions=True)
+
+
+def _understand(line: bytes) -> Event | None:
+    """Return what a line says, None for what a library has printed."""
+    try:
+        event = json.loads(line)
+    except ValueError:
+        return None
+    return event if isinstance(event, dict) else None
+
+
+async def _last_words(stream: asyncio.StreamReader) -> str:
+    kept = ""
+    while part := await stream.read(1 << 16):
+        kept = (kept + part.decode(errors="replace"))[-_LAST_WORDS:]
+    return kept

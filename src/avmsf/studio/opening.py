@@ -1,0 +1,143 @@
+"""What a user has opened: a field, a capture folder, or a mesh or pictures of which a capture shall be made."""
+
+import re
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from avmsf.capture.folder import settings_of
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.surface import find_surface_file
+from avmsf.capture.table import TABLE
+from avmsf.errors import StudioError
+from avmsf.pipeline.reconstruct import CACHE, FIELD
+from avmsf.pipeline.scene import CLOUD
+from avmsf.pipeline.sources import find_source, find_splats
+
+MESHES = (".obj", ".ply", ".glb", ".stl")
+"""Suffixes of the meshes that a capture may have as its surface."""
+LARGEST_MESH = 512 << 20
+"""Bytes; what a browser shows has far fewer."""
+_MATERIALS = re.compile(r"^\s*mtllib\s+(.+?)\s*$", re.MULTILINE)
+_TEXTURES = re.compile(r"^\s*map_\w+\s+(?:.*\s)?(\S+)\s*$", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Opened:
+    """Where everything is that the page shows or writes."""
+
+    name: str
+    home: Path
+    """Folder that edited fields are saved to."""
+    field: Path | None = None
+    capture: Path | None = None
+    """Folder of recordings, to mark them and to add to them."""
+    object: Path | None = None
+    """Mesh or Gaussians to show, where they are given and not found in the capture."""
+
+    @property
+    def settings(self) -> CaptureSettings:
+        """How the capture's files are read."""
+        return CaptureSettings() if self.capture is None else settings_of(self.capture)
+
+
+def open_target(target: Path, *, object: Path | None = None, capture: Path | None = None) -> Opened:
+    """Return what is behind a path. Raises StudioError for a path from which there is nothing to see or hear.
+
+    A mesh becomes the surface of a capture folder, `capture` or one beside it of the mesh's name, and stays what it is.
+    """
+    if object is not None and not object.is_file():
+        raise StudioError(f"{object}: expected a mesh or Gaussians to show, found no such file: check --object")
+    if capture is not None and target.suffix.lower() not in MESHES and not capture.is_dir():
+        raise StudioError(f"{capture}: expected a capture folder, found none: check --capture")
+    if target.is_dir():
+        return _open_folder(target, object)
+    if not target.is_file():
+        raise StudioError(
+            f"{target}: expected a field, a capture folder, a folder of images or a mesh, found nothing: check the path"
+        )
+    if target.suffix.lower() in MESHES:
+        return _open_mesh(target, object, capture)
+    kept = target.resolve().parent.name == CACHE
+    home = target.resolve().parent.parent if kept else target.resolve().parent
+    recordings = home if capture is None and kept and (home / TABLE).is_file() else capture
+    name = target.stem if recordings is None else recordings.resolve().name
+    return Opened(name, home, target.resolve(), None if recordings is None else recordings.resolve(), object)
+
+
+def find_object(opened: Opened) -> Path | None:
+    """Return the file that shows the object: the given one, the capture's mesh, its Gaussians, or those made of it."""
+    if opened.object is not None or opened.capture is None:
+        return opened.object
+    surface = find_surface_file(opened.capture, opened.settings)
+    if surface is not None and surface.is_file():
+        return surface
+    made = opened.capture / CACHE / CLOUD
+    return made if made.is_file() else find_splats(opened.capture)
+
+
+def shows_more(opened: Opened) -> bool:
+    """Whether the capture holds pictures of which an object to click can be made, and none was made yet."""
+    if opened.capture is None or find_object(opened) is not None:
+        return False
+    return find_source(opened.capture, opened.settings) is not None
+
+
+def is_gaussians(path: Path) -> bool:
+    """Whether a file holds Gaussians and not a mesh: a .ply whose header names their scales."""
+    if path.suffix.lower() != ".ply":
+        return False
+    with open(path, "rb") as file:
+        return b" scale_0" in file.read(1 << 16).partition(b"end_header")[0]
+
+
+def _open_folder(folder: Path, object: Path | None) -> Opened:
+    folder = folder.resolve()
+    field = folder / CACHE / FIELD
+    opened = Opened(folder.name, folder, field if field.is_file() else None, folder, object)
+    if not ((folder / TABLE).is_file() or find_object(opened) is not None or shows_more(opened)):
+        raise StudioError(
+            f"{folder}: expected a capture folder with {TABLE}, or with what shows the object (images/, a video, "
+            f"{', '.join(f'surface{suffix}' for suffix in MESHES)}, splats.ply), found none of these: put one there"
+        )
+    return opened
+
+
+def _open_mesh(mesh: Path, object: Path | None, capture: Path | None) -> Opened:
+    size = mesh.stat().st_size
+    if size > LARGEST_MESH:
+        raise StudioError(
+            f"{mesh}: expected a mesh of at most {LARGEST_MESH >> 20} MiB, found {size >> 20}: reduce it first, a "
+            "hundred thousand triangles show all that is heard"
+        )
+    if capture is None and mesh.stem == "surface":
+        return _open_folder(mesh.resolve().parent, object)
+    folder = mesh.with_suffix("") if capture is None else capture
+    surface = folder / f"surface{mesh.suffix.lower()}"
+    others = [folder / f"surface{suffix}" for suffix in MESHES if (folder / f"surface{suffix}").is_file()]
+    if folder.exists() and not folder.is_dir():
+        raise StudioError(f"{folder}: expected a capture folder or nothing, found a file: name one by --capture")
+    if others and not (surface in others and surface.read_bytes() == mesh.read_bytes()):
+        raise StudioError(
+            f"{folder}: has another mesh, {others[0].name}, and its strikes belong to that one: open the folder, or "
+            "name another by --capture"
+        )
+    if not others:
+        folder.mkdir(parents=True, exist_ok=True)
+        _copy_beside(mesh, folder)
+        shutil.copyfile(mesh, surface)
+    return _open_folder(folder, object)
+
+
+def _copy_beside(mesh: Path, folder: Path) -> None:
+    """Copy what a Wavefront mesh names beside it: its materials and their pictures."""
+    if mesh.suffix.lower() != ".obj":
+        return
+    for name in _MATERIALS.findall(mesh.read_text(errors="replace")):
+        material = mesh.parent / Path(name).name
+        if material.is_file():
+            shutil.copyfile(material, folder / material.name)
+            for texture in _TEXTURES.findall(material.read_text(errors="replace")):
+                picture = mesh.parent / Path(texture).name
+                if picture.is_file():
+                    shutil.copyfile(picture, folder / picture.name)

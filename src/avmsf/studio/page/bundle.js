@@ -1,0 +1,59 @@
+// The field as the page reads it: a manifest and its tensors, from files beside the page or from within it.
+
+const FORMAT = 1;
+const ARRAYS = { float64: Float64Array, float32: Float32Array };
+
+/** Return the URL of one of the page's files. A page that is one file carries them in `avmsfInlined`, as base64. */
+export function fileUrl(name, { base = document.baseURI } = {}) {
+  const inlined = globalThis.avmsfInlined?.[name];
+  if (inlined === undefined) return new URL(name, base).href;
+  if (inlined.url === undefined) {
+    const bytes = Uint8Array.from(atob(inlined.base64), (letter) => letter.charCodeAt(0));
+    inlined.url = URL.createObjectURL(new Blob([bytes], { type: inlined.type }));
+    delete inlined.base64;
+  }
+  return inlined.url;
+}
+
+/**
+ * Return {manifest, tensors, url(file)}: tensors by name (points, normals, frequency, damping, sine, cosine, noise) as
+ * flat arrays, row by row; `url` gives the address of a file that the manifest names. Throws with words for the reader.
+ */
+export async function loadBundle({ base = document.baseURI } = {}) {
+  const manifest = await (await fetched("manifest.json", base)).json();
+  if (manifest.format !== FORMAT)
+    throw new Error(`expected a field of format ${FORMAT}, found ${manifest.format}: export it again with this version`);
+  const files = {};
+  const tensors = {};
+  for (const [name, { file, offset, dtype, shape }] of Object.entries(manifest.tensors)) {
+    files[file] ??= await (await fetched(file, base)).arrayBuffer();
+    tensors[name] = readTensor(files[file], offset, dtype, shape, `${file}: ${name}`);
+  }
+  // Modes that all start as sines have no cosines to send.
+  tensors.cosine ??= new Float32Array(tensors.sine.length);
+  return { manifest, tensors, url: (file) => fileUrl(file, { base }) };
+}
+
+async function fetched(name, base) {
+  const response = await fetch(fileUrl(name, { base }), { cache: "no-cache" }).catch(() => null);
+  if (response === null) throw new Error(`${name} cannot be reached: is the server still running?`);
+  if (!response.ok) throw new Error(`${name} cannot be read (${response.status}): export the page again`);
+  return response;
+}
+
+function readTensor(buffer, offset, dtype, shape, what) {
+  const count = shape.reduce((product, size) => product * size, 1);
+  const bytes = { float64: 8, float32: 4, float16: 2 }[dtype];
+  if (bytes === undefined) throw new Error(`${what} is of type ${dtype}, which this page does not know`);
+  if (offset + count * bytes > buffer.byteLength)
+    throw new Error(`${what} is cut short: expected ${offset + count * bytes} bytes, found ${buffer.byteLength}: export the page again`);
+  if (dtype === "float16") return Float32Array.from(new Uint16Array(buffer, offset, count), halfToNumber);
+  return new ARRAYS[dtype](buffer, offset, count);
+}
+
+function halfToNumber(bits) {
+  const sign = bits & 0x8000 ? -1 : 1, exponent = (bits >> 10) & 31, fraction = bits & 1023;
+  if (exponent === 0) return sign * fraction * 2 ** -24;
+  if (exponent === 31) return fraction ? NaN : sign * Infinity;
+  return sign * (1 + fraction / 1024) * 2 ** (exponent - 15);
+}

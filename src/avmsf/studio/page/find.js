@@ -1,0 +1,149 @@
+/** The tab that finds a blow: a recording in, where on the object it was struck painted and listed. */
+
+import { amountScale } from "./colours.js";
+import { attempt, button, element, filePicker, millimetres, say } from "./dom.js";
+import { MicrophoneError, Recorder } from "./recorder.js";
+import { numbers, server } from "./server.js";
+import { looksLikeWav } from "./wav.js";
+
+export function findSheet(studio) {
+  const results = element("div", { className: "group", "aria-live": "polite" });
+  const level = element("meter", { min: 0, max: 1, high: 0.95, "aria-label": "Microphone level" });
+  const heard = element("small", {}, "");
+  const busy = element("progress", { hidden: true, "aria-label": "Locating" });
+  let painted = null;
+
+  const recorder = new Recorder(({ peak, seconds, struck }) => {
+    level.value = peak;
+    heard.textContent = `${seconds.toFixed(1)} s, ${struck ? "blow heard" : "waiting for the blow"}`;
+  });
+  const record = button("● Record", async () => {
+    if (recorder.recording) {
+      recorder.stop();
+      return;
+    }
+    record.textContent = "■ Stop";
+    record.classList.add("recording");
+    try {
+      const { blob } = await recorder.record();
+      await locate(blob, "the recording");
+    } catch (error) {
+      if (!(error instanceof MicrophoneError)) throw error;
+      say(error.message, { name: "microphone", bad: true });
+    } finally {
+      record.textContent = "● Record";
+      record.classList.remove("recording");
+    }
+  });
+
+  const locate = async (blob, name) => {
+    busy.hidden = false;
+    const answer = await attempt(() => server.locate(blob), "locate");
+    busy.hidden = true;
+    if (answer) show(answer.blows, name);
+  };
+
+  const show = (blows, name) => {
+    const list = element("div", { className: "group" });
+    const paint = (place) => {
+      painted = paintBlow(studio, blows[place]);
+      list.replaceChildren(...describe(studio, blows[place]));
+    };
+    const several = element("div", { className: "row" });
+    if (blows.length > 1) {
+      const pick = (_, place) => button(`Blow ${place + 1}`, () => paint(place), { className: "small" });
+      several.append(...blows.map(pick));
+    }
+    results.replaceChildren(element("h2", {}, `${name}: ${blows.length === 1 ? "one blow" : `${blows.length} blows`}`));
+    results.append(several, list);
+    if (blows.length) paint(0);
+    else results.append(element("p", {}, "No blow was heard in it."));
+  };
+
+  const take = async (file) => {
+    if (!(await looksLikeWav(file))) {
+      const words = `${file.name}: expected a WAV file, found another kind. Save the sound as WAV and drop it again.`;
+      say(words, { name: "locate", bad: true });
+      return;
+    }
+    await locate(file, file.name);
+  };
+
+  // Paint and found places belong to the field as it was when it was asked.
+  studio.addEventListener("bundle", () => {
+    results.replaceChildren();
+    clearFound(studio);
+    if (painted && studio.view?.painted?.values === painted) studio.paint(null);
+    painted = null;
+  });
+
+  const sheet = element(
+    "section",
+    {},
+    element("p", { className: "faint" }, "Strike the real object near the microphone, or drop a WAV file anywhere."),
+    element("div", { className: "row" }, record, filePicker("Choose a WAV file …", ".wav,audio/wav", take)),
+    level,
+    heard,
+    busy,
+    results,
+  );
+  return { element: sheet, take };
+}
+
+/** Paint where a blow may have fallen and mark where it most likely did; returns the values that are painted. */
+function paintBlow(studio, blow) {
+  const probability = numbers(blow.probability);
+  const greatest = probability.reduce((most, value) => Math.max(most, value), 1e-30);
+  // The eye tells apart what a thousandth of the greatest is only on a logarithmic scale.
+  const values = probability.map((value) => 1 + Math.log10(Math.max(value / greatest, 1e-4)) / 4);
+  studio.paint(values, {
+    scale: amountScale,
+    title: "Probability of the contact",
+    ends: ["÷ 10 000", "÷ 100", "greatest"],
+  });
+  if (!studio.view) return values;
+  clearFound(studio);
+  studio.view.face(blow.place);
+  mark(studio, "found", blow.place, "here");
+  (blow.counterparts ?? []).forEach(({ place }, number) => mark(studio, `counterpart-${number}`, place, "or here"));
+  return values;
+}
+
+function mark(studio, name, place, words) {
+  const { normal } = studio.view.contactAt(place);
+  const dot = element("div", { className: "dot next" });
+  const label = element("span", { className: "label" }, words);
+  studio.view.mark(name, element("div", { className: "mark" }, dot, label), place, normal);
+}
+
+function clearFound(studio) {
+  if (!studio.view) return;
+  for (const name of [...studio.view.marks.keys()])
+    if (name === "found" || name.startsWith("counterpart-")) studio.view.unmark(name);
+}
+
+const percent = (share) => `${(100 * share).toPrecision(2)} %`;
+
+function describe(studio, blow) {
+  const { level, radius_metres: radius, share } = blow.region;
+  const facts = [
+    ["Place", `${millimetres(blow.place)} mm`],
+    [`${percent(level)} region`, `${(1000 * radius).toFixed(1)} mm about it, ${percent(share)} of the surface`],
+  ];
+  if (blow.explained !== undefined && blow.explained !== null)
+    facts.push(["Explained", `${percent(blow.explained)} of the sound's energy`]);
+  const list = element("dl", { className: "measures" });
+  for (const [name, words] of facts) list.append(element("dt", {}, name), element("dd", {}, words));
+  const parts = [list, button("Strike it here", () => studio.strike(blow.row))];
+  if (blow.counterparts?.length) {
+    parts.push(element("h3", {}, "Sounds alike"));
+    const places = element("ul", { className: "listing" });
+    for (const { place, probability, words } of blow.counterparts) {
+      const text = `${millimetres(place)} mm, ${percent(probability)}${words ? `: ${words}` : ""}`;
+      places.append(element("li", {}, text));
+    }
+    parts.push(places);
+  }
+  for (const note of blow.notes ?? []) parts.push(element("p", { className: "warning" }, note));
+  return parts;
+}

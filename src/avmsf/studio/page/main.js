@@ -1,0 +1,194 @@
+/** The page: load the field, show it, sound it, and put a panel with what can be done beside it. */
+
+import { BlowInput } from "./blowinput.js";
+import { loadBundle } from "./bundle.js";
+import { element, makeTabs, say } from "./dom.js";
+import { editSheet } from "./edit.js";
+import { findSheet } from "./find.js";
+import { captureSheet } from "./capturemode.js";
+import { modeTable } from "./modetable.js";
+import { SoundEngine } from "./sound.js";
+import { SpectrumView } from "./spectrumview.js";
+import { strikeSheet } from "./strikesheet.js";
+import { Studio } from "./studio.js";
+
+const at = (name) => document.getElementById(name);
+const UPS = ["z", "y", "x"];
+
+async function open() {
+  // The 3D library is by far the largest part: it is fetched beside all else, and by itself, so that the panel works
+  // where it cannot be had.
+  const library = import("./objectview.js");
+  library.catch(() => {});
+  const studio = new Studio(await loadBundle());
+  window.avmsf.studio = studio;
+  const { manifest } = studio.bundle;
+  const capturing = studio.live?.mode === "capture";
+  showTitle(studio);
+  const sound = capturing ? null : startSound(studio);
+  const sheets = await (capturing ? captureTabs(studio) : fieldTabs(studio));
+  await showObject(studio, sheets, library);
+  await sound;
+  studio.dispatchEvent(new Event("view"));
+  at("hint").hidden = !studio.view;
+  at("hint").innerHTML = capturing
+    ? "<strong>Click the object</strong> where you are about to strike it"
+    : "<strong>Click the object</strong> to strike it. Hold longer: harder. Drag: turn.";
+  takeDrops(sheets);
+  document.title = `${manifest.name} · avmsf studio`;
+  // Struck it can be from now on, and seen from the next frame.
+  await new Promise((drawn) => requestAnimationFrame(drawn));
+  window.avmsf.readyAt = performance.now();
+  return studio;
+}
+
+function showTitle(studio) {
+  studio.on("bundle", () => {
+    const { name, modes, points, sampleRate } = studio.bundle.manifest;
+    at("name").textContent = name;
+    const facts = [
+      modes ? `${modes} modes` : null,
+      points ? `${points.toLocaleString("en")} contacts` : null,
+      modes ? `${Math.round(sampleRate / 100) / 10} kHz` : null,
+    ];
+    at("facts").textContent = facts.filter(Boolean).join(" · ");
+  });
+}
+
+async function startSound(studio) {
+  at("charts").hidden = false;
+  studio.spectra = new SpectrumView(at("spectrum"), at("decay"));
+  try {
+    studio.engine = await SoundEngine.start(studio.bundle);
+  } catch (error) {
+    const words = `There is no sound: ${error.message}. What is drawn is computed all the same.`;
+    say(words, { name: "sound", bad: true });
+    at("heard").textContent = "heard (no sound)";
+  }
+  studio.on("bundle", () => {
+    if (studio.engine && studio.engine.bundle !== studio.bundle) studio.engine.replace(studio.bundle);
+    studio.spectra.listen(studio.modes, studio.engine);
+  });
+}
+
+async function fieldTabs(studio) {
+  const strike = strikeSheet(studio);
+  const sheets = [
+    { name: "strike", words: "Strike", ...strike },
+    { name: "modes", words: "Modes", ...modeTable(studio) },
+  ];
+  if (studio.can("locate")) sheets.push({ name: "find", words: "Find", ...findSheet(studio) });
+  if (studio.can("edit")) sheets.push({ name: "edit", words: "Edit", ...editSheet(studio, () => reload(studio)) });
+  if (studio.can("capture")) sheets.push({ name: "capture", words: "Capture", ...(await captureSheet(studio)) });
+  const show = makeTabs(sheets);
+  const find = sheets.find(({ name }) => name === "find");
+  const capture = sheets.find(({ name }) => name === "capture");
+  const adding = () => capture !== undefined && !capture.element.hidden;
+  return {
+    atPress: () => !adding() && strike.atPress(),
+    struck: (hit, factor, event) => {
+      if (adding()) capture.choose(hit);
+      else studio.strike(hit.row, { factor, since: event.timeStamp });
+    },
+    take: find && ((file) => (adding() ? capture.take(file) : (show("find"), find.take(file)))),
+  };
+}
+
+async function captureTabs(studio) {
+  const capture = await captureSheet(studio);
+  makeTabs([{ name: "capture", words: "Capture", ...capture }]);
+  if (studio.modes.points <= 1)
+    say("There is no object to click yet. Once it is made of its pictures it appears here; until then, type places.");
+  return { atPress: () => false, struck: (hit) => capture.choose(hit), take: capture.take };
+}
+
+/** Fetch what the server now has; after an edit, say, or when another tab was faster. */
+async function reload(studio) {
+  try {
+    const bundle = await loadBundle();
+    await studio.view?.replace(bundle);
+    studio.take(bundle);
+  } catch (error) {
+    say(error.message, { name: "reload", bad: true });
+  }
+}
+
+async function showObject(studio, { atPress, struck }, library) {
+  try {
+    const { ObjectView } = await library.catch((error) => {
+      throw new Error(
+        `The 3D library could not be loaded (${error.message}). Without a network, run avmsf studio --fetch-modules ` +
+          "once; sounds work all the same, by the buttons in the panel.",
+      );
+    });
+    studio.view = await ObjectView.create(at("stage"), at("overlay"), studio.bundle);
+  } catch (error) {
+    say(error.message, { name: "view", bad: true });
+    return;
+  }
+  at("stage").append(element("div", { className: "crosshair" }));
+  new BlowInput(studio.view, {
+    strike: (hit, factor, event) => {
+      at("hint").hidden = true;
+      struck(hit, factor, event);
+    },
+    hover: (hit) => studio.view.canvas.classList.toggle("over-object", hit !== null),
+    atPress,
+  });
+  at("tools").hidden = false;
+  at("look").addEventListener("click", () => studio.view.look(studio.view.up));
+  at("upright").addEventListener("click", () => {
+    const up = UPS[(UPS.indexOf(studio.view.up) + 1) % UPS.length];
+    studio.view.look(up);
+    at("upright").textContent = `Up: ${up}`;
+  });
+  at("unpaint").addEventListener("click", () => {
+    studio.choose(null);
+    studio.paint(null);
+  });
+}
+
+/** A WAV file may be dropped anywhere, where there is something to do with it. */
+function takeDrops({ take }) {
+  if (!take) return;
+  const target = at("drop-target");
+  const files = ({ dataTransfer }) => [...(dataTransfer?.types ?? [])].includes("Files");
+  window.addEventListener("dragover", (event) => {
+    if (!files(event)) return;
+    event.preventDefault();
+    target.hidden = false;
+  });
+  window.addEventListener("dragleave", (event) => {
+    if (event.relatedTarget === null) target.hidden = true;
+  });
+  window.addEventListener("drop", (event) => {
+    event.preventDefault();
+    target.hidden = true;
+    const [file] = event.dataTransfer?.files ?? [];
+    if (file) take(file);
+  });
+}
+
+/** For scripts and tests: the same doors as the pointer's. */
+window.avmsf = {
+  ready: null,
+  /** Strike a contact, by its row or by a place on the object, metres. */
+  strike(contact, { force = 1, contactTime = null } = {}) {
+    const { studio } = window.avmsf;
+    const row = typeof contact === "number" ? contact : studio.view.contactAt(contact).row;
+    studio.strike(row, { force, contactTime });
+    return row;
+  },
+  /** The sound of blows [{row, force, contactTime, when}], from the bank that plays. */
+  renderOffline: (blows, seconds, options) => window.avmsf.studio.engine.renderOffline(blows, seconds, options),
+  pick: (clientX, clientY) => window.avmsf.studio.view.pick(clientX, clientY),
+  project: (place) => window.avmsf.studio.view.project(place),
+  /** Values and colours that the contacts are painted by; null without paint. */
+  painted: () => window.avmsf.studio.view.painted,
+};
+
+window.avmsf.ready = open().catch((error) => {
+  at("name").textContent = "Nothing to show";
+  say(error.message, { name: "open", bad: true, answers: [["Load again", () => location.reload()]] });
+  throw error;
+});

@@ -1,0 +1,258 @@
+/** The object on the screen: turned, pointed at, painted, with marks that follow its surface. */
+
+import * as THREE from "three";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+
+import { PointGrid } from "./nearest.js";
+import { MeshLayer, PointLayer, SplatLayer } from "./objectlayers.js";
+
+/** Contacts about a place among which one on the near side of a wall is sought. */
+const WALL_NEIGHBOURS = 16;
+const UPS = { z: [0, 0, 1], y: [0, 1, 0], x: [1, 0, 0] };
+
+/** The object cannot be shown; the message says why. */
+export class ViewError extends Error {}
+
+export class ObjectView {
+  /** Show a bundle's object in `host`; marks are drawn as elements in `overlay`. */
+  static async create(host, overlay, bundle) {
+    let renderer;
+    try {
+      renderer = new THREE.WebGLRenderer({ antialias: bundle.manifest.object.kind !== "gaussians", alpha: true });
+    } catch {
+      throw new ViewError(
+        "This browser shows no 3D (WebGL is missing or switched off), so the object cannot be seen. Sounds work all " +
+          "the same: strike contacts by the buttons in the panel.",
+      );
+    }
+    const view = new ObjectView(host, overlay, renderer);
+    await view.replace(bundle);
+    return view;
+  }
+
+  constructor(host, overlay, renderer) {
+    this.host = host;
+    this.overlay = overlay;
+    this.renderer = renderer;
+    this.marks = new Map();
+    this.scene = new THREE.Scene();
+    this.camera = new THREE.PerspectiveCamera(35, 1, 0.001, 100);
+    this.camera.up.set(...UPS.z);
+    // A lamp that goes with the eye: whatever one looks at is lit.
+    const lamp = new THREE.DirectionalLight(0xffffff, 1.4);
+    lamp.position.set(0.4, 0.6, 1);
+    this.camera.add(lamp);
+    this.scene.add(this.camera, new THREE.AmbientLight(0xffffff, 1.9));
+    host.append(renderer.domElement);
+    this.#follow();
+    new ResizeObserver(() => this.#resize()).observe(host);
+    this.#resize();
+  }
+
+  get canvas() {
+    return this.renderer.domElement;
+  }
+
+  #follow() {
+    this.controls?.dispose();
+    this.controls = new OrbitControls(this.camera, this.canvas);
+    this.controls.addEventListener("change", () => this.redraw());
+  }
+
+  /** Show another bundle, from where one looked at the last if its contacts are the same. */
+  async replace(bundle) {
+    const points = bundle.tensors.points;
+    if (!points?.length) {
+      throw new ViewError(
+        "This field has no geometry: it holds no place on an object that could be shown. Give it one with " +
+          "`avmsf studio FIELD --object MESH`, or strike contacts by the buttons in the panel.",
+      );
+    }
+    const same = this.grid?.count === points.length / 3 && points.every((value, at) => value === this.grid.points[at]);
+    if (same && this.object?.file === bundle.manifest.object.file) {
+      this.normals = bundle.tensors.normals;
+      return;
+    }
+    this.grid = new PointGrid(points);
+    this.spacing = this.grid.spacing;
+    this.normals = bundle.tensors.normals;
+    const layer = await this.#layer(bundle);
+    if (this.layer) {
+      this.scene.remove(this.layer.object);
+      this.layer.dispose();
+    }
+    this.layer = layer;
+    this.object = bundle.manifest.object;
+    this.scene.add(layer.object);
+    this.look();
+  }
+
+  async #layer(bundle) {
+    const { kind, file } = bundle.manifest.object;
+    if (kind === "points" || !file) return new PointLayer(this.grid, this.spacing);
+    const answer = await fetch(bundle.url(file));
+    if (!answer.ok) throw new ViewError(`The object's file ${file} cannot be read (${answer.status}).`);
+    const bytes = await answer.arrayBuffer();
+    if (kind === "mesh") return MeshLayer.load(bytes, this.grid, this.spacing);
+    return SplatLayer.load(bytes, this.grid, { renderer: this.renderer, onDirty: () => this.redraw() });
+  }
+
+  /** Look at the whole object from above its side, with this axis upwards. */
+  look(up = "z") {
+    this.up = up;
+    const { low, points } = this.grid;
+    const high = [-Infinity, -Infinity, -Infinity];
+    for (let at = 0; at < points.length; at++) high[at % 3] = Math.max(high[at % 3], points[at]);
+    const middle = low.map((value, axis) => (value + high[axis]) / 2);
+    const away = { z: [0.75, -1, 0.85], y: [0.75, 0.85, 1], x: [0.85, 0.75, -1] }[up];
+    const distance = (0.62 * this.grid.diagonal) / Math.sin((this.camera.fov * Math.PI) / 360);
+    const fit = Math.max(1, 1 / this.camera.aspect) * distance;
+    this.camera.up.set(...UPS[up]);
+    this.camera.position.set(...away).setLength(fit).add(new THREE.Vector3(...middle));
+    this.camera.near = fit / 100;
+    this.camera.far = fit * 10;
+    this.camera.updateProjectionMatrix();
+    // The controls take the upward axis when they are made.
+    this.#follow();
+    this.controls.target.set(...middle);
+    this.controls.minDistance = this.grid.diagonal / 20;
+    this.controls.maxDistance = fit * 5;
+    this.controls.update();
+    this.redraw();
+  }
+
+  /** Turn about the object by angles, radians: to the right, and up. */
+  turn(right, up) {
+    const offset = this.camera.position.clone().sub(this.controls.target);
+    const toUp = new THREE.Quaternion().setFromUnitVectors(this.camera.up, new THREE.Vector3(0, 1, 0));
+    offset.applyQuaternion(toUp);
+    const sphere = new THREE.Spherical().setFromVector3(offset);
+    sphere.theta += right;
+    sphere.phi -= up;
+    offset.setFromSpherical(sphere.makeSafe()).applyQuaternion(toUp.invert());
+    this.camera.position.copy(this.controls.target).add(offset);
+    this.controls.update();
+    this.redraw();
+  }
+
+  /** Look at the object from the side on which a place lies, a little from above. */
+  face(place) {
+    const { target } = this.controls;
+    const distance = this.camera.position.distanceTo(target);
+    const outward = new THREE.Vector3(...place).sub(target).divideScalar(this.grid.diagonal / 2);
+    outward.addScaledVector(this.camera.up, 0.5);
+    if (outward.lengthSq() === 0) return;
+    this.camera.position.copy(target).add(outward.setLength(distance));
+    this.controls.update();
+    this.redraw();
+  }
+
+  /** What lies under a place on the screen: {row, place, normal}, the nearest contact's row; null beside the object. */
+  pick(clientX, clientY) {
+    const box = this.canvas.getBoundingClientRect();
+    const onScreen = new THREE.Vector2(
+      (2 * (clientX - box.left)) / box.width - 1,
+      1 - (2 * (clientY - box.top)) / box.height,
+    );
+    const raycaster = new THREE.Raycaster();
+    this.camera.updateMatrixWorld();
+    raycaster.setFromCamera(onScreen, this.camera);
+    const hit = this.layer.hit(raycaster) ?? this.#hitContacts(raycaster.ray);
+    return hit ? this.contactAt(hit.toArray(), raycaster.ray.direction.toArray()) : null;
+  }
+
+  /** Where a ray meets the surface that the contacts stand for: discs as wide as they lie apart. */
+  #hitContacts({ origin, direction }) {
+    const { points, count } = this.grid;
+    const [ox, oy, oz] = origin.toArray();
+    const [dx, dy, dz] = direction.toArray();
+    const reach = 1.5 * this.spacing;
+    let [best, nearest] = [Infinity, null];
+    for (let row = 0; row < count; row++) {
+      const [x, y, z] = [points[3 * row] - ox, points[3 * row + 1] - oy, points[3 * row + 2] - oz];
+      const along = x * dx + y * dy + z * dz;
+      const beside = Math.hypot(x - along * dx, y - along * dy, z - along * dz);
+      // Among neighbours on the near side, the one that the ray comes closest to.
+      const cost = along + 3 * beside;
+      if (beside <= reach && cost < best) [best, nearest] = [cost, row];
+    }
+    return nearest === null ? null : new THREE.Vector3(...this.placeOf(nearest));
+  }
+
+  /** The contact nearest to a place; along a `sight`, of those whose side of a thin wall it meets. */
+  contactAt(place, sight = null) {
+    const near = this.grid.nearest(...place, sight && this.normals ? WALL_NEIGHBOURS : 1);
+    const meets = ({ row, distance }) =>
+      distance <= 3 * this.spacing && this.normalOf(row).reduce((sum, value, at) => sum + value * sight[at], 0) < 0;
+    const { row, distance } = (near.length > 1 && near.find(meets)) || near[0];
+    return { row, place, distance, normal: this.normalOf(row) };
+  }
+
+  placeOf(row) {
+    return Array.from(this.grid.points.subarray(3 * row, 3 * row + 3));
+  }
+
+  normalOf(row) {
+    return this.normals ? Array.from(this.normals.subarray(3 * row, 3 * row + 3)) : null;
+  }
+
+  /** Where a place is on the screen, in client coordinates, and whether its side of the surface faces the eye. */
+  project(place, normal = null) {
+    const box = this.canvas.getBoundingClientRect();
+    this.camera.updateMatrixWorld();
+    const onScreen = new THREE.Vector3(...place).project(this.camera);
+    const sight = new THREE.Vector3(...place).sub(this.camera.position);
+    return {
+      x: box.left + ((onScreen.x + 1) / 2) * box.width,
+      y: box.top + ((1 - onScreen.y) / 2) * box.height,
+      facing: onScreen.z < 1 && (!normal || sight.dot(new THREE.Vector3(...normal)) < 0),
+    };
+  }
+
+  /** Paint each contact by its value on a scale; null takes the paint off. */
+  paint(values, scale) {
+    this.painted = values && { values, colours: scale.colours(values) };
+    this.layer.paint(this.painted?.colours ?? null);
+    this.redraw();
+  }
+
+  /** Let an element follow a place on the surface; the old one of this name goes. */
+  mark(name, element, place, normal = null) {
+    this.unmark(name);
+    this.overlay.append(element);
+    this.marks.set(name, { element, place, normal });
+    this.redraw();
+  }
+
+  unmark(name) {
+    this.marks.get(name)?.element.remove();
+    this.marks.delete(name);
+  }
+
+  redraw() {
+    this.waiting ??= requestAnimationFrame(() => {
+      this.waiting = undefined;
+      this.#draw();
+    });
+  }
+
+  #draw() {
+    this.renderer.render(this.scene, this.camera);
+    const box = this.overlay.getBoundingClientRect();
+    for (const { element, place, normal } of this.marks.values()) {
+      const { x, y, facing } = this.project(place, normal);
+      element.style.transform = `translate(${x - box.left}px, ${y - box.top}px)`;
+      element.classList.toggle("behind", !facing);
+    }
+  }
+
+  #resize() {
+    const { clientWidth: width, clientHeight: height } = this.host;
+    if (!width || !height) return;
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.renderer.setSize(width, height);
+    this.camera.aspect = width / height;
+    this.camera.updateProjectionMatrix();
+    this.redraw();
+  }
+}

@@ -1,0 +1,102 @@
+/** What the page asks of the server that it came from: one method for each thing the server does. */
+
+/** The server said no, or did not answer: `status` is 0 then. */
+export class ServerError extends Error {
+  constructor(words, { status = 0, revision = null } = {}) {
+    super(words);
+    this.status = status;
+    this.revision = revision;
+  }
+
+  /** Whether another tab was faster. */
+  get stale() {
+    return this.status === 409 && this.revision !== null;
+  }
+
+  get unreachable() {
+    return this.status === 0;
+  }
+}
+
+const GONE = "The server does not answer. Is `avmsf studio` still running? Nothing is lost here: try again.";
+
+async function ask(method, place, { body, headers, signal } = {}) {
+  let answer;
+  try {
+    answer = await fetch(place, { method, body, headers, signal, cache: "no-store" });
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new ServerError(GONE);
+  }
+  const text = await answer.text().catch(() => "");
+  let content = null;
+  try {
+    content = text ? JSON.parse(text) : null;
+  } catch {
+    content = null;
+  }
+  if (answer.ok) return content;
+  const words = content?.error ?? `The server answered ${answer.status} to ${method} ${place}.`;
+  throw new ServerError(words, { status: answer.status, revision: content?.revision ?? null });
+}
+
+/** What only the last message of a job holds. */
+const OUTCOMES = ["error", "field", "object", "revision"];
+
+const json = (content) => ({ body: JSON.stringify(content), headers: { "Content-Type": "application/json" } });
+const wav = (body, headers = {}) => ({ body, headers: { "Content-Type": "audio/wav", ...headers } });
+
+/** A strike's address; its file may lie in a folder of its own. */
+const strikePlace = (file) => `capture/strikes/${file.split("/").map(encodeURIComponent).join("/")}`;
+
+/** Numbers that came as base64 of float32, little endian. */
+export function numbers(text) {
+  const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  return new Float32Array(bytes.buffer);
+}
+
+export const server = {
+  manifest: () => ask("GET", "manifest.json"),
+
+  /** Where a recording was struck. */
+  locate: (recording) => ask("POST", "locate", wav(recording)),
+
+  edit: (base, change) => ask("POST", "edit", json({ base, ...change })),
+  undo: (base) => ask("POST", "undo", json({ base })),
+  save: (base, name) => ask("POST", "save", json({ base, name })),
+
+  capture: () => ask("GET", "capture"),
+  checkStrike: (recording) => ask("POST", "capture/check", wav(recording)),
+
+  /** Add a strike; the same key twice adds it once. */
+  addStrike: (recording, { contact, direction, key }) => {
+    const query = new URLSearchParams();
+    ["x", "y", "z"].forEach((axis, place) => query.set(axis, contact[place]));
+    if (direction) ["nx", "ny", "nz"].forEach((axis, place) => query.set(axis, direction[place]));
+    return ask("POST", `capture/strikes?${query}`, wav(recording, { "Idempotency-Key": key }));
+  },
+  redoStrike: (file, recording, { key }) =>
+    ask("PUT", strikePlace(file), wav(recording, { "Idempotency-Key": key })),
+  removeStrike: (file) => ask("DELETE", strikePlace(file)),
+
+  reconstruct: (settings = {}) => ask("POST", "reconstruct", json(settings)),
+  cancel: (job) => ask("DELETE", `jobs/${encodeURIComponent(job)}`),
+
+  /** Hear of a job's progress; `heard` gets every message, the last of which holds what came of it or "error". */
+  follow(job, heard) {
+    const source = new EventSource(`jobs/${encodeURIComponent(job)}/events`);
+    const take = (event) => {
+      const message = JSON.parse(event.data);
+      const ended = message.stage === "cancelled" || OUTCOMES.some((name) => name in message);
+      if (ended) source.close();
+      heard(message, ended);
+    };
+    source.onmessage = take;
+    // The source tries again by itself while it is connecting; only a source that has given up is closed.
+    source.onerror = () => {
+      if (source.readyState === EventSource.CLOSED) heard({ error: GONE }, true);
+      else heard({ words: "The connection broke; listening again …" }, false);
+    };
+    return () => source.close();
+  },
+};

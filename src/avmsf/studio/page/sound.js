@@ -1,0 +1,223 @@
+// The sound engine: blows on the field's points, heard through the modal bank on the audio thread.
+
+import { pulseSamples } from "./pulse.js";
+import { resample } from "./resample.js";
+
+const PROCESSOR = "avmsf-modal-bank";
+/** Blows that may sound at once; with dampings shared by all contacts this bounds their noise alone. */
+const VOICES = 64;
+/** Peak that the loudest contact's blow of force 1 is brought to, over full scale. */
+const COMFORTABLE = 0.5;
+/** Contacts, and seconds of their sound, that the loudest is sought among. */
+const LOUD_CONTACTS = 8, LOUD_SECONDS = 0.03;
+
+/** What a field is at one sample rate, and the blows on it as the bank wants them. */
+class Tuned {
+  constructor(bundle, rate) {
+    const { manifest, tensors } = bundle;
+    this.rate = rate;
+    this.tensors = tensors;
+    this.modes = manifest.modes;
+    this.points = manifest.points;
+    this.kept = [...tensors.frequency.keys()].filter((mode) => tensors.frequency[mode] < rate / 2);
+    this.shared = manifest.damping === "shared";
+    this.frequency = this.pick(tensors.frequency, 0);
+    const damping = this.shared ? this.pick(tensors.damping, 0) : null;
+    const noise = resample(tensors.noise, manifest.sampleRate, rate);
+    this.field = { frequency: this.frequency, damping, noise };
+  }
+
+  pick(tensor, row) {
+    return Float64Array.from(this.kept, (mode) => tensor[row * this.modes + mode]);
+  }
+
+  blow(row, { force = 1, contactTime = 0, shape = "half-sine" }, frame, id = 0) {
+    if (!(Number.isInteger(row) && row >= 0 && row < this.points))
+      throw new RangeError(`there is no contact ${row} among ${this.points}`);
+    if (!Number.isFinite(force)) throw new RangeError(`a blow of force ${force}: expected a number`);
+    const sine = this.pick(this.tensors.sine, row), cosine = this.pick(this.tensors.cosine, row);
+    const pulse = pulseSamples(contactTime, this.rate, shape);
+    let loudest = 0;
+    for (let mode = 0; mode < sine.length; mode++) {
+      const passed = passedBy(pulse, (2 * Math.PI * this.frequency[mode]) / this.rate);
+      loudest = Math.max(loudest, Math.hypot(sine[mode], cosine[mode]) * passed * Math.abs(force));
+    }
+    const damping = this.shared ? null : this.pick(this.tensors.damping, row);
+    return { id, frame, sine, cosine, damping, force: pulse.map((part) => part * force), strength: force, loudest };
+  }
+
+  /** The largest that a sample of a blow of force 1 can be. */
+  bound(row) {
+    let sum = this.noisePeak ??= this.field.noise.reduce((peak, value) => Math.max(peak, Math.abs(value)), 0);
+    for (const mode of this.kept) {
+      const place = row * this.modes + mode;
+      // Math.hypot is tenfold slower, and this runs for every contact before the page can sound.
+      sum += Math.sqrt(this.tensors.sine[place] ** 2 + this.tensors.cosine[place] ** 2);
+    }
+    return sum;
+  }
+
+  /** The peak of the loudest contacts' sound, at force 1. */
+  loudest() {
+    const bounds = Array.from({ length: this.points }, (_, row) => [this.bound(row), row]);
+    const rows = bounds.sort((one, other) => other[0] - one[0]).slice(0, LOUD_CONTACTS);
+    return rows.reduce((peak, [, row]) => Math.max(peak, this.peak(row)), 0);
+  }
+
+  peak(row) {
+    const sound = new Float64Array(Math.ceil(LOUD_SECONDS * this.rate));
+    this.kept.forEach((mode) => {
+      const place = row * this.modes + mode, damping = this.tensors.damping[this.shared ? mode : place];
+      const radius = Math.exp(-damping / this.rate), angle = (2 * Math.PI * this.tensors.frequency[mode]) / this.rate;
+      const turnRe = radius * Math.cos(angle), turnIm = radius * Math.sin(angle);
+      let re = this.tensors.cosine[place], im = -this.tensors.sine[place];
+      for (let n = 0; n < sound.length; n++) {
+        sound[n] += re;
+        [re, im] = [turnRe * re - turnIm * im, turnRe * im + turnIm * re];
+      }
+    });
+    return sound.reduce((peak, value) => Math.max(peak, Math.abs(value)), 0);
+  }
+}
+
+/** Return how much of a vibration of `angle` radians a sample a pulse leaves. */
+function passedBy(pulse, angle) {
+  const turnRe = Math.cos(angle), turnIm = Math.sin(angle);
+  let re = 1, im = 0, sumRe = 0, sumIm = 0;
+  for (const part of pulse) {
+    sumRe += part * re;
+    sumIm += part * im;
+    [re, im] = [turnRe * re - turnIm * im, turnRe * im + turnIm * re];
+  }
+  return Math.hypot(sumRe, sumIm);
+}
+
+function bankNode(context, tuned, { level, voices = VOICES, blows = [] }) {
+  const processorOptions = { field: tuned.field, level, voices, blows };
+  return new AudioWorkletNode(context, PROCESSOR, {
+    numberOfInputs: 1, numberOfOutputs: 1, outputChannelCount: [1],
+    channelCount: 1, channelCountMode: "explicit", channelInterpretation: "speakers", processorOptions,
+  });
+}
+
+async function addBank(context) {
+  if (context.audioWorklet === undefined)
+    throw new Error("this browser offers no AudioWorklet here: open the page by https or from localhost, in a current browser");
+  // A page that is one file carries the processor; as data, for browsers load no worklet from a file's blobs.
+  const inlined = globalThis.avmsfInlined?.["page/bank.js"];
+  const url = inlined === undefined
+    ? new URL("./bank.js", import.meta.url).href : `data:${inlined.type};base64,${inlined.base64}`;
+  await context.audioWorklet.addModule(url);
+}
+
+/**
+ * Return the sound of blows, [{row, force, contactTime, shape, when}] with `when` in seconds, from the bank that also
+ * plays live. At the field's own rate, or another; as long as a training sound, or `seconds`. In the field's unit.
+ */
+export async function renderOffline(bundle, blows, seconds, { sampleRate = bundle.manifest.sampleRate, voices } = {}) {
+  const samples = seconds === undefined
+    ? Math.round((bundle.manifest.samples * sampleRate) / bundle.manifest.sampleRate) : Math.round(seconds * sampleRate);
+  const context = new OfflineAudioContext(1, Math.max(1, samples), sampleRate);
+  await addBank(context);
+  const tuned = new Tuned(bundle, context.sampleRate);
+  const ready = blows.map((blow, id) => tuned.blow(blow.row, blow, Math.round((blow.when ?? 0) * sampleRate), id));
+  // So low that the limiter has nothing to do, whatever the unit; a power of two rounds nothing.
+  const bound = blows.reduce((sum, { row, force = 1 }) => sum + Math.abs(force) * tuned.bound(row), 0);
+  const level = bound > 0 ? 2 ** -Math.ceil(Math.log2(2 * bound)) : 1;
+  bankNode(context, tuned, { level, blows: ready, voices }).connect(context.destination);
+  const sound = (await context.startRendering()).getChannelData(0);
+  return sound.map((value) => value / level);
+}
+
+/** Blows heard live. */
+export class SoundEngine {
+  /**
+   * Return an engine. It may be started before the reader has touched the page; browsers then hold the sound back until
+   * the first blow that follows a touch. Throws with words for the reader where there is no sound to be had.
+   */
+  static async start(bundle, { context } = {}) {
+    if (typeof AudioContext === "undefined") throw new Error("this browser cannot play computed sound (no AudioContext)");
+    const used = context ?? new AudioContext({ latencyHint: "interactive" });
+    await addBank(used);
+    return new SoundEngine(bundle, used);
+  }
+
+  constructor(bundle, context) {
+    this.bundle = bundle;
+    this.context = context;
+    this.tuned = new Tuned(bundle, context.sampleRate);
+    this.volume = 1;
+    this.comfortable = COMFORTABLE / (this.tuned.loudest() || 1);
+    this.node = bankNode(context, this.tuned, { level: this.comfortable });
+    this.analyser = new AnalyserNode(context, { fftSize: 8192, smoothingTimeConstant: 0 });
+    this.node.connect(this.analyser).connect(context.destination);
+    this.next = 1;
+    this.state = { voices: 0, modes: 0, limited: false };
+    /** Called with {id, time} when a blow's first sample is made; `time` is the context's, seconds. */
+    this.onbegin = null;
+    /** Called with {voices, modes, limited} while anything sounds. */
+    this.onstate = null;
+    this.node.port.onmessage = ({ data }) => this.hear(data);
+  }
+
+  /** What samples are multiplied by on their way out: the volume, over the loudest contact's peak. */
+  get level() {
+    return this.volume * this.comfortable;
+  }
+
+  setVolume(volume) {
+    this.volume = volume;
+    this.node.port.postMessage({ type: "level", level: this.level });
+  }
+
+  /**
+   * Strike the contact in a row of the bundle's points. `force` in newtons where the field knows them, else relative to
+   * an average recorded blow; `contactTime` in seconds, 0 for the recorded hammer; `when` in seconds of the context's
+   * time, at once without it. Returns the blow's number.
+   */
+  strike(row, { force = 1, contactTime = 0, shape = "half-sine", when } = {}) {
+    const id = this.next++;
+    const frame = when === undefined ? 0 : Math.round(when * this.context.sampleRate);
+    this.node.port.postMessage({ type: "strike", blow: this.tuned.blow(row, { force, contactTime, shape }, frame, id) });
+    if (this.context.state === "suspended") this.context.resume();
+    return id;
+  }
+
+  renderOffline(blows, seconds, options) {
+    return renderOffline(this.bundle, blows, seconds, options);
+  }
+
+  /** Go on with another field, such as an edited one; what sounds fades. The level stays, so that edits are compared. */
+  replace(bundle) {
+    this.bundle = bundle;
+    this.tuned = new Tuned(bundle, this.context.sampleRate);
+    this.node.port.postMessage({ type: "field", field: this.tuned.field });
+  }
+
+  /** Play a recording in the field's unit, at the level of the blows; returns its source, which `stop` ends. */
+  play(audioBuffer, { when = 0 } = {}) {
+    const source = new AudioBufferSourceNode(this.context, { buffer: audioBuffer });
+    source.connect(this.node);
+    source.start(when);
+    if (this.context.state === "suspended") this.context.resume();
+    return source;
+  }
+
+  /** Let everything that sounds fade. */
+  hush() {
+    this.node.port.postMessage({ type: "hush" });
+  }
+
+  async close() {
+    this.node.disconnect();
+    await this.context.close();
+  }
+
+  hear({ type, ...data }) {
+    if (type === "begun") this.onbegin?.({ id: data.id, time: data.frame / this.context.sampleRate });
+    if (type === "state") {
+      this.state = data;
+      this.onstate?.(data);
+    }
+  }
+}

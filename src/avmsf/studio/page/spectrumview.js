@@ -1,0 +1,281 @@
+/** Spectrum and decay of what sounds, drawn while it sounds; two spectra side by side to compare. */
+
+import { decibels } from "./modes.js";
+
+const LOW = 40;
+const HIGH = 20000;
+const RANGE_DB = 80;
+/** What a Blackman window and the halves of a real spectrum take from a sine's level in the browser's analyser. */
+const ANALYSER_DB = 20 * Math.log10(2 / 0.42);
+const QUIET_SECONDS = 0.6;
+const LABELLED = [100, 1000, 10000];
+const MARGIN = { left: 34, right: 8, top: 8, bottom: 20 };
+
+/** A canvas that is as sharp as the screen, with axes in the page's own colours. */
+class Chart {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.context = canvas.getContext("2d");
+  }
+
+  begin() {
+    const { canvas, context } = this;
+    const ratio = devicePixelRatio;
+    this.width = canvas.clientWidth;
+    this.height = canvas.clientHeight;
+    if (canvas.width !== Math.round(this.width * ratio) || canvas.height !== Math.round(this.height * ratio)) {
+      canvas.width = Math.round(this.width * ratio);
+      canvas.height = Math.round(this.height * ratio);
+    }
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.clearRect(0, 0, this.width, this.height);
+    const style = getComputedStyle(canvas);
+    this.ink = Object.fromEntries(
+      ["faint", "line", "accent", "second"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]),
+    );
+    context.font = `11px ${style.fontFamily}`;
+    context.lineWidth = 1;
+  }
+
+  x(share) {
+    return MARGIN.left + share * (this.width - MARGIN.left - MARGIN.right);
+  }
+
+  y(share) {
+    return MARGIN.top + share * (this.height - MARGIN.top - MARGIN.bottom);
+  }
+
+  axes(across, down) {
+    const { context, ink } = this;
+    context.strokeStyle = ink.line;
+    context.fillStyle = ink.faint;
+    context.beginPath();
+    for (const { share, words } of down) {
+      const y = Math.round(this.y(share)) + 0.5;
+      context.moveTo(this.x(0), y);
+      context.lineTo(this.x(1), y);
+      context.textAlign = "right";
+      context.textBaseline = "middle";
+      context.fillText(words, this.x(0) - 5, y);
+    }
+    for (const { share, words } of across) {
+      const x = Math.round(this.x(share)) + 0.5;
+      context.moveTo(x, this.y(0));
+      context.lineTo(x, this.y(1));
+      context.textAlign = share > 0.9 ? "right" : "center";
+      context.textBaseline = "bottom";
+      context.fillText(words, share > 0.9 ? this.x(1) : x, this.height - 3);
+    }
+    context.stroke();
+  }
+
+  curve(shares, colour, { width = 1.5, dash = [], fill = false } = {}) {
+    const { context } = this;
+    context.save();
+    context.beginPath();
+    context.rect(this.x(0), this.y(0), this.x(1) - this.x(0), this.y(1) - this.y(0));
+    context.clip();
+    context.beginPath();
+    shares.forEach(([across, down], place) => {
+      const [x, y] = [this.x(across), this.y(Math.min(Math.max(down, -0.1), 1.1))];
+      if (place) context.lineTo(x, y);
+      else context.moveTo(x, y);
+    });
+    context.strokeStyle = colour;
+    context.lineWidth = width;
+    context.setLineDash(dash);
+    context.stroke();
+    if (fill) {
+      context.lineTo(this.x(shares.at(-1)[0]), this.y(1));
+      context.lineTo(this.x(shares[0][0]), this.y(1));
+      context.globalAlpha = 0.16;
+      context.fillStyle = colour;
+      context.fill();
+    }
+    context.restore();
+  }
+}
+
+const across = (frequency) => Math.log(frequency / LOW) / Math.log(HIGH / LOW);
+const named = (frequency) => (frequency >= 1000 ? `${frequency / 1000} kHz` : `${frequency} Hz`);
+
+export class SpectrumView {
+  #blow = null;
+  #trace = [];
+  #quietSince = null;
+  #compared = null;
+  #running = false;
+
+  constructor(spectrumCanvas, decayCanvas) {
+    this.spectrum = new Chart(spectrumCanvas);
+    this.decay = new Chart(decayCanvas);
+    this.modes = null;
+    this.engine = null;
+    this.analyser = null;
+    new ResizeObserver(() => this.#running || this.#draw()).observe(spectrumCanvas);
+  }
+
+  /** What is heard from now on: the field's modes, and the engine, or null without sound. */
+  listen(modes, engine) {
+    this.modes = modes;
+    this.engine = engine;
+    this.analyser = engine?.analyser ?? null;
+    this.#blow = null;
+    this.#draw();
+  }
+
+  /** A blow at a contact sounds from now on. */
+  struck(row, force) {
+    const { modes } = this;
+    const stems = Array.from({ length: modes.count }, (_, mode) => ({
+      frequency: modes.frequency(mode),
+      level: decibels(force * modes.amplitude(mode, row)),
+      damping: modes.damping(mode, row),
+    }));
+    const loudest = Math.max(...stems.map(({ level }) => level));
+    this.#blow = { stems, at: performance.now(), top: Math.ceil((loudest + 6) / 10) * 10, seconds: spanOf(stems) };
+    this.#compared = null;
+    this.#run();
+  }
+
+  /** Something else sounds, such as a recording: only what is heard is drawn. */
+  heard() {
+    this.#compared = null;
+    this.#run();
+  }
+
+  /** Draw two spectra over each other, each {label, levels} with levels in dB from LOW to HIGH. */
+  compare(recording, model) {
+    this.#compared = { recording, model };
+    this.#draw();
+  }
+
+  static get range() {
+    return { low: LOW, high: HIGH, count: 400 };
+  }
+
+  /** Decibels by which the engine makes everything louder or softer than the field has it. */
+  get #volume() {
+    return decibels(this.engine?.level ?? 1);
+  }
+
+  #run() {
+    this.#trace = [];
+    this.#quietSince = null;
+    if (this.#running) return;
+    this.#running = true;
+    const step = () => {
+      this.#running = this.#listenOnce() && !this.#compared;
+      this.#draw();
+      if (this.#running) requestAnimationFrame(step);
+    };
+    requestAnimationFrame(step);
+  }
+
+  /** Take down the level of this moment; returns whether anything is to come. */
+  #listenOnce() {
+    const seconds = this.#blow ? (performance.now() - this.#blow.at) / 1000 : 0;
+    if (!this.analyser) return this.#blow !== null && seconds < this.#blow.seconds;
+    this.wave ??= new Float32Array(this.analyser.fftSize);
+    this.lines ??= new Float32Array(this.analyser.frequencyBinCount);
+    this.analyser.getFloatTimeDomainData(this.wave);
+    this.analyser.getFloatFrequencyData(this.lines);
+    // The newest part only, so that the decay isn't blurred by the long window of the spectrum.
+    const newest = this.wave.subarray(Math.max(0, this.wave.length - 1024));
+    const power = newest.reduce((sum, value) => sum + value * value, 0) / newest.length;
+    const level = decibels(Math.sqrt(power)) - this.#volume;
+    this.#trace.push([seconds, level]);
+    const top = this.#blow?.top ?? 0;
+    if (level > top - RANGE_DB - 10) this.#quietSince = null;
+    else this.#quietSince ??= seconds;
+    const span = this.#blow?.seconds ?? 0;
+    return this.#quietSince === null || seconds - this.#quietSince < QUIET_SECONDS || seconds < Math.min(span, 1);
+  }
+
+  #draw() {
+    this.#drawSpectrum();
+    this.#drawDecay();
+  }
+
+  #drawSpectrum() {
+    const { spectrum: chart } = this;
+    chart.begin();
+    const top = this.#compared ? 0 : (this.#blow?.top ?? 0);
+    const down = (level) => (top - level) / RANGE_DB;
+    chart.axes(
+      LABELLED.map((frequency) => ({ share: across(frequency), words: named(frequency) })),
+      [0, 0.25, 0.5, 0.75, 1].map((share) => ({ share, words: `${Math.round(top - share * RANGE_DB)}` })),
+    );
+    if (this.#compared) {
+      for (const [{ levels }, colour, dash] of [
+        [this.#compared.recording, chart.ink.second, []],
+        [this.#compared.model, chart.ink.accent, []],
+      ]) {
+        const loudest = Math.max(...levels);
+        const shares = Array.from(levels, (level, place) => [place / (levels.length - 1), down(level - loudest)]);
+        chart.curve(shares, colour, { width: 1.3, dash });
+      }
+      return;
+    }
+    if (this.#blow) {
+      const seconds = (performance.now() - this.#blow.at) / 1000;
+      for (const { frequency, level, damping } of this.#blow.stems) {
+        const now = level - decibels(Math.exp(1)) * damping * seconds;
+        if (frequency < LOW || frequency > HIGH) continue;
+        const place = across(frequency);
+        // What it was at the blow stays to be seen, faintly.
+        for (const [height, colour, width] of [
+          [level, chart.ink.line, 3],
+          [now, chart.ink.accent, 2],
+        ]) {
+          if (height < top - RANGE_DB) continue;
+          chart.curve([[place, 1], [place, down(height)]], colour, { width });
+        }
+      }
+    }
+    if (this.analyser && this.lines && this.#running) {
+      const hertz = this.analyser.context.sampleRate / this.analyser.fftSize;
+      const shares = [];
+      for (let line = Math.ceil(LOW / hertz); line < this.lines.length && line * hertz <= HIGH; line++)
+        shares.push([across(line * hertz), down(Math.max(this.lines[line] + ANALYSER_DB - this.#volume, -1000))]);
+      if (shares.length) chart.curve(shares, chart.ink.second, { width: 1.2, fill: true });
+    }
+  }
+
+  #drawDecay() {
+    const { decay: chart } = this;
+    chart.begin();
+    const seconds = this.#blow?.seconds ?? 1;
+    const top = this.#blow?.top ?? 0;
+    const down = (level) => (top - level) / RANGE_DB;
+    const named = (share) => `${Number((share * seconds).toPrecision(2))} s`;
+    chart.axes(
+      (chart.width < 240 ? [0.5, 1] : [0.25, 0.5, 0.75, 1]).map((share) => ({ share, words: named(share) })),
+      [0, 0.25, 0.5, 0.75, 1].map((share) => ({ share, words: `${Math.round(top - share * RANGE_DB)}` })),
+    );
+    if (this.#trace.length > 1) {
+      const shares = this.#trace.map(([at, level]) => [at / seconds, down(level)]);
+      chart.curve(shares, chart.ink.second, { fill: true });
+    }
+    if (this.#blow) {
+      const shares = Array.from({ length: 101 }, (_, step) => {
+        const at = (step / 100) * seconds;
+        const power = this.#blow.stems.reduce(
+          (sum, { level, damping }) => sum + 0.5 * 10 ** (level / 10) * Math.exp(-2 * damping * at),
+          0,
+        );
+        return [step / 100, down(10 * Math.log10(power + 1e-30))];
+      });
+      chart.curve(shares, chart.ink.accent, { dash: [5, 4] });
+    }
+  }
+}
+
+/** Seconds that show the modes' sound fall by the range of the chart, or most of it. */
+function spanOf(stems) {
+  const loudest = Math.max(...stems.map(({ level }) => level));
+  const longest = stems.map(({ level, damping }) =>
+    Math.max(0, (level - loudest + RANGE_DB) / (decibels(Math.exp(1)) * damping)),
+  );
+  return Math.min(Math.max(...longest, 0.1), 6);
+}

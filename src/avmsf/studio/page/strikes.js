@@ -1,0 +1,146 @@
+/** The blows that were measured: marked on the object, each to be heard beside the model's sound. */
+
+import { attempt, button, element } from "./dom.js";
+import { soundSpectrum } from "./spectrum.js";
+import { SpectrumView } from "./spectrumview.js";
+
+const PAUSE_SECONDS = 0.25;
+const LONGEST_SECONDS = 2.5;
+
+export function measuredStrikes(studio) {
+  const list = element("ul", { className: "listing" });
+  const shown = element("input", { type: "checkbox", checked: true });
+  const box = element(
+    "div",
+    { className: "group" },
+    element("h2", {}, "Measured strikes"),
+    element("small", {}, "Choose one to hear its recording, then the model at the same contact."),
+    list,
+    element("label", { className: "check" }, shown, "Mark them on the object"),
+  );
+  const comparison = new Comparison(studio);
+  let strikes = [];
+
+  const choose = (place) => {
+    [...list.children].forEach((item, at) => item.classList.toggle("chosen", at === place));
+    for (const dot of document.querySelectorAll(".mark .dot[data-strike]"))
+      dot.classList.toggle("chosen", Number(dot.dataset.strike) === place);
+    return strikes[place];
+  };
+  const play = (place, what) => attempt(() => comparison[what](choose(place)), "strike");
+
+  const mark = () => {
+    if (!studio.view) return;
+    strikes.forEach((strike, place) => {
+      if (!shown.checked) {
+        studio.view.unmark(`strike-${place}`);
+        return;
+      }
+      const dot = button("", () => play(place, "both"), {
+        className: "dot",
+        tabIndex: -1,
+        title: `${strike.name}: recording, then model`,
+        "data-strike": place,
+      });
+      const { normal } = studio.view.contactAt(strike.contact);
+      studio.view.mark(`strike-${place}`, element("div", { className: "mark" }, dot), strike.contact, normal);
+    });
+  };
+  shown.addEventListener("change", mark);
+
+  const showAll = () => {
+    strikes.forEach((_, place) => studio.view?.unmark(`strike-${place}`));
+    strikes = studio.bundle.manifest.strikes ?? [];
+    box.hidden = strikes.length === 0;
+    list.replaceChildren(
+      ...strikes.map((strike, place) =>
+        element(
+          "li",
+          {},
+          button(strike.name, () => play(place, "both"), { className: "grow", title: "Recording, then model" }),
+          button("Recording", () => play(place, "recording"), { className: "small" }),
+          button("Model", () => play(place, "model"), { className: "small" }),
+        ),
+      ),
+    );
+    mark();
+  };
+  studio.on("bundle view", showAll);
+  return box;
+}
+
+/** Recording and model of one strike, to hear one after the other and to see over each other. */
+class Comparison {
+  #buffers = new Map();
+
+  constructor(studio) {
+    this.studio = studio;
+    studio.addEventListener("bundle", () => this.#buffers.clear());
+  }
+
+  row(strike) {
+    const { points } = this.studio.bundle.tensors;
+    let [best, nearest] = [Infinity, 0];
+    for (let row = 0; row < points.length / 3; row++) {
+      const distance = Math.hypot(...strike.contact.map((value, axis) => value - points[3 * row + axis]));
+      if (distance < best) [best, nearest] = [distance, row];
+    }
+    return nearest;
+  }
+
+  async recording(strike) {
+    const { studio } = this;
+    this.#expectSound();
+    const buffer = await this.#buffer(strike);
+    studio.engine.play(buffer);
+    studio.spectra.heard();
+  }
+
+  async model(strike) {
+    this.#expectSound();
+    // As the recorded blow was: no harder, no softer.
+    this.studio.strike(this.row(strike), { force: 1, contactTime: null });
+  }
+
+  async both(strike) {
+    const { studio } = this;
+    this.#expectSound();
+    const buffer = await this.#buffer(strike);
+    const row = this.row(strike);
+    const length = Math.min(buffer.duration, LONGEST_SECONDS);
+    studio.engine.play(buffer);
+    studio.strikeSoon?.cancel();
+    const timer = setTimeout(
+      () => studio.engine.strike(row, { force: 1 }),
+      1000 * (length + PAUSE_SECONDS),
+    );
+    studio.strikeSoon = { cancel: () => clearTimeout(timer) };
+    const model = await studio.engine.renderOffline([{ row, force: 1 }], length);
+    const { sampleRate } = studio.bundle.manifest;
+    const part = buffer.getChannelData(0).subarray(0, Math.round(length * buffer.sampleRate));
+    studio.spectra.compare(
+      { levels: soundSpectrum(part, buffer.sampleRate, SpectrumView.range) },
+      { levels: soundSpectrum(model, sampleRate, SpectrumView.range) },
+    );
+    document.getElementById("blow-facts").textContent = `${strike.name}: recording and model`;
+  }
+
+  #expectSound() {
+    if (!this.studio.engine) throw new Error("This browser plays no sound here, so there is nothing to compare.");
+  }
+
+  async #buffer(strike) {
+    if (!this.#buffers.has(strike)) {
+      const answer = await fetch(this.studio.bundle.url(strike.sound));
+      if (!answer.ok) throw new Error(`The recording ${strike.sound} cannot be read (${answer.status}).`);
+      const bytes = await answer.arrayBuffer();
+      const rate = this.studio.bundle.manifest.sampleRate;
+      try {
+        this.#buffers.set(strike, await new OfflineAudioContext(1, 1, rate).decodeAudioData(bytes));
+      } catch {
+        throw new Error(`${strike.sound}: expected a WAV file, found what the browser cannot read.`);
+      }
+    }
+    return this.#buffers.get(strike);
+  }
+}

@@ -1,0 +1,55 @@
+/** One recording before it is kept: what it looks like, how loud it is, when it begins, whether it is cut off. */
+
+import { button, element, seconds } from "./dom.js";
+
+/** What the server measured, in words; `report` as `capture/check` gives it. */
+export function measures(report) {
+  const rows = [
+    ["Peak", report.peak_db === null ? "silence" : `${report.peak_db.toFixed(1)} dB re full scale`],
+    ["Clipping", report.clipped ? "yes: the loudest samples are cut off" : "none"],
+    ["Onset", report.onset_seconds === null ? "no blow found" : `at ${seconds(report.onset_seconds)}`],
+    ["Length", seconds(report.seconds)],
+  ];
+  const list = element("dl", { className: "measures" });
+  for (const [name, words] of rows) list.append(element("dt", {}, name), element("dd", {}, words));
+  const warnings = report.warnings ?? [];
+  const verdict = warnings.length
+    ? warnings.map((words) => element("p", { className: "warning" }, words))
+    : [element("p", { className: "fine" }, "✓ A good recording.")];
+  return element("div", { className: "group" }, list, ...verdict);
+}
+
+/** Draw a recording's envelope into a canvas, and a line at its onset. */
+export async function drawTake(canvas, blob, onset) {
+  const { samples, sampleRate } = await decode(blob);
+  const context = canvas.getContext("2d");
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((size) => Math.round(size * devicePixelRatio));
+  [canvas.width, canvas.height] = [width, height];
+  const style = getComputedStyle(canvas);
+  context.fillStyle = style.getPropertyValue("--second");
+  const peak = samples.reduce((most, value) => Math.max(most, Math.abs(value)), 1e-9);
+  for (let x = 0; x < width; x++) {
+    let [low, high] = [0, 0];
+    const last = ((x + 1) * samples.length) / width;
+    for (let at = Math.floor((x * samples.length) / width); at < last; at++) {
+      low = Math.min(low, samples[at]);
+      high = Math.max(high, samples[at]);
+    }
+    const y = (value) => (height / 2) * (1 - (0.95 * value) / peak);
+    context.fillRect(x, y(high), 1, Math.max(1, y(low) - y(high)));
+  }
+  if (onset === null || onset === undefined) return;
+  context.fillStyle = style.getPropertyValue("--accent");
+  context.fillRect((onset * sampleRate * width) / samples.length, 0, 2 * devicePixelRatio, height);
+}
+
+export async function decode(blob) {
+  const bytes = await blob.arrayBuffer();
+  const buffer = await new OfflineAudioContext(1, 1, 48000).decodeAudioData(bytes);
+  return { samples: buffer.getChannelData(0), sampleRate: buffer.sampleRate };
+}
+
+/** A button that plays a recording, by the browser's own player. */
+export function listenButton(address, words = "Listen") {
+  return button(words, () => new Audio(address()).play().catch(() => {}), { className: "small" });
+}

@@ -1,0 +1,221 @@
+"""The addresses under the server's secret one, each of which asks the studio for one thing."""
+
+import json
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from avmsf.errors import AvmsfError
+from avmsf.studio.capturing import Place
+from avmsf.studio.guard import LARGEST_UPLOAD, contained, read_words
+from avmsf.studio.modules import find_modules, with_local_modules
+from avmsf.studio.refusal import RefusedError, response_to
+from avmsf.studio.studio import Studio
+
+PAGE = Path(__file__).parent / "page"
+_TYPES = {
+    ".bin": "application/octet-stream",
+    ".css": "text/css",
+    ".glb": "model/gltf-binary",
+    ".js": "text/javascript",
+    ".json": "application/json",
+    ".mjs": "text/javascript",
+    ".ply": "application/octet-stream",
+    ".wasm": "application/wasm",
+    ".wav": "audio/wav",
+}
+"""What is served, and as what: nothing else is."""
+_GONE = 499
+"""Nobody reads it: the page has hung up."""
+Handler = Callable[[Request], Awaitable[Response]]
+
+
+def make_app(studio: Studio) -> Starlette:
+    """Return the application of a studio, which begins and ends with it."""
+    modules = find_modules()
+    page = (PAGE / "index.html").read_text(encoding="utf-8")
+    html = page if modules is None else with_local_modules(page)
+
+    @asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        await studio.begin()
+        try:
+            yield
+        finally:
+            await studio.close()
+
+    async def show_page(request: Request) -> Response:
+        return HTMLResponse(html)
+
+    async def send_module(request: Request) -> Response:
+        if modules is None:
+            raise RefusedError(404, "there is nothing at this address")
+        return _file(modules, request)
+
+    calls = Calls(studio)
+    routes = [
+        _get("/", show_page),
+        _get("/page/{path:path}", partial(_send_from, PAGE)),
+        _get("/modules/{path:path}", send_module),
+        _get("/manifest.json", calls.send_manifest),
+        _get("/revisions/{number:int}/{path}", calls.send_revision),
+        _get("/{path}", calls.send_shown),
+        _get("/strikes/{path}", calls.send_measured),
+        Route("/locate", calls.locate, methods=["POST"]),
+        Route("/edit", calls.edit, methods=["POST"]),
+        Route("/undo", calls.undo, methods=["POST"]),
+        Route("/save", calls.save, methods=["POST"]),
+        Route("/capture/check", calls.check, methods=["POST"]),
+        Route("/capture/strikes", calls.add_strike, methods=["POST"]),
+        Route("/capture/strikes/{path:path}", calls.change_strike, methods=["GET", "PUT", "DELETE"]),
+        Route("/reconstruct", calls.reconstruct, methods=["POST"]),
+        _get("/jobs/{job}/events", calls.hear_job),
+        Route("/jobs/{job}", calls.cancel_job, methods=["DELETE"]),
+    ]
+    app = Starlette(
+        routes=routes,
+        lifespan=lifespan,
+        exception_handlers={
+            AvmsfError: _answer_refused,
+            HTTPException: _answer_unknown,
+            ClientDisconnect: _answer_nobody,
+            Exception: _answer_broken,
+        },
+    )
+    # It would lead to an address without the token.
+    app.router.redirect_slashes = False
+    return app
+
+
+class Calls:
+    """What the page can ask of a studio."""
+
+    def __init__(self, studio: Studio) -> None:
+        self.studio = studio
+
+    async def send_manifest(self, request: Request) -> Response:
+        """What is shown, and what the server can do."""
+        return JSONResponse(self.studio.manifest())
+
+    async def send_revision(self, request: Request) -> Response:
+        """A file of a revision."""
+        return _file(self.studio.showcase.files_of(request.path_params["number"]), request)
+
+    async def send_shown(self, request: Request) -> Response:
+        """The table of the current revision, or the object's file; and what the capture holds."""
+        name = request.path_params["path"]
+        if name == "capture":
+            return JSONResponse(await self.studio.capture())
+        showcase = self.studio.showcase
+        return _file(showcase.object_folder if name.startswith("object.") else showcase.current.folder, request)
+
+    async def send_measured(self, request: Request) -> Response:
+        """The sound of a measured strike, as the field was fitted to it."""
+        return _file(self.studio.showcase.object_folder / "strikes", request)
+
+    async def locate(self, request: Request) -> Response:
+        """Where a recorded blow fell."""
+        return JSONResponse(await self.studio.locate(await request.body()))
+
+    async def edit(self, request: Request) -> Response:
+        """Change the field."""
+        done = await self.studio.edit(await read_words(request, largest=LARGEST_UPLOAD))
+        return JSONResponse(done, 202 if "job" in done else 200)
+
+    async def undo(self, request: Request) -> Response:
+        """Take a change back."""
+        return JSONResponse(await self.studio.undo(await read_words(request)))
+
+    async def save(self, request: Request) -> Response:
+        """Write the field to a file."""
+        return JSONResponse(await self.studio.save(await read_words(request)), 201)
+
+    async def check(self, request: Request) -> Response:
+        """Judge a recording and forget it."""
+        content = await request.body()
+        return JSONResponse(await self.studio.with_book(lambda book: book.judge(content)))
+
+    async def add_strike(self, request: Request) -> Response:
+        """Add a strike to the capture."""
+        place, key = Place.read(request.query_params), request.headers.get("idempotency-key", "")
+        content = await request.body()
+        return JSONResponse(await self.studio.with_book(lambda book: book.add(content, place, key=key)), 201)
+
+    async def change_strike(self, request: Request) -> Response:
+        """Send, redo or take out one of the capture's recordings."""
+        name = request.path_params["path"]
+        if request.method == "DELETE":
+            await self.studio.with_book(lambda book: book.remove(name))
+            return JSONResponse({"removed": name})
+        if request.method == "PUT":
+            content = await request.body()
+            return JSONResponse(await self.studio.with_book(lambda book: book.redo(name, content)))
+        return _file(self.studio.expect_book().folder, request, only=".wav")
+
+    async def reconstruct(self, request: Request) -> Response:
+        """Make a field of the capture."""
+        return JSONResponse({"job": (await self.studio.reconstruct()).identifier}, 202)
+
+    async def hear_job(self, request: Request) -> Response:
+        """What a job says, as server-sent events; a page that has lost the connection hears what it has missed."""
+        job = self.studio.jobs.named(request.path_params["job"])
+        last = request.headers.get("last-event-id", "")
+        after = int(last) + 1 if last.isdigit() and len(last) < 10 else 0
+
+        async def events() -> AsyncIterator[str]:
+            async for number, event in job.listen(after=after):
+                yield f"id: {number}\ndata: {json.dumps(event)}\n\n"
+
+        return StreamingResponse(events(), media_type="text/event-stream")
+
+    async def cancel_job(self, request: Request) -> Response:
+        """Stop a job."""
+        await self.studio.jobs.named(request.path_params["job"]).cancel()
+        return JSONResponse({"cancelled": request.path_params["job"]})
+
+
+def _get(path: str, handler: Handler) -> Route:
+    async def answer(request: Request) -> Response:
+        return await handler(request)
+
+    return Route(path, answer, methods=["GET"])
+
+
+async def _send_from(folder: Path, request: Request) -> Response:
+    return _file(folder, request)
+
+
+def _file(folder: Path, request: Request, *, only: str | None = None) -> Response:
+    """Return a file of a folder. Raises RefusedError (404) for other kinds than pages have use for."""
+    path = contained(folder, request.path_params["path"])
+    kind = _TYPES.get(path.suffix.lower())
+    hidden = any(part.startswith(".") for part in path.relative_to(folder.resolve()).parts)
+    if kind is None or hidden or only not in (None, path.suffix.lower()):
+        raise RefusedError(404, "there is nothing at this address")
+    return FileResponse(path, media_type=kind)
+
+
+async def _answer_refused(request: Request, error: Exception) -> Response:
+    assert isinstance(error, AvmsfError)
+    return response_to(error)
+
+
+async def _answer_unknown(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    return JSONResponse({"error": f"{request.method}: there is nothing of the kind at this address"}, error.status_code)
+
+
+async def _answer_nobody(request: Request, error: Exception) -> Response:
+    return Response(status_code=_GONE)
+
+
+async def _answer_broken(request: Request, error: Exception) -> Response:
+    words = f"the server failed at this ({type(error).__name__}): its terminal shows more; nothing was changed"
+    return JSONResponse({"error": words}, 500)

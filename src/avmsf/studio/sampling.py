@@ -1,0 +1,57 @@
+"""The table of an edited field without asking its gains anew: edits leave the ratios between places as they are."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.export.sampledfield import SampledField
+from avmsf.field.gainfield import GainField
+from avmsf.field.scaledgains import ScaledGains
+from avmsf.field.soundfield import SoundField
+
+
+def length_of(field: SoundField) -> float:
+    """Return lengths on a field's object over those on the object that it was fitted to, which the page shows."""
+    gains = field.gain_field
+    return gains.length if isinstance(gains, ScaledGains) else 1.0
+
+
+def sample(field: SoundField, points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"]) -> SampledField:
+    """Return the table of a field at points of the object that it was fitted to, metres."""
+    sampled = SampledField.of(field, points.double() * length_of(field), normals)
+    return replace(sampled, points=points)
+
+
+def resample(sampled: SampledField, before: SoundField, after: SoundField) -> SampledField | None:
+    """Return the table of the field `after` an edit from that of the field `before`.
+
+    None where that cannot be: another fitted field, another phase, or a mode that could not be heard or was mute.
+    """
+    if _fitted(before) is not _fitted(after) or not torch.equal(before.phase, after.phase):
+        return None
+    old, new = _scale(before), _scale(after)
+    if bool((after.audible & (~before.audible | ((old == 0) & (new != 0)))).any()):
+        return None
+    heard = torch.nonzero(after.audible).flatten()
+    columns = (torch.cumsum(before.audible.long(), 0) - 1)[heard]
+    factor = torch.where(old[heard] == 0, 0.0, new[heard] / old[heard])
+    change = after.bank.damping[heard] / before.bank.damping[heard]
+    return replace(
+        sampled,
+        frequency=after.bank.frequency[heard],
+        damping=sampled.damping[..., columns] * change,
+        sine=(sampled.sine[:, columns] * factor).float(),
+        cosine=(sampled.cosine[:, columns] * factor).float(),
+    )
+
+
+def _fitted(field: SoundField) -> GainField:
+    gains = field.gain_field
+    return gains.field if isinstance(gains, ScaledGains) else gains
+
+
+def _scale(field: SoundField) -> Float[Tensor, " modes"]:
+    gains = field.gain_field
+    return gains.scale if isinstance(gains, ScaledGains) else torch.ones_like(field.bank.frequency)

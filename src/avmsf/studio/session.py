@@ -1,0 +1,155 @@
+"""The field that is open in the page: revisions that never change, of which the last one is heard.
+
+Whoever changes it says which revision that is based on; where another tab was faster, nothing is changed and the page
+is told so. Numbers of revisions only grow, an undone one's is never given again.
+"""
+
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import RLock
+
+from avmsf.errors import StudioError
+from avmsf.field.soundfield import SoundField
+from avmsf.field.store import save
+from avmsf.studio.editing import REST, Sliders
+from avmsf.studio.refusal import RefusedError
+
+SUFFIX = ".safetensors"
+_NAME = re.compile(r"[\w][\w .()+-]{0,99}")
+_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
+"""Names that are no files on Windows, where a capture may be opened next."""
+MOST_UNDONE = 100
+"""Revisions that can be gone back to."""
+
+
+@dataclass(frozen=True, eq=False)
+class Revision:
+    """The field at one time."""
+
+    number: int
+    opening: int = 0
+    """Which field it is of: counts those that were opened."""
+    ground: SoundField | None = None
+    """The field as it was opened, saved or led last: what the sliders are relative to. None before there is one."""
+    sliders: Sliders = REST
+    """What was done to it since."""
+    field: SoundField | None = None
+    """What is heard."""
+    remarks: tuple[str, ...] = ()
+    """What its owner should know of it."""
+
+    def expect_field(self) -> SoundField:
+        """Return what is heard. Raises RefusedError (409) before there is a field."""
+        if self.field is None:
+            raise RefusedError(409, "expected a field, found none yet: record strikes and reconstruct it first")
+        return self.field
+
+
+class Session:
+    """The revisions. Its methods may be called from any thread; `publish` is called for a revision before it counts."""
+
+    def __init__(self, home: Path, publish: Callable[[Revision], None]) -> None:
+        self.home, self._publish = home, publish
+        self._current = Revision(0)
+        self._past: list[Revision] = []
+        self._lock = RLock()
+
+    @property
+    def current(self) -> Revision:
+        """What is heard now."""
+        return self._current
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is a revision to go back to."""
+        return bool(self._past)
+
+    def open(self, field: SoundField | None) -> Revision:
+        """Hear a field just read, or none; the one before it can be gone back to."""
+        with self._lock:
+            before = self._current
+            fresh = Revision(0, before.opening + 1, ground=field, field=field)
+            return self._advance(fresh) if before.field is None else self._remember(fresh)
+
+    def edit(self, base: int, sliders: Sliders) -> Revision:
+        """Set the sliders. Raises RefusedError (409) where `base` is not the current revision, and as edits do."""
+        with self._lock:
+            self.expect_current(base)
+            self._current.expect_field()
+            ground = self._current.ground
+            assert ground is not None
+            field, remarks = sliders.apply(ground)
+            return self._remember(Revision(0, self._current.opening, ground, sliders, field, tuple(remarks)))
+
+    def lead(self, base: int, field: SoundField, remarks: tuple[str, ...]) -> Revision:
+        """Take in what a descent has made of revision `base`; sliders are relative to it from then on."""
+        with self._lock:
+            self.expect_current(base)
+            return self._remember(Revision(0, self._current.opening, field, REST, field, remarks))
+
+    def undo(self, base: int) -> Revision:
+        """Go back by one revision, under a new number. Raises RefusedError (409) as `edit`, and where there is none."""
+        with self._lock:
+            self.expect_current(base)
+            if not self._past:
+                raise RefusedError(409, "there is nothing to undo: the field is as it was opened")
+            undone = self._advance(self._past[-1])
+            self._past.pop()
+            return undone
+
+    def save(self, base: int, name: str) -> tuple[Path, Revision]:
+        """Write the field as it is to a new file of the folder, and let the sliders be relative to it.
+
+        Raises RefusedError where there is a file of this name (409), or the name is none (400).
+        """
+        with self._lock:
+            self.expect_current(base)
+            field = self._current.expect_field()
+            path = self.home / file_name(name)
+            try:
+                os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+            except FileExistsError as error:
+                raise RefusedError(409, f"{path.name} is there already and stays: choose another name") from error
+            except OSError as error:
+                raise StudioError(f"{path}: cannot be written ({error.strerror}): free some space") from error
+            try:
+                save(field, path)
+            except BaseException:
+                path.unlink(missing_ok=True)
+                raise
+            return path, self._advance(replace(self._current, ground=field, sliders=REST))
+
+    def expect_current(self, base: int) -> None:
+        """Raise RefusedError (409), with the current revision, where `base` is another one."""
+        if base != self._current.number:
+            raise RefusedError(
+                409,
+                f"expected a change of revision {self._current.number}, found one of revision {base}: another tab has "
+                "changed the field meanwhile, and nothing was overwritten; look at what it is now and change it again",
+                revision=self._current.number,
+            )
+
+    def _remember(self, revision: Revision) -> Revision:
+        before = self._current
+        changed = self._advance(revision)
+        self._past = [*self._past, before][-MOST_UNDONE:]
+        return changed
+
+    def _advance(self, revision: Revision) -> Revision:
+        numbered = replace(revision, number=self._current.number + 1)
+        self._publish(numbered)
+        self._current = numbered
+        return numbered
+
+
+def file_name(name: str) -> str:
+    """Return the file that a user's name stands for. Raises RefusedError (400) for a name that leads elsewhere."""
+    stem = name.strip().removesuffix(SUFFIX)
+    if not _NAME.fullmatch(stem) or _DEVICES.fullmatch(stem) or stem.endswith((".", " ")):
+        raise RefusedError(
+            400, f"expected a name of letters, digits, spaces, - and _, such as bowl in wood, found {name[:120]!r}"
+        )
+    return f"{stem}{SUFFIX}"

@@ -1,0 +1,249 @@
+"""What the page fetches to see and hear: a folder of files for each revision, of which the last few are kept."""
+
+import json
+import shutil
+import warnings
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+import avmsf
+from avmsf.capture.folder import read_capture
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.surface import Surface, read_surface
+from avmsf.capture.warning import CaptureWarning
+from avmsf.errors import CaptureError, StudioError
+from avmsf.export.bundle import FORMAT, MOST_POINTS, write_bundle
+from avmsf.export.normals import outward_normals
+from avmsf.export.objectfile import read_object
+from avmsf.export.sampledfield import SampledField
+from avmsf.field.soundfield import SoundField
+from avmsf.scene.features import FeatureField
+from avmsf.scene.ply import read_splats
+from avmsf.studio.capturing import StrikeBook
+from avmsf.studio.opening import Opened, find_object, is_gaussians
+from avmsf.studio.sampling import length_of, resample, sample
+from avmsf.studio.session import Revision
+
+_CLICKED = 8_000
+"""Points of an object without a field."""
+_NOTHING: dict[str, np.ndarray] = {
+    "frequency": np.zeros(0),
+    "damping": np.zeros(0),
+    "noise": np.zeros(0, np.float32),
+}
+_KEPT = 4
+"""Revisions whose files are kept: a page may still be reading those of the one before."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """One revision's files."""
+
+    folder: Path
+    manifest: dict[str, Any]
+    sampled: SampledField
+    revision: Revision
+    remarks: tuple[str, ...]
+    """What is shown differs from what there is, a sentence each."""
+
+
+class Showcase:
+    """The files of the last revisions, in a folder that is removed with the server."""
+
+    def __init__(self, opened: Opened, folder: Path, book: StrikeBook | None) -> None:
+        self.opened, self.folder, self.book = opened, folder, book
+        self._shown: OrderedDict[int, Shown] = OrderedDict()
+        self._first_of_field: Shown | None = None
+        self._lock = Lock()
+
+    @property
+    def current(self) -> Shown:
+        """The last revision's files."""
+        return next(reversed(self._shown.values()))
+
+    def files_of(self, number: int) -> Path:
+        """Return the folder of a revision's files; the last one's where they are no longer kept."""
+        shown = self._shown.get(number)
+        return (self.current if shown is None else shown).folder
+
+    @property
+    def object_folder(self) -> Path:
+        """The folder of the object's file and the measured strikes' sounds."""
+        assert self._first_of_field is not None
+        return self._first_of_field.folder
+
+    def show(self, revision: Revision) -> None:
+        """Write a revision's files. Raises as `write_bundle`, and StudioError where there is nothing to click."""
+        with self._lock:
+            sampled = self._sampled(revision)
+            path = self.folder / f"revision-{revision.number}"
+            fresh = self._is_other_field(revision)
+            shown = find_object(self.opened) if fresh else None
+            strikes, remarks = self._strikes(revision.field) if fresh else (None, ())
+            if revision.field is None:
+                remarks = _write_bare(sampled, path, shown, self.metres)
+            else:
+                remarks += write_bundle(sampled, path, object=shown, metres=self.metres, strikes=strikes).remarks
+            manifest = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
+            manifest["name"] = manifest["name"] or self.opened.name
+            if fresh:
+                self._first_of_field = Shown(path, manifest, sampled, revision, remarks)
+            assert self._first_of_field is not None
+            for part in ("object", "strikes"):
+                manifest[part] = self._first_of_field.manifest[part]
+            for tensor in manifest["tensors"].values():
+                # By revision, so that a page never reads one's manifest with another's numbers.
+                tensor["file"] = f"revisions/{revision.number}/field.bin"
+            self._shown[revision.number] = Shown(path, manifest, sampled, revision, self._first_of_field.remarks)
+            self._forget()
+
+    def _sampled(self, revision: Revision) -> SampledField:
+        field = revision.field
+        if field is None:
+            return self._without_field()
+        if not self._is_other_field(revision):
+            before = self.current
+            assert before.revision.field is not None
+            found = resample(before.sampled, before.revision.field, field)
+            if found is not None:
+                return found
+            return sample(field, before.sampled.points, before.sampled.normals)
+        return self._first(field)
+
+    def _is_other_field(self, revision: Revision) -> bool:
+        """Whether a revision is of another field than the one shown before it, or of the first."""
+        return not self._shown or self.current.revision.opening != revision.opening
+
+    def _first(self, field: SoundField) -> SampledField:
+        """Return the table of a field just opened, over its own points, or where it has none, over the object's."""
+        own = field.gain_field.points
+        if len(own):
+            sampled = SampledField.of(field, _thinned(own, MOST_POINTS))
+            return replace(sampled, points=(sampled.points.double() / length_of(field)).float())
+        points, normals = self._clickable()
+        return sample(field, points, normals)
+
+    def _without_field(self) -> SampledField:
+        points, normals = self._clickable()
+        nothing, empty = torch.zeros(len(points), 0), torch.zeros(0, dtype=torch.float64)
+        name = self.opened.name
+        return SampledField(points, normals, empty, empty, nothing, nothing, torch.zeros(0), 48_000.0, False, name)
+
+    def _clickable(self) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points 3"]]:
+        """Return points of the object where no field holds any. Raises StudioError where nothing shows the object."""
+        path = find_object(self.opened)
+        if path is not None and not is_gaussians(path):
+            return _on_mesh(read_surface(path, metres=self.metres))
+        if path is not None:
+            points = read_splats(path).centers
+        else:
+            contacts = [] if self.book is None else [strike.contact for strike in self.book.strikes()]
+            if len(contacts) >= 2:
+                points = FeatureField.from_contacts(torch.tensor(contacts, dtype=torch.float64)).points
+            else:
+                # Until the capture's pictures have become something to click.
+                points = torch.zeros(0 if self.opened.capture is None else 1, 3)
+        if not len(points):
+            raise StudioError(
+                f"{self.opened.name}: expected the object's geometry, found none: give a mesh or Gaussians by --object"
+            )
+        points = _thinned(points.float(), _CLICKED)
+        return points, outward_normals(points)
+
+    @property
+    def metres(self) -> float:
+        """Metres in one unit of the object's mesh."""
+        return 1.0 if self.opened.object is not None else self.opened.settings.surface_metres
+
+    def _strikes(self, field: SoundField | None) -> tuple[Impacts | None, tuple[str, ...]]:
+        """Return the capture's strikes as the field was fitted to them, or a word on why they cannot be compared."""
+        if field is None or self.opened.capture is None:
+            return None, ()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", CaptureWarning)
+                impacts = read_capture(self.opened.capture).impacts
+        except CaptureError as error:
+            return None, (f"measured strikes are not shown: {error}",)
+        if impacts.sample_rate != field.sample_rate:
+            return None, (
+                f"measured strikes are not shown: they are at {impacts.sample_rate:g} Hz and the field is at "
+                f"{field.sample_rate:g} Hz",
+            )
+        return impacts, ()
+
+    def _forget(self) -> None:
+        """Remove the files of revisions that no page reads any more."""
+        while len(self._shown) > _KEPT:
+            _, old = self._shown.popitem(last=False)
+            if old.folder != self.object_folder:
+                shutil.rmtree(old.folder, ignore_errors=True)
+
+
+def _on_mesh(surface: Surface) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points 3"]]:
+    """Return points all over a mesh, and the normals of its faces, on the whole outwards; its vertices without faces.
+
+    Of faces that are not turned alike, the normals are judged from how the points lie.
+    """
+    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy())
+    if not len(surface.faces) or not mesh.area > 0:
+        points = _thinned(surface.vertices, _CLICKED)
+        return points, outward_normals(points)
+    places, rows = trimesh.sample.sample_surface(mesh, _CLICKED, seed=0)
+    points, normals = torch.from_numpy(np.array(places)).float(), torch.from_numpy(mesh.face_normals[rows]).float()
+    if not mesh.is_winding_consistent:
+        return points, outward_normals(points)
+    outwards = float((normals * (points - points.mean(0))).sum())
+    return points, normals if outwards > 0 else -normals
+
+
+def _thinned(points: Float[Tensor, "points 3"], most: int) -> Float[Tensor, "kept 3"]:
+    """Return at most so many of the points, by chance that is always the same: the farthest of all take minutes."""
+    if len(points) <= most:
+        return points
+    return points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:most].sort().values]
+
+
+def _write_bare(sampled: SampledField, folder: Path, path: Path | None, metres: float) -> tuple[str, ...]:
+    """Write an object without a field, in the same form: with points to click, and no modes."""
+    shown = read_object(path, sampled.points, metres=metres)
+    points, normals = sampled.points.float().numpy(), sampled.normals.numpy()
+    parts: dict[str, np.ndarray] = {
+        "points": points,
+        "normals": normals,
+        **_NOTHING,
+        "sine": np.zeros((len(points), 0), np.float32),
+    }
+    tensors, content = {}, b""
+    for name, part in parts.items():
+        tensors[name] = {"offset": len(content), "dtype": part.dtype.name, "shape": list(part.shape)}
+        content += part.astype(part.dtype.newbyteorder("<")).tobytes() + bytes(-part.nbytes % 8)
+    manifest = {
+        "format": FORMAT,
+        "package": avmsf.__version__,
+        "name": sampled.name,
+        "sampleRate": sampled.sample_rate,
+        "samples": 0,
+        "perNewton": False,
+        "modes": 0,
+        "points": len(points),
+        "damping": "shared",
+        "tensors": tensors,
+        "object": {"kind": shown.kind, "file": shown.name},
+        "strikes": [],
+    }
+    folder.mkdir()
+    (folder / "field.bin").write_bytes(content)
+    if shown.name is not None:
+        (folder / shown.name).write_bytes(shown.content)
+    (folder / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
+    return shown.remarks

@@ -1,0 +1,152 @@
+"""The process that does work of minutes for the page: `python -m avmsf.studio.worker`.
+
+It reads one line of JSON, the task, and writes lines of JSON: {"stage", "done", "total", "words"} as it goes, and
+{"result"} or {"error"} at the end. It ends with all that it has started where its standard input is closed.
+"""
+
+import json
+import os
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TextIO
+
+from avmsf.capture import read_capture
+from avmsf.capture.folder import settings_of
+from avmsf.capture.warning import CaptureWarning
+from avmsf.errors import AvmsfError
+from avmsf.field.fit import Progress
+from avmsf.field.store import load, save
+from avmsf.modal.extract import HighResolution
+from avmsf.pipeline.reconstruct import CACHE, ReconstructConfig, reconstruct
+from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages
+from avmsf.pipeline.stages import StageFolder
+from avmsf.scene.lift import LiftProgress
+from avmsf.scene.splat import SplatProgress
+from avmsf.studio.lifeline import end_with_server
+from avmsf.tasks.distillation import DecoderDistillation
+from avmsf.tasks.reference import Reference
+from avmsf.tasks.stableaudio import StableAudio
+from avmsf.tasks.steer import Guide, SteerConfig, SteerProgress, steer
+
+Values = Mapping[str, Any]
+_RARELY = 10
+"""Steps of a fit between two words about it."""
+
+
+class Voice:
+    """Tells the server how far the work is."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+
+    def say(self, event: Values) -> None:
+        """Write one event."""
+        self.stream.write(json.dumps(event) + "\n")
+        self.stream.flush()
+
+    def step(self, stage: str, done: int, total: int, words: str) -> None:
+        """Say how far a stage is."""
+        self.say({"stage": stage, "done": done, "total": total, "words": words})
+
+    def tell(self, words: str) -> None:
+        """Say that a stage begins, which stands before the colon."""
+        self.say({"stage": words.partition(":")[0], "done": 0, "total": 0, "words": words})
+
+    @property
+    def listener(self) -> Listener:
+        """Who hears of the stages of a reconstruction."""
+        return Listener(self.tell, self._splatting, self._lifting)
+
+    def _splatting(self, progress: SplatProgress) -> None:
+        if progress.step % _RARELY == 0 or progress.step == progress.steps:
+            self.step("splat", progress.step, progress.steps, f"{progress.psnr:.1f} dB, {progress.gaussians} Gaussians")
+
+    def _lifting(self, progress: LiftProgress) -> None:
+        self.step("lift", progress.done, progress.total, progress.view)
+
+    def fitting(self, progress: Progress) -> None:
+        """Hear of a fit."""
+        if progress.step % _RARELY == 0 or progress.step == progress.steps:
+            self.step("fit", progress.step, progress.steps, f"{progress.stage}, loss {progress.loss:.3g}")
+
+    def steering(self, progress: SteerProgress) -> None:
+        """Hear of an edit's descent."""
+        self.step("edit", progress.step, progress.steps, f"loss {progress.loss:.3g}, pitch x {progress.pitch:.4g}")
+
+
+def make_field(task: Values, voice: Voice) -> Values:
+    """Reconstruct the capture `folder` and return where its field is, with what its owner should know."""
+    folder = Path(task["folder"])
+    settings = settings_of(folder)
+    voice.tell("capture: reading the recordings")
+    capture = read_capture(folder, settings)
+    made = reconstruct(
+        folder,
+        capture,
+        capture.impacts,
+        ReconstructConfig(),
+        method=HighResolution(modes=int(task["modes"])),
+        cache=folder / CACHE,
+        settings=settings,
+        listener=voice.listener,
+        fitting=voice.fitting,
+    )
+    return {"field": str(made.field), "gains": made.gains, "stages": [each.stage for each in made.stages if each.fresh]}
+
+
+def make_object(task: Values, voice: Voice) -> Values:
+    """Make Gaussians of what the capture `folder` shows of its object, and return their file."""
+    folder = Path(task["folder"])
+    stages = StageFolder(folder / CACHE)
+    scene = SceneStages(folder, stages, SceneConfig(), settings=settings_of(folder), listener=voice.listener)
+    return {"object": str(scene.cloud.path)}
+
+
+def lead(task: Values, voice: Voice) -> Values:
+    """Lead a field towards a recording or words, and return the file of the edited one."""
+    field = load(task["field"])
+    guide: Guide
+    if "recording" in task:
+        guide = Reference.read(task["recording"], sample_rate=field.sample_rate)
+    else:
+        voice.tell("model: loading")
+        model = StableAudio.load(task["model"])
+        guide = DecoderDistillation(model, task["prompt"], sample_rate=field.sample_rate)
+    config = SteerConfig(steps=int(task["steps"]), preview_every=0)
+    save(steer(field, guide, config=config, progress=voice.steering), task["output"])
+    return {"output": task["output"]}
+
+
+TASKS: Mapping[str, Callable[[Values, Voice], Values]] = {
+    "make_field": make_field,
+    "make_object": make_object,
+    "lead": lead,
+}
+
+
+def main() -> int:
+    """Do the task of the standard input's first line."""
+    voice = Voice(os.fdopen(os.dup(1), "w", encoding="utf-8"))
+    # What libraries print is no event.
+    os.dup2(2, 1)
+    task = json.loads(sys.stdin.readline())
+    threading.Thread(target=end_with_server, daemon=True).start()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", CaptureWarning)
+        warnings.showwarning = lambda message, *rest, **more: voice.say({"stage": "note", "words": str(message)})
+        try:
+            voice.say({"result": TASKS[task["task"]](task, voice)})
+        except AvmsfError as error:
+            voice.say({"error": " ".join(str(error).split())})
+            return 2
+        except MemoryError:
+            voice.say({"error": "the memory of this machine does not suffice: close other programs, or use less data"})
+            return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

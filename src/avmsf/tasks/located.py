@@ -1,0 +1,62 @@
+"""All that is found out about a located blow, as plain values for programs and pages."""
+
+from typing import Any
+
+import torch
+
+from avmsf.errors import AvmsfError
+from avmsf.field.soundfield import SoundField
+from avmsf.scene.symmetry import Symmetries
+from avmsf.scene.symmetrysearch import find_symmetries
+from avmsf.tasks.contactmap import ContactMap
+
+_JUDGED = 600
+"""Points of the object in which symmetries are looked for."""
+_CLOSED = 0.02
+"""Part of the surface that may have its counterpart in a hole: a field's points cover their object."""
+
+
+def symmetries_of(field: SoundField) -> Symmetries | None:
+    """Return the symmetries of a field's points; None where these are too few to tell."""
+    try:
+        return find_symmetries(
+            field.gain_field.points, generator=torch.Generator().manual_seed(0), missing=_CLOSED, limit=_JUDGED
+        )
+    except AvmsfError:
+        return None
+
+
+def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: float) -> dict[str, Any]:
+    """Return where a blow fell, within which region with a probability of `level`, and what else fits, and why.
+
+    Lengths in metres. Raises LocationError for a level that is not between 0 and 1.
+    """
+    others = contact.counterparts(symmetries, level)
+    return {
+        "place": contact.place.tolist(),
+        "region": {
+            "level": level,
+            "radius_metres": _radius(contact, level),
+            "share": float(contact.region(level).double().mean()),
+        },
+        "explained": contact.explained,
+        "modes_explain": contact.modal,
+        "force": contact.force,
+        "cosine": {
+            "place": contact.points[contact.best].tolist(),
+            "distance": float(contact.distance[contact.best]),
+        },
+        "ambiguous": bool(others),
+        "counterparts": [
+            {"place": other.place.tolist(), "probability": other.probability, "words": str(other)} for other in others
+        ],
+        "notes": list(contact.notes),
+    }
+
+
+def _radius(contact: ContactMap, level: float) -> float:
+    """Return how far from the likeliest place the blow fell at most, with a probability of `level`, metres."""
+    apart = (contact.points.double() - contact.place.double()).norm(dim=1)
+    order = torch.argsort(apart, stable=True)
+    reached = torch.cumsum(contact.probability[order], 0) >= level * contact.probability.sum()
+    return float(apart[order][int(reached.double().argmax())])
