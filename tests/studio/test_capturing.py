@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import soundfile
 import torch
-from opened_plate import blow, wav
 
 from avmsf.capture import check, read_capture
 from avmsf.errors import AvmsfError, CaptureError
@@ -17,6 +16,7 @@ from avmsf.studio import capturing
 from avmsf.studio.capturing import Place, StrikeBook
 from avmsf.studio.refusal import RefusedError
 from capture_folder import fill, ring
+from opened_plate import blow, wav
 
 DOWN = (0.0, 0.0, -2.0)
 

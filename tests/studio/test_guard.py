@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from opened_plate import blow, open_plate
-from served import Served, served
 
 from avmsf.studio.guard import LOOPBACK, Guard, contained, new_token
 from avmsf.studio.refusal import RefusedError
+from opened_plate import blow, open_plate
+from served import Served, served
 
 LARGEST = 200_000
 

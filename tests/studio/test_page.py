@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import soundfile
 import torch
-from page_plate import RATE, SIDES, lay_out, page_modules, plate_object, plate_shapes, plate_strikes, plate_table
 
 from avmsf.export.sampledfield import SampledField
+from page_plate import RATE, SIDES, lay_out, page_modules, plate_object, plate_shapes, plate_strikes, plate_table
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page, Request, Route
@@ -508,6 +508,15 @@ def test_a_measured_strike_is_compared_with_the_model(visit: Open) -> None:
     page = visit(strikes=True)
     page.click("#sheet-strike >> text=100.wav")
     page.wait_for_function("document.getElementById('blow-facts').textContent.includes('recording and model')")
+    compared = page.evaluate(
+        "(({ recording, model }) => [[...recording.levels], [...model.levels]])(avmsf.studio.spectra.compared)"
+    )
+    recording, model = torch.tensor(compared)
+    # Its recording is the model's own sound: a picture of both shows one line, with its peaks at the modes' pitches.
+    near = recording > recording.max() - 60
+    torch.testing.assert_close(model[near], recording[near], atol=0.1, rtol=0)
+    peak = 40 * 500 ** (float(recording.argmax() + 0.5) / len(recording))
+    assert min(abs(peak - 400 * order) for order in range(1, 7)) < 0.02 * peak
     assert page.locator(".mark .dot[data-strike]").count() == 2
     assert page.locator(".mark .dot[data-strike].chosen").count() == 1
     page.uncheck("text=Mark them on the object")

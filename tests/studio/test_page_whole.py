@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
-from opened_plate import RATE, open_plate, plate_field, wav
-from page_plate import SIDES, page_modules, plate_object
-from served import Served, served
 
 from avmsf.capture import read_capture
 from avmsf.field.store import load
 from avmsf.studio.modules import MODULES_VARIABLE
 from avmsf.studio.opening import Opened, open_target
+from opened_plate import RATE, open_plate, plate_field, wav
+from page_plate import SIDES, page_modules, plate_object
+from served import Served, served
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -21,8 +21,6 @@ import pytest
 import soundfile
 import torch
 import trimesh
-from opened_plate import RATE, blow, open_plate, plate_field, wav
-from served import Served, served
 
 from avmsf.cli import main
 from avmsf.errors import AvmsfError, StudioError
@@ -37,7 +35,9 @@ from avmsf.tasks.locator import Locator
 from avmsf.tasks.recast import recast
 from avmsf.tasks.severalblows import locate_blows
 from capture_folder import fill, ring
+from opened_plate import RATE, blow, open_plate, plate_field, wav
 from plate_capture import fill_plate
+from served import Served, served
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from opened_plate import plate_field
 
 from avmsf.errors import EditError, FieldFileError, SimulationError
 from avmsf.export.sampledfield import SampledField
@@ -21,6 +20,7 @@ from avmsf.studio.session import Revision, Session, file_name
 from avmsf.tasks.recast import recast
 from avmsf.tasks.retune import retune
 from made_fields import FIELDS
+from opened_plate import plate_field
 
 WOODEN = {"material": {"from": "ceramic", "to": "wood"}, "size": 1.5, "pitch": 0.8, "decay": 2.0, "brightness": 1.0}
 

@@ -103,7 +103,8 @@ export class SpectrumView {
   #blow = null;
   #trace = [];
   #quietSince = null;
-  #compared = null;
+  /** The two spectra that are shown over each other; null while what sounds is shown. */
+  compared = null;
   #running = false;
 
   constructor(spectrumCanvas, decayCanvas) {
@@ -134,19 +135,19 @@ export class SpectrumView {
     }));
     const loudest = Math.max(...stems.map(({ level }) => level));
     this.#blow = { stems, at: performance.now(), top: Math.ceil((loudest + 6) / 10) * 10, seconds: spanOf(stems) };
-    this.#compared = null;
+    this.compared = null;
     this.#run();
   }
 
   /** Something else sounds, such as a recording: only what is heard is drawn. */
   heard() {
-    this.#compared = null;
+    this.compared = null;
     this.#run();
   }
 
   /** Draw two spectra over each other, each {label, levels} with levels in dB from LOW to HIGH. */
   compare(recording, model) {
-    this.#compared = { recording, model };
+    this.compared = { recording, model };
     this.#draw();
   }
 
@@ -165,7 +166,7 @@ export class SpectrumView {
     if (this.#running) return;
     this.#running = true;
     const step = () => {
-      this.#running = this.#listenOnce() && !this.#compared;
+      this.#running = this.#listenOnce() && !this.compared;
       this.#draw();
       if (this.#running) requestAnimationFrame(step);
     };
@@ -200,16 +201,16 @@ export class SpectrumView {
   #drawSpectrum() {
     const { spectrum: chart } = this;
     chart.begin();
-    const top = this.#compared ? 0 : (this.#blow?.top ?? 0);
+    const top = this.compared ? 0 : (this.#blow?.top ?? 0);
     const down = (level) => (top - level) / RANGE_DB;
     chart.axes(
       LABELLED.map((frequency) => ({ share: across(frequency), words: named(frequency) })),
       [0, 0.25, 0.5, 0.75, 1].map((share) => ({ share, words: `${Math.round(top - share * RANGE_DB)}` })),
     );
-    if (this.#compared) {
+    if (this.compared) {
       for (const [{ levels }, colour, dash] of [
-        [this.#compared.recording, chart.ink.second, []],
-        [this.#compared.model, chart.ink.accent, []],
+        [this.compared.recording, chart.ink.second, []],
+        [this.compared.model, chart.ink.accent, []],
       ]) {
         const loudest = Math.max(...levels);
         const shares = Array.from(levels, (level, place) => [place / (levels.length - 1), down(level - loudest)]);
