@@ -9,6 +9,15 @@ if TYPE_CHECKING:
     from avmsf.capture.cameras import Camera, View
     from avmsf.capture.views import find_foreground, read_views
     from avmsf.capture.views.write import write_views
+    from avmsf.export.bundle import write_bundle
+    from avmsf.export.faust import write_faust
+    from avmsf.export.gltf import write_gltf
+    from avmsf.export.modaldemo import read_demo, write_demo
+    from avmsf.export.player import Player
+    from avmsf.export.sampledfield import SampledField
+    from avmsf.export.universal import write_universal
+    from avmsf.export.wavgrid import write_grid
+    from avmsf.export.webpage import write_webpage
     from avmsf.field.automatic import Automatic
     from avmsf.field.config import PAPER, FitConfig
     from avmsf.field.fit import fit
@@ -20,6 +29,7 @@ if TYPE_CHECKING:
     from avmsf.modal.bank import ModalBank
     from avmsf.modal.extract import HighResolution, ShortTime, extract
     from avmsf.modal.extraction import Extraction
+    from avmsf.modal.pulse import ForcePulse
     from avmsf.modal.residual import Residual
     from avmsf.pipeline.physics import BodyConfig, physics_of
     from avmsf.scene.descriptors import ImageDescriptors
@@ -64,6 +74,7 @@ __all__ = [
     "Extraction",
     "FeatureField",
     "FitConfig",
+    "ForcePulse",
     "GaussianCloud",
     "HighResolution",
     "ImageDescriptors",
@@ -74,8 +85,10 @@ __all__ = [
     "MaterialStatistics",
     "ModalBank",
     "Physics",
+    "Player",
     "Reference",
     "Residual",
+    "SampledField",
     "ShortTime",
     "SoundField",
     "SplatConfig",
@@ -98,6 +111,7 @@ __all__ = [
     "locate_blows",
     "physics_of",
     "read_capture",
+    "read_demo",
     "read_splats",
     "read_views",
     "recast",
@@ -112,13 +126,33 @@ __all__ = [
     "steer",
     "suggest",
     "with_positions",
+    "write_bundle",
     "write_capture",
+    "write_demo",
+    "write_faust",
+    "write_gltf",
+    "write_grid",
     "write_splats",
+    "write_universal",
     "write_views",
+    "write_webpage",
 ]
 
 # Names are fetched when they are first asked for: torch takes seconds to import, and `avmsf --help` needs none of it.
 _HOMES = {
+    "avmsf.export.bundle": ("write_bundle",),
+    "avmsf.export.faust": ("write_faust",),
+    "avmsf.export.gltf": ("write_gltf",),
+    "avmsf.export.modaldemo": (
+        "read_demo",
+        "write_demo",
+    ),
+    "avmsf.export.player": ("Player",),
+    "avmsf.export.sampledfield": ("SampledField",),
+    "avmsf.export.universal": ("write_universal",),
+    "avmsf.export.wavgrid": ("write_grid",),
+    "avmsf.export.webpage": ("write_webpage",),
+    "avmsf.modal.pulse": ("ForcePulse",),
     "avmsf.capture.cameras": (
         "Camera",
         "View",
