@@ -134,6 +134,18 @@ def test_a_wider_interval_covers_more() -> None:
     assert high == pytest.approx(0.9, abs=0.08)
 
 
+def test_splines_are_not_asked_from_which_side_a_blow_came() -> None:
+    everywhere = bar_contacts(60, seed=13)
+    values = drawn_gains(everywhere, seed=0)
+    turned = torch.where(torch.arange(40)[:, None, None] % 2 == 0, -values[20:], values[20:])
+    splines = sound_field(spline_field(everywhere[:20], values[:20]))
+    assert coverage(splines, everywhere[20:], turned).plain == coverage(splines, everywhere[20:], values[20:]).plain
+    # Physics is told the directions, and a gain of the wrong sign is missed.
+    physics = sound_field(physics_field(everywhere[:20], values[:20]))
+    straight = coverage(physics, everywhere[20:], values[20:]).plain
+    assert coverage(physics, everywhere[20:], turned).plain < straight - 0.1
+
+
 @pytest.mark.parametrize("made", [physics_field, spline_field])
 def test_fields_judge_themselves_by_the_gains_that_were_measured(made) -> None:
     contacts = bar_contacts(12, seed=4)

@@ -129,9 +129,10 @@ def coverage(
 ) -> Coverage:
     """Return which part of the gains measured at other contacts lies in the interval of this level.
 
-    `parts` as `GainCase.parts`: amplitudes along each of the field's modes' phases and a quarter of a period ahead. The
-    interval is that of a measured gain, so it holds the scatter of a blow as well as the field's doubt, and is as wide
-    as `widening` says. Raises FitError for gains that know no doubt and for gains of other modes.
+    `parts` as `GainCase.parts`: amplitudes along each of the field's modes' phases and a quarter of a period ahead, of
+    each contact up to their common sign where the field knows no directions of blows. The interval is that of a
+    measured gain, so it holds the scatter of a blow as well as the field's doubt, and is as wide as `widening` says.
+    Raises FitError for gains that know no doubt and for gains of other modes.
     """
     gains, scale = measured_gains(field), scale_of(field).square()[:, None]
     if parts.shape != (len(contacts), len(field.bank), 2):
@@ -141,7 +142,14 @@ def coverage(
         )
     deviation = deviation_of(field, contacts, directions)
     spread = (deviation.square() + scale * _scatter(gains)).sqrt()
-    within = (parts - parts_of(field, contacts, directions)).abs() <= widening(field, level=level) * spread
+    foretold = parts_of(field, contacts, directions)
+    if gains.ways(contacts, directions) is None:
+        # Gains that know no directions count all blows as if from one side; which one it was they cannot tell.
+        agree = (parts * foretold / spread.square().clamp_min(torch.finfo(torch.float64).tiny)).sum(
+            (1, 2), keepdim=True
+        )
+        parts = torch.where(agree < 0, -parts, parts)
+    within = (parts - foretold).abs() <= widening(field, level=level) * spread
     energy = (scale * gains.values.square().mean(0) / (4.0 * field.bank.damping.double())[:, None]).expand_as(parts)
     return Coverage(float(within.double().mean()), float((within * energy).sum() / energy.sum()))
 
