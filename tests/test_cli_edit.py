@@ -255,6 +255,14 @@ class Echo:
         return self.answer.expand_as(latents)
 
 
+def test_settings_of_a_descent_want_something_to_lead_to(field: Path, capsys: Streams) -> None:
+    assert (
+        main(["edit", str(field), "--output", str(field.with_name("x.safetensors")), "--pitch", "2", "--steps", "9"])
+        == 2
+    )
+    assert "--steps goes with --prompt, --like or --like-material" in capsys.readouterr().err
+
+
 def test_towards_words(field: Path, monkeypatch: pytest.MonkeyPatch, capsys: Streams) -> None:
     model = Echo(retune(ceramic(), pitch=1.02).render(PLACES[:1])[0])
     loaded = []

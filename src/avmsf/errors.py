@@ -1,8 +1,15 @@
-"""One family of errors: whatever the user can cause and mend is an `AvmsfError` with a message that says how."""
+"""One family of errors: whatever the user can cause and mend is an `AvmsfError` with a message that says how.
+
+And one of warnings, `AvmsfWarning`: what goes on all the same, and the user should know.
+"""
 
 
 class AvmsfError(Exception):
     """Something the user gave cannot be used; the message says what was expected, what was found and what to do."""
+
+
+class AvmsfWarning(UserWarning):
+    """Something is not as it should be, and the work goes on; the message says what, and what to do."""
 
 
 class CaptureError(AvmsfError):

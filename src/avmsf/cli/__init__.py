@@ -10,7 +10,7 @@ from typing import TextIO
 import tyro
 
 import avmsf
-from avmsf.errors import AvmsfError
+from avmsf.errors import AvmsfError, AvmsfWarning
 
 VERBS = {
     "check": "Say what each recording of a capture is worth, and what is wrong.",
@@ -90,9 +90,7 @@ def _explain(words: list[str]) -> None:
 
 
 def _show_plainly() -> None:
-    """Let what a capture's owner should know appear as a sentence, without Python's file, line and category."""
-    from avmsf.capture.warning import CaptureWarning  # its package imports torch, which help does without
-
+    """Let what a user should know appear as a sentence, without Python's file, line and category."""
     others = warnings.showwarning
 
     def show(
@@ -103,10 +101,10 @@ def _show_plainly() -> None:
         file: TextIO | None = None,
         line: str | None = None,
     ) -> None:
-        if issubclass(category, CaptureWarning):
+        if issubclass(category, AvmsfWarning):
             print(f"note: {message}", file=sys.stderr)
         else:
             others(message, category, filename, lineno, file, line)
 
-    warnings.simplefilter("always", CaptureWarning)
+    warnings.simplefilter("always", AvmsfWarning)
     warnings.showwarning = show

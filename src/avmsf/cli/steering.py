@@ -1,13 +1,11 @@
 """An edit towards words, recordings or a material's sound on the command line: its guide, progress and previews."""
 
+import dataclasses
 import sys
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, TextIO
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -77,6 +75,16 @@ class Steering:
             )
         if self.like_material is not None:
             material_named(self.like_material)
+        if not self._guides:
+            changed = [
+                f"--{each.name.replace('_', '-')}"
+                for each in dataclasses.fields(self.config)
+                if getattr(self.config, each.name) != each.default
+            ]
+            if changed:
+                raise EditError(
+                    f"{' and '.join(changed)} goes with --prompt, --like or --like-material, and none of them is given"
+                )
         if self.prompt is not None and not self.prompt.strip():
             raise EditError('--prompt is empty: describe the sound, such as "a wooden bowl is hit"')
 
@@ -87,7 +95,7 @@ class Steering:
         """
         guide = self._guide(field, old)
         preview = beside(output, "preview.wav")
-        with SteerBar(preview, sample_rate=field.sample_rate) as bar, _remarks_as_notes():
+        with SteerBar(preview, sample_rate=field.sample_rate) as bar:
             return steer(field, guide, config=self.config, progress=bar.show, checkpoint=beside(output, "checkpoint"))
 
     @property
@@ -155,26 +163,3 @@ class SteerBar:
 def beside(output: Path, ending: str) -> Path:
     """Return where a part of an unfinished edit is kept: beside the field that it will become."""
     return output.with_name(f"{output.name}.{ending}")
-
-
-@contextmanager
-def _remarks_as_notes() -> Iterator[None]:
-    """Let what an edit warns of appear as a sentence, without Python's file, line and category."""
-    with warnings.catch_warnings():
-        others = warnings.showwarning
-
-        def show(
-            message: Warning | str,
-            category: type[Warning],
-            filename: str,
-            lineno: int,
-            file: TextIO | None = None,
-            line: str | None = None,
-        ) -> None:
-            if category is UserWarning and Path(filename).parent.parent.name == "avmsf":
-                say(f"note: {message}")
-            else:
-                others(message, category, filename, lineno, file, line)
-
-        warnings.showwarning = show
-        yield

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import FieldFileError, FitError
+from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.arguments import expect_fitting, fingerprint
 from avmsf.field.automatic import Automatic
 from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
@@ -262,7 +262,7 @@ class _Job:
             write_checkpoint(self.checkpoint, state)
         except FieldFileError as error:
             # A full disk costs the checkpoint, not the fit.
-            warnings.warn(f"the fit goes on without a new checkpoint: {error}", stacklevel=2)
+            warnings.warn(f"the fit goes on without a new checkpoint: {error}", AvmsfWarning, stacklevel=2)
         self.saved_at = time.monotonic()
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from avmsf.capture.cameras import View
-from avmsf.errors import SceneError
+from avmsf.errors import AvmsfWarning, SceneError
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.hull import visual_hull
 from avmsf.scene.keep import keep_object
@@ -125,7 +125,7 @@ class _Keeper:
             write_checkpoint(self.path, {"fingerprint": self.fingerprint, "run": run.state()})
         except SceneError as error:
             # A full disk costs the checkpoint, not the run.
-            warnings.warn(f"splatting goes on without a new checkpoint: {error}", stacklevel=3)
+            warnings.warn(f"splatting goes on without a new checkpoint: {error}", AvmsfWarning, stacklevel=3)
         self.saved_at = time.monotonic()
 
 

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.errors import EditError
+from avmsf.errors import AvmsfWarning, EditError
 from avmsf.tasks.clips import lasting, levelled, resampled
 from avmsf.tasks.modaledit import ModalEdit, Struck
 
@@ -224,5 +224,6 @@ class DecoderDistillation:
             torch.cuda.empty_cache()
         warnings.warn(
             f"{self.model.name} runs out of memory on {self.model.device}: going on with batches of {self.batch}",
+            AvmsfWarning,
             stacklevel=3,
         )

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.errors import EditError
+from avmsf.errors import AvmsfWarning, EditError
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.spectra import scaled_fft_size
@@ -271,5 +271,5 @@ class _Steering:
             write_steering(self.checkpoint, state)
         except EditError as error:
             # A full disk costs the checkpoint, not the edit.
-            warnings.warn(f"the edit goes on without a new checkpoint: {error}", stacklevel=2)
+            warnings.warn(f"the edit goes on without a new checkpoint: {error}", AvmsfWarning, stacklevel=2)
         self.saved_at = time.monotonic()
