@@ -265,12 +265,9 @@ def _stream(options: LocatingOptions) -> Report:
         train, features, extract(train), FitConfig(steps=0), gains=_physics(slab(STRUCK.plate), 0.0, "plate", options)
     )
     begun = time.process_time()
-    locator = Locator.of(field)
+    listener = Listener(Locator.of(field))
     prepared = time.process_time() - begun
     stream, begins = streamed(test, STREAM_BLOWS)
-    listener = Listener(locator)
-    # The equations of the window's length are made once, as they would be before the first blow is waited for.
-    locator.locate(test.sounds[0][: listener.window])
     blows: list[Blow] = []
     unloaded: list[float] = []
     computed = 0.0

@@ -73,7 +73,7 @@ def _cost(options: Options) -> Report:
                 tell(f"physics.cost: {words}: {taken['seconds']:.0f} s")
         figures["physics.render_ms"] = taken["render_ms"]
     title = f"{COSTED}, 8 recordings; a sound is rendered in {taken['render_ms']:.1f} ms"
-    columns = ("", "s for bodies", "s for modes and fit", "s", "GB", "modes", "freedoms")
+    columns = ("", "s for bodies", "s for modes and fit", "s", "GB", "modes", "freedoms asked")
     return Report(tables=(Table(title, columns, rows),), figures=figures)
 
 
@@ -128,7 +128,10 @@ def _coverage(options: Options) -> Report:
     plain, by_energy, error = torch.tensor([[float(value) for value in row[1:]] for row in rows]).mean(0).tolist()
     figures = {"physics.coverage90": plain, "physics.coverage90_by_energy": by_energy, "physics.sim20.error": error}
     columns = ("object", "coverage90", "by energy", "error")
-    return Report(tables=(Table("intervals of 90 % on sim-20, 8 blows learnt from", columns, rows),), figures=figures)
+    return Report(
+        tables=(Table(f"intervals of 90 % on {len(rows)} objects of sim-20, 8 blows learnt from", columns, rows),),
+        figures=figures,
+    )
 
 
 PARTS: dict[str, Callable[[Options], Report]] = {"cost": _cost, "coverage": _coverage}

@@ -51,6 +51,13 @@ def spot(blow: Blow) -> int:
     return blow.map.most_probable
 
 
+def test_nothing_is_left_to_compute_for_the_first_blow() -> None:
+    fresh = Locator.of(locator().field)
+    listener = Listener(fresh, later=0.2)
+    assert "heed" in vars(fresh)
+    assert {length for length, _ in fresh.lengths} == {listener.window, listener.later}
+
+
 def test_every_blow_is_found_while_earlier_ones_ring() -> None:
     blows = heard(Listener(locator(), sample_rate=RATE), stream())
     assert [spot(blow) for blow in blows] == list(STRUCK)

@@ -144,6 +144,7 @@ class Listener:
         self._modes = Ringing.of(field.bank, strength, sample_rate=rate, hop=self.hop, window=self.window)
         self._kept = (self.later or self.window) + self.hop * (_MEMORY + 2 * _SKIPPED) + round(_BEFORE * rate)
         self.ears = self._silence()
+        locator.prepare(*(each for each in (self.window, self.later) if each is not None))
 
     def hear(self, block: Float[Tensor, " samples"]) -> list[Blow]:
         """Return the answers that the next samples of the stream complete, in the order of time.

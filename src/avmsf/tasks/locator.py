@@ -111,6 +111,12 @@ class Locator:
             float(found.force[row]) / length.unit,
         )
 
+    def prepare(self, *samples: int) -> None:
+        """Compute now what the first sound of each of these lengths would have to wait for."""
+        _ = self.heed
+        for length in samples:
+            self._length(min(length, self.field.samples), float("inf"))
+
     @cached_property
     def heed(self) -> float:
         """Factor on what modes tell beside one another: as much as the field's own strikes, left out, bear out."""
