@@ -68,6 +68,53 @@ def test_gaussians_lie_beside_the_glb(field_file: Path, tmp_path: Path) -> None:
     assert main([*words, "--object", str(tmp_path / "plate.ply")]) == 0
 
 
+def test_a_strangers_file_beside_the_glb_is_left_alone(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    gaussians(tmp_path / "plate.ply")
+    (tmp_path / "a.gaussians.ply").write_bytes(b"theirs")
+    words = [str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb")]
+    words += ["--object", str(tmp_path / "plate.ply")]
+    assert "a.gaussians.ply: expected a free name or an earlier export" in refused(words, capsys)
+    assert (tmp_path / "a.gaussians.ply").read_bytes() == b"theirs"
+    assert not (tmp_path / "a.glb").exists()
+    assert main(["export", *words, "--force"]) == 0
+    assert (tmp_path / "a.gaussians.ply").read_bytes() == (tmp_path / "plate.ply").read_bytes()
+
+
+def test_a_mesh_in_another_unit_is_refused(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    trimesh.creation.box([1000 * side for side in SIDES]).export(tmp_path / "plate.stl")
+    words = [str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb")]
+    said = refused([*words, "--object", str(tmp_path / "plate.stl")], capsys)
+    assert "expected an object as large as the field's" in said
+    assert not (tmp_path / "a.glb").exists()
+
+
+def test_faust_gets_what_it_compiles_unless_asked_for_more(
+    field_file: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [str(field_file), "--to", "faust", "--output", str(tmp_path / "a.dsp")]
+    # 64 points of 5 modes with phases and the noise's 1200 samples are 1840 numbers.
+    monkeypatch.setattr("avmsf.export.faust.MOST_NUMBERS", 1500)
+    assert main(["export", *words]) == 0
+    assert "of these 30, as many as Faust compiles" in capsys.readouterr().err
+    text = (tmp_path / "a.dsp").read_text()
+    assert "points = 30;" in text
+    assert "noiseDraw" in text
+    # Beside the noise 10 would be left: it is given up.
+    monkeypatch.setattr("avmsf.export.faust.MOST_NUMBERS", 1300)
+    assert main(["export", *words]) == 0
+    assert "the noise beside the modes is left out" in capsys.readouterr().err
+    text = (tmp_path / "a.dsp").read_text()
+    assert "points = 64;" in text
+    assert "noiseDraw" not in text
+    assert "found 1840: 64 points" in refused([*words, "--points", "64"], capsys)
+
+
+def test_without_noise_is_a_flag(field_file: Path, tmp_path: Path) -> None:
+    words = ["--to", "faust", "--output", str(tmp_path / "a.dsp"), "--points", "3", "--no-noise"]
+    assert main(["export", str(field_file), *words]) == 0
+    assert "noiseDraw" not in (tmp_path / "a.dsp").read_text()
+
+
 def test_the_demo_goes_out_in_and_out_again(field_file: Path, tmp_path: Path) -> None:
     cloud = gaussians(tmp_path / "plate.ply")
     first, again = tmp_path / "demo", tmp_path / "again"
@@ -104,7 +151,9 @@ def test_a_demo_is_read_into_any_other_format(field_file: Path, tmp_path: Path) 
 
 def test_wavs_have_the_layers_asked_for(field_file: Path, tmp_path: Path) -> None:
     words = ["export", str(field_file), "--to", "wavs", "--output", str(tmp_path / "w"), "--points", "2"]
+    words += ["--pulse", "hertz"]
     assert main([*words, "--forces", "0.5", "2", "--contact-times", "0.001", "0", "--seconds", "0.05"]) == 0
+    assert json.loads((tmp_path / "w" / "manifest.json").read_text())["pulses"] == ["hertz", "hertz"]
     with (tmp_path / "w" / "strikes.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [(row["force"], row["contact_time"]) for row in rows] == [("0.5", "0.001"), ("2", "0")] * 2
@@ -144,7 +193,17 @@ def test_what_cannot_be_exported_is_said(field_file: Path, tmp_path: Path, capsy
     words = [field, "--to", "wavs", "--output", out, "--forces", "1", "2", "3", "--contact-times", "0", "0"]
     assert "found 3 forces and 2 times" in refused(words, capsys)
     words = [field, "--to", "gltf", "--output", str(tmp_path / "a.glb"), "--object", str(tmp_path / "none.obj")]
-    assert "there is no such mesh file" in refused(words, capsys)
+    assert "found no such file" in refused(words, capsys)
+    words = [field, "--to", "uff", "--output", str(tmp_path / "a.uff"), "--functions", "-1"]
+    assert "expected 0 response functions or more, found -1" in refused(words, capsys)
+    words = [field, "--to", "avmsf-demo", "--output", out, "--capture", str(tmp_path)]
+    assert "--capture says nothing to --to avmsf-demo, only to web, gltf: leave it out" in refused(words, capsys)
+    words = [field, "--to", "faust", "--output", str(tmp_path / "b.dsp"), "--rate", "8000"]
+    assert "--rate says nothing to --to faust, only to the demo's folders" in refused(words, capsys)
+    trimesh.creation.box(SIDES).export(tmp_path / "box.ply")
+    words = [field, "--to", "avmsf-demo", "--output", out, "--object", str(tmp_path / "box.ply")]
+    assert "expected a .ply of Gaussians, which the demo shows, found another object" in refused(words, capsys)
+    assert not (tmp_path / "out").exists()
     (tmp_path / "a.dsp").write_text("theirs")
     words = [field, "--to", "faust", "--output", str(tmp_path / "a.dsp"), "--points", "3"]
     assert "add --force" in refused(words, capsys)

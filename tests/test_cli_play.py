@@ -2,6 +2,7 @@
 
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +16,7 @@ import torch
 from avmsf.cli import main, play
 from avmsf.errors import PlayerError
 from avmsf.export.midi import Note
-from avmsf.export.player import Blow, Player, random_blows
+from avmsf.export.player import Blow, Capacity, Player, random_blows
 from avmsf.export.sampledfield import SampledField
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
@@ -68,7 +69,9 @@ def test_a_score_is_played_to_its_end(field_file: Path, tmp_path: Path) -> None:
     file.tracks.append(track)
     file.save(tmp_path / "one.mid")
     point = spline().points[5].tolist()
-    words = ["--midi", str(tmp_path / "one.mid"), "--keys", "pitch", "--at", *map(str, point), "--level-db", "-20"]
+    millimetres = [str(1000 * value) for value in point]
+    words = ["--midi", str(tmp_path / "one.mid"), "--keys", "pitch", "--at", *millimetres, "--unit", "mm"]
+    words += ["--level-db", "-20"]
     heard = bounced(field_file, tmp_path / "a.wav", *words)
     assert len(heard) == round(2.5 * RATE)
     assert not heard[: round(0.5 * RATE)].any()
@@ -121,6 +124,61 @@ def test_a_device_hears_what_a_file_holds(
     assert (device.asked["device"], device.asked["samplerate"], device.asked["blocksize"]) == (3, RATE, 50)
     filed = bounced(field_file, tmp_path / "a.wav", *words)
     np.testing.assert_allclose(np.concatenate(device.heard)[:1500], filed[:1500], atol=1e-7)
+
+
+class Running(Device):
+    """A sound device that takes a second's blocks at once when it starts, and then is interrupted by Ctrl-C."""
+
+    def OutputStream(self, **asked: Any) -> Any:  # noqa: N802
+        device = self
+
+        class Stream:
+            def __enter__(self) -> "Stream":
+                for _ in range(round(RATE) // asked["blocksize"]):
+                    out = np.full((asked["blocksize"], 1), np.nan, dtype=np.float32)
+                    asked["callback"](out, asked["blocksize"], None, False)
+                    device.heard.append(out[:, 0])
+                return self
+
+            def __exit__(self, *_: object) -> None:
+                pass
+
+        return Stream()
+
+
+def test_without_an_end_blows_come_as_they_are_due_until_ctrl_c(
+    field_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device, struck, hours = Running(), [], iter(range(1000))
+
+    class Clock:
+        perf_counter = staticmethod(time.perf_counter)
+
+        @staticmethod
+        def monotonic() -> float:
+            hour = next(hours)
+            if hour == 50:
+                raise KeyboardInterrupt
+            return 3600.0 * hour
+
+    def strike(self: Player, blow: Blow) -> None:
+        struck.append((self.now, blow.start))
+        plain(self, blow)
+
+    plain = Player.strike
+    monkeypatch.setitem(sys.modules, "sounddevice", device)
+    monkeypatch.setattr(play, "measure_capacity", lambda *_, **__: Capacity(1, 1.0))
+    words = ["--blows", "40", "--block", "50"]
+    with monkeypatch.context() as patched:
+        patched.setattr(play, "time", Clock)
+        patched.setattr(Player, "strike", strike)
+        patched.setattr("threading.Event.wait", lambda *_: False)
+        assert main(["play", str(field_file), *words]) == 130
+    # Every blow is handed over within the block in which it begins, and none beforehand.
+    assert all(now <= start < now + 50 for now, start in struck)
+    assert 15 < len(struck) < 80
+    filed = bounced(field_file, tmp_path / "a.wav", *words, "--seconds", "1")
+    np.testing.assert_allclose(np.concatenate(device.heard), filed, atol=1e-7)
 
 
 def test_a_keyboard_is_heard(field_file: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -179,6 +237,10 @@ def test_a_failing_callback_ends_the_playing(
         (["--contact-time", "2"], "expected 0 to .1 s"),
         (["--block", "1"], "expected 16 to"),
         (["--level-db", "nan"], "expected a finite number"),
+        (["--midi", "a.mid", "--keys", "pitch", "--at", "nan", "0", "0"], "--at is nan 0 0; expected finite numbers"),
+        (["--midi", "a.mid", "--keys", "pitch", "--at", "1000", "0", "0"], "m outside an object"),
+        (["--midi", "a.mid", "--at", "0", "0", "0"], "add --keys pitch"),
+        (["--keys", "pitch"], "random blows have no keys"),
     ],
 )
 def test_bad_settings_are_refused(words: list[str], said: str, field_file: Path, capsys: Streams) -> None:

@@ -11,7 +11,8 @@ import trimesh
 
 from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.errors import ExportError
-from avmsf.export.gltf import Look, write_gltf
+from avmsf.export.gltf import write_gltf
+from avmsf.export.look import Look, read_look
 from made_tables import MODES, POINTS, apart, summed, table
 
 KINDS = {5126: "<f4", 5125: "<u4"}
@@ -153,6 +154,26 @@ def test_a_texture_becomes_the_corners_colours():
     upper = int((look.vertices[:, 1] == 1).nonzero()[0])
     assert look.colors[upper].tolist() == [0.0, 1.0, 0.0]
     assert look.colors.sum() == 1.0
+
+
+def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colours(tmp_path, monkeypatch):
+    pytest.importorskip("fast_simplification", reason="needs pip install 'avmsf[fem]'")
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.6)
+    upper = ball.vertices[:, 2] > 0
+    ball.visual.vertex_colors = np.where(upper[:, None], [255, 0, 0, 255], [0, 0, 255, 255]).astype(np.uint8)
+    ball.export(tmp_path / "ball.ply")
+    whole, remarks = read_look(tmp_path / "ball.ply", table())
+    assert (len(whole.faces), remarks) == (5120, ())
+    monkeypatch.setattr("avmsf.export.look.MOST_FACES", 1000)
+    few, (remark,) = read_look(tmp_path / "ball.ply", table())
+    assert 500 < len(few.faces) <= 1000
+    assert "5,120 triangles, too many for a browser" in remark
+    np.testing.assert_allclose(few.vertices.norm(dim=1), 0.6, atol=0.02)
+    high = few.vertices[:, 2] > 0.05
+    np.testing.assert_allclose(few.colors[high], torch.tensor([[1.0, 0.0, 0.0]]).expand(int(high.sum()), 3), atol=0.01)
+    monkeypatch.setattr("avmsf.export.objectfile.MOST_READ", 5000)
+    with pytest.raises(ExportError, match="expected at most 5,000 triangles, found 5,120"):
+        read_look(tmp_path / "ball.ply", table())
 
 
 def test_another_ending_and_anothers_file_are_refused(tmp_path):

@@ -1,6 +1,7 @@
 """The layout of the paper's demo: its bytes are where its manifests say, and it comes back as it was."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 import torch
 
 from avmsf.errors import ExportError
-from avmsf.export.modaldemo import Demo, discs, is_demo, read_demo, write_demo
+from avmsf.export.discs import discs
+from avmsf.export.modaldemo import Demo, is_demo, read_demo, write_demo
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats
 from made_tables import MODES, POINTS, RATE, SAMPLES, apart, summed, table
@@ -124,7 +126,7 @@ def test_offsets_alone_at_the_top_are_understood(tmp_path):
     offsets = {name: record["offset"] for name, record in sound["arrays"].items()}
     bare_sound = {"num_modes": MODES, "duration": 3.0, "offsets": offsets}
     (tmp_path / "original" / "manifest.json").write_text(json.dumps(bare_sound))
-    with pytest.raises(ExportError, match="expected a sample rate, found None"):
+    with pytest.raises(ExportError, match="expected a sample rate from 1 to 768000 Hz, found None"):
         read_demo(tmp_path)
     demo = read_demo(tmp_path, sample_rate=RATE)
     assert isinstance(demo, Demo)
@@ -141,6 +143,51 @@ def test_of_several_variants_one_is_named(tmp_path):
     with pytest.raises(ExportError, match="found original, wood: name one"):
         read_demo(tmp_path)
     assert read_demo(tmp_path, variant="wood").field.origin["variant"] == "wood"
+
+
+def test_variants_of_the_same_gaussians_gather_in_one_folder(tmp_path):
+    first, second = cosines(), replace(cosines(), frequency=1.1 * cosines().frequency)
+    write_demo(first, tmp_path / "demo")
+    words = " ".join(write_demo(second, tmp_path / "demo", variant="glass").remarks)
+    assert "other variants stay as they were: original" in words
+    assert json.loads((tmp_path / "demo" / "manifest.json").read_text())["variants"] == ["glass", "original"]
+    for name, field in (("original", first), ("glass", second)):
+        torch.testing.assert_close(
+            read_demo(tmp_path / "demo", variant=name).field.frequency, field.frequency, rtol=1e-6, atol=0
+        )
+    # Again, in its place.
+    write_demo(second, tmp_path / "demo", variant="original")
+    assert len(list((tmp_path / "demo").glob("*/modal.bin"))) == 2
+    elsewhere = replace(first, points=first.points + 1)
+    with pytest.raises(ExportError, match="variants of the same Gaussians, found glass of others: choose another"):
+        write_demo(elsewhere, tmp_path / "demo")
+    assert read_demo(tmp_path / "demo", variant="glass").field.frequency[0] > 450
+    assert "of no use any more: glass" in " ".join(write_demo(elsewhere, tmp_path / "demo", force=True).remarks)
+    torch.testing.assert_close(read_demo(tmp_path / "demo").field.points, elsewhere.points)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        (("arrays", "frequencies", "shape"), [], "shape of 'frequencies' as whole numbers from 1"),
+        (("arrays", "gains", "shape"), 5, "shape of 'gains' as whole numbers from 1, found 5"),
+        (("arrays", "dampings", "shape"), [4.0], r"shape of 'dampings' as whole numbers from 1, found \[4.0\]"),
+        (("arrays", "gains", "offset"), True, "the offset of 'gains' in bytes"),
+        (("duration",), 1e300, "a duration above 0 and up to 600 s, found 1e"),
+        (("duration",), 1e9, "a duration above 0 and up to 600 s, found 1000000000"),
+        (("sampleRate",), float("inf"), "a sample rate from 1 to 768000 Hz, found inf"),
+        (("sampleRate",), 10**30, "a sample rate from 1 to 768000 Hz, found 1000"),
+    ],
+)
+def test_a_manifest_that_says_nonsense_is_refused(tmp_path, place, value, words):
+    _, sound = written(tmp_path)
+    record = sound
+    for key in place[:-1]:
+        record = record[key]
+    record[place[-1]] = value
+    (tmp_path / "original" / "manifest.json").write_text(json.dumps(sound))
+    with pytest.raises(ExportError, match=words):
+        read_demo(tmp_path)
 
 
 def test_what_is_broken_is_named(tmp_path):

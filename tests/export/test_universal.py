@@ -1,6 +1,7 @@
 """The universal file is read back by pyuff and by its columns, and sounds as the field."""
 
 import math
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +34,7 @@ def test_nodes_and_real_shapes_come_back(tmp_path):
         damping.append(mode["modal_damp_vis"] * 2 * math.pi * mode["freq"])
         frequency.append(mode["freq"] * math.sqrt(1 - mode["modal_damp_vis"] ** 2))
         shape = np.stack([mode["r1"], mode["r2"], mode["r3"]], axis=1)
-        gains.append((shape * field.normals.numpy()).sum(1))
+        gains.append((shape * -field.normals.numpy()).sum(1))
     np.testing.assert_allclose(frequency, field.frequency, rtol=6e-6)
     np.testing.assert_allclose(damping, field.damping, rtol=2e-5)
     np.testing.assert_allclose(np.array(gains).T, field.sine, atol=2e-5)
@@ -45,7 +46,7 @@ def test_complex_shapes_are_residues(tmp_path):
     times, total = np.arange(SAMPLES) / RATE, np.zeros(SAMPLES)
     for mode in sets(tmp_path / "thing.uff", 55):
         assert mode["analysis_type"] == 3
-        residue = sum(mode[f"r{axis + 1}"][5] * float(field.normals[5, axis]) for axis in range(3))
+        residue = sum(mode[f"r{axis + 1}"][5] * -float(field.normals[5, axis]) for axis in range(3))
         total += 2 * np.real(residue * np.exp(mode["eig"] * times))
     # Six digits of a frequency of 3300 Hz are .005 Hz, or .006 radians after .2 s.
     assert apart(total, field.render(torch.tensor([5]))[0]) < 5e-3
@@ -77,6 +78,34 @@ def test_responses_are_the_transforms_of_the_sounds(tmp_path):
         assert np.sign(each["ref_dir"]) == np.sign(float(blow[axis]))
 
 
+@pytest.mark.parametrize("phased", [False, True])
+def test_a_reader_makes_the_responses_of_the_shapes(tmp_path, phased):
+    """By modal superposition in the reference direction, as programs do that know data sets 55 and 58 alone."""
+    field = table(phased=phased)
+    signs = torch.where(torch.arange(POINTS) % 2 == 0, 1.0, -1.0)
+    straight = replace(field, normals=signs[:, None] * torch.eye(3)[torch.arange(POINTS) % 3])
+    remarks = write_universal(straight, tmp_path / "thing.uff", functions=POINTS).remarks
+    assert "degrees off" not in " ".join(remarks)
+    functions, modes = sets(tmp_path / "thing.uff", 58), sets(tmp_path / "thing.uff", 55)
+    assert {each["ref_dir"] for each in functions} == {-3, -2, -1, 1, 2, 3}
+    for each in functions:
+        s = 2j * np.pi * each["x"]
+        total = np.zeros(len(s), dtype=complex)
+        for mode in modes:
+            shape = mode[f"r{abs(each['ref_dir'])}"][each["ref_node"] - 1] * np.sign(each["ref_dir"])
+            if phased:
+                pole = mode["eig"]
+                total += shape / (s - pole) + np.conj(shape) / (s - np.conj(pole))
+            else:
+                ratio, undamped = mode["modal_damp_vis"], 2 * np.pi * mode["freq"]
+                turning = undamped * math.sqrt(1 - ratio**2)
+                total += shape * turning / (s**2 + 2 * ratio * undamped * s + undamped**2)
+        # Six digits of a frequency, .005 Hz of 3300, beside resonances of some hertz.
+        assert np.abs(total - each["data"]).max() < 5e-3 * np.abs(each["data"]).max()
+    oblique = replace(straight, normals=torch.nn.functional.normalize(torch.ones(POINTS, 3), dim=1))
+    assert "up to 55 degrees off" in " ".join(write_universal(oblique, tmp_path / "thing.uff").remarks)
+
+
 def test_one_damping_a_mode_is_said_to_be_a_mean(tmp_path):
     field = table(spatial=True, noisy=True)
     words = " ".join(write_universal(field, tmp_path / "thing.unv", functions=0).remarks)
@@ -89,8 +118,10 @@ def test_one_damping_a_mode_is_said_to_be_a_mean(tmp_path):
     assert mode["modal_damp_vis"] * 2 * math.pi * mode["freq"] == pytest.approx(expected, rel=2e-5)
 
 
-def test_the_same_field_gives_the_same_file(tmp_path):
-    for name in ("a.uff", "b.uff"):
+def test_the_same_field_gives_the_same_file(tmp_path, monkeypatch):
+    plain = time.strftime
+    for name, when in (("a.uff", 0.0), ("b.uff", 1e9)):
+        monkeypatch.setattr("time.strftime", lambda form, *_, when=when: plain(form, time.gmtime(when)))
         write_universal(table(), tmp_path / name)
     assert (tmp_path / "a.uff").read_bytes() == (tmp_path / "b.uff").read_bytes()
     # Its own file is written again without being asked.
@@ -103,6 +134,8 @@ def test_without_pyuff_it_says_what_to_install(tmp_path, monkeypatch):
         write_universal(table(), tmp_path / "thing.uff")
 
 
-def test_another_ending_is_refused(tmp_path):
+def test_another_ending_and_fewer_functions_than_none_are_refused(tmp_path):
+    with pytest.raises(ExportError, match="expected 0 response functions or more, found -1"):
+        write_universal(table(), tmp_path / "thing.uff", functions=-1)
     with pytest.raises(ExportError, match=r"\.uff or \.unv, found no ending"):
         write_universal(table(), tmp_path / "thing")

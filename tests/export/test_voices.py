@@ -1,13 +1,23 @@
 """The real-time bank sounds as the field's render, whatever the blocks, and stays whole when too much is struck."""
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
 import torch
 
 from avmsf.errors import PlayerError
-from avmsf.export.player import Blow, Keyboard, Player, bounce, comfortable_level, measure_capacity, random_blows
+from avmsf.export.player import (
+    Blow,
+    Keyboard,
+    Player,
+    bounce,
+    comfortable_level,
+    endless_blows,
+    measure_capacity,
+    random_blows,
+)
 from avmsf.modal.pulse import ForcePulse
 from avmsf.modal.voices import CEILING, FLOOR, VoiceBank, turns
 from made_tables import MODES, POINTS, RATE, SAMPLES, apart, summed, table
@@ -141,13 +151,29 @@ def test_the_noise_ends_without_a_click():
     assert not heard[SAMPLES:].any()
 
 
-def test_of_too_many_noises_the_faintest_is_left_out():
+def test_of_too_many_noises_the_faintest_dies_away():
     field = table(noisy=True)
     field.sine[:] = 0.0
     blows = Blow(0, 1.0), Blow(0, 0.1, 10), Blow(0, 2.0, 20)
     heard = played(field, *blows, block=1, voices=2)
+    np.testing.assert_allclose(heard[:20], rendered(field, *blows)[:20], atol=1e-8)
     loud = rendered(field, blows[0], blows[2])
-    assert apart(heard[20 : SAMPLES - FADE], loud[20 : SAMPLES - FADE]) < 1e-6
+    assert apart(heard[20 + FADE : SAMPLES - FADE], loud[20 + FADE : SAMPLES - FADE]) < 1e-6
+
+
+@pytest.mark.parametrize("block", [1, 64])
+def test_a_noise_that_makes_room_does_not_click(block):
+    """A constant instead of noise: whatever steps then, beside the blows' own beginnings, is a click."""
+    field = table(noisy=True)
+    field.noise[:] = 0.5
+    field.sine[:] = 0.0
+    blows = Blow(0, 1.0), Blow(0, 2.0, 640), Blow(0, 3.0, 1000), Blow(0, 0.1, 1001)
+    heard = played(field, *blows, block=block, voices=1)
+    steps = np.diff(heard)
+    steps[[639, 999]] -= [1.0, 1.5]
+    assert np.abs(steps).max() < 1.01 * (1.0 + 2.0) * 0.5 / FADE
+    # The last is fainter than what sounds, and is never heard; the others are gone after their fading.
+    np.testing.assert_allclose(heard[1001 + FADE : SAMPLES], 1.5, atol=1e-6)
 
 
 def test_the_chosen_level_leaves_room():
@@ -169,6 +195,10 @@ def test_chance_has_a_seed_and_a_rate():
     assert len(blows) == pytest.approx(1000, abs=4 * 1000**0.5)
     assert blows[0].start == 0
     assert all(blow.start < 200 * RATE for blow in blows)
+    # They are the first of those without end.
+    endless = endless_blows(field, each_second=5.0, seed=3)
+    assert list(islice(endless, len(blows))) == blows
+    assert next(endless).start >= 200 * RATE
     assert {blow.row for blow in blows} == set(range(POINTS))
     decibels = 20 * np.log10([blow.force for blow in blows])
     assert decibels.std() == pytest.approx(6.0, rel=0.1)
@@ -186,12 +216,31 @@ def test_keys_are_contacts_or_pitches():
     assert pitches.blow(60, 100, start=0).ratio == 1.0
 
 
-def test_the_capacity_is_that_of_the_field():
-    shared, own = measure_capacity(table(), seconds=0.2), measure_capacity(table(spatial=True), seconds=0.2)
-    assert shared.voices > 0
-    assert own.voices > 0
-    assert shared.blows > 0
-    assert np.isnan(own.blows)
+@pytest.mark.parametrize("tried", [5, 16])
+def test_the_capacity_is_that_of_the_field(monkeypatch, tried):
+    """On a clock by which a voice takes a microsecond a sample, and a blow a quarter of a millisecond."""
+    clock, begun = [0.0], [0]
+
+    def render(self, count, *, limit=True):
+        sound = plain(self, count, limit=limit)
+        clock[0] += 1e-6 * count * self.ringing + 2.5e-4 * max(0, begun[0] - tried)
+        begun[0] = 0
+        return sound
+
+    def strike(self, blow):
+        begun[0] += 1
+        plain_strike(self, blow)
+
+    plain, plain_strike = Player.render, Player.strike
+    monkeypatch.setattr(Player, "render", render)
+    monkeypatch.setattr(Player, "strike", strike)
+    monkeypatch.setattr("avmsf.export.player.time.process_time", lambda: clock[0])
+    for field in (table(), table(spatial=True)):
+        assert measure_capacity(field, seconds=0.2, tried=tried).voices == int(1e6 / RATE)
+    assert np.isnan(measure_capacity(table(spatial=True), seconds=0.2, tried=tried).blows)
+    # A thousand blows, and .2 s (6 blocks of 256) of the one voice that they ring in.
+    taken = 2.5e-4 * (1000 - tried) + 1e-6 * 6 * 256
+    assert measure_capacity(table(), seconds=0.2, tried=tried).blows == pytest.approx(1000 / taken, rel=1e-9)
 
 
 def test_what_cannot_be_is_refused():

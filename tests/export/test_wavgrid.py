@@ -37,7 +37,7 @@ def test_every_row_is_its_blow(tmp_path):
         point = field.nearest(place)
         assert float((field.points[point] - place).abs().max()) < 1e-6
         assert [float(row[axis]) for axis in ("nx", "ny", "nz")] == pytest.approx(field.normals[point][0].tolist())
-        pulse = ForcePulse(float(row["contact_time"]), "hertz")
+        pulse = ForcePulse(float(row["contact_time"]))
         truths.append(field.render(point, force=float(row["force"]), pulse=pulse)[0].numpy())
         sounds.append(sound)
         assert (rate, len(sound), float(row["seconds"])) == (RATE, SAMPLES, SAMPLES / RATE)
@@ -59,11 +59,42 @@ def test_contacts_lie_apart_and_have_a_note_each(tmp_path):
 
 def test_the_instrument_plays_every_file_at_its_key(tmp_path):
     write_grid(table(), tmp_path / "grid", Grid(4, LAYERS))
-    text = (tmp_path / "grid" / "instrument.sfz").read_text()
-    regions = re.findall(r"<region> sample=(\S+) key=(\d+) lovel=(\d+) hivel=(\d+)", text)
+    regions = played(tmp_path / "grid")
     expected = [(r["file"], r["midi_note"], r["velocity_low"], r["velocity_high"]) for r in rows(tmp_path / "grid")]
-    assert regions == expected
-    assert all((tmp_path / "grid" / name).is_file() for name, *_ in regions)
+    assert sorted((r["sample"], r["key"], r["lovel"], r["hivel"]) for r in regions) == sorted(expected)
+    assert all((tmp_path / "grid" / region["sample"]).is_file() for region in regions)
+
+
+def played(folder: Path) -> list[dict[str, str]]:
+    """Return the instrument's regions, each with what it takes over from its group."""
+    regions, group = [], {}
+    for header, rest in re.findall(r"<(\w+)> (.*)", (folder / "instrument.sfz").read_text()):
+        opcodes = dict(word.split("=") for word in rest.split())
+        if header == "group":
+            group = opcodes
+        elif header == "region":
+            regions.append(group | opcodes)
+    return regions
+
+
+def test_a_layers_hardest_velocity_plays_it_as_it_is_and_no_loudness_counts_twice(tmp_path):
+    write_grid(table(), tmp_path / "grid", Grid(2, LAYERS))
+    for region in played(tmp_path / "grid"):
+        low, high = int(region["lovel"]), int(region["hivel"])
+        for velocity in range(low, high + 1):
+            assert float(region[f"amp_velcurve_{velocity}"]) == pytest.approx((velocity / high) ** 2, rel=1e-5)
+    write_grid(table(), tmp_path / "one", Grid(2))
+    # One layer has the whole keyboard, and the square of the velocity as every SFZ player has it.
+    assert float(played(tmp_path / "one")[0]["amp_velcurve_64"]) == pytest.approx((64 / 127) ** 2, rel=1e-5)
+
+
+@pytest.mark.parametrize("count", [85, 86, 100, 127])
+def test_every_layer_has_a_velocity(tmp_path, count):
+    write_grid(table(), tmp_path / "grid", Grid(1, tuple(Layer(0.1 + each) for each in range(count)), seconds=0.01))
+    found = rows(tmp_path / "grid")
+    struck = [v for row in found for v in range(int(row["velocity_low"]), int(row["velocity_high"]) + 1)]
+    assert struck == list(range(1, 128))
+    assert all(int(row["velocity_low"]) <= int(row["velocity_high"]) for row in found)
 
 
 def test_lengths_are_as_asked(tmp_path):

@@ -1,11 +1,17 @@
 """Exports are whole or absent, and never write over what is not theirs."""
 
 import json
+import os
 
 import pytest
 
 from avmsf.errors import ExportError
+from avmsf.export.faust import write_faust
+from avmsf.export.gltf import write_gltf
+from avmsf.export.universal import write_universal
+from avmsf.export.webpage import write_webpage
 from avmsf.export.written import Written, write_file, write_folder
+from made_tables import table
 
 
 def fill(*names):
@@ -64,6 +70,55 @@ def test_what_fails_half_way_leaves_all_as_it_was(tmp_path):
     with pytest.raises(ExportError, match="No space left on device"):
         write_folder(tmp_path / "out", fail, {})
     assert listed(tmp_path) == ["out/a.txt", "out/manifest.json"]
+
+
+def test_a_folder_behind_a_link_is_replaced_and_the_link_stays(tmp_path):
+    write_folder(tmp_path / "real", fill("old.txt"), {})
+    (tmp_path / "link").symlink_to("real")
+    sizes = write_folder(tmp_path / "link", fill("a.txt"), {})
+    assert set(sizes) == {tmp_path / "link" / name for name in ("a.txt", "manifest.json")}
+    assert (tmp_path / "link").is_symlink()
+    assert sorted(os.listdir(tmp_path)) == ["link", "real"]
+    assert listed(tmp_path / "real") == ["a.txt", "manifest.json"]
+
+
+def test_the_old_folder_comes_back_where_the_new_one_cannot_take_its_place(tmp_path, monkeypatch):
+    write_folder(tmp_path / "out", fill("a.txt"), {})
+    plain = os.replace
+
+    def fail(source, target):
+        if str(source).endswith(".part"):
+            raise OSError(5, "Input/output error")
+        plain(source, target)
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(ExportError, match="Input/output error"):
+        write_folder(tmp_path / "out", fill("b.txt"), {})
+    assert listed(tmp_path) == ["out/a.txt", "out/manifest.json"]
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [("a.dsp", write_faust), ("a.glb", write_gltf), ("a.uff", write_universal), ("a.html", write_webpage)],
+)
+def test_ours_are_known_again_and_what_speaks_of_us_is_not_ours(tmp_path, name, write):
+    if name == "a.uff":
+        pytest.importorskip("pyuff", reason="needs pip install 'avmsf[uff]'")
+    path = tmp_path / name
+    for seed in (0, 1):
+        write(table(seed=seed), path)
+    path.write_text("// my own program, with tables that avmsf 0.7.0 made\n<!-- from avmsf 0.7.0 -->\n")
+    with pytest.raises(ExportError, match="found a file that no export wrote"):
+        write(table(), path)
+    write(table(), path, force=True)
+
+
+def test_what_is_there_already_may_be_written(tmp_path):
+    (tmp_path / "a.ply").write_bytes(b"theirs")
+    write_file(tmp_path / "a.ply", b"theirs")
+    with pytest.raises(ExportError, match="found a file that no export wrote"):
+        write_file(tmp_path / "a.ply", b"other")
+    assert (tmp_path / "a.ply").read_bytes() == b"theirs"
 
 
 def test_files_and_folders_are_told_apart(tmp_path):

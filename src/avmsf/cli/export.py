@@ -1,7 +1,7 @@
 """`avmsf export`: a field in the formats of other tools."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -10,25 +10,25 @@ import tyro
 
 from avmsf.capture.folder import read_capture, settings_of
 from avmsf.capture.surface import find_surface_file
-from avmsf.capture.texturedmesh import read_textured_mesh
 from avmsf.cli.printing import figure, say
 from avmsf.cli.render import METRES
 from avmsf.errors import ExportError
 from avmsf.export.bundle import MOST_POINTS
-from avmsf.export.faust import write_faust
-from avmsf.export.gltf import Look, write_gltf
+from avmsf.export.faust import fitted, write_faust
+from avmsf.export.gltf import write_gltf
+from avmsf.export.look import Look, read_look
 from avmsf.export.modaldemo import SCENE, Precision, is_demo, read_demo, write_demo
-from avmsf.export.objectfile import read_object
+from avmsf.export.objectfile import holds_gaussians, read_object
 from avmsf.export.sampledfield import SampledField, spread_rows
 from avmsf.export.universal import write_universal
 from avmsf.export.wavgrid import Grid, Layer, write_grid
 from avmsf.export.webpage import write_webpage
-from avmsf.export.written import Written, write_file
+from avmsf.export.written import Written, expect_free, write_file
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
+from avmsf.modal.pulse import PulseShape
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats
-from avmsf.scene.start import ZEROTH
 
 Format = Literal["web", "gltf", "faust", "avmsf-demo", "wavs", "uff"]
 _POINTS = {"web": MOST_POINTS, "gltf": 2000, "faust": 64, "avmsf-demo": 10_000, "wavs": 16, "uff": 1000}
@@ -67,8 +67,10 @@ class Options:
     """wavs: how long the hammer of each layer touches, seconds; one for all, or as many as forces."""
     seconds: float | None = None
     """wavs: length of the sounds; that of the training sounds where it is not given."""
-    noise: bool = True
-    """faust: with --no-noise, the modes alone."""
+    pulse: PulseShape = "half-sine"
+    """wavs: how the force rises and falls over that time, as in `avmsf render`."""
+    no_noise: bool = False
+    """faust: the modes alone."""
     functions: int = 16
     """uff: points whose frequency response functions are written beside the mode shapes."""
     variant: str | None = None
@@ -81,13 +83,14 @@ class Options:
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf export", args=words)
+    return tyro.cli(Options, prog="avmsf export", args=words, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def run(options: Options) -> int:
     """Read, write, and say how large it is and what it lacks."""
     if options.points is not None and options.points < 1:
         raise ExportError(f"--points is {options.points}; expected 1 or more")
+    _refuse_idle(options)
     field = _read(options)
     written = _WRITERS[options.to](field, options)
     for remark in written.remarks:
@@ -100,6 +103,17 @@ def run(options: Options) -> int:
     files = f"{len(written.sizes)} files, the largest {largest.name}" if len(written.sizes) > 1 else "one file"
     print(f"wrote {options.output}: {options.to}, {written.size / 1e6:.3g} MB, {files}")
     return 0
+
+
+def _refuse_idle(options: Options) -> None:
+    """Raise `ExportError` for a setting that says nothing to this format."""
+    heeded = _HEEDED[options.to] + (("variant", "rate") if options.field.is_dir() else ())
+    for each in fields(options):
+        if each.name in _OF_SOME and each.name not in heeded and getattr(options, each.name) != each.default:
+            others = ", ".join(name for name, known in _HEEDED.items() if each.name in known) or "the demo's folders"
+            raise ExportError(
+                f"--{each.name.replace('_', '-')} says nothing to --to {options.to}, only to {others}: leave it out"
+            )
 
 
 def _read(options: Options) -> SoundField | SampledField:
@@ -135,10 +149,9 @@ def _object(options: Options) -> tuple[Path | None, float]:
 
 def _gaussians(path: Path | None, metres: float, field: SampledField) -> GaussianCloud | None:
     """Return the file's Gaussians, which are in metres; None for a mesh, whose coordinates count `metres`."""
-    if path is None or path.suffix.lower() != ".ply":
+    if path is None or path.suffix.lower() != ".ply" or (path.is_file() and not holds_gaussians(path)):
         return None
-    if read_object(path, field.points, metres=metres).kind != "gaussians":
-        return None
+    read_object(path, field.points, metres=metres)
     return read_splats(path)
 
 
@@ -160,26 +173,37 @@ def _gltf(field: SoundField | SampledField, options: Options) -> Written:
     source, metres = _object(options)
     cloud = _gaussians(source, metres, sampled)
     if cloud is not None and source is not None:
-        colors = (0.5 + ZEROTH * cloud.harmonics[:, 0]).clamp(0.0, 1.0)
-        normals = sampled.normals[sampled.nearest(cloud.centers)]
-        look = Look(cloud.centers, torch.zeros(0, 3, dtype=torch.int64), normals, colors)
-        written = write_gltf(sampled, options.output, look=look, force=options.force)
-        beside = options.output.with_suffix(".gaussians.ply")
-        copied = write_file(beside, source.read_bytes(), force=options.force or beside.is_file())
-        return Written({**written.sizes, **copied}, written.remarks, written.error)
-    shown = None if source is None else Look.of_mesh(read_textured_mesh(source, metres=metres))
-    return write_gltf(sampled, options.output, look=shown, force=options.force)
+        beside, content = options.output.with_suffix(".gaussians.ply"), source.read_bytes()
+        expect_free(beside, content, force=options.force)
+        written = write_gltf(sampled, options.output, look=Look.of_gaussians(cloud, sampled), force=options.force)
+        copied = write_file(beside, content, force=options.force)
+        return replace(written, sizes={**written.sizes, **copied})
+    shown, remarks = (None, ()) if source is None else read_look(source, sampled, metres=metres)
+    written = write_gltf(sampled, options.output, look=shown, force=options.force)
+    return replace(written, remarks=remarks + written.remarks)
 
 
 def _faust(field: SoundField | SampledField, options: Options) -> Written:
-    return write_faust(_sampled(field, options), options.output, noise=options.noise, force=options.force)
+    sampled, noise = _sampled(field, options), not options.no_noise
+    if options.points is None:
+        asked = len(sampled)
+        sampled, noise = fitted(sampled, noise=noise)
+        if len(sampled) < asked:
+            say(f"note: of these {len(sampled)}, as many as Faust compiles in reasonable time")
+    return write_faust(sampled, options.output, noise=noise, force=options.force)
 
 
 def _demo(field: SoundField | SampledField, options: Options) -> Written:
-    source = options.field / SCENE if options.field.is_dir() and options.object is None else options.object
+    scene = options.field / SCENE
+    source = scene if options.object is None and scene.is_file() else options.object
     most = options.points or _POINTS["avmsf-demo"]
     sampled = _sampled(field, options)
-    cloud = _gaussians(source, METRES[options.object_unit], sampled)
+    cloud = _gaussians(source, 1.0, sampled)
+    if cloud is None and source is not None:
+        raise ExportError(
+            f"{source}: expected a .ply of Gaussians, which the demo shows, found another object: name one, or leave "
+            "--object out, and each contact is shown as a disc"
+        )
     if cloud is not None and isinstance(field, SoundField):
         if len(cloud) > most:
             cloud = cloud.take(spread_rows(cloud.centers, most))
@@ -209,7 +233,7 @@ def _wavs(field: SoundField | SampledField, options: Options) -> Written:
         raise ExportError(
             f"expected a contact time for each force, or one for all, found {len(forces)} forces and {len(times)} times"
         )
-    layers = tuple(Layer(force, each) for force, each in zip(forces, times, strict=True))
+    layers = tuple(Layer(force, each, options.pulse) for force, each in zip(forces, times, strict=True))
     sampled = _sampled(field, options)
     return write_grid(sampled, options.output, Grid(len(sampled), layers, options.seconds), force=options.force)
 
@@ -218,6 +242,16 @@ def _uff(field: SoundField | SampledField, options: Options) -> Written:
     return write_universal(_sampled(field, options), options.output, functions=options.functions, force=options.force)
 
 
+_HEEDED: dict[Format, tuple[str, ...]] = {
+    "web": ("object", "object_unit", "capture"),
+    "gltf": ("object", "object_unit", "capture"),
+    "faust": ("no_noise",),
+    "avmsf-demo": ("object", "variant", "precision"),
+    "wavs": ("forces", "contact_times", "pulse", "seconds"),
+    "uff": ("functions",),
+}
+"""The settings that each format heeds, beside those that all do."""
+_OF_SOME = {"rate"}.union(*_HEEDED.values())
 _WRITERS: dict[str, Callable[[SoundField | SampledField, Options], Written]] = {
     "web": _web,
     "gltf": _gltf,

@@ -4,26 +4,32 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 import tyro
 
+from avmsf.cli.contacts import Contacts, contacts_at, refuse_far
 from avmsf.cli.printing import say
+from avmsf.cli.render import METRES
 from avmsf.cli.writing import Coding, expect_writable, write_sound
 from avmsf.errors import PlayerError
 from avmsf.export.midi import Note, listen, read_midi
-from avmsf.export.player import Blow, Keyboard, Keys, Player, bounce, measure_capacity, random_blows
+from avmsf.export.player import Blow, Keyboard, Keys, Player, bounce, endless_blows, measure_capacity
 from avmsf.export.sampledfield import SampledField
+from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 
 _MIDI_FILES = (".mid", ".midi")
 _RING_SECONDS = 2.0
 """What a MIDI file's last note is given to ring."""
+_BOUNCED_SECONDS = 10.0
+"""Of random blows in a file, where no length is asked for."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,9 @@ class Options:
     keys: Keys = "contacts"
     """What the keys of a MIDI keyboard are."""
     at: tuple[float, float, float] | None = None
-    """The contact that `--keys pitch` strikes, in the object frame, metres."""
+    """The contact that `--keys pitch` strikes, in the object frame."""
+    unit: Literal["m", "cm", "mm", "in", "ft"] = "m"
+    """What the coordinates of `--at` count."""
     blows: float = 4.0
     """Random blows a second."""
     seed: int = 0
@@ -75,12 +83,14 @@ def parse(words: Sequence[str]) -> Options:
 def run(options: Options) -> int:
     """Play, or write."""
     _expect(options)
-    field = SampledField.of(load(options.field), limit=options.points)
+    whole = load(options.field)
+    place = _place(options, whole)
+    field = SampledField.of(whole, limit=options.points)
     if not len(field.frequency):
         raise PlayerError(f"{options.field}: expected modes that sound below half the sample rate, found none to play")
     level = None if options.level_db is None else 10 ** (options.level_db / 20)
     player = Player(field, voices=options.voices, level=level)
-    row = None if options.at is None else int(field.nearest(torch.tensor([options.at]))[0])
+    row = None if place is None else int(field.nearest(place.places.float())[0])
     keyboard = Keyboard(field, keys=options.keys, row=row, contact_time=options.contact_time)
     capacity = measure_capacity(field, block=options.block)
     shared = f"; blows in one set of resonators: {capacity.blows:.0f} a second" if field.shared_damping else ""
@@ -108,40 +118,52 @@ def _expect(options: Options) -> None:
         raise PlayerError(f"--block is {options.block}; expected 16 to {1 << 16} samples")
     if options.level_db is not None and not math.isfinite(options.level_db):
         raise PlayerError(f"--level-db is {options.level_db}; expected a finite number")
+    if options.keys == "pitch" and options.midi is None:
+        raise PlayerError(
+            "--keys pitch: random blows have no keys; name a MIDI file or input by --midi, or leave it out"
+        )
+    if options.at is not None and options.keys != "pitch":
+        raise PlayerError("--at is the contact that --keys pitch strikes; add --keys pitch, or leave --at out")
 
 
-def _known_blows(player: Player, keyboard: Keyboard, options: Options, seconds: float | None) -> tuple[list[Blow], int]:
-    """Return blows that are known beforehand, and the sound's length in samples."""
+def _place(options: Options, field: SoundField) -> Contacts | None:
+    """Return the contact that all keys strike."""
+    if options.at is None:
+        return None
+    if not all(map(math.isfinite, options.at)):
+        raise PlayerError(f"--at is {' '.join(f'{value:g}' for value in options.at)}; expected finite numbers")
+    place = Contacts(contacts_at([options.at], metres=METRES[options.unit]).places, ("--at",))
+    refuse_far(place, field)
+    return place
+
+
+def _known_blows(player: Player, keyboard: Keyboard, options: Options) -> tuple[Iterator[Blow], float]:
+    """Return blows that are known beforehand, from the first to the last, and how long they are to be heard, s."""
     rate = player.field.sample_rate
-    if options.midi is not None:
-        notes = read_midi(Path(options.midi))
-        blows = [keyboard.blow(each.number, each.velocity, start=round(each.seconds * rate)) for each in notes]
-        length = seconds if seconds is not None else max(each.seconds for each in notes) + _RING_SECONDS
-        return blows, round(length * rate)
-    length = 10.0 if seconds is None else seconds
-    blows = random_blows(
-        player.field,
-        seconds=length,
-        each_second=options.blows,
-        seed=options.seed,
-        contact_time=options.contact_time,
-    )
-    return blows, round(length * rate)
+    if options.midi is None:
+        blows = endless_blows(
+            player.field, each_second=options.blows, seed=options.seed, contact_time=options.contact_time
+        )
+        return blows, math.inf if options.seconds is None else options.seconds
+    notes = sorted(read_midi(Path(options.midi)), key=lambda note: note.seconds)
+    length = options.seconds if options.seconds is not None else notes[-1].seconds + _RING_SECONDS
+    return (keyboard.blow(each.number, each.velocity, start=round(each.seconds * rate)) for each in notes), length
 
 
 def _bounce(player: Player, keyboard: Keyboard, options: Options) -> int:
     assert options.bounce is not None
     rate = player.field.sample_rate
-    blows, samples = _known_blows(player, keyboard, options, options.seconds)
+    known, seconds = _known_blows(player, keyboard, options)
+    samples = round((seconds if math.isfinite(seconds) else _BOUNCED_SECONDS) * rate)
     if samples < 1:
         raise PlayerError(f"--seconds is {options.seconds}; expected a time that holds a sample at {rate:g} Hz")
+    blows = list(takewhile(lambda blow: blow.start < samples, known))
     begun = time.perf_counter()
     sound = bounce(player, blows, samples, block=options.block)
     taken = time.perf_counter() - begun
     write_sound(options.bounce, torch.from_numpy(sound), sample_rate=rate, coding=options.coding)
-    struck = sum(blow.start < samples for blow in blows)
     print(
-        f"wrote {options.bounce}: {struck} blows, {samples / rate:.3g} s at {rate:g} Hz, {options.coding}, "
+        f"wrote {options.bounce}: {len(blows)} blows, {samples / rate:.3g} s at {rate:g} Hz, {options.coding}, "
         f"{samples / rate / max(taken, 1e-9):.0f} times as fast as real time"
     )
     return 0
@@ -150,9 +172,11 @@ def _bounce(player: Player, keyboard: Keyboard, options: Options) -> int:
 class _Live:
     """What the sound device's callback and the threads that hear of blows have in common."""
 
-    def __init__(self, player: Player) -> None:
+    def __init__(self, player: Player, known: Iterable[Blow] = ()) -> None:
         self.player = player
         self.coming: queue.SimpleQueue[Blow] = queue.SimpleQueue()
+        self._known = iter(known)
+        self._next = next(self._known, None)
         self.failed: list[BaseException] = []
         self.late = 0
 
@@ -164,6 +188,10 @@ class _Live:
                 blow = self.coming.get()
                 start = max(blow.start, self.player.now)
                 self.player.strike(Blow(blow.row, blow.force, start, blow.contact_time, blow.ratio))
+            # No more than are due: a callback has milliseconds, and blows at random have no end.
+            while self._next is not None and self._next.start < self.player.now + frames:
+                self.player.strike(self._next)
+                self._next = next(self._known, None)
             out[:] = self.player.render(frames)[:, None]
         except Exception as error:
             out[:] = 0.0
@@ -172,13 +200,17 @@ class _Live:
 
 def _play(player: Player, keyboard: Keyboard, options: Options) -> None:
     devices = _sounddevice()
-    live = _Live(player)
+    file = options.midi is not None and Path(options.midi).suffix.lower() in _MIDI_FILES
+    seconds = math.inf if options.seconds is None else options.seconds
+    known: Iterable[Blow] = ()
+    if options.midi is None or file:
+        known, seconds = _known_blows(player, keyboard, options)
+    live = _Live(player, known)
     rate = player.field.sample_rate
     device: int | str | None = options.device
     if options.device is not None and options.device.isdecimal():
         device = int(options.device)
     ended = threading.Event()
-    until = math.inf if options.seconds is None else options.seconds
     try:
         stream = devices.OutputStream(
             samplerate=rate, blocksize=options.block, device=device, channels=1, dtype="float32", callback=live.fill
@@ -188,21 +220,18 @@ def _play(player: Player, keyboard: Keyboard, options: Options) -> None:
             f"no sound device plays {rate:g} Hz here ({error}): name another by --device, or write a file by --bounce "
             "FILE.wav"
         ) from error
-    file = options.midi is not None and Path(options.midi).suffix.lower() in _MIDI_FILES
-    with stream:
-        if options.midi is not None and not file:
-            with listen(options.midi, lambda note: live.coming.put(_heard(keyboard, note))) as name:
-                say(f"listening to {name}; Ctrl-C ends")
-                _wait(live, until, ended)
-        else:
-            seconds = options.seconds if file else (3600.0 if options.seconds is None else options.seconds)
-            blows, samples = _known_blows(player, keyboard, options, seconds)
-            say("playing; Ctrl-C ends")
-            for blow in blows:
-                live.coming.put(blow)
-            _wait(live, min(until, samples / rate), ended)
-    if live.late:
-        say(f"note: {live.late} blocks came too late; a larger --block or fewer --voices help")
+    try:
+        with stream:
+            if options.midi is not None and not file:
+                with listen(options.midi, lambda note: live.coming.put(_heard(keyboard, note))) as name:
+                    say(f"listening to {name}; Ctrl-C ends")
+                    _wait(live, seconds, ended)
+            else:
+                say("playing; Ctrl-C ends")
+                _wait(live, seconds, ended)
+    finally:
+        if live.late:
+            say(f"note: {live.late} blocks came too late; a larger --block or fewer --voices help")
 
 
 def _heard(keyboard: Keyboard, note: Note) -> Blow:

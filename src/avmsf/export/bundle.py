@@ -49,11 +49,13 @@ def make_bundle(
     strikes: Impacts | None = None,
     limit: int = MOST_POINTS,
     live: Mapping[str, Any] | None = None,
+    mute: bool = False,
 ) -> Bundle:
     """Return a field's bundle, at no more than `limit` contacts.
 
     `object` is shown for it: a mesh whose coordinates count `metres` each, Gaussians, or the contacts alone. `strikes`
-    are measured ones to compare with, `live` what a server behind the page offers. Raises `ExportError`.
+    are measured ones to compare with, `live` what a server behind the page offers. Raises `ExportError`, for a field
+    without a mode too unless it may be `mute`, as an object's that is to be struck first.
     """
     remarks: tuple[str, ...] = ()
     if isinstance(field, SoundField):
@@ -62,7 +64,7 @@ def make_bundle(
         count, sampled = len(field), field if len(field) <= limit else field.take(field.spread(limit))
     if len(sampled) < count:
         remarks = (f"{len(sampled):,} of the field's {count:,} contacts are kept, spread evenly",)
-    if len(sampled.frequency) == 0:
+    if len(sampled.frequency) == 0 and not mute:
         raise ExportError("expected a mode that can be heard, found none below half the sample rate: nothing to strike")
     shown = read_object(object, sampled.points, metres=metres)
     content, tensors = _packed(_tensors(sampled))
@@ -83,13 +85,14 @@ def write_bundle(
     strikes: Impacts | None = None,
     limit: int = MOST_POINTS,
     live: Mapping[str, Any] | None = None,
+    mute: bool = False,
     force: bool = False,
 ) -> Written:
     """Write a field's bundle as a folder, whole or not at all; the arguments are those of `make_bundle`.
 
     A bundle that is there is replaced. Raises `ExportError` for another folder that is not empty, unless with `force`.
     """
-    bundle = make_bundle(field, object=object, metres=metres, strikes=strikes, limit=limit, live=live)
+    bundle = make_bundle(field, object=object, metres=metres, strikes=strikes, limit=limit, live=live, mute=mute)
     sizes = write_folder(
         Path(folder), lambda place: write_files(bundle.files, place), dict(bundle.manifest), force=force
     )

@@ -16,6 +16,8 @@ from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, generator, write_file
 
 SUFFIXES = (".dsp", ".lib")
+_FEWEST = 16
+"""Points below which the noise is given up for more of them."""
 _ROW = 8
 """Numbers in a line of text."""
 MOST_NUMBERS = 150_000
@@ -48,11 +50,31 @@ def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, fo
     return Written(write_file(path, text.encode(), force=force), tuple(remarks))
 
 
+def fitted(field: SampledField, *, noise: bool = True) -> tuple[SampledField, bool]:
+    """Return the field at as many of its points as Faust compiles in reasonable time, and whether with the noise.
+
+    Where hardly a point would be left beside a long noise, that is left out.
+    """
+    sounding = noise and bool(field.noise.any())
+    if sounding and _fitting(field, noise=True) < min(_FEWEST, len(field)):
+        sounding = False
+    most = max(1, _fitting(field, noise=sounding))
+    return (field if len(field) <= most else field.take(field.spread(most))), sounding
+
+
+def _fitting(field: SampledField, *, noise: bool) -> int:
+    """Return how many points fit into `MOST_NUMBERS`."""
+    return (MOST_NUMBERS - noise * field.samples) // max(1, _numbers_at_a_point(field))
+
+
+def _numbers_at_a_point(field: SampledField) -> int:
+    return field.sine.shape[1] * (1 + bool(field.cosine.any()) + (not field.shared_damping))
+
+
 def faust_library(field: SampledField, *, noise: bool) -> str:
     """Return the definitions, of which `strike(contact, force, contactTime, gate)` is the sound."""
     points, modes = field.sine.shape
-    phased = bool(field.cosine.any())
-    numbers = points * modes * (1 + phased + (not field.shared_damping)) + noise * field.samples
+    numbers = points * _numbers_at_a_point(field) + noise * field.samples
     if numbers > MOST_NUMBERS:
         raise ExportError(
             f"expected at most {MOST_NUMBERS} numbers, which Faust compiles in seconds, found {numbers}: {points} "

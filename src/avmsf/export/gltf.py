@@ -19,8 +19,8 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.errors import ExportError
+from avmsf.export.look import Look
 from avmsf.export.onephase import deviation, importance, shared_dampings, signed_amplitudes
 from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, generator, write_file
@@ -30,36 +30,6 @@ _FLOAT, _UNSIGNED = 5126, 5125
 _POINTS, _TRIANGLES = 0, 4
 _VERTICES, _INDICES = 34962, 34963
 _GREY = 0.7
-
-
-@dataclass(frozen=True, eq=False)
-class Look:
-    """What a viewer shows: triangles with colours, or the field's points."""
-
-    vertices: Float[Tensor, "vertices 3"]
-    """Object frame, metres."""
-    faces: Int[Tensor, "faces 3"]
-    """Rows of `vertices`; none for points."""
-    normals: Float[Tensor, "vertices 3"]
-    """Unit vectors out of the object."""
-    colors: Float[Tensor, "vertices 3"] | None = None
-    """Red, green, blue as displayed (sRGB), 0 to 1; None for grey."""
-
-    @classmethod
-    def of_points(cls, sampled: SampledField) -> "Look":
-        """Return the field's points."""
-        return cls(sampled.points, torch.zeros(0, 3, dtype=torch.int64), sampled.normals)
-
-    @classmethod
-    def of_mesh(cls, mesh: TexturedMesh) -> "Look":
-        """Return a mesh, whose corners keep their own normals and colours where these differ between faces.
-
-        Textures become colours of the corners.
-        """
-        corners = torch.cat([mesh.vertices[mesh.faces], mesh.normals, _corner_colors(mesh)], dim=2).reshape(-1, 9)
-        table, rows = np.unique(corners.numpy(), axis=0, return_inverse=True)
-        kept = torch.from_numpy(table).float()
-        return cls(kept[:, :3], torch.from_numpy(rows.reshape(-1, 3)), kept[:, 3:6], kept[:, 6:])
 
 
 def write_gltf(sampled: SampledField, path: str | Path, *, look: Look | None = None, force: bool = False) -> Written:
@@ -200,16 +170,3 @@ def _remarks(sampled: SampledField) -> tuple[str, ...]:
 def _linear(colors: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
     """Return colours as light, as glTF holds vertex colours, of colours as displayed (IEC 61966-2-1)."""
     return torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
-
-
-def _corner_colors(mesh: TexturedMesh) -> Float[Tensor, "faces 3 3"]:
-    """Return each corner's colour times that of its texture there."""
-    colors = mesh.colors.clone()
-    for number, texture in enumerate(mesh.textures):
-        chosen = mesh.materials == number
-        height, width = texture.shape[:2]
-        across, up = mesh.coordinates[chosen].unbind(2)
-        column = (across.remainder(1.0) * width).long().clamp(max=width - 1)
-        row = ((1.0 - up.remainder(1.0)) * height).long().clamp(0, height - 1)
-        colors[chosen] *= texture[row, column].float() / 255.0
-    return colors

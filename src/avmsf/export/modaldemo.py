@@ -7,7 +7,6 @@ float32, dampings [M] or [N, M] in 1/s. The demo's player starts every mode as a
 """
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,23 +14,25 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
-from scipy.spatial import cKDTree
+from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.errors import ExportError
+from avmsf.export.bundle import write_files
+from avmsf.export.discs import discs
 from avmsf.export.normals import outward_normals
 from avmsf.export.onephase import deviation, signed_amplitudes
+from avmsf.export.packedarrays import described, number_in, pack, read_array, read_manifest
 from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import MANIFEST, Written, generator, write_folder
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import write_splats
-from avmsf.scene.start import ZEROTH
 
 PICKING, SCENE, MODAL = "picking.bin", "scene.ply", "modal.bin"
 Precision = Literal["float16", "float32"]
-_GREY = 0.7
 _PICKED = {"means": 3, "scales": 3, "quaternions": 4, "opacities": 1}
+_MOST_RATE, _MOST_SECONDS = 768_000, 600
+"""Hz and seconds that sounds have at most; what is beyond is taken for a slip."""
 _COUNTS = ("count", "num_gaussians", "numGaussians", "N")
 _MODES = ("modes", "num_modes", "numModes", "M")
 
@@ -61,8 +62,10 @@ def write_demo(
 ) -> Written:
     """Write the demo's folder; where there is no `cloud` whose centers are the field's points, with a disc at each.
 
-    Modes keep their loudness and start as cosines, whatever their phase is in the field. Raises `ExportError`.
+    Modes keep their loudness and start as cosines, whatever their phase is in the field. Other variants that the folder
+    holds of the same Gaussians stay there. Raises `ExportError`, also where it holds variants of others.
     """
+    folder = Path(folder)
     shown = discs(field) if cloud is None else cloud
     if len(shown) != len(field):
         raise ExportError(
@@ -77,7 +80,7 @@ def write_demo(
             f"expected gains that {precision} holds, up to 65504, found {float(field.sine.abs().max()):.3g}: write "
             "float32"
         )
-    picking, places = _packed(
+    picking, places = pack(
         {
             "means": field.points.numpy().astype("<f4"),
             "scales": shown.log_scales.exp().numpy().astype("<f4"),
@@ -85,7 +88,7 @@ def write_demo(
             "opacities": shown.opacities.numpy().astype("<f4"),
         }
     )
-    modal, tensors = _packed(
+    modal, tensors = pack(
         {
             "frequencies": field.frequency.numpy().astype("<f4"),
             "gains": gains,
@@ -93,7 +96,18 @@ def write_demo(
         }
     )
 
+    others = _other_variants(folder, variant)
+    stay = bool(others) and _content(folder / PICKING) == picking
+    if others and not stay and not force:
+        raise ExportError(
+            f"{folder}: expected a free name, or variants of the same Gaussians, found {', '.join(others)} of others: "
+            "choose another folder, or add --force to lose them"
+        )
+    kept = others if stay else {}
+
     def fill(place: Path) -> None:
+        for name, files in kept.items():
+            write_files(files, place / name)
         (place / PICKING).write_bytes(picking)
         write_splats(shown, place / SCENE)
         (place / variant).mkdir()
@@ -103,10 +117,14 @@ def write_demo(
         (place / variant / MANIFEST).write_text(json.dumps(sound, indent=1) + "\n")
 
     manifest = {"name": field.name, "count": len(field), "file": PICKING, "arrays": places, "scene": SCENE}
-    sizes = write_folder(Path(folder), fill, {**manifest, "variants": [variant]}, force=force)
+    sizes = write_folder(folder, fill, {**manifest, "variants": sorted([variant, *kept])}, force=force)
     remarks = ["every mode starts as a cosine in the demo, of the loudness that it has in the field"]
     if field.noise.any():
         remarks.append("the noise beside the modes is left out, of which the demo knows nothing")
+    if kept:
+        remarks.append(f"the folder's other variants stay as they were: {', '.join(kept)}")
+    elif others:
+        remarks.append(f"variants of other Gaussians are of no use any more: {', '.join(others)}")
     written = torch.from_numpy(gains.astype(np.float32))
     error = deviation(field, sine=None, cosine=written, damping=field.damping)
     return Written(sizes, tuple(remarks), error)
@@ -119,28 +137,33 @@ def read_demo(folder: str | Path, *, variant: str | None = None, sample_rate: fl
     folder of another kind, files cut short, and numbers that are none.
     """
     folder = Path(folder)
-    top = _manifest(folder)
-    count = _number(top, _COUNTS, folder / MANIFEST)
+    top = read_manifest(folder)
+    count = number_in(top, _COUNTS, folder / MANIFEST)
     picked = {
-        name: _array(folder / PICKING, top, name, (count, width) if width > 1 else (count,), "float32")
+        name: read_array(folder / PICKING, top, name, (count, width) if width > 1 else (count,), "float32")
         for name, width in _PICKED.items()
     }
     sound_folder = folder / (_only_variant(folder) if variant is None else variant)
-    sound = _manifest(sound_folder)
-    described = _described(sound, "frequencies", sound_folder / MANIFEST)
-    modes = described["shape"][0] if "shape" in described else _number(sound, _MODES, sound_folder / MANIFEST)
+    sound = read_manifest(sound_folder)
+    place = described(sound, "frequencies", sound_folder / MANIFEST)
+    modes = place["shape"][0] if "shape" in place else number_in(sound, _MODES, sound_folder / MANIFEST)
     path = sound_folder / MODAL
-    frequency = _array(path, sound, "frequencies", (modes,), "float32")
-    gains = _array(path, sound, "gains", (count, modes), _gain_kind(sound, path))
-    damping = _array(path, sound, "dampings", _damping_shape(sound, path, count, modes), "float32")
+    frequency = read_array(path, sound, "frequencies", (modes,), "float32")
+    gains = read_array(path, sound, "gains", (count, modes), _gain_kind(sound, path))
+    damping = read_array(path, sound, "dampings", _damping_shape(sound, path, count, modes), "float32")
     rate = sound.get("sampleRate", sound.get("sample_rate", sample_rate)) if sample_rate is None else sample_rate
-    if not isinstance(rate, int | float) or not rate > 0:
-        raise ExportError(f"{sound_folder / MANIFEST}: expected a sample rate, found {rate!r}: give it, in Hz")
+    if not isinstance(rate, int | float) or not 1 <= rate <= _MOST_RATE:
+        raise ExportError(
+            f"{sound_folder / MANIFEST}: expected a sample rate from 1 to {_MOST_RATE} Hz, found {rate!r}: give it"
+        )
     if not (frequency > 0).all() or not (damping >= 0).all():
         raise ExportError(f"{path}: expected frequencies above 0 and dampings from 0, found others: export it again")
     seconds = sound.get("duration", 3.0)
-    if not isinstance(seconds, int | float) or not 0 < seconds < math.inf:
-        raise ExportError(f"{sound_folder / MANIFEST}: expected a duration in seconds, found {seconds!r}: mend it")
+    if not isinstance(seconds, int | float) or not 0 < seconds <= _MOST_SECONDS:
+        raise ExportError(
+            f"{sound_folder / MANIFEST}: expected a duration above 0 and up to {_MOST_SECONDS} s, found {seconds!r}: "
+            "mend it"
+        )
     heard = frequency < 0.5 * rate
     points = torch.from_numpy(picked["means"].copy())
     cosine = torch.from_numpy(gains[:, heard].astype(np.float32))
@@ -165,111 +188,13 @@ def is_demo(folder: Path) -> bool:
     return (folder / MANIFEST).is_file() and (folder / PICKING).is_file()
 
 
-def discs(field: SampledField) -> GaussianCloud:
-    """Return a flat grey Gaussian at each point, along the surface, as wide as the points lie apart."""
-    places = field.points.double().numpy()
-    if len(places) > 1:
-        apart = np.median(cKDTree(places).query(places, k=min(4, len(places)))[0][:, 1:], axis=1)
-    else:
-        apart = np.ones(1) * 0.01
-    width = torch.from_numpy(np.maximum(apart, 1e-6)).float() * 0.6
-    scales = torch.stack([width, width, 0.1 * width], dim=1)
-    # The turn that brings the third axis onto the normal, half way between the two.
-    turned = torch.cat([1.0 + field.normals[:, 2:], -field.normals[:, 1:2], field.normals[:, :1]], dim=1)
-    turned = torch.cat([turned, torch.zeros(len(field), 1)], dim=1)
-    below = field.normals[:, 2] < -1 + 1e-6
-    turned[below] = torch.tensor([0.0, 1.0, 0.0, 0.0])
-    return GaussianCloud(
-        field.points.float(),
-        torch.nn.functional.normalize(turned, dim=1),
-        scales.log(),
-        torch.full((len(field),), 3.0),
-        torch.full((len(field), 1, 3), (_GREY - 0.5) / ZEROTH),
-    )
-
-
 def _seconds(field: SampledField) -> float:
     return field.samples / field.sample_rate
 
 
-def _packed(arrays: Mapping[str, Shaped[np.ndarray, "..."]]) -> tuple[bytes, dict[str, dict[str, Any]]]:
-    """Return arrays one after another, each at a multiple of four bytes, and where each is."""
-    content, places = b"", {}
-    for name, array in arrays.items():
-        content += b"\0" * (-len(content) % 4)
-        places[name] = {"offset": len(content), "dtype": array.dtype.name, "shape": list(array.shape)}
-        content += array.tobytes()
-    return content, places
-
-
-def _manifest(folder: Path) -> dict[str, Any]:
-    path = folder / MANIFEST
-    try:
-        found = json.loads(path.read_text())
-    except OSError as error:
-        raise ExportError(
-            f"{path}: expected the manifest of the paper's demo, found none ({error.strerror or error}): name a folder "
-            "that holds one"
-        ) from error
-    except ValueError as error:
-        raise ExportError(f"{path}: expected JSON, found something else ({error}): export it again") from error
-    if not isinstance(found, dict):
-        raise ExportError(f"{path}: expected a JSON object, found {type(found).__name__}: export it again")
-    return found
-
-
-def _number(manifest: Mapping[str, Any], names: tuple[str, ...], path: Path) -> int:
-    value = next((manifest[name] for name in names if name in manifest), None)
-    if not isinstance(value, int) or value < 1:
-        raise ExportError(f"{path}: expected {names[0]!r} as a whole number from 1, found {value!r}: mend it")
-    return value
-
-
-def _described(manifest: Mapping[str, Any], name: str, path: Path) -> dict[str, Any]:
-    """Return where an array is: its offset in bytes alone, or a record of it, at the top or in a group."""
-    groups = [manifest, *(manifest[key] for key in ("arrays", "offsets", "buffers") if key in manifest)]
-    for group in groups:
-        if isinstance(group, Mapping) and name in group:
-            found = group[name]
-            record = {"offset": found} if isinstance(found, int) else found
-            if isinstance(record, dict):
-                record = {**record, "offset": record.get("offset", record.get("byteOffset"))}
-                if isinstance(record["offset"], int) and record["offset"] >= 0:
-                    return record
-            raise ExportError(f"{path}: expected the offset of {name!r} in bytes, found {found!r}: mend it")
-    raise ExportError(f"{path}: expected where {name!r} begins, found {', '.join(manifest) or 'nothing'}: mend it")
-
-
-def _array(
-    path: Path, manifest: Mapping[str, Any], name: str, shape: tuple[int, ...], kind: str
-) -> Shaped[np.ndarray, "..."]:
-    described = _described(manifest, name, path.with_name(MANIFEST))
-    if tuple(described.get("shape", shape)) not in (shape, (*shape, 1)):
-        raise ExportError(
-            f"{path.with_name(MANIFEST)}: expected {name!r} of shape {list(shape)}, found {described['shape']}: "
-            "the two manifests belong to different objects"
-        )
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise ExportError(f"{path}: cannot be read ({error.strerror or error}): export it again") from error
-    layout = np.dtype(kind).newbyteorder("<")
-    needed = described["offset"] + layout.itemsize * math.prod(shape)
-    if needed > len(content):
-        raise ExportError(f"{path}: {name!r} ends at byte {needed} of {len(content)}: it was cut short, copy it again")
-    values = np.frombuffer(content, layout, math.prod(shape), described["offset"]).reshape(shape)
-    wrong = np.argwhere(~np.isfinite(values))
-    if len(wrong):
-        raise ExportError(
-            f"{path}: expected finite numbers in {name!r}, found {values[tuple(wrong[0])]} in row {wrong[0][0]}: "
-            "export it again"
-        )
-    return values
-
-
 def _gain_kind(sound: Mapping[str, Any], path: Path) -> str:
-    described = _described(sound, "gains", path.with_name(MANIFEST))
-    kind = described.get("dtype", sound.get("gains_dtype", sound.get("gainsDtype", "float32")))
+    place = described(sound, "gains", path.with_name(MANIFEST))
+    kind = place.get("dtype", sound.get("gains_dtype", sound.get("gainsDtype", "float32")))
     if kind not in ("float16", "float32"):
         raise ExportError(f"{path.with_name(MANIFEST)}: expected gains in float16 or float32, found {kind!r}")
     return str(kind)
@@ -277,12 +202,13 @@ def _gain_kind(sound: Mapping[str, Any], path: Path) -> str:
 
 def _damping_shape(sound: Mapping[str, Any], path: Path, count: int, modes: int) -> tuple[int, ...]:
     """Return the dampings' shape: as it is written, or a row a Gaussian if the file is long enough for that."""
-    described = _described(sound, "dampings", path.with_name(MANIFEST))
-    if "shape" in described:
-        return (count, modes) if len(described["shape"]) == 2 else (modes,)
-    others = [_described(sound, name, path)["offset"] for name in ("frequencies", "gains")]
-    behind = min([offset for offset in others if offset > described["offset"]], default=0)
-    length = (behind or (path.stat().st_size if path.is_file() else 0)) - described["offset"]
+    manifest = path.with_name(MANIFEST)
+    place = described(sound, "dampings", manifest)
+    if "shape" in place:
+        return (count, modes) if len(place["shape"]) == 2 else (modes,)
+    others = [described(sound, name, manifest)["offset"] for name in ("frequencies", "gains")]
+    behind = min([offset for offset in others if offset > place["offset"]], default=0)
+    length = (behind or (path.stat().st_size if path.is_file() else 0)) - place["offset"]
     return (count, modes) if length >= 4 * count * modes and count > 1 else (modes,)
 
 
@@ -292,3 +218,18 @@ def _only_variant(folder: Path) -> str:
         names = ", ".join(found) or "none"
         raise ExportError(f"{folder}: expected one variant, a folder with {MODAL}, found {names}: name one of them")
     return found[0]
+
+
+def _other_variants(folder: Path, variant: str) -> dict[str, dict[str, bytes]]:
+    """Return the content of each variant's files in a folder, but for the one named."""
+    names = sorted(path.parent.name for path in folder.glob(f"*/{MODAL}"))
+    return {
+        name: {each: _content(folder / name / each) for each in (MANIFEST, MODAL)} for name in names if name != variant
+    }
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ExportError(f"{path}: cannot be read ({error.strerror or error}): choose another folder") from error

@@ -52,22 +52,34 @@ def read_object(
     if isinstance(source, Surface):
         mesh = trimesh.Trimesh(source.vertices.numpy(), source.faces.numpy(), process=False)
         return _shown(trimesh.Scene([mesh]), points, "the surface", most)
-    if not source.is_file():
-        raise ExportError(f"{source}: expected a mesh or a .ply of Gaussians, found no such file: check the name")
-    size = source.stat().st_size
-    if size > MOST_BYTES:
-        raise ExportError(
-            f"{source}: expected a mesh of at most {MOST_BYTES >> 20} MiB, found {size >> 20}: reduce it first"
-        )
-    if source.suffix.lower() == ".ply" and _holds_gaussians(source):
-        _expect_alike(read_splats(source).centers.numpy(), points, str(source))
+    expect_readable(source)
+    if source.suffix.lower() == ".ply" and holds_gaussians(source):
+        expect_alike(read_splats(source).centers.numpy(), points, str(source))
         return ObjectFile("gaussians", "object.ply", source.read_bytes())
     scene = _read_mesh(source)
     scene.apply_scale(metres)  # type: ignore[no-untyped-call]
     return _shown(scene, points, str(source), most)
 
 
-def _holds_gaussians(path: Path) -> bool:
+def expect_readable(path: Path) -> None:
+    """Raise `ExportError` where there is no such file, or one too large to be read."""
+    if not path.is_file():
+        raise ExportError(f"{path}: expected a mesh or a .ply of Gaussians, found no such file: check the name")
+    size = path.stat().st_size
+    if size > MOST_BYTES:
+        raise ExportError(
+            f"{path}: expected a mesh of at most {MOST_BYTES >> 20} MiB, found {size >> 20}: reduce it first"
+        )
+
+
+def expect_few(faces: int, what: str) -> None:
+    """Raise `ExportError` for more triangles than are read."""
+    if faces > MOST_READ:
+        raise ExportError(f"{what}: expected at most {MOST_READ:,} triangles, found {faces:,}: reduce the mesh first")
+
+
+def holds_gaussians(path: Path) -> bool:
+    """Return whether a .ply's header speaks of Gaussians."""
     with path.open("rb") as file:
         header, _, _ = file.read(1 << 16).partition(b"end_header")
     return b"scale_0" in header and b"rot_0" in header
@@ -88,15 +100,14 @@ def _shown(scene: trimesh.Scene, points: Float[Tensor, "points 3"], what: str, m
     faces = sum(len(mesh.faces) for mesh in meshes)
     if not meshes:
         return ObjectFile("points", remarks=(f"{what} has no triangles, so the field's own points are shown",))
-    if faces > MOST_READ:
-        raise ExportError(f"{what}: expected at most {MOST_READ:,} triangles, found {faces:,}: reduce the mesh first")
+    expect_few(faces, what)
     places = np.concatenate([np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes])
     if not np.isfinite(places).all():
         raise ExportError(f"{what}: expected finite coordinates, found NaN or infinity: export the mesh again")
-    _expect_alike(places, points, what)
+    expect_alike(places, points, what)
     if faces <= most:
         return ObjectFile("mesh", "object.glb", _as_glb(scene))
-    reduced = trimesh.Scene([_reduced(mesh, most / faces, what) for mesh in meshes])
+    reduced = trimesh.Scene([reduced(mesh, most / faces, what) for mesh in meshes])
     left = sum(len(mesh.faces) for mesh in reduced.geometry.values())
     remark = f"{what} has {faces:,} triangles, too many for a browser: {left:,} are shown, without its textures"
     return ObjectFile("mesh", "object.glb", _as_glb(reduced), (remark,))
@@ -108,7 +119,8 @@ def _as_glb(scene: trimesh.Scene) -> bytes:
     return content
 
 
-def _reduced(mesh: trimesh.Trimesh, share: float, what: str) -> trimesh.Trimesh:
+def reduced(mesh: trimesh.Trimesh, share: float, what: str) -> trimesh.Trimesh:
+    """Return a mesh of such a share of the triangles, with vertex colours but no textures; raises `ExportError`."""
     try:
         simplify = import_module("fast_simplification").simplify
     except ImportError as error:
@@ -128,7 +140,7 @@ def _reduced(mesh: trimesh.Trimesh, share: float, what: str) -> trimesh.Trimesh:
     return small
 
 
-def _expect_alike(places: Float[np.ndarray, "places 3"], points: Float[Tensor, "points 3"], what: str) -> None:
+def expect_alike(places: Float[np.ndarray, "places 3"], points: Float[Tensor, "points 3"], what: str) -> None:
     """Raise `ExportError` for an object that is not about as large as the field and where it is."""
     own = points.double().numpy()
     size, expected = np.ptp(places, axis=0), np.ptp(own, axis=0)

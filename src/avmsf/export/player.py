@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import Literal
 
 import numpy as np
@@ -123,21 +124,36 @@ def random_blows(
     force: float = 1.0,
     contact_time: float = 0.0,
 ) -> list[Blow]:
-    """Return blows at random times (a Poisson process), points and forces, the same for one seed.
+    """Return those of `endless_blows` that begin within so many seconds; raises `PlayerError` as it does."""
+    _expect_above_zero(seconds, "seconds")
+    blows = endless_blows(field, each_second=each_second, seed=seed, force=force, contact_time=contact_time)
+    return list(takewhile(lambda blow: blow.start < seconds * field.sample_rate, blows))
 
-    Forces scatter by 6 dB about `force`. Raises `PlayerError` for times and rates that are not positive.
+
+def endless_blows(
+    field: SampledField, *, each_second: float, seed: int, force: float = 1.0, contact_time: float = 0.0
+) -> Iterator[Blow]:
+    """Return blows at random times (a Poisson process), points and forces, the same for one seed, one after another.
+
+    Forces scatter by 6 dB about `force`. Raises `PlayerError` for rates and forces that are not positive.
     """
-    for value, what in ((seconds, "seconds"), (each_second, "blows a second"), (force, "force")):
-        if not 0 < value < math.inf:
-            raise PlayerError(f"expected {what} above 0, found {value:g}")
-    generator = np.random.default_rng(seed)
-    blows, when = [], 0.0
-    while True:
-        row, strength = int(generator.integers(len(field))), force * 10 ** (6 * generator.standard_normal() / 20)
-        blows.append(Blow(row, strength, round(when * field.sample_rate), contact_time))
-        when += generator.exponential(1.0 / each_second)
-        if when >= seconds:
-            return blows
+    _expect_above_zero(each_second, "blows a second")
+    _expect_above_zero(force, "force")
+
+    def drawn() -> Iterator[Blow]:
+        generator = np.random.default_rng(seed)
+        when = 0.0
+        while True:
+            row, strength = int(generator.integers(len(field))), force * 10 ** (6 * generator.standard_normal() / 20)
+            yield Blow(row, strength, round(when * field.sample_rate), contact_time)
+            when += generator.exponential(1.0 / each_second)
+
+    return drawn()
+
+
+def _expect_above_zero(value: float, what: str) -> None:
+    if not 0 < value < math.inf:
+        raise PlayerError(f"expected {what} above 0, found {value:g}")
 
 
 class Keyboard:

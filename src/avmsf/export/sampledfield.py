@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avmsf.errors import ExportError
 from avmsf.export.normals import outward_normals
-from avmsf.field.gainfield import GainField, Gains
+from avmsf.field.gainfield import GainField
 from avmsf.field.modalbasis import ModalBasis
 from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import SoundField
@@ -198,14 +198,6 @@ def _expect_places(
         )
     if limit is not None and limit < 1:
         raise ExportError(f"expected to keep 1 point or more, found a limit of {limit}: ask for some")
-
-
-def _resolved(known: Gains, phase: Float64[Tensor, " modes"]) -> Float64[Tensor, "points modes 2"]:
-    """Return the amplitudes of sines and cosines of what starts with `phase` and a quarter of a period ahead."""
-    mean = known.mean.double()
-    quadrature = torch.zeros_like(mean) if known.quadrature is None else known.quadrature.double()
-    along, ahead = torch.cos(phase), torch.sin(phase)
-    return torch.stack([mean * along - quadrature * ahead, mean * ahead + quadrature * along], dim=2)
 
 
 def _known_normals(gain_field: GainField, places: Float[Tensor, "points 3"]) -> Float64[Tensor, "points 3"] | None:

@@ -1,12 +1,13 @@
 """A field in the universal file format, which modal-analysis programs read: nodes, mode shapes, response functions.
 
-Data set 2411 holds the points, 55 the shape of each mode along the normals, 58 the frequency response functions of some
-of the points. Numbers of data set 55 have six digits, as the format sets them; those of 58 are in double precision.
+Data set 2411 holds the points, 55 how a force excites each mode, 58 the frequency response functions of some of the
+points. Numbers of data set 55 have six digits, as the format sets them; those of 58 are in double precision.
 """
 
 import contextlib
 import io
 import math
+import re
 import tempfile
 import warnings
 from pathlib import Path
@@ -24,7 +25,10 @@ from avmsf.export.written import Written, generator, write_file
 
 _NORMAL_MODE, _COMPLEX_MODE = 2, 3
 _TRANSLATION = 2
+_STRAIGHT = 1.0
+"""Degrees up to which a normal counts as along an axis."""
 _RESPONSE = 4
+_TIME = re.compile(rb"^\d\d-\w{3}-\d\d \d\d:\d\d:\d\d *$", re.MULTILINE)
 _MOST_LINES = 1 << 16
 """Frequencies of a response function, at most."""
 
@@ -40,6 +44,8 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
     if path.suffix not in (".uff", ".unv"):
         found = repr(path.suffix) if path.suffix else "no ending"
         raise ExportError(f"{path}: expected a name that ends in .uff or .unv, found {found}")
+    if functions < 0:
+        raise ExportError(f"expected 0 response functions or more, found {functions}: say how many are wanted")
     pyuff = _pyuff()
     damping = shared_dampings(field)
     sets = [_header(field), _units(), _nodes(field)]
@@ -53,12 +59,19 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             pyuff.UFF(str(place)).write_sets(sets, mode="overwrite")
-        content = place.read_bytes()
+        # pyuff adds the time, by which the same field would give another file.
+        content = _TIME.sub(lambda found: b" " * len(found[0]), place.read_bytes(), count=1)
     remarks = ["frequencies, dampings and shapes have six digits in data set 55, as the format sets them"]
     if not field.shared_damping:
         remarks.append("each mode has one damping, its mean by energy; the response functions have each point's own")
     if field.noise.any():
         remarks.append("the noise beside the modes is left out")
+    leaning = math.degrees(math.acos(min(1.0, float(field.normals[rows].abs().amax(1).min())))) if len(rows) else 0.0
+    if leaning > _STRAIGHT:
+        remarks.append(
+            "response functions are of blows against the normal, of which their reference direction names the nearest "
+            f"axis, up to {leaning:.0f} degrees off"
+        )
     return Written(write_file(path, content, force=force), tuple(remarks))
 
 
@@ -121,7 +134,7 @@ def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) ->
         "type": 55,
         "id1": field.name[:80] or "object",
         "id2": f"mode {mode + 1}: {frequency:.9g} Hz, exp(-{rate:.9g} t)",
-        "id4": "shape along the normals",
+        "id4": "times the direction of a force: what it excites; blows go against normals",
         "id5": "NONE",
         "model_type": 1,
         "data_ch": _TRANSLATION,
@@ -152,7 +165,8 @@ def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) ->
             "modal_damp_his": 0.0,
         }
     normals = field.normals.double().numpy()
-    return record | kind | {f"r{axis + 1}": values * normals[:, axis] for axis in range(3)}
+    # Times the direction of a force they are what it excites: the amplitudes themselves for one against the normal.
+    return record | kind | {f"r{axis + 1}": -values * normals[:, axis] for axis in range(3)}
 
 
 def _function(field: SampledField, row: int, frequencies: Float64[np.ndarray, " lines"]) -> dict[str, Any]:

@@ -34,7 +34,7 @@ class Layer:
     """Newtons where the field knows forces, else relative to an average recorded blow."""
     contact_time: float = 0.0
     """How long hammer and object touch, seconds; 0 is the blow as it was recorded."""
-    shape: PulseShape = "hertz"
+    shape: PulseShape = "half-sine"
     """Course of the force over that time."""
 
 
@@ -71,13 +71,14 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
     ]
     peak = max(float(each.abs().max()) for each in sounds)
     scale = 10 ** (grid.level_db / 20) / peak if peak > 0 else 1.0
-    edges = np.linspace(0, HIGHEST_NOTE + 1, len(grid.layers) + 1).round().astype(int)
+    # From 1 on: a note of velocity 0 is the end of one. No range is empty, as there are no more layers than velocities.
+    edges = np.linspace(1, HIGHEST_NOTE + 1, len(grid.layers) + 1).round().astype(int)
     records = []
     for place, row in enumerate(rows.tolist()):
         for number, layer in enumerate(grid.layers):
             sound = scale * sounds[number][place]
             where = [f"{value:.9g}" for value in (*field.points[row].tolist(), *field.normals[row].tolist())]
-            range_ = (max(1, int(edges[number])), int(edges[number + 1]) - 1)
+            range_ = (int(edges[number]), int(edges[number + 1]) - 1)
             loudest = float(sound.abs().max())
             note = LOWEST_NOTE + place
             name = f"{SOUNDS}/{place + 1:03d}-{number + 1}.wav"
@@ -93,6 +94,7 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
         (place / INSTRUMENT).write_text(_instrument(field.name, [record for _, record in records]))
 
     manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
+    manifest["pulses"] = [layer.shape for layer in grid.layers]
     sizes = write_folder(Path(folder), fill, manifest, force=force)
     return Written(sizes, (f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {grid.level_db:g} dB",))
 
@@ -132,12 +134,14 @@ def _table(records: Sequence[Sequence[object]]) -> str:
 
 def _instrument(name: str, records: Sequence[Sequence[object]]) -> str:
     """Return an SFZ instrument that plays each contact at its note and each layer at its velocities."""
-    # The velocity chooses the layer and moves the level within it as in the recordings: amplitude by its square.
     lines = [f"// {name or 'object'}, as exported by avmsf", "<global> loop_mode=one_shot amp_veltrack=100"]
-    for record in records:
-        cells = dict(zip(COLUMNS, record, strict=True))
-        lines.append(
-            f"<region> sample={cells['file']} key={cells['midi_note']} lovel={cells['velocity_low']} "
-            f"hivel={cells['velocity_high']}"
-        )
+    regions = [dict(zip(COLUMNS, record, strict=True)) for record in records]
+    for low, high in sorted({(int(str(each["velocity_low"])), int(str(each["velocity_high"]))) for each in regions}):
+        # A layer's sounds are those of its own force, which its hardest velocity plays as they are; softer ones are
+        # fainter by the square of what they lack, as between layers the forces are.
+        curve = " ".join(f"amp_velcurve_{each}={(each / high) ** 2:.6g}" for each in range(low, high + 1))
+        lines.append(f"<group> lovel={low} hivel={high} {curve}")
+        lines += [
+            f"<region> sample={each['file']} key={each['midi_note']}" for each in regions if each["velocity_low"] == low
+        ]
     return "\n".join(lines) + "\n"

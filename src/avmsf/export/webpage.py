@@ -78,9 +78,11 @@ def single_file(bundle: Bundle, page: Mapping[str, bytes] | None = None) -> str:
     carried = {"manifest.json": json.dumps(bundle.manifest).encode(), "page/bank.js": page["page/bank.js"]}
     inlined = {name: _carried(name, content) for name, content in {**carried, **bundle.files}.items()}
     begin = (
-        f"<!-- {generator()} -->\n<script>globalThis.avmsfInlined = {json.dumps(inlined)};</script>\n"
+        f"<script>globalThis.avmsfInlined = {json.dumps(inlined)};</script>\n"
         '<script type="module">import "avmsf/{name}";</script>'
     )
+    # Who made it stands at its beginning, where a later export looks before it writes over it.
+    html = html.replace("<!doctype html>\n", f"<!doctype html>\n<!-- {generator()} -->\n", 1)
     return _once(_START, html, lambda found: begin.replace("{name}", found[1]), "script that starts the page")
 
 

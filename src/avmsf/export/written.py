@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -15,6 +16,16 @@ from avmsf.files import write_whole
 MANIFEST = "manifest.json"
 _READ = 4096
 """Bytes at a file's beginning in which its maker is looked for."""
+_MADE_HERE = re.compile(
+    rb"""
+      ^//\ .*\ as\ exported\ by\ avmsf\ \d    # Faust
+    | "asset":\{[^{}]*"generator":"avmsf\ \d   # glTF
+    | ^\ *151\ *\r?\n(.*\r?\n){5}avmsf\ \d           # universal, in its header
+    | ^<!--\ avmsf\ \d[^\ ]*\ -->$            # a page
+    """,
+    re.MULTILINE | re.VERBOSE,
+)
+"""What our own files have there, each by its format."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +53,19 @@ def generator() -> str:
 def write_file(path: Path, content: bytes, *, force: bool = False) -> dict[Path, int]:
     """Write one file in one step; return its size. Raises `ExportError` where another program's file lies there.
 
-    A file is one of ours if its first kilobytes hold the word `generator` begins with.
+    A file is one of ours if its first kilobytes hold the mark of its format, or if it holds just this content.
     """
-    if path.is_dir():
-        raise ExportError(f"{path}: expected the name of a file, found a folder: name a file in it")
-    if path.exists() and not force and not _made_here(path):
-        raise _foreign(path, "a file that no export wrote")
+    expect_free(path, content, force=force)
     write_whole(path, lambda place: place.write_bytes(content), raising=ExportError)
     return {path: len(content)}
+
+
+def expect_free(path: Path, content: bytes, *, force: bool = False) -> None:
+    """Raise `ExportError` where `write_file` would."""
+    if path.is_dir():
+        raise ExportError(f"{path}: expected the name of a file, found a folder: name a file in it")
+    if path.exists() and not force and not _made_here(path) and path.read_bytes() != content:
+        raise _foreign(path, "a file that no export wrote")
 
 
 def write_folder(
@@ -58,23 +74,25 @@ def write_folder(
     """Let `fill` write files into a temporary folder, add the manifest, and put it all in place; return the sizes.
 
     The manifest lists the files, by which a folder of ours is known again and replaced as a whole. Into any other that
-    holds something files are put only with `force`, each in one step, and none is removed. Raises `ExportError`.
+    holds something files are put only with `force`, each in one step, and none is removed. Of a link it is the folder
+    that it leads to. Raises `ExportError`.
     """
+    place = folder.resolve()
     if folder.exists() and not folder.is_dir():
         raise ExportError(f"{folder}: expected a folder, or a name that is free, found a file: choose another")
     ours = not folder.exists() or not any(folder.iterdir()) or _folder_made_here(folder)
     if not ours and not force:
         raise _foreign(folder, "a folder with files that no export wrote")
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
+        place.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{place.name}.", suffix=".part", dir=place.parent))
         try:
             fill(temporary)
             names = sorted(str(path.relative_to(temporary)) for path in temporary.rglob("*") if path.is_file())
             content = {"generator": generator(), **manifest, "files": [*names, MANIFEST]}
             (temporary / MANIFEST).write_text(json.dumps(content, indent=1) + "\n")
             sizes = {folder / name: (temporary / name).stat().st_size for name in [*names, MANIFEST]}
-            _place(temporary, folder, whole=ours)
+            _place(temporary, place, whole=ours)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
     except OSError as error:
@@ -99,15 +117,19 @@ def _place(temporary: Path, folder: Path, *, whole: bool) -> None:
         # A folder cannot be exchanged for another in one step: the old one stands aside until the new one is there.
         aside = temporary.with_suffix(".old")
         os.replace(folder, aside)
-        os.replace(temporary, folder)
-        shutil.rmtree(aside)
+        try:
+            os.replace(temporary, folder)
+        except OSError:
+            os.replace(aside, folder)
+            raise
+        shutil.rmtree(aside, ignore_errors=True)
     else:
         os.replace(temporary, folder)
 
 
 def _made_here(path: Path) -> bool:
     with path.open("rb") as file:
-        return b"avmsf" in file.read(_READ)
+        return _MADE_HERE.search(file.read(_READ)) is not None
 
 
 def _folder_made_here(folder: Path) -> bool:

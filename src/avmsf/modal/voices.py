@@ -46,6 +46,16 @@ class _Blow:
     pulse: Float64[np.ndarray, " pulse"]
 
 
+@dataclass(eq=False)
+class _Noise:
+    """What one blow brings along beside its modes."""
+
+    start: int
+    force: float
+    fading: int = -1
+    """As a voice's."""
+
+
 class VoiceBank:
     """Sounds blows as they come; not thread-safe: let one thread strike and render."""
 
@@ -65,8 +75,9 @@ class VoiceBank:
         self._limit, self._floor = voices, floor
         self._voices: dict[Hashable, _Voice] = {}
         self._fading: list[_Voice] = []
-        self._noise = _faded(noise.astype(np.float64), round(_FADE * sample_rate))
-        self._noises: list[tuple[int, float]] = []
+        self._fade = max(1, round(_FADE * sample_rate))
+        self._noise = _faded(noise.astype(np.float64), self._fade)
+        self._noises: list[_Noise] = []
         self._coming: list[tuple[int, int, Hashable, Complex128[np.ndarray, " modes"], _Blow, float]] = []
         self._struck = 0
         self._gain = 1.0
@@ -110,12 +121,10 @@ class VoiceBank:
             self._ring(voice, out)
         self._voices = {key: voice for key, voice in self._voices.items() if voice.blows or voice.state.any()}
         self._fading = [voice for voice in self._fading if voice.fading > 0]
-        for start, force in self._noises:
-            first, last = max(start, self.now), min(start + len(self._noise), self.now + count)
-            if first < last:
-                out[first - self.now : last - self.now] += force * self._noise[first - start : last - start]
+        for noise in self._noises:
+            self._rustle(noise, out)
         self.now += count
-        self._noises = [each for each in self._noises if each[0] + len(self._noise) > self.now]
+        self._noises = [each for each in self._noises if each.start + len(self._noise) > self.now and each.fading != 0]
         if limit:
             self._gain = _limit(out, self._gain, math.exp(-1.0 / (_RELEASE * self.sample_rate)))
         return out.astype(np.float32)
@@ -127,9 +136,14 @@ class VoiceBank:
             self._voices[key] = _Voice(turn, np.zeros_like(turn))
         self._voices[key].blows.append(blow)
         if self._noise.any():
-            self._noises.append((blow.start, force))
-            if len(self._noises) > self._limit:
-                self._noises.remove(min(self._noises, key=lambda each: (abs(each[1]), each[0])))
+            self._noises.append(_Noise(blow.start, force))
+            kept = [each for each in self._noises if each.fading < 0]
+            if len(kept) > self._limit:
+                faintest = min(kept, key=lambda each: (abs(each.force), each.start))
+                faintest.fading = self._fade
+                if faintest.start >= self.now:
+                    # Nothing of it was heard, so that it leaves no step behind.
+                    self._noises.remove(faintest)
 
     def _ring(self, voice: _Voice, out: Float64[np.ndarray, " samples"]) -> None:
         end = self.now + len(out)
@@ -162,10 +176,23 @@ class VoiceBank:
         voice.state[heard] = real + 1j * imaginary
         voice.blows = [blow for blow in voice.blows if blow.start + len(blow.pulse) > end]
         if voice.fading >= 0:
-            ramp = np.clip((voice.fading - np.arange(len(out))) / (_FADE * self.sample_rate), 0.0, 1.0)
-            added *= ramp
+            added *= self._ramp(voice.fading, len(out))
             voice.fading = max(0, voice.fading - len(out))
         out += added
+
+    def _rustle(self, noise: _Noise, out: Float64[np.ndarray, " samples"]) -> None:
+        first, last = max(noise.start, self.now), min(noise.start + len(self._noise), self.now + len(out))
+        if first >= last:
+            return
+        added = noise.force * self._noise[first - noise.start : last - noise.start]
+        if noise.fading >= 0:
+            added *= self._ramp(noise.fading, len(out))[: len(added)]
+            noise.fading = max(0, noise.fading - len(out))
+        out[first - self.now : last - self.now] += added
+
+    def _ramp(self, fading: int, count: int) -> Float64[np.ndarray, " samples"]:
+        """Return how loud the next samples are of what has so many of its fading to come."""
+        return np.clip((fading - np.arange(count)) / self._fade, 0.0, 1.0)
 
     def _make_room(self) -> None:
         """Let the voice die away that sounds the faintest."""
@@ -176,7 +203,7 @@ class VoiceBank:
             return float(np.abs(voice.state).sum()) + coming
 
         voice = self._voices.pop(min(self._voices, key=strength))
-        voice.fading = max(1, round(_FADE * self.sample_rate))
+        voice.fading = self._fade
         self._fading.append(voice)
 
 
@@ -189,7 +216,7 @@ def turns(
 
 def _faded(noise: Float64[np.ndarray, " samples"], length: int) -> Float64[np.ndarray, " samples"]:
     """Return the noise with an end that does not click."""
-    ramp = np.clip((len(noise) - np.arange(len(noise))) / max(1, length), 0.0, 1.0)
+    ramp = np.clip((len(noise) - np.arange(len(noise))) / length, 0.0, 1.0)
     return noise * ramp
 
 

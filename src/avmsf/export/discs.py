@@ -1,0 +1,34 @@
+"""Gaussians to see and to pick where there are none: a flat disc on the surface at each of a field's points."""
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from avmsf.export.sampledfield import SampledField
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.start import ZEROTH
+
+_GREY = 0.7
+
+
+def discs(field: SampledField) -> GaussianCloud:
+    """Return a flat grey Gaussian at each point, along the surface, as wide as the points lie apart."""
+    places = field.points.double().numpy()
+    if len(places) > 1:
+        apart = np.median(cKDTree(places).query(places, k=min(4, len(places)))[0][:, 1:], axis=1)
+    else:
+        apart = np.ones(1) * 0.01
+    width = torch.from_numpy(np.maximum(apart, 1e-6)).float() * 0.6
+    scales = torch.stack([width, width, 0.1 * width], dim=1)
+    # The turn that brings the third axis onto the normal, half way between the two.
+    turned = torch.cat([1.0 + field.normals[:, 2:], -field.normals[:, 1:2], field.normals[:, :1]], dim=1)
+    turned = torch.cat([turned, torch.zeros(len(field), 1)], dim=1)
+    below = field.normals[:, 2] < -1 + 1e-6
+    turned[below] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    return GaussianCloud(
+        field.points.float(),
+        torch.nn.functional.normalize(turned, dim=1),
+        scales.log(),
+        torch.full((len(field),), 3.0),
+        torch.full((len(field), 1, 3), (_GREY - 0.5) / ZEROTH),
+    )
