@@ -1,5 +1,6 @@
 """The studio's page: how soon it can be struck, how soon a click sounds, and what it looks like."""
 
+import io
 import math
 import os
 import re
@@ -18,6 +19,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import soundfile
 import torch
 
 from avmsf.export.bundle import write_bundle
@@ -36,10 +38,13 @@ CONVENTIONS = (
     f"Gaussians, as many contacts and {MODES} modes, three and spark from this machine's disk, headless Chromium "
     "without a graphics processor; median of fresh browser profiles.",
     "click_to_sample_ms: from the pointer's release to the message that carries the blow to the sound's thread, and "
-    "from there to the first sample that its bank makes, by the sound's own clock: our own code, without the browser's "
-    "way through its mixer and the loudspeaker. Median of clicks on different contacts.",
+    "from there to its first sample, by the sound's own clock, the 1.5 ms by which the limiter looks ahead counted: "
+    "our own code, without the browser's way through its mixer and the loudspeaker. Median of clicks on different "
+    "contacts.",
 )
 WIDE, NARROW = {"width": 1280, "height": 800}, {"width": 390, "height": 780}
+TALL = {"width": 1280, "height": 1000}
+RINGING_MILLISECONDS = 300
 LARGEST_PICTURE = 200_000
 """Bytes."""
 _COMMAND = (sys.executable, "-c", "import sys; from avmsf.cli import main; sys.exit(main())")
@@ -72,7 +77,7 @@ def measure_page() -> Report:
     table = Table("the page", ("", "median", "worst"), (
         ("until it can be struck, s", median(loads), max(loads)),
         ("click to message, ms", median(posted), max(posted)),
-        ("click to the bank's first sample, ms", median(begun), max(begun)),
+        ("click to the first sample, ms", median(begun), max(begun)),
     ))  # fmt: skip
     return Report(CONVENTIONS, (table,), figures)
 
@@ -128,36 +133,37 @@ def draw_screenshots(folder: Path) -> tuple[Path, ...]:
 
 def _draw_field(browser: Any, address: str, capture: Path, folder: Path) -> list[Path]:
     written = []
+    # The edit comes last: what it makes of the field is seen by every page opened after it.
+    with _page(browser, address, WIDE, color_scheme="dark") as page:
+        _strike(page)
+        written.append(_shoot(page, folder / "dark.png", ringing=True))
+    with _page(browser, address, NARROW) as page:
+        _strike(page)
+        written.append(_shoot(page, folder / "narrow.png", ringing=True))
     with _page(browser, address, WIDE) as page:
         _strike(page)
-        written.append(_shoot(page, folder / "strike.png"))
+        written.append(_shoot(page, folder / "strike.png", ringing=True))
         page.click("#tab-modes")
         page.click("tbody tr >> nth=2")
-        written.append(_shoot(page, folder / "modes.png"))
+        written.append(_shoot(page, folder / "modes.png", ringing=True))
         page.click("#tab-find")
         page.set_input_files("#sheet-find input[type=file]", str(capture / "003.wav"))
         page.wait_for_selector("#sheet-find dl", timeout=120_000)
-        written.append(_shoot(page, folder / "find.png"))
+        written.append(_shoot(page, folder / "find.png", ringing=True))
         page.click("#unpaint")
         page.click("#tab-edit")
         page.select_option("#sheet-edit select >> nth=1", "wood")
         page.wait_for_function("window.avmsf.studio.revision > 1", timeout=60_000)
-        written.append(_shoot(page, folder / "edit.png"))
-    with _page(browser, address, WIDE, color_scheme="dark") as page:
-        _strike(page)
-        written.append(_shoot(page, folder / "dark.png"))
-    with _page(browser, address, NARROW) as page:
-        _strike(page)
-        written.append(_shoot(page, folder / "narrow.png"))
+        written.append(_shoot(page, folder / "edit.png", ringing=True))
     return written
 
 
 def _draw_capture(browser: Any, address: str, recorded: Path, folder: Path) -> Path:
-    with _page(browser, address, WIDE) as page:
+    with _page(browser, address, TALL) as page:
         for number, (right, down) in enumerate(((-40, 30), (50, -20), (0, 60)), start=1):
             place = page.evaluate("window.avmsf.project(window.avmsf.studio.view.controls.target.toArray())")
             page.mouse.click(place["x"] + right, place["y"] + down)
-            page.set_input_files("#sheet-capture input[type=file]", str(recorded / f"{number:03d}.wav"))
+            page.set_input_files("#sheet-capture input[type=file]", _well_recorded(recorded / f"{number:03d}.wav"))
             page.wait_for_selector("#sheet-capture dl")
             if number < 3:
                 page.click("text=Keep it")
@@ -165,15 +171,29 @@ def _draw_capture(browser: Any, address: str, recorded: Path, folder: Path) -> P
         return _shoot(page, folder / "capture.png")
 
 
+def _well_recorded(path: Path) -> Any:
+    """Return a recording as loud as one should be, to be uploaded: the example's are all far from full scale."""
+    samples, rate = soundfile.read(path)
+    memory = io.BytesIO()
+    soundfile.write(memory, samples * 0.5 / abs(samples).max(), rate, "FLOAT", format="WAV")
+    return {"name": path.name, "mimeType": "audio/wav", "buffer": memory.getvalue()}
+
+
 def _strike(page: Any) -> None:
     place = page.evaluate("window.avmsf.project(window.avmsf.studio.view.controls.target.toArray())")
     page.mouse.click(place["x"] + 30, place["y"] + 20)
-    page.wait_for_timeout(250)
+    # The first blow starts the browser's sound.
+    page.wait_for_function("window.avmsf.studio.engine.context.state === 'running'")
+    page.wait_for_timeout(1000)
 
 
-def _shoot(page: Any, path: Path) -> Path:
+def _shoot(page: Any, path: Path, *, ringing: bool = False) -> Path:
+    """Write a picture; `ringing`, of the moment in which the blow is struck again."""
     page.mouse.move(5, 300)
     page.wait_for_timeout(400)
+    if ringing:
+        page.evaluate("window.avmsf.strike(window.avmsf.studio.row)")
+        page.wait_for_timeout(RINGING_MILLISECONDS)
     page.screenshot(path=str(path))
     return path
 
@@ -242,7 +262,8 @@ def _chromium() -> Iterator[Any]:
 @contextmanager
 def _page(browser: Any, address: str, viewport: dict[str, int], **context: Any) -> Iterator[Any]:
     """Open an address in a profile of its own, and wait until it is ready."""
-    profile = browser.new_context(viewport=viewport, **context)
+    # The studio's page forbids the evaluation of text, by which playwright waits.
+    profile = browser.new_context(viewport=viewport, bypass_csp=True, **context)
     try:
         page = profile.new_page()
         page.goto(address)

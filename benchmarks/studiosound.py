@@ -30,12 +30,15 @@ ARGUMENTS = [
 ]
 RATE, SECONDS, MODES, CONTACTS = 44_100.0, 3.0, 128, 16
 VOICES, STRUCK_SECONDS = (32, 64, 128), 3.0
+QUICK, MOST = 60, 64
 CONVENTIONS = (
     "render_error: largest difference between the page's modal bank, rendered in an OfflineAudioContext by headless "
     "Chromium, and the field's own render of the same blows, over the loudest sample; the worst of the rows.",
     f"voices: {MODES} modes a blow at {RATE:g} Hz that all ring to the end (nothing is culled), struck within a tenth "
     "of a second, with noise. real time: seconds of sound a second of wall time, one core. page.voices: blows at once "
-    "that keep up with real time where every contact has its own dampings, from the largest number that was run.",
+    "that keep up with real time where every contact has its own dampings, from the largest number that was run. A row "
+    f"of quick blows: {QUICK} a second for all that time, each to ring for longer than it takes, so that all but the "
+    f"last {MOST} have to make room.",
 )
 _START = """
 import { loadBundle } from "./bundle.js";
@@ -57,7 +60,7 @@ def measure(options: Options) -> Report:
     """Run both measurements, for shared dampings and for those of each contact."""
     rows: list[tuple[str | float, ...]] = []
     speeds: list[tuple[str | float, ...]] = []
-    worst, voices = 0.0, {True: 0.0, False: 0.0}
+    worst, voices, quick = 0.0, {True: 0.0, False: 0.0}, {True: 0.0, False: 0.0}
     with _browser() as browser:
         for shared in (True, False):
             table = ringing_table(shared=shared)
@@ -73,7 +76,15 @@ def measure(options: Options) -> Report:
                     # Work grows with the voices only where each has resonators of its own.
                     voices[shared] = count * factor
                     speeds.append((f"{count} blows, {_kind(shared)}", factor, count * factor))
-    figures = {"page.render_error": worst, "page.voices": voices[False], "page.voices_shared": voices[True]}
+                quick[shared] = _quick_speed(page)
+                speeds.append((f"{QUICK} blows a second, {_kind(shared)}", quick[shared], "-"))
+    figures = {
+        "page.render_error": worst,
+        "page.voices": voices[False],
+        "page.voices_shared": voices[True],
+        "page.quick_blows_speed": quick[False],
+        "page.quick_blows_speed_shared": quick[True],
+    }
     tables = (
         Table("the page's sound against Python's", ("blows", "error"), rows),
         Table("the page's sound against real time", ("at once", "times real time", "blows in real time"), speeds),
@@ -125,6 +136,12 @@ def _speed(page: Any, count: int) -> float:
     """Return how many seconds of `count` blows at once are rendered in a second, the best of three."""
     blows = [{"row": place % CONTACTS, "when": 0.1 * place / count} for place in range(count)]
     return max(STRUCK_SECONDS / _rendered(page, blows, STRUCK_SECONDS, voices=count)[1] for _ in range(3))
+
+
+def _quick_speed(page: Any) -> float:
+    """Return how many seconds of blows that steal one another's voices are rendered in a second."""
+    blows = [{"row": place % CONTACTS, "when": place / QUICK} for place in range(round(QUICK * STRUCK_SECONDS))]
+    return STRUCK_SECONDS / _rendered(page, blows, STRUCK_SECONDS, voices=MOST)[1]
 
 
 def _rendered(page: Any, blows: list[dict[str, Any]], seconds: float, *, voices: int = 64) -> tuple[np.ndarray, float]:

@@ -1,6 +1,7 @@
 """Capture mode: what it writes is an ordinary capture folder, whole after every step, and nothing is written twice."""
 
 import csv
+import hashlib
 import io
 import json
 from pathlib import Path
@@ -12,9 +13,12 @@ import torch
 
 from avmsf.capture import check, read_capture
 from avmsf.errors import AvmsfError, CaptureError
-from avmsf.studio import capturing
-from avmsf.studio.capturing import Place, StrikeBook
+from avmsf.studio import judgements, strikefiles
+from avmsf.studio.capturing import StrikeBook
+from avmsf.studio.place import Place
 from avmsf.studio.refusal import RefusedError
+from avmsf.studio.strikefiles import StrikeFiles
+from avmsf.studio.striketable import StrikeTable
 from capture_folder import fill, ring
 from opened_plate import blow, wav
 
@@ -89,8 +93,10 @@ def test_a_retry_writes_nothing_twice(tmp_path: Path) -> None:
     assert strikes.add(blow(), place(0.1), key=key(1))["file"] == "002.wav"
 
 
-@pytest.mark.parametrize("broken", ["_write_recording", "_write_table"])
-def test_what_broke_off_is_finished_by_the_retry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str) -> None:
+@pytest.mark.parametrize("broken", [(StrikeFiles, "write"), (StrikeTable, "add")])
+def test_what_broke_off_is_finished_by_the_retry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: tuple[type, str]
+) -> None:
     strikes = book(tmp_path)
     strikes.add(blow(1), place(0.3), key=key(1))
 
@@ -98,7 +104,7 @@ def test_what_broke_off_is_finished_by_the_retry(tmp_path: Path, monkeypatch: py
         raise OSError("the power went")
 
     with monkeypatch.context() as patched:
-        patched.setattr(StrikeBook, broken, fail)
+        patched.setattr(*broken, fail)
         with pytest.raises(OSError, match="power"):
             strikes.add(blow(), place(0.1), key=key(0))
     assert len(table(tmp_path)) == 2
@@ -179,10 +185,18 @@ def test_a_link_out_of_the_folder_is_neither_read_nor_written(tmp_path: Path) ->
     assert not told["readable"]
     assert "outside the capture folder" in told["warnings"][0]
     assert [strike.file for strike in strikes.strikes()] == ["b.wav", "c.wav"]
-    with pytest.raises(RefusedError, match="outside the capture folder"):
-        strikes.redo("a.wav", blow())
-    with pytest.raises(RefusedError, match="outside the capture folder"):
-        strikes.remove("a.wav")
+    for change in (lambda: strikes.redo("a.wav", blow()), lambda: strikes.remove("a.wav")):
+        before = (folder / "impacts.csv").read_bytes()
+        with pytest.raises(RefusedError, match="expected the recording itself, found a link"):
+            change()
+        assert (folder / "impacts.csv").read_bytes() == before
+        assert not (folder / ".avmsf").exists()
+    # Its rate is another's matter too.
+    outside.write_bytes(wav(ring(rate=16000), rate=16000))
+    for name in ("b.wav", "c.wav"):
+        (folder / name).unlink()
+    assert strikes.judge(blow())["sample_rate"] == 8000
+    outside.write_bytes(blow(5))
     assert outside.read_bytes() == blow(5)
 
 
@@ -194,7 +208,9 @@ def test_a_table_of_the_users_own_keeps_its_unit_columns_and_order(tmp_path: Pat
     text = (folder / "impacts.csv").read_text().splitlines()
     assert text[1] == "first;a.wav;0;0,1;0"
     assert text[4].split(";")[:2] == ["", "001.wav"]
-    assert [float(cell) for cell in text[4].split(";")[2:]] == pytest.approx([30, 11, 2], abs=1e-12)
+    assert text[0] == header
+    # With decimal commas, as those before it, and in no more digits than it takes.
+    assert text[4].split(";")[2:] == ["30,0", "11,0", "2,0"]
 
 
 def test_every_row_has_what_the_table_has_columns_for(tmp_path: Path) -> None:
@@ -206,7 +222,7 @@ def test_every_row_has_what_the_table_has_columns_for(tmp_path: Path) -> None:
     forced.add(blow(), Place((0.1, 0.0, 0.0), None, 12.5), key=key(0))
     with pytest.raises(RefusedError, match="every row has a force"):
         forced.add(blow(), place(0.2, direction=None), key=key(1))
-    assert table(tmp_path / "forced")[1] == ["001.wav", "0.10000000000000001", "0", "0", "12.5"]
+    assert table(tmp_path / "forced")[1] == ["001.wav", "0.1", "0.0", "0.0", "12.5"]
 
 
 @pytest.mark.parametrize(
@@ -284,7 +300,112 @@ def test_a_broken_table_is_left_alone(tmp_path: Path) -> None:
 def test_a_journal_that_was_damaged_costs_no_recording(tmp_path: Path) -> None:
     strikes = book(tmp_path)
     strikes.add(blow(), place(0.1), key=key(0))
-    (tmp_path / ".avmsf" / capturing.JOURNAL).write_text("{")
+    (tmp_path / ".avmsf" / strikefiles.JOURNAL).write_text("{")
     assert strikes.add(blow(1), place(0.2), key=key(1))["file"] == "002.wav"
     assert (tmp_path / "001.wav").read_bytes() == blow()
-    assert json.loads((tmp_path / ".avmsf" / capturing.JOURNAL).read_text())[key(1)]["file"] == "002.wav"
+    assert json.loads((tmp_path / ".avmsf" / strikefiles.JOURNAL).read_text())[key(1)]["file"] == "002.wav"
+
+
+def test_a_link_to_another_strike_is_read_and_never_written_through(tmp_path: Path) -> None:
+    strikes = book(tmp_path)
+    strikes.add(blow(1), place(0.1), key=key(1))
+    (tmp_path / "003.wav").symlink_to("001.wav")
+    (tmp_path / "sub").symlink_to(".")
+    rows = "001.wav,0,0,0,0,0,1\n003.wav,0.1,0,0,0,0,1\nsub/001.wav,0.2,0,0,0,0,1\n"
+    (tmp_path / "impacts.csv").write_text(f"file,x,y,z,nx,ny,nz\n{rows}")
+    assert all(strike["readable"] for strike in strikes.describe()["strikes"])
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    for file in ("003.wav", "sub/001.wav"):
+        for change in (lambda: strikes.redo(file, blow(5)), lambda: strikes.remove(file)):  # noqa: B023
+            with pytest.raises(RefusedError, match="found a link to it: copy it there first") as refused:
+                change()
+            assert refused.value.status == 409
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_recording_of_two_rows_is_changed_in_neither(tmp_path: Path) -> None:
+    strikes = book(tmp_path)
+    strikes.add(blow(1), place(0.1), key=key(1))
+    (tmp_path / "impacts.csv").write_text("file,x,y,z\n001.wav,0,0,0\n001.wav,1,0,0\n")
+    before = (tmp_path / "impacts.csv").read_bytes()
+    for change in (lambda: strikes.redo("001.wav", blow(5)), lambda: strikes.remove("001.wav")):
+        with pytest.raises(RefusedError, match=r"stands in lines 2, 3 of impacts\.csv"):
+            change()
+    assert (tmp_path / "impacts.csv").read_bytes() == before
+    assert (tmp_path / "001.wav").read_bytes() == blow(1)
+
+
+def test_another_tabs_recording_is_neither_overwritten_nor_taken_out(tmp_path: Path) -> None:
+    strikes = book(tmp_path)
+    added = strikes.add(blow(1), place(0.1), key=key(1))
+    assert added["digest"] == hashlib.sha256(blow(1)).hexdigest()
+    redone = strikes.redo("001.wav", blow(2), key=key(2), match=added["digest"])
+    assert strikes.describe()["strikes"][0]["digest"] == redone["digest"] != added["digest"]
+    for change in (
+        lambda: strikes.redo("001.wav", blow(3), key=key(3), match=added["digest"]),
+        lambda: strikes.remove("001.wav", match=added["digest"]),
+    ):
+        with pytest.raises(RefusedError, match=r"001\.wav is another recording by now") as refused:
+            change()
+        assert refused.value.status == 409
+    # The page has not heard that it was done, and sends it again.
+    assert strikes.redo("001.wav", blow(2), key=key(2), match=added["digest"]) == redone
+    assert (tmp_path / "001.wav").read_bytes() == blow(2)
+    strikes.remove("001.wav", match=redone["digest"])
+    assert not (tmp_path / "impacts.csv").exists()
+
+
+def test_a_recording_of_another_kind_is_redone_as_a_wav_of_its_own_name(tmp_path: Path) -> None:
+    before = wav(ring(before=0.1), subtype="PCM_16", kind="FLAC")
+    (tmp_path / "hit.flac").write_bytes(before)
+    (tmp_path / "hit2.flac").write_bytes(before)
+    (tmp_path / "hit2.wav").write_bytes(blow(4))
+    (tmp_path / "impacts.csv").write_text("file,x,y,z,note\nhit.flac,0,0,0, a  b\nhit2.flac,0.1,0,0,\n")
+    strikes = book(tmp_path)
+    redone = strikes.redo("hit.flac", blow(6), key=key(1))
+    assert (redone["file"], redone["row"], redone["readable"]) == ("hit.wav", 0, True)
+    assert (tmp_path / "hit.wav").read_bytes() == blow(6)
+    assert not (tmp_path / "hit.flac").exists()
+    assert [path.read_bytes() for path in (tmp_path / ".avmsf" / "removed").glob("hit-*.flac")] == [before]
+    assert strikes.redo("hit.flac", blow(6), key=key(1)) == redone
+    assert strikes.redo("hit2.flac", blow(7))["file"] == "001.wav"
+    assert (tmp_path / "hit2.wav").read_bytes() == blow(4)
+    assert (tmp_path / "impacts.csv").read_text().splitlines()[1] == "hit.wav,0,0,0, a  b"
+
+
+def test_what_the_user_has_written_stays_to_the_last_byte(tmp_path: Path) -> None:
+    folder = fill(tmp_path / "filled")
+    rows = ('a.wav,0,0,0,"Ann, of \r\n here"', " b.wav ,1e-1,0,0,", "c.wav,0,0,0.2,")
+    text = "\r\n".join(['\ufeffFile , X,Y,Z,"Operator\r\nName"', "", *rows])
+    (folder / "impacts.csv").write_bytes(text.encode())
+    strikes = book(folder)
+    strikes.add(blow(3), Place((0.1, 0.0, 1e-3)), key=key(0))
+    added = f"{text}\r\n001.wav,0.1,0.0,0.001,\r\n"
+    assert (folder / "impacts.csv").read_bytes().decode() == added
+    strikes.remove("b.wav")
+    assert (folder / "impacts.csv").read_bytes().decode() == added.replace(" b.wav ,1e-1,0,0,\r\n", "")
+    strikes.remove("a.wav")
+    assert [strike["file"] for strike in strikes.describe()["strikes"]] == ["c.wav", "001.wav"]
+
+
+def test_an_unchanged_folder_is_judged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    strikes, judged = book(fill(tmp_path / "filled")), []
+
+    def counted(*arguments: object) -> object:
+        judged.append(arguments)
+        return check(*arguments)
+
+    monkeypatch.setattr(judgements, "check", counted)
+    first = strikes.describe()
+    assert strikes.describe() == first
+    assert len(judged) == 1
+    strikes.add(blow(3), place(0.5, direction=None), key=key(0))
+    assert len(strikes.describe()["strikes"]) == 4
+    assert len(judged) == 2
+
+
+def test_a_recording_that_is_long_beyond_use_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avmsf.studio.locating._MOST_SAMPLES", 1000)
+    with pytest.raises(RefusedError, match="expected at most 1,000 samples") as refused:
+        book(tmp_path).add(blow(), place(0.1), key=key(0))
+    assert refused.value.status == 413

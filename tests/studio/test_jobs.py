@@ -59,6 +59,80 @@ def test_a_result_that_cannot_be_used_is_an_error() -> None:
     assert run("say(result={})", finish=refuse) == [{"error": "the field cannot be read"}]
 
 
+@pytest.mark.parametrize(
+    ("raised", "words"), [(OSError(28, "No space left"), "No space left"), (KeyError("revision"), "KeyError: 'rev")]
+)
+def test_a_finish_that_breaks_is_an_error_and_the_next_job_runs(
+    raised: Exception, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def broken(result: Any) -> Any:
+        raise raised
+
+    async def two() -> tuple[Any, Any]:
+        jobs = Jobs()
+        first = jobs.start("reconstruct", {}, broken, script("say(result={})"))
+        heard = [event async for _, event in first.listen()]
+        assert not await first.cancel()
+        await jobs.close()
+        second = jobs.start("reconstruct", {}, same, script("say(result={})"))
+        return heard, [event async for _, event in second.listen()]
+
+    [first], second = asyncio.run(asyncio.wait_for(two(), 20))
+    assert "reconstruct failed" in first["error"]
+    assert words in first["error"]
+    assert second == [{"taken": {}}]
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_line_without_end_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    async def hear() -> list[Any]:
+        job = Job("test", {}, same, script("print('x' * (1 << 23), flush=True); time.sleep(60)"))
+        task = asyncio.create_task(job.run())
+        events = [event async for _, event in job.listen()]
+        await task
+        return events
+
+    [last] = asyncio.run(asyncio.wait_for(hear(), 20))
+    assert "test failed (ValueError" in last["error"]
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_worker_that_cannot_start_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    async def hear() -> list[Any]:
+        jobs = Jobs()
+        job = jobs.start("test", {}, same, (str(tmp_path / "missing"),))
+        events = [event async for _, event in job.listen()]
+        assert jobs.current is None
+        await jobs.close()
+        return events
+
+    [last] = asyncio.run(asyncio.wait_for(hear(), 20))
+    assert "test failed (FileNotFoundError" in last["error"]
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_result_that_is_being_taken_in_is_told_whoever_stops_the_job() -> None:
+    async def stop_late() -> tuple[bool, list[Any]]:
+        begun, go = asyncio.Event(), asyncio.Event()
+
+        async def slow(result: Any) -> Any:
+            begun.set()
+            await go.wait()
+            return {"revision": 2}
+
+        job = Jobs().start("test", {}, slow, script("say(result={})"))
+        await begun.wait()
+        stopping = asyncio.create_task(job.cancel())
+        await asyncio.sleep(0.05)
+        assert not stopping.done()
+        go.set()
+        return await stopping, job.events
+
+    stopped, events = asyncio.run(asyncio.wait_for(stop_late(), 20))
+    assert not stopped
+    assert events == [{"revision": 2}]
+
+
 def test_who_comes_later_hears_what_was_missed() -> None:
     async def listen() -> tuple[list[Any], list[Any]]:
         job = Job("test", {}, same, script("for n in range(4): say(done=n)\nsay(result={})"))
@@ -151,7 +225,15 @@ def test_a_worker_ends_where_its_server_was_killed() -> None:
         assert process.stdin is not None
         assert process.stdout is not None
         number = int(await process.stdout.readline())
+        # As long as the server lives nothing happens to it.
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(asyncio.shield(ending := asyncio.ensure_future(process.wait())), 0.3)
+        assert alive(number)
         process.stdin.close()
-        return await asyncio.wait_for(process.wait(), 5) if alive(number) else -9
+        status = await asyncio.wait_for(ending, 10)
+        # The loop must not end before the pipes have.
+        await process.communicate()
+        await asyncio.sleep(0.05)
+        return status
 
     assert asyncio.run(orphan()) == -9

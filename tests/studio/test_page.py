@@ -1,7 +1,6 @@
 """The page in a browser: what is clicked is struck, what is painted is true, and nothing is lost or overwritten."""
 
 import base64
-import contextlib
 import io
 import json
 from collections.abc import Callable, Iterator
@@ -13,19 +12,15 @@ import pytest
 import soundfile
 import torch
 
-from avmsf.export.sampledfield import SampledField
-from page_plate import RATE, SIDES, lay_out, page_modules, plate_object, plate_shapes, plate_strikes, plate_table
+from page_plate import SIDES, page_modules, plate_shapes, plate_table
+from plate_page import LIVE, Open, Serve, answer, on_screen, plate_site, upload, visiting, wav, words_on
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page, Request, Route
 
 SPACING = SIDES[0] / 30
 """Between neighbouring contacts, metres."""
-FIELD_ABILITIES = ["locate", "edit", "save", "like"]
-LIVE = {"revision": 1, "undo": False, "abilities": FIELD_ABILITIES, "mode": "field", "rows": [0, 1, 2, 3, 4, 5]}
 LIVE_CAPTURE = {"revision": 1, "undo": False, "abilities": ["capture", "reconstruct"], "mode": "capture", "job": None}
-Serve = Callable[..., str]
-Open = Callable[..., "Page"]
 
 
 @pytest.fixture(scope="session")
@@ -35,39 +30,7 @@ def modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def site(serve: Callable[[Path], str], modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Serve:
-    """Return a function that gives the address of the plate's page; the same one twice for the same wishes."""
-    known: dict[str, str] = {}
-
-    def address(kind: str = "points", *, strikes: bool = False, live: dict[str, Any] | None = None) -> str:
-        name = repr((kind, strikes, live))
-        if name not in known:
-            folder = tmp_path_factory.mktemp("page")
-            table = plate_table()
-            shown = plate_object(kind, tmp_path_factory.mktemp("object"))
-            measured = plate_strikes(table) if strikes else None
-            known[name] = serve(lay_out(folder / "site", table, modules, object=shown, strikes=measured, live=live))
-        return known[name]
-
-    return address
-
-
-@contextlib.contextmanager
-def visiting(browser: "Browser", site: Serve) -> Iterator[Open]:
-    """Yield a function that opens the plate's page in a browser of its own, after `before(page)`."""
-    with contextlib.ExitStack() as opened:
-
-        def visit(*, before: Callable[["Page"], Any] | None = None, viewport: Any = None, **wishes: Any) -> "Page":
-            context = browser.new_context(viewport=viewport or {"width": 900, "height": 600})
-            opened.callback(context.close)
-            page = context.new_page()
-            page.set_default_timeout(10_000)
-            if before is not None:
-                before(page)
-            page.goto(site(**wishes))
-            page.evaluate("window.avmsf.ready.then(() => null)")
-            return page
-
-        yield visit
+    return plate_site(serve, modules, tmp_path_factory)
 
 
 @pytest.fixture
@@ -83,37 +46,13 @@ def plain(browser: "Browser", site: Serve) -> Iterator["Page"]:
         yield visit()
 
 
-def on_screen(page: "Page", place: Any) -> tuple[float, float]:
-    where = page.evaluate("(place) => window.avmsf.project(place)", [float(value) for value in place])
-    return where["x"], where["y"]
-
-
 def last_place(page: "Page") -> torch.Tensor:
     """Return where the last blow fell, metres."""
     return torch.tensor(page.evaluate("avmsf.studio.view.placeOf(avmsf.studio.last.row)"))
 
 
-def words_on(page: "Page", kind: str = ".word") -> str:
-    return " ".join(page.locator(f"#words {kind}").all_inner_texts())
-
-
-def wav(seconds: float = 0.5) -> bytes:
-    memory = io.BytesIO()
-    time = np.arange(round(seconds * RATE)) / RATE
-    soundfile.write(memory, 0.5 * np.exp(-9 * time) * np.sin(2600 * time), round(RATE), "PCM_16", format="WAV")
-    return memory.getvalue()
-
-
-def upload(name: str = "blow.wav", content: bytes | None = None) -> Any:
-    return {"name": name, "mimeType": "audio/wav", "buffer": wav() if content is None else content}
-
-
 def packed(values: torch.Tensor) -> str:
     return base64.b64encode(values.float().numpy().astype("<f4").tobytes()).decode()
-
-
-def answer(route: "Route", content: Any, status: int = 200) -> None:
-    route.fulfill(status=status, content_type="application/json", body=json.dumps(content))
 
 
 @pytest.mark.parametrize("kind", ["mesh", "gaussians", "points"])
@@ -271,101 +210,6 @@ def test_a_dropped_recording_is_located_and_painted(visit: Open) -> None:
     assert 0 < box["x"] - x < 30
 
 
-class EditServer:
-    """Answers the page's edits as the studio does, and remembers what it was asked."""
-
-    def __init__(self, page: "Page", first: dict[str, Any], edited: dict[str, Any]) -> None:
-        self.asked: list[tuple[str, dict[str, Any]]] = []
-        self.revision, self.taken = 1, set[str]()
-        self.first, self.edited = first, edited
-        page.route("**/manifest.json", lambda route: answer(route, self.manifest()))
-        page.route("**/edited.bin", lambda route: route.fulfill(body=self.edited["content"]))
-        for what in ("edit", "undo", "save"):
-            page.route(f"**/{what}", self.hear)
-
-    def manifest(self) -> dict[str, Any]:
-        shown = self.first if self.revision == 1 else self.edited["manifest"]
-        return {**shown, "live": {**LIVE, "revision": self.revision, "undo": self.revision > 1}}
-
-    def hear(self, route: "Route", request: "Request") -> None:
-        what, words = request.url.rsplit("/", 1)[1], request.post_data_json
-        self.asked.append((what, words))
-        if words["base"] != self.revision:
-            answer(route, {"error": "expected the last revision", "revision": self.revision}, 409)
-        elif what == "save":
-            name = words["name"]
-            taken, _ = name in self.taken, self.taken.add(name)
-            answer(
-                route, {"error": f"{name} is there: choose another"} if taken else {"file": name}, 409 if taken else 201
-            )
-        else:
-            self.revision = self.revision + 1 if what == "edit" else 1
-            answer(route, {"revision": self.revision, "remarks": []})
-
-
-@pytest.fixture
-def edit_server(site: Serve, tmp_path: Path, modules: Path) -> Callable[["Page"], EditServer]:
-    def bundle_of(table: SampledField, name: str) -> dict[str, Any]:
-        folder = lay_out(tmp_path / name, table, modules)
-        return {
-            "manifest": json.loads((folder / "manifest.json").read_text()),
-            "content": (folder / "field.bin").read_bytes(),
-        }
-
-    first, edited = bundle_of(plate_table(), "first"), bundle_of(plate_table(pitch=1.25), "edited")
-    for tensor in edited["manifest"]["tensors"].values():
-        tensor["file"] = "edited.bin"
-    return lambda page: EditServer(page, first["manifest"], edited)
-
-
-def pitch_of_page(page: "Page") -> float:
-    """Return the first mode's pitch in what the page would play now, Hz."""
-    page.wait_for_function("avmsf.studio.engine.bundle === avmsf.studio.bundle")
-    sound = page.evaluate("avmsf.renderOffline([{ row: 0 }], 0.5).then((sound) => [...sound])")
-    spectrum = np.abs(np.fft.rfft(np.hanning(len(sound)) * np.array(sound)))
-    return float(np.argmax(spectrum[: round(700 * 0.5)]) / 0.5)
-
-
-def test_an_edit_is_heard_undone_and_saved(visit: Open, edit_server: Any) -> None:
-    servers: list[EditServer] = []
-    page = visit(live=LIVE, before=lambda page: servers.append(edit_server(page)))
-    (server,) = servers
-    assert pitch_of_page(page) == pytest.approx(400.0, abs=3)
-    page.click("#tab-edit")
-    page.locator("#sheet-edit .slider", has_text="Pitch").first.locator("input").focus()
-    page.keyboard.press("ArrowRight")
-    page.wait_for_function("avmsf.studio.revision === 2 && avmsf.studio.last !== undefined")
-    what, words = server.asked[0]
-    assert (what, words["base"], words["size"], words["modes"], words["material"]) == ("edit", 1, 1.0, [], None)
-    assert words["pitch"] == pytest.approx(4.0 ** (1 / 200), rel=1e-6)
-    assert pitch_of_page(page) == pytest.approx(500.0, abs=3)
-    page.fill("#sheet-edit input[type=text]", "higher")
-    page.click("text=Save as")
-    page.wait_for_selector("text=Saved: higher")
-    page.click("text=Save as")
-    page.wait_for_selector("text=higher is there: choose another")
-    page.click("#sheet-edit >> text=Undo")
-    page.wait_for_function("avmsf.studio.live.revision === 1")
-    assert pitch_of_page(page) == pytest.approx(400.0, abs=3)
-    assert [what for what, _ in server.asked] == ["edit", "save", "save", "undo"]
-
-
-def test_another_tabs_edit_is_not_overwritten_in_silence(visit: Open, edit_server: Any) -> None:
-    servers: list[EditServer] = []
-    page = visit(live=LIVE, before=lambda page: servers.append(edit_server(page)))
-    (server,) = servers
-    server.revision = 5
-    page.click("#tab-edit")
-    page.select_option("#sheet-edit select >> nth=1", "glass")
-    page.wait_for_selector("text=Another tab changed this field meanwhile")
-    assert [words["base"] for _, words in server.asked] == [1]
-    assert server.revision == 5
-    page.click("text=Put mine in its place")
-    page.wait_for_function("avmsf.studio.revision === 6")
-    assert server.asked[-1][1]["base"] == 5
-    assert server.asked[-1][1]["material"] == {"from": None, "to": "glass"}
-
-
 class CaptureServer:
     """Answers capture mode as the studio does; `broken` cuts the line after the strike was written."""
 
@@ -418,6 +262,15 @@ def take_strike(page: "Page", place: tuple[float, float, float]) -> None:
     page.wait_for_selector("#sheet-capture dl")
 
 
+def until(page: "Page", true: Callable[[], bool]) -> None:
+    """Let the page go on until something is true; fail after ten seconds."""
+    for _ in range(200):
+        if true():
+            return
+        page.wait_for_timeout(50)
+    pytest.fail("the page did not do it in ten seconds")
+
+
 def test_a_capture_is_made_redone_and_reconstructed(visit: Open) -> None:
     servers: list[CaptureServer] = []
     page = visit(live=LIVE_CAPTURE, before=lambda page: servers.append(CaptureServer(page)))
@@ -440,8 +293,7 @@ def test_a_capture_is_made_redone_and_reconstructed(visit: Open) -> None:
     page.click("[aria-label='Record 001.wav again']")
     page.set_input_files("#sheet-capture input[type=file]", upload())
     page.click("text=Put it in place")
-    page.wait_for_function("document.querySelector('#sheet-capture .main').disabled")
-    assert server.asked[-1] == ("PUT", "001.wav")
+    until(page, lambda: server.asked[-1] == ("PUT", "001.wav"))
     page.click("text=Make the sound field")
     page.wait_for_selector("text=avmsf studio /captures/plate/field")
     page.on("dialog", lambda dialog: dialog.accept())
@@ -468,6 +320,24 @@ def test_a_recording_outlives_a_broken_connection_and_a_reload(visit: Open) -> N
     assert len({key for _, key in server.asked}) == 1, "sent again under the same key"
     assert len(server.asked) >= 2
     assert len(server.strikes) == 1
+
+
+def test_a_strike_is_changed_only_as_this_page_knows_it(visit: Open) -> None:
+    asked: list[tuple[str, str, str | None]] = []
+
+    def hear(route: "Route", request: "Request") -> None:
+        asked.append((request.method, request.url.partition("/capture/strikes/")[2], request.headers.get("if-match")))
+        answer(route, {})
+
+    page = visit(before=lambda page: page.route("**/capture/strikes/**", hear))
+    page.evaluate(
+        """() => import(new URL("page/server.js", location)).then(async ({ server }) => {
+             await server.redoStrike("wavs/a b.wav", new Blob(["RIFF"]), { key: "k", digest: "d1" });
+             await server.removeStrike("002.wav", { digest: "d2" });
+             await server.removeStrike("003.wav");
+           })"""
+    )
+    assert asked == [("PUT", "wavs/a%20b.wav", "d1"), ("DELETE", "002.wav", "d2"), ("DELETE", "003.wav", None)]
 
 
 def test_the_microphone_records_what_is_heard(visit: Open) -> None:
@@ -502,25 +372,6 @@ def test_the_microphone_records_what_is_heard(visit: Open) -> None:
     assert len(samples) > 0.2 * rate
     spectrum = np.abs(np.fft.rfft(samples[-round(0.2 * rate) :]))
     assert np.argmax(spectrum) / 0.2 == pytest.approx(500, abs=10)
-
-
-def test_a_measured_strike_is_compared_with_the_model(visit: Open) -> None:
-    page = visit(strikes=True)
-    page.click("#sheet-strike >> text=100.wav")
-    page.wait_for_function("document.getElementById('blow-facts').textContent.includes('recording and model')")
-    compared = page.evaluate(
-        "(({ recording, model }) => [[...recording.levels], [...model.levels]])(avmsf.studio.spectra.compared)"
-    )
-    recording, model = torch.tensor(compared)
-    # Its recording is the model's own sound: a picture of both shows one line, with its peaks at the modes' pitches.
-    near = recording > recording.max() - 60
-    torch.testing.assert_close(model[near], recording[near], atol=0.1, rtol=0)
-    peak = 40 * 500 ** (float(recording.argmax() + 0.5) / len(recording))
-    assert min(abs(peak - 400 * order) for order in range(1, 7)) < 0.02 * peak
-    assert page.locator(".mark .dot[data-strike]").count() == 2
-    assert page.locator(".mark .dot[data-strike].chosen").count() == 1
-    page.uncheck("text=Mark them on the object")
-    assert page.locator(".mark .dot[data-strike]").count() == 0
 
 
 def test_a_page_without_a_server_offers_nothing_that_needs_one(plain: "Page") -> None:
@@ -576,7 +427,9 @@ def test_what_goes_wrong_with_a_recording_is_told(visit: Open) -> None:
     page.wait_for_selector("text=does not let this page use the microphone")
 
 
-def test_a_field_without_geometry_is_told(visit: Open) -> None:
+def test_a_field_without_geometry_is_told_and_offers_no_blow(visit: Open) -> None:
+    broken: list[str] = []
+
     def empty(page: "Page") -> None:
         def bend(route: "Route") -> None:
             manifest = route.fetch().json()
@@ -584,10 +437,68 @@ def test_a_field_without_geometry_is_told(visit: Open) -> None:
                 manifest["tensors"][name]["shape"][0] = 0
             answer(route, {**manifest, "points": 0})
 
+        page.on("pageerror", lambda error: broken.append(str(error)))
         page.route("**/manifest.json", bend)
 
     page = visit(before=empty)
     assert "This field has no geometry" in words_on(page, ".bad")
+    assert page.is_disabled("text=Strike again")
+    assert page.is_disabled("text=Strike somewhere")
+    page.evaluate("avmsf.strike(0)")
+    assert "no contact that could be struck" in words_on(page, ".bad")
+    assert broken == []
+    page.click("#tab-modes")
+    assert page.locator("tr[data-mode='3'] td").all_inner_texts() == ["3", "1600.0", "0.432", "–"]
+
+
+def test_a_row_is_forgotten_when_the_contacts_are_others(visit: Open) -> None:
+    page = visit()
+    page.evaluate("avmsf.strike(1000)")
+    page.evaluate("avmsf.studio.take({ ...avmsf.studio.bundle })")
+    assert page.evaluate("avmsf.studio.row") == 1000
+    page.evaluate(
+        """() => {
+             const { bundle } = avmsf.studio, { tensors } = bundle;
+             const few = (name, width) => tensors[name].slice(0, 10 * width);
+             const cut = { points: few("points", 3), normals: few("normals", 3), sine: few("sine", 6) };
+             const manifest = { ...bundle.manifest, points: 10 };
+             avmsf.studio.take({ ...bundle, manifest, tensors: { ...tensors, ...cut, cosine: few("cosine", 6) } });
+           }"""
+    )
+    assert page.evaluate("avmsf.studio.row") is None
+    page.click("text=Strike again")
+    assert page.evaluate("avmsf.studio.row") < 10
+
+
+def test_a_mode_is_chosen_by_keys_and_keeps_them(visit: Open) -> None:
+    page = visit()
+    page.click("#tab-modes")
+    choose = page.locator("tr[data-mode='2'] button")
+    choose.focus()
+    page.keyboard.press("Enter")
+    assert page.locator("tbody button[aria-pressed='true']").count() == 1
+    assert choose.get_attribute("aria-pressed") == "true"
+    assert page.evaluate("avmsf.painted() !== null")
+    page.evaluate("avmsf.strike(5)")
+    page.keyboard.press(" ")
+    assert choose.get_attribute("aria-pressed") == "false"
+    assert page.evaluate("avmsf.painted()") is None
+
+
+def test_a_file_dropped_on_a_page_without_a_server_does_not_replace_it(plain: "Page") -> None:
+    page = plain
+    kept = page.evaluate(
+        """() => ["dragover", "drop"].map((name) => {
+             const dataTransfer = new DataTransfer();
+             dataTransfer.items.add(new File(["RIFF"], "blow.wav"));
+             const event = new DragEvent(name, { dataTransfer, cancelable: true });
+             window.dispatchEvent(event);
+             return event.defaultPrevented;
+           })"""
+    )
+    assert kept == [True, True]
+    assert "no server" in words_on(page)
+    assert page.locator("#drop-target").is_hidden()
 
 
 def test_all_fits_on_a_telephone(visit: Open) -> None:

@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -24,15 +25,22 @@ import trimesh
 
 from avmsf.cli import main
 from avmsf.errors import AvmsfError, StudioError
+from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
+from avmsf.scene.ply import write_splats
+from avmsf.scene.start import StartPoints, starting_cloud
+from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.simulate.material import CERAMIC, WOOD
-from avmsf.studio import modules, server, studio
+from avmsf.studio import leading, locating, modules, server, studio
+from avmsf.studio.locating import Finder
 from avmsf.studio.modules import find_modules, with_local_modules
-from avmsf.studio.opening import Opened, open_target
+from avmsf.studio.opening import Opened, find_object, open_target
 from avmsf.studio.routes import PAGE
 from avmsf.studio.server import serve
+from avmsf.tasks.located import enlarged
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.recast import recast
+from avmsf.tasks.retune import retune
 from avmsf.tasks.severalblows import locate_blows
 from capture_folder import fill, ring
 from opened_plate import RATE, blow, open_plate, plate_field, wav
@@ -181,8 +189,109 @@ def test_words_need_their_model(plate: Served, monkeypatch: pytest.MonkeyPatch) 
     assert answer.status == 422
     assert "pip install 'avmsf[text]'" in answer.words["error"]
     assert plate.ask("POST", "edit", {"base": 1, "like": "no base64!"}).status == 400
-    monkeypatch.setattr(studio, "find_spec", lambda name: None)
-    assert studio.words_model("folder") is None
+    monkeypatch.setattr(leading, "find_spec", lambda name: None)
+    assert leading.words_model("folder") is None
+
+
+def test_a_descent_is_asked_for_alone(plate: Served) -> None:
+    like = base64.b64encode(blow()).decode()
+    for more, message in (({"pitch": 2.0}, "found pitch too"), ({"prompt": "wood"}, "found both: choose one")):
+        answer = plate.ask("POST", "edit", {"base": 1, "like": like, **more})
+        assert answer.status == 400
+        assert message in answer.words["error"]
+    assert list(plate.studio.folder.glob("lead-*")) == []
+
+
+def test_a_descent_that_another_tab_has_overtaken_is_kept(
+    plate: Served, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    script = "import json, shutil, sys; task = json.loads(input()); shutil.copy(sys.argv[1], task['output'])\n"
+    wait = (
+        "import os, time\nwhile not os.path.exists(sys.argv[2]): time.sleep(0.01)\nprint(json.dumps({'result': task}))"
+    )
+    led = retune(plate_field("physics"), pitch=1.25)
+    save(led, tmp_path / "led")
+    worker = (sys.executable, "-c", script + wait, str(tmp_path / "led"), str(tmp_path / "go"))
+    start = plate.studio.jobs.start
+    monkeypatch.setattr(plate.studio.jobs, "start", lambda kind, task, take: start(kind, task, take, worker))
+    like = {"base": 1, "like": base64.b64encode(blow()).decode()}
+    job = plate.ask("POST", "edit", like).words["job"]
+    assert plate.ask("POST", "edit", like).status == 409
+    assert len(list(plate.studio.folder.glob("lead-*"))) == 1
+    assert plate.ask("POST", "edit", {"base": 1, "pitch": 1.5}).words["revision"] == 2
+    (tmp_path / "go").touch()
+    last = plate.events(job)[-1]
+    assert last["revision"] == 2
+    assert "so that is kept beside it" in last["remarks"][0]
+    assert Path(last["file"]).parent == plate.studio.opened.home
+    assert torch.equal(load(last["file"]).bank.frequency, led.bank.frequency)
+    assert plate.manifest()["live"]["sliders"]["pitch"] == 1.5
+
+
+def test_only_the_current_revision_is_prepared_and_symmetries_once(
+    plate: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared: list[int] = []
+    searched: list[object] = []
+    search, prepare = locating.symmetries_of, Finder.prepare
+
+    def counted(field: SoundField) -> Any:
+        searched.append(field)
+        return search(field)
+
+    edited = threading.Event()
+
+    def slow(finder: Finder) -> None:
+        prepared.append(plate.studio.session.current.number)
+        assert edited.wait(20)
+        prepare(finder)
+
+    monkeypatch.setattr(locating, "symmetries_of", counted)
+    monkeypatch.setattr(Finder, "prepare", slow)
+    monkeypatch.setattr("avmsf.studio.searches._SETTLED", 0.0)
+    for number in range(1, 6):
+        plate.ask("POST", "edit", {"base": number, "material": {"from": "ceramic"}, "size": 1.0 + number / 10})
+        end = time.monotonic() + 20
+        while not prepared:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+    edited.set()
+    while not prepared or prepared[-1] != 6 or plate.studio.busy:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert len(prepared) == 2
+    finder = plate.studio.searches.finder_of(plate.studio.session.current)
+    _ = finder.symmetries
+    assert len(searched) == 1
+    assert {"locator", "heed"} <= vars(finder).keys() | vars(finder.locator).keys()
+
+
+def test_a_larger_object_has_the_same_symmetries_farther_out() -> None:
+    grid = torch.cartesian_prod(torch.linspace(-0.1, 0.1, 21), torch.linspace(-0.06, 0.06, 13))
+    points = torch.cat([grid, torch.full((len(grid), 1), 0.03)], dim=1) + torch.tensor([0.2, 0.0, 0.0])
+    found = find_symmetries(points, generator=torch.Generator().manual_seed(0))
+    expected = find_symmetries(1.5 * points, generator=torch.Generator().manual_seed(0))
+    larger = enlarged(found, 1.5)
+    assert len(larger.mirrors) == len(expected.mirrors) > 0
+    assert larger.spacing == pytest.approx(expected.spacing, rel=1e-5)
+    for kind in ("mirrors", "rotations"):
+        for one, other in zip(getattr(larger, kind), getattr(expected, kind), strict=True):
+            assert torch.allclose(one.point.double(), other.point.double(), atol=1e-3)
+
+
+def test_the_capture_is_guarded_by_the_recordings_digest(capture: Served) -> None:
+    place, headers = "capture/strikes?x=0&y=0&z=0.002", {"Idempotency-Key": "strike-0001"}
+    added = capture.ask("POST", place, blow(), headers=headers).words
+    file = "capture/strikes/001.wav"
+    quoted = {"If-Match": f'"{added["digest"]}"'}
+    assert capture.ask("PUT", file, blow(1), headers=quoted).status == 200
+    for method, content in (("PUT", blow(2)), ("DELETE", None)):
+        late = capture.ask(method, file, content, headers=quoted)
+        assert late.status == 409
+        assert "001.wav is another recording by now" in late.words["error"]
+    assert capture.get(file).content == blow(1)
+    [strike] = capture.get("capture").words["strikes"]
+    assert capture.ask("DELETE", file, headers={"If-Match": strike["digest"]}).status == 200
 
 
 def test_a_capture_is_made_of_a_mesh(capture: Served, tmp_path: Path) -> None:
@@ -318,11 +427,93 @@ def test_what_can_be_opened_and_what_not(tmp_path: Path, monkeypatch: pytest.Mon
     assert open_target(mesh) == opened
     assert (tmp_path / "bowl" / "surface.stl").read_bytes() == mesh.read_bytes()
     trimesh.creation.box((0.2, 0.1, 0.1)).export(mesh)
-    with pytest.raises(StudioError, match=r"has another mesh, surface\.stl"):
+    with pytest.raises(StudioError, match=r"has another object, surface\.stl"):
         open_target(mesh)
     monkeypatch.setattr("avmsf.studio.opening.LARGEST_MESH", 10)
     with pytest.raises(StudioError, match="expected a mesh of at most"):
         open_target(mesh)
+
+
+def wavefront(folder: Path) -> Path:
+    folder.mkdir()
+    shape = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 2 3\nf 1 2 4\n"
+    (folder / "bowl.obj").write_text(f"mtllib bowl.mtl\n{shape}")
+    (folder / "bowl.mtl").write_text("newmtl glazed\nmap_Kd pic.png\n")
+    (folder / "pic.png").write_bytes(b"the mesh's picture")
+    return folder / "bowl.obj"
+
+
+def test_a_mesh_brings_its_pictures_and_overwrites_none(tmp_path: Path) -> None:
+    mesh, other = wavefront(tmp_path / "mesh"), tmp_path / "other"
+    other.mkdir()
+    (other / "pic.png").write_bytes(b"the user's own picture")
+    with pytest.raises(StudioError, match=r"pic\.png: expected no file, or the pic\.png that the mesh names"):
+        open_target(mesh, capture=other)
+    assert [path.name for path in other.iterdir()] == ["pic.png"]
+    assert (other / "pic.png").read_bytes() == b"the user's own picture"
+    opened = open_target(mesh, capture=mesh.parent)
+    assert find_object(opened) == mesh.parent.resolve() / "surface.obj"
+    assert (mesh.parent / "pic.png").read_bytes() == b"the mesh's picture"
+    beside = open_target(mesh)
+    assert beside.capture is not None
+    names = sorted(path.name for path in beside.capture.iterdir())
+    assert names == ["bowl.mtl", "pic.png", "surface.obj"]
+
+
+def test_gaussians_are_opened_as_gaussians(tmp_path: Path) -> None:
+    points = plate_field().gain_field.points.float()
+    start = StartPoints(points, torch.full_like(points, 0.5), torch.tensor([[0.0, 0.0, 1.0]]).expand_as(points))
+    write_splats(starting_cloud(start, degree=0, scale=1.0, opacity=0.9, flatness=0.2), tmp_path / "cloud.ply")
+    opened = open_target(tmp_path / "cloud.ply")
+    assert opened.capture is not None
+    assert find_object(opened) == opened.capture / "splats.ply"
+    assert open_target(tmp_path / "cloud.ply") == opened
+    assert open_target(opened.capture / "splats.ply") == opened
+    (tmp_path / "files").mkdir()
+    manifest = studio.Studio(opened, tmp_path / "files").manifest()
+    assert manifest["object"] == {"kind": "gaussians", "file": "object.ply"}
+    assert manifest["points"] == len(points)
+
+
+def test_hours_of_silence_in_a_few_bytes_are_not_unpacked(plate: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    sound = wav(np.zeros(120 * RATE), subtype="PCM_16", kind="FLAC")
+    monkeypatch.setattr("avmsf.studio.locating._MOST_SAMPLES", 100 * RATE)
+    answer = plate.ask("POST", "locate", sound)
+    assert answer.status == 413
+    assert "expected at most 800,000 samples, minutes of sound, found 960,000 (2 minutes)" in answer.words["error"]
+    assert plate.ask("POST", "edit", {"base": 1, "like": base64.b64encode(sound).decode()}).status == 413
+
+
+def test_a_picture_that_could_not_be_written_can_be_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = open_target(fill(tmp_path / "bare"))
+    (tmp_path / "files").mkdir()
+    fresh = studio.Studio(opened, tmp_path / "files")
+
+    def full(*arguments: object, **options: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("avmsf.studio.showing.json.loads", full)
+        with pytest.raises(OSError, match="No space"):
+            fresh.session.open(None)
+    assert fresh.session.open(None).number == 2
+    assert fresh.manifest()["modes"] == 0
+
+
+def test_a_failure_nobody_has_foreseen_is_told_here_and_in_the_terminal(
+    plate: Served, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def break_down(*arguments: object) -> None:
+        raise KeyError("unforeseen")
+
+    monkeypatch.setattr(plate.studio.session, "undo", break_down)
+    answer = plate.ask("POST", "undo", {"base": 1})
+    assert answer.status == 500
+    assert "failed at this (KeyError): its terminal shows more" in answer.words["error"]
+    assert "nothing was changed" not in answer.words["error"]
+    assert "KeyError: 'unforeseen'" in capsys.readouterr().err
 
 
 def test_a_port_in_use_is_named_with_a_way_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -338,6 +529,25 @@ def test_a_port_in_use_is_named_with_a_way_out(tmp_path: Path, monkeypatch: pyte
             assert listener.getsockname()[0] == "127.0.0.1"
     with pytest.raises(StudioError, match="expected 0 to 65535"):
         server._listening(70_000)
+
+
+def test_the_browsers_command_line_holds_no_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[str] = []
+    looked, leave = threading.Event(), threading.Event()
+
+    def look(address: str) -> bool:
+        heard.append(address)
+        looked.set()
+        return leave.wait(20)
+
+    monkeypatch.setattr("webbrowser.open", look)
+    # Who calls is the event loop, and must not wait for a browser that stays.
+    server._open_browser("http://127.0.0.1:8634/secret/", tmp_path)
+    assert looked.wait(20)
+    leave.set()
+    assert heard == [(tmp_path / "open.html").as_uri()]
+    assert 'content="0; url=http://127.0.0.1:8634/secret/"' in (tmp_path / "open.html").read_text()
+    assert (tmp_path / "open.html").stat().st_mode & 0o777 == 0o600
 
 
 def test_the_page_takes_its_libraries_from_here_where_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

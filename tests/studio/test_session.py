@@ -1,6 +1,7 @@
 """The open field: revisions, what edits make of it, and that nobody's work is overwritten in silence."""
 
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from avmsf.errors import EditError, FieldFileError, SimulationError
+from avmsf.errors import EditError, FieldFileError, SimulationError, StudioError
 from avmsf.export.sampledfield import SampledField
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
@@ -77,6 +78,10 @@ def test_sliders_are_read_back_from_what_the_page_is_told() -> None:
         ({"material": "wood"}, "material: expected an object with from, to"),
         ({"material": {"to": 3}}, 'material "to": expected a name, found 3'),
         ({"law": "paper"}, "law: expected one of displacement"),
+        ({"pitch": 10**400}, "pitch: expected a number, found 1000"),
+        ({"law": [1]}, r"law: expected one of displacement.*found \[1\]"),
+        ({"modes": [{"mode": 0, "db": -900}]}, "db: expected -120 to 120 dB, found -900"),
+        ({"brightness": 400}, "brightness: expected -40 to 40 dB, found 400"),
         ({"louder": 2}, "an edit: expected base, material, .* found louder"),
     ],
 )
@@ -207,6 +212,38 @@ def test_names_that_lead_elsewhere_are_refused(name: str) -> None:
     with pytest.raises(RefusedError, match="expected a name of letters") as refused:
         file_name(name)
     assert refused.value.status == 400
+
+
+def test_a_name_is_as_long_as_files_names_may_be(tmp_path: Path) -> None:
+    session, _ = opened(tmp_path)
+    assert session.save(1, "音" * 66)[0].is_file()
+    with pytest.raises(RefusedError, match="at most 200 bytes, found 201: choose a shorter one") as refused:
+        session.save(2, "音" * 67)
+    assert refused.value.status == 400
+
+
+@pytest.mark.parametrize(("number", "way_out"), [(13, "may write to"), (28, "free some space"), (30, "another")])
+def test_a_file_that_cannot_be_made_says_what_helps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, way_out: str
+) -> None:
+    session, _ = opened(tmp_path)
+
+    def refuse(*arguments: object) -> int:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("avmsf.studio.session.os.open", refuse)
+    with pytest.raises(StudioError, match=f"{os.strerror(number)}.*{way_out}".replace("another", "can be written")):
+        session.save(1, "bowl")
+
+
+def test_a_field_that_is_not_heard_is_kept_under_a_free_name(tmp_path: Path) -> None:
+    session, shown = opened(tmp_path)
+    (tmp_path / "plate led.safetensors").write_text("precious")
+    names = [session.keep(plate_field(), "plate led").name for _ in range(2)]
+    assert names == ["plate led 2.safetensors", "plate led 3.safetensors"]
+    assert same(load(tmp_path / names[1]), plate_field())
+    assert (tmp_path / "plate led.safetensors").read_text() == "precious"
+    assert len(shown) == 1
 
 
 def test_before_there_is_a_field_nothing_can_be_edited(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -17,6 +18,10 @@ from avmsf.tasks.recast import LAWS, recast
 from avmsf.tasks.retune import retune
 
 _MATERIAL, _MODE = ("from", "to"), ("mode", "db", "pitch", "decay")
+_MOST = {"db": 120.0, "brightness": 40.0}
+"""Decibels up or down: what is farther off float32 cannot bring back beside the other modes."""
+_SHOWN = 60
+"""Characters of what was found that are told."""
 MUTE = -math.inf
 """Decibels that a mode is muted by; in JSON, where there are no such numbers, null."""
 
@@ -28,8 +33,11 @@ class ModeChange:
     mode: int
     """Row in the bank of the field as it was opened, counted from 0."""
     db: float = 0.0
+    """Change of its level; MUTE for none of it."""
     pitch: float = 1.0
+    """Factor on its frequency, beside that of all modes."""
     decay: float = 1.0
+    """Factor on the time in which it dies away, beside that of all modes."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +51,7 @@ class Sliders:
     size: float = 1.0
     """The new object's lengths over the old one's."""
     pitch: float = 1.0
+    """Factor on all frequencies."""
     decay: float = 1.0
     """Factor on the times in which modes die away."""
     brightness: float = 0.0
@@ -62,7 +71,7 @@ class Sliders:
         if not isinstance(rows, list):
             raise RefusedError(400, f"modes: expected a list, found {rows!r}: reload the page")
         law = words.get("law", "displacement")
-        if law not in LAWS:
+        if not isinstance(law, str) or law not in LAWS:
             raise RefusedError(400, f"law: expected one of {', '.join(LAWS)}, found {law!r}")
         return cls(
             _name(material.get("to"), "to"),
@@ -139,9 +148,16 @@ def _number(words: Mapping[str, Any], name: str, rest: float) -> float:
     value = words.get(name, rest)
     if value is None:
         return rest
-    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
-        raise RefusedError(400, f"{name}: expected a number, found {value!r}")
-    return float(value)
+    number = math.nan
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        with suppress(OverflowError):
+            number = float(value)
+    if not math.isfinite(number):
+        raise RefusedError(400, f"{name}: expected a number, found {repr(value)[:_SHOWN]}")
+    most = _MOST.get(name, math.inf)
+    if abs(number) > most:
+        raise RefusedError(400, f"{name}: expected {-most:g} to {most:g} dB, found {number:g}")
+    return number
 
 
 def _name(value: Any, what: str) -> str | None:

@@ -15,6 +15,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from avmsf.studio.policy import NOTHING
 from avmsf.studio.refusal import RefusedError, response_to
 
 LARGEST_UPLOAD = 64 << 20
@@ -25,7 +26,7 @@ LOOPBACK = ("127.0.0.1", "localhost")
 """Names under which a browser may know this machine."""
 _HEADERS = {
     "cache-control": "no-store",
-    "content-security-policy": "frame-ancestors 'none'",
+    "content-security-policy": NOTHING,
     "cross-origin-resource-policy": "same-origin",
     # The token is in the address, and other sites that the page loads its libraries from must not learn it.
     "referrer-policy": "no-referrer",

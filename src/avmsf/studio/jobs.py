@@ -10,6 +10,7 @@ import os
 import secrets
 import signal
 import sys
+import traceback
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from typing import Any
 
@@ -20,6 +21,7 @@ Event = dict[str, Any]
 Finish = Callable[[Event], Awaitable[Event]]
 CANCELLED = "cancelled"
 """The stage of the last event of a job that somebody has stopped."""
+_STOPPED: Event = {"stage": CANCELLED, "words": "stopped"}
 WORKER = (sys.executable, "-m", "avmsf.studio.worker")
 _LINE = 1 << 22
 """Bytes of one line, at most."""
@@ -38,36 +40,45 @@ class Job:
         self.identifier, self.kind, self.task, self.finish = secrets.token_hex(8), kind, task, finish
         self.events: list[Event] = []
         self.ended = False
-        self.cancelled = False
+        self._cancelled = self._finishing = False
         self._heard = asyncio.Condition()
         self._process: asyncio.subprocess.Process | None = None
 
     async def run(self) -> None:
         """Run to the end, whatever that is; the last event says how it went."""
+        last = _STOPPED
         try:
             last = await self._work()
         except AvmsfError as error:
             last = {"error": " ".join(str(error).split())}
         except asyncio.CancelledError:
-            self.cancelled = True
-            last = {"stage": CANCELLED, "words": "stopped"}
+            last = _STOPPED
+        except Exception as error:  # whatever it is, the next job must be able to start
+            traceback.print_exception(error)
+            words = " ".join(f"{type(error).__name__}: {error}".split())[:_LAST_WORDS]
+            last = {"error": f"{self.kind} failed ({words}): the server's terminal shows more; start it again"}
         finally:
             self._end_process(signal.SIGKILL)
-        await self._tell({"stage": CANCELLED, "words": "stopped"} if self.cancelled else last, last=True)
+            await self._tell(last, last=True)
 
-    async def cancel(self) -> None:
-        """Stop the process, and wait until it has stopped; what it has finished so far stays for the next run."""
+    async def cancel(self) -> bool:
+        """Stop the process, and wait until it has stopped; what it has finished so far stays for the next run.
+
+        Returns whether it was stopped: a job whose result has come is waited for, and says what came of it.
+        """
         if self.ended:
-            return
-        self.cancelled = True
-        self._end_process(signal.SIGTERM)
-        for _ in range(round(_GRACE / 0.05)):
-            if self._process is None or self._process.returncode is not None:
-                break
-            await asyncio.sleep(0.05)
-        self._end_process(signal.SIGKILL)
+            return False
+        if not self._finishing:
+            self._cancelled = True
+            self._end_process(signal.SIGTERM)
+            for _ in range(round(_GRACE / 0.05)):
+                if self._process is None or self._process.returncode is not None:
+                    break
+                await asyncio.sleep(0.05)
+            self._end_process(signal.SIGKILL)
         async with self._heard:
             await self._heard.wait_for(lambda: self.ended)
+        return self._cancelled
 
     async def listen(self, *, after: int = 0) -> AsyncIterator[tuple[int, Event]]:
         """Yield the events from number `after` on, counted from 0, as they come, up to the last."""
@@ -95,7 +106,7 @@ class Job:
         assert process.stdin is not None
         assert process.stdout is not None
         assert process.stderr is not None
-        if self.cancelled:
+        if self._cancelled:
             self._end_process(signal.SIGKILL)
         said = asyncio.create_task(_last_words(process.stderr))
         result: Event | None = None
@@ -113,11 +124,23 @@ class Job:
             status = await process.wait()
         except (BrokenPipeError, ConnectionResetError):
             status = await process.wait()
+        except BaseException:
+            self._end_process(signal.SIGKILL)
+            # A process is not over for the loop before what it wrote is read.
+            while await process.stdout.read(1 << 16):
+                pass
+            await said
+            raise
         words = await said
+        if self._cancelled:
+            return _STOPPED
         if result is None:
             ending = words.strip().splitlines()[-1:] or ["it said nothing"]
             return {"error": f"{self.kind} ended with status {status} and no result: {ending[0]}"}
-        return result if "error" in result else await self.finish(result["result"])
+        if "error" in result:
+            return result
+        self._finishing = True
+        return await self.finish(result["result"])
 
     async def _tell(self, event: Event, *, last: bool = False) -> None:
         async with self._heard:
@@ -146,8 +169,8 @@ class Jobs:
         """The job that runs."""
         return next((job for job in self._jobs.values() if not job.ended), None)
 
-    def start(self, kind: str, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> Job:
-        """Begin a job. Raises RefusedError (409) while another one runs."""
+    def expect_none(self) -> None:
+        """Raise RefusedError (409) while a job runs."""
         current = self.current
         if current is not None:
             raise RefusedError(
@@ -155,6 +178,10 @@ class Jobs:
                 f"{current.kind} is under way, and one job runs at a time: wait for it or stop it",
                 job=current.identifier,
             )
+
+    def start(self, kind: str, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> Job:
+        """Begin a job. Raises RefusedError (409) while another one runs."""
+        self.expect_none()
         job = Job(kind, task, finish, command)
         self._jobs[job.identifier] = job
         self._running = asyncio.create_task(job.run())

@@ -10,6 +10,7 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
+import soundfile
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -18,10 +19,30 @@ from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.symmetry import Symmetries
+from avmsf.studio.refusal import RefusedError
 from avmsf.tasks.contactmap import LEVEL, ContactMap
-from avmsf.tasks.located import describe_blow, symmetries_of
+from avmsf.tasks.located import describe_blow, enlarged, symmetries_of
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.severalblows import locate_blows
+
+_MOST_SAMPLES = 1 << 24
+"""Of one recording, in all channels: 6 minutes at 48 kHz, 134 MB as they are read."""
+
+
+class Likeness:
+    """The symmetries of one object, which an edit that makes it larger leaves as they are but for their lengths."""
+
+    def __init__(self) -> None:
+        self._found: tuple[Symmetries | None, float] | None = None
+        self._lock = Lock()
+
+    def on(self, field: SoundField, length: float) -> Symmetries | None:
+        """Return the symmetries of a field's object, `length` times as large as the one in the page; None for none."""
+        with self._lock:
+            if self._found is None:
+                self._found = (symmetries_of(field), length)
+            found, before = self._found
+        return None if found is None else enlarged(found, length / before)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +54,8 @@ class Finder:
     """The page's points, on the object as the field has it now, metres."""
     length: float
     """Lengths on that object over those of the page's picture."""
+    likeness: "Likeness" = dataclasses.field(default_factory=lambda: Likeness())
+    """The symmetries of the object, whose search other revisions need not repeat."""
     settings: CaptureSettings | None = None
     """How the capture's recordings are read, where it is known."""
     _lock: Lock = dataclasses.field(default_factory=Lock, repr=False)
@@ -42,15 +65,16 @@ class Finder:
         """The tables over the page's points."""
         return Locator.of(self.field, points=self.points)
 
-    @cached_property
+    @property
     def symmetries(self) -> Symmetries | None:
         """What explains why several places sound the same."""
-        return symmetries_of(self.field)
+        return self.likeness.on(self.field, self.length)
 
     def prepare(self) -> None:
         """Make all that takes time, once, whoever asks first."""
         with self._lock:
-            _ = self.locator, self.symmetries
+            self.locator.prepare(self.field.samples)
+            _ = self.symmetries
 
     def locate(self, recording: Recording) -> list[dict[str, Any]]:
         """Return the blows of a recording, each with a value for every point of the page.
@@ -76,11 +100,31 @@ class Finder:
 
 
 def read_upload(content: bytes, *, name: str = "the recording") -> Recording:
-    """Return the recording that a page has sent. Raises CaptureError for what is no sound file."""
+    """Return the recording that a page has sent.
+
+    Raises CaptureError for what is no sound file, and RefusedError (413) for one that is long beyond use: a few bytes
+    hold hours of silence where it is compressed.
+    """
     with tempfile.TemporaryDirectory(prefix="avmsf-upload-") as folder:
         path = Path(folder) / "upload.wav"
         path.write_bytes(content)
+        _expect_short(path, name)
         return read_recording(path, name)
+
+
+def _expect_short(path: Path, name: str) -> None:
+    try:
+        with soundfile.SoundFile(path) as file:
+            samples, seconds = file.frames * file.channels, file.frames / file.samplerate
+    except (soundfile.LibsndfileError, OSError):
+        # The reader says what is wrong with it.
+        return
+    if samples > _MOST_SAMPLES:
+        raise RefusedError(
+            413,
+            f"{name}: expected at most {_MOST_SAMPLES:,} samples, minutes of sound, found {samples:,} "
+            f"({seconds / 60:.3g} minutes): send the seconds about the blow",
+        )
 
 
 def packed(values: Float[Tensor, " points"]) -> str:

@@ -1,7 +1,9 @@
 """What a user has opened: a field, a capture folder, or a mesh or pictures of which a capture shall be made."""
 
+import filecmp
 import re
 import shutil
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,9 +12,11 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import find_surface_file
 from avmsf.capture.table import TABLE
 from avmsf.errors import StudioError
+from avmsf.export.objectfile import holds_gaussians
+from avmsf.files import write_whole
 from avmsf.pipeline.reconstruct import CACHE, FIELD
 from avmsf.pipeline.scene import CLOUD
-from avmsf.pipeline.sources import find_source, find_splats
+from avmsf.pipeline.sources import SPLATS, find_source, find_splats
 
 MESHES = (".obj", ".ply", ".glb", ".stl")
 """Suffixes of the meshes that a capture may have as its surface."""
@@ -85,10 +89,7 @@ def shows_more(opened: Opened) -> bool:
 
 def is_gaussians(path: Path) -> bool:
     """Whether a file holds Gaussians and not a mesh: a .ply whose header names their scales."""
-    if path.suffix.lower() != ".ply":
-        return False
-    with open(path, "rb") as file:
-        return b" scale_0" in file.read(1 << 16).partition(b"end_header")[0]
+    return path.suffix.lower() == ".ply" and holds_gaussians(path)
 
 
 def _open_folder(folder: Path, object: Path | None) -> Opened:
@@ -110,34 +111,58 @@ def _open_mesh(mesh: Path, object: Path | None, capture: Path | None) -> Opened:
             f"{mesh}: expected a mesh of at most {LARGEST_MESH >> 20} MiB, found {size >> 20}: reduce it first, a "
             "hundred thousand triangles show all that is heard"
         )
-    if capture is None and mesh.stem == "surface":
+    if capture is None and (mesh.stem == "surface" or mesh.name in SPLATS):
         return _open_folder(mesh.resolve().parent, object)
     folder = mesh.with_suffix("") if capture is None else capture
-    surface = folder / f"surface{mesh.suffix.lower()}"
-    others = [folder / f"surface{suffix}" for suffix in MESHES if (folder / f"surface{suffix}").is_file()]
+    surface = folder / (SPLATS[0] if is_gaussians(mesh) else f"surface{mesh.suffix.lower()}")
+    names = (*(f"surface{suffix}" for suffix in MESHES), *SPLATS)
+    others = [folder / name for name in names if (folder / name).is_file()]
     if folder.exists() and not folder.is_dir():
         raise StudioError(f"{folder}: expected a capture folder or nothing, found a file: name one by --capture")
-    if others and not (surface in others and surface.read_bytes() == mesh.read_bytes()):
+    if others and not (surface in others and _same(surface, mesh)):
         raise StudioError(
-            f"{folder}: has another mesh, {others[0].name}, and its strikes belong to that one: open the folder, or "
+            f"{folder}: has another object, {others[0].name}, and its strikes belong to that one: open the folder, or "
             "name another by --capture"
         )
     if not others:
-        folder.mkdir(parents=True, exist_ok=True)
-        _copy_beside(mesh, folder)
-        shutil.copyfile(mesh, surface)
+        _copy(_named_by(mesh), folder)
+        _copy_whole(mesh, surface)
     return _open_folder(folder, object)
 
 
-def _copy_beside(mesh: Path, folder: Path) -> None:
-    """Copy what a Wavefront mesh names beside it: its materials and their pictures."""
+def _named_by(mesh: Path) -> Iterator[Path]:
+    """Yield what a Wavefront mesh names beside it: its materials and their pictures."""
     if mesh.suffix.lower() != ".obj":
         return
     for name in _MATERIALS.findall(mesh.read_text(errors="replace")):
         material = mesh.parent / Path(name).name
         if material.is_file():
-            shutil.copyfile(material, folder / material.name)
+            yield material
             for texture in _TEXTURES.findall(material.read_text(errors="replace")):
                 picture = mesh.parent / Path(texture).name
                 if picture.is_file():
-                    shutil.copyfile(picture, folder / picture.name)
+                    yield picture
+
+
+def _copy(files: Iterable[Path], folder: Path) -> None:
+    """Copy files into a folder. Raises StudioError, before anything is written, where it has others of their names."""
+    lacking = {}
+    for path in files:
+        place = folder / path.name
+        if not (place.exists() or place.is_symlink()):
+            lacking[place] = path
+        elif not _same(place, path):
+            raise StudioError(
+                f"{place}: expected no file, or the {path.name} that the mesh names, found another one: move it away, "
+                "or name another folder by --capture"
+            )
+    for place, path in lacking.items():
+        _copy_whole(path, place)
+
+
+def _copy_whole(path: Path, place: Path) -> None:
+    write_whole(place, lambda temporary: shutil.copyfile(path, temporary), raising=StudioError)
+
+
+def _same(one: Path, other: Path) -> bool:
+    return one.is_file() and (one.samefile(other) or filecmp.cmp(one, other, shallow=False))

@@ -1,7 +1,8 @@
 """The addresses under the server's secret one, each of which asks the studio for one thing."""
 
 import json
-from collections.abc import AsyncIterator, Awaitable, Callable
+import traceback
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
@@ -13,25 +14,32 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Respon
 from starlette.routing import Route
 
 from avmsf.errors import AvmsfError
-from avmsf.studio.capturing import Place
 from avmsf.studio.guard import LARGEST_UPLOAD, contained, read_words
 from avmsf.studio.modules import find_modules, with_local_modules
+from avmsf.studio.place import Place
+from avmsf.studio.policy import policy_of
 from avmsf.studio.refusal import RefusedError, response_to
 from avmsf.studio.studio import Studio
 
 PAGE = Path(__file__).parent / "page"
 _TYPES = {
+    ".aif": "audio/aiff",
+    ".aiff": "audio/aiff",
     ".bin": "application/octet-stream",
     ".css": "text/css",
+    ".flac": "audio/flac",
     ".glb": "model/gltf-binary",
     ".js": "text/javascript",
     ".json": "application/json",
     ".mjs": "text/javascript",
+    ".mp3": "audio/mpeg",
+    ".ogg": "audio/ogg",
     ".ply": "application/octet-stream",
     ".wasm": "application/wasm",
     ".wav": "audio/wav",
 }
 """What is served, and as what: nothing else is."""
+_SOUNDS = tuple(suffix for suffix, kind in _TYPES.items() if kind.startswith("audio/"))
 _GONE = 499
 """Nobody reads it: the page has hung up."""
 Handler = Callable[[Request], Awaitable[Response]]
@@ -42,6 +50,7 @@ def make_app(studio: Studio) -> Starlette:
     modules = find_modules()
     page = (PAGE / "index.html").read_text(encoding="utf-8")
     html = page if modules is None else with_local_modules(page)
+    policy = {"content-security-policy": policy_of(html)}
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
@@ -52,7 +61,7 @@ def make_app(studio: Studio) -> Starlette:
             await studio.close()
 
     async def show_page(request: Request) -> Response:
-        return HTMLResponse(html)
+        return HTMLResponse(html, headers=policy)
 
     async def send_module(request: Request) -> Response:
         if modules is None:
@@ -151,13 +160,16 @@ class Calls:
     async def change_strike(self, request: Request) -> Response:
         """Send, redo or take out one of the capture's recordings."""
         name = request.path_params["path"]
+        match, key = _expected(request), request.headers.get("idempotency-key")
         if request.method == "DELETE":
-            await self.studio.with_book(lambda book: book.remove(name))
+            await self.studio.with_book(lambda book: book.remove(name, match=match))
             return JSONResponse({"removed": name})
         if request.method == "PUT":
             content = await request.body()
-            return JSONResponse(await self.studio.with_book(lambda book: book.redo(name, content)))
-        return _file(self.studio.expect_book().folder, request, only=".wav")
+            return JSONResponse(
+                await self.studio.with_book(lambda book: book.redo(name, content, key=key, match=match))
+            )
+        return _file(self.studio.expect_book().folder, request, only=_SOUNDS)
 
     async def reconstruct(self, request: Request) -> Response:
         """Make a field of the capture."""
@@ -176,9 +188,16 @@ class Calls:
         return StreamingResponse(events(), media_type="text/event-stream")
 
     async def cancel_job(self, request: Request) -> Response:
-        """Stop a job."""
-        await self.studio.jobs.named(request.path_params["job"]).cancel()
-        return JSONResponse({"cancelled": request.path_params["job"]})
+        """Stop a job, and say whether it was stopped or had ended."""
+        job = request.path_params["job"]
+        stopped = await self.studio.jobs.named(job).cancel()
+        return JSONResponse({"cancelled" if stopped else "ended": job})
+
+
+def _expected(request: Request) -> str | None:
+    """Return the digest of the recording that a change is meant for; None where any is."""
+    match = request.headers.get("if-match", "*").strip().removeprefix("W/").strip('"')
+    return None if match == "*" else match
 
 
 def _get(path: str, handler: Handler) -> Route:
@@ -192,12 +211,12 @@ async def _send_from(folder: Path, request: Request) -> Response:
     return _file(folder, request)
 
 
-def _file(folder: Path, request: Request, *, only: str | None = None) -> Response:
+def _file(folder: Path, request: Request, *, only: Sequence[str] = ()) -> Response:
     """Return a file of a folder. Raises RefusedError (404) for other kinds than pages have use for."""
     path = contained(folder, request.path_params["path"])
     kind = _TYPES.get(path.suffix.lower())
     hidden = any(part.startswith(".") for part in path.relative_to(folder.resolve()).parts)
-    if kind is None or hidden or only not in (None, path.suffix.lower()):
+    if kind is None or hidden or (only and path.suffix.lower() not in only):
         raise RefusedError(404, "there is nothing at this address")
     return FileResponse(path, media_type=kind)
 
@@ -217,5 +236,7 @@ async def _answer_nobody(request: Request, error: Exception) -> Response:
 
 
 async def _answer_broken(request: Request, error: Exception) -> Response:
-    words = f"the server failed at this ({type(error).__name__}): its terminal shows more; nothing was changed"
+    # The server's own word on it is hidden with all that it says of ordinary requests.
+    traceback.print_exception(error)
+    words = f"the server failed at this ({type(error).__name__}): its terminal shows more; reload to see what was done"
     return JSONResponse({"error": words}, 500)

@@ -1,9 +1,11 @@
 """The server of the page: on this machine alone, under an address that nobody else knows, until Ctrl-C."""
 
 import errno
+import os
 import signal
 import socket
 import tempfile
+import threading
 import webbrowser
 from collections.abc import Callable
 from contextlib import suppress
@@ -61,7 +63,7 @@ def serve(
         def announce() -> None:
             tell(address)
             if browser:
-                webbrowser.open(address)
+                _open_browser(address, Path(folder))
 
         server = PageServer(
             uvicorn.Config(
@@ -81,6 +83,15 @@ def serve(
         finally:
             signal.signal(signal.SIGTERM, before)
         return studio.busy
+
+
+def _open_browser(address: str, folder: Path) -> None:
+    """Open the page by way of a file that only its owner reads: everybody reads a browser's command line."""
+    path = folder / "open.html"
+    with open(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w", encoding="utf-8") as file:
+        file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={address}" />\n')
+    # Browsers of the terminal stay until they are left.
+    threading.Thread(target=webbrowser.open, args=(path.as_uri(),), daemon=True).start()
 
 
 def _listening(port: int | None) -> socket.socket:

@@ -4,6 +4,7 @@ Whoever changes it says which revision that is based on; where another tab was f
 is told so. Numbers of revisions only grow, an undone one's is never given again.
 """
 
+import errno
 import os
 import re
 from collections.abc import Callable
@@ -21,6 +22,19 @@ SUFFIX = ".safetensors"
 _NAME = re.compile(r"[\w][\w .()+-]{0,99}")
 _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Names that are no files on Windows, where a capture may be opened next."""
+_LONGEST_NAME = 200
+"""Bytes: files' names have 255 at most, of which the ending and what a half-written file is called need some."""
+_MOST_ALIKE = 1000
+_HELP = {
+    errno.ENOSPC: "free some space",
+    errno.EDQUOT: "free some space",
+    errno.EACCES: "make the folder one that you may write to",
+    errno.EPERM: "make the folder one that you may write to",
+    errno.EROFS: "copy what is opened to a disk that can be written to",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ENOENT: "the folder is gone: put it back",
+}
+"""What to do where a file cannot be made."""
 MOST_UNDONE = 100
 """Revisions that can be gone back to."""
 
@@ -109,18 +123,19 @@ class Session:
             self.expect_current(base)
             field = self._current.expect_field()
             path = self.home / file_name(name)
-            try:
-                os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-            except FileExistsError as error:
-                raise RefusedError(409, f"{path.name} is there already and stays: choose another name") from error
-            except OSError as error:
-                raise StudioError(f"{path}: cannot be written ({error.strerror}): free some space") from error
-            try:
-                save(field, path)
-            except BaseException:
-                path.unlink(missing_ok=True)
-                raise
+            _write_new(field, path)
             return path, self._advance(replace(self._current, ground=field, sliders=REST))
+
+    def keep(self, field: SoundField, stem: str) -> Path:
+        """Write a field that is not heard to a new file of the folder, `stem` with a number where that is taken."""
+        for name in (stem, *(f"{stem} {number}" for number in range(2, _MOST_ALIKE))):
+            path = self.home / f"{name}{SUFFIX}"
+            try:
+                _write_new(field, path)
+            except RefusedError:
+                continue
+            return path
+        raise StudioError(f"{self.home}: has {_MOST_ALIKE} files called {stem}: move them away")
 
     def expect_current(self, base: int) -> None:
         """Raise RefusedError (409), with the current revision, where `base` is another one."""
@@ -145,11 +160,31 @@ class Session:
         return numbered
 
 
+def _write_new(field: SoundField, path: Path) -> None:
+    """Write a field to a file that is not there yet. Raises RefusedError (409) where it is, and StudioError."""
+    try:
+        os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    except FileExistsError as error:
+        raise RefusedError(409, f"{path.name} is there already and stays: choose another name") from error
+    except OSError as error:
+        way_out = _HELP.get(error.errno or 0, f"look at {path.parent}")
+        raise StudioError(f"{path}: cannot be written ({error.strerror}): {way_out}") from error
+    try:
+        save(field, path)
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+
+
 def file_name(name: str) -> str:
     """Return the file that a user's name stands for. Raises RefusedError (400) for a name that leads elsewhere."""
     stem = name.strip().removesuffix(SUFFIX)
     if not _NAME.fullmatch(stem) or _DEVICES.fullmatch(stem) or stem.endswith((".", " ")):
         raise RefusedError(
             400, f"expected a name of letters, digits, spaces, - and _, such as bowl in wood, found {name[:120]!r}"
+        )
+    if len(stem.encode()) > _LONGEST_NAME:
+        raise RefusedError(
+            400, f"expected a name of at most {_LONGEST_NAME} bytes, found {len(stem.encode())}: choose a shorter one"
         )
     return f"{stem}{SUFFIX}"

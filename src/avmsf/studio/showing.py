@@ -15,15 +15,13 @@ import trimesh
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-import avmsf
 from avmsf.capture.folder import read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import Surface, read_surface
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError, StudioError
-from avmsf.export.bundle import FORMAT, MOST_POINTS, write_bundle
+from avmsf.export.bundle import MOST_POINTS, write_bundle
 from avmsf.export.normals import outward_normals
-from avmsf.export.objectfile import read_object
 from avmsf.export.sampledfield import SampledField
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.features import FeatureField
@@ -35,11 +33,6 @@ from avmsf.studio.session import Revision
 
 _CLICKED = 8_000
 """Points of an object without a field."""
-_NOTHING: dict[str, np.ndarray] = {
-    "frequency": np.zeros(0),
-    "damping": np.zeros(0),
-    "noise": np.zeros(0, np.float32),
-}
 _KEPT = 4
 """Revisions whose files are kept: a page may still be reading those of the one before."""
 
@@ -89,10 +82,8 @@ class Showcase:
             fresh = self._is_other_field(revision)
             shown = find_object(self.opened) if fresh else None
             strikes, remarks = self._strikes(revision.field) if fresh else (None, ())
-            if revision.field is None:
-                remarks = _write_bare(sampled, path, shown, self.metres)
-            else:
-                remarks += write_bundle(sampled, path, object=shown, metres=self.metres, strikes=strikes).remarks
+            mute = revision.field is None
+            remarks += write_bundle(sampled, path, object=shown, metres=self.metres, strikes=strikes, mute=mute).remarks
             manifest = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
             manifest["name"] = manifest["name"] or self.opened.name
             if fresh:
@@ -211,39 +202,3 @@ def _thinned(points: Float[Tensor, "points 3"], most: int) -> Float[Tensor, "kep
     if len(points) <= most:
         return points
     return points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:most].sort().values]
-
-
-def _write_bare(sampled: SampledField, folder: Path, path: Path | None, metres: float) -> tuple[str, ...]:
-    """Write an object without a field, in the same form: with points to click, and no modes."""
-    shown = read_object(path, sampled.points, metres=metres)
-    points, normals = sampled.points.float().numpy(), sampled.normals.numpy()
-    parts: dict[str, np.ndarray] = {
-        "points": points,
-        "normals": normals,
-        **_NOTHING,
-        "sine": np.zeros((len(points), 0), np.float32),
-    }
-    tensors, content = {}, b""
-    for name, part in parts.items():
-        tensors[name] = {"offset": len(content), "dtype": part.dtype.name, "shape": list(part.shape)}
-        content += part.astype(part.dtype.newbyteorder("<")).tobytes() + bytes(-part.nbytes % 8)
-    manifest = {
-        "format": FORMAT,
-        "package": avmsf.__version__,
-        "name": sampled.name,
-        "sampleRate": sampled.sample_rate,
-        "samples": 0,
-        "perNewton": False,
-        "modes": 0,
-        "points": len(points),
-        "damping": "shared",
-        "tensors": tensors,
-        "object": {"kind": shown.kind, "file": shown.name},
-        "strikes": [],
-    }
-    folder.mkdir()
-    (folder / "field.bin").write_bytes(content)
-    if shown.name is not None:
-        (folder / shown.name).write_bytes(shown.content)
-    (folder / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
-    return shown.remarks

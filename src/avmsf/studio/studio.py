@@ -1,42 +1,34 @@
 """All that one server has open, and what it does when the page asks: nothing of HTTP, nothing that blocks the loop."""
 
-import asyncio
-import base64
-import binascii
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
-from threading import Lock
-from typing import Any, TypeVar
-
-import anyio
-import anyio.to_thread
+from typing import Any
 
 from avmsf.capture.together import refuse_few
-from avmsf.errors import CaptureError, EditError
+from avmsf.errors import CaptureError
 from avmsf.field.store import load, save
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.editing import MATERIAL_NAMES, Sliders
 from avmsf.studio.jobs import Event, Job, Jobs
-from avmsf.studio.locating import Finder, read_upload
+from avmsf.studio.leading import Wish, is_wish, words_model
+from avmsf.studio.locating import read_upload
 from avmsf.studio.opening import Opened, find_object, shows_more
 from avmsf.studio.refusal import RefusedError
-from avmsf.studio.sampling import length_of
+from avmsf.studio.searches import Searches
 from avmsf.studio.session import Revision, Session
 from avmsf.studio.showing import Showcase
+from avmsf.studio.threads import Result, Threads
 from avmsf.tasks.edits import EDITS, remarks
-from avmsf.tasks.stableaudiofiles import STABLE_AUDIO
 
-Result = TypeVar("Result")
 MODES = 128
-"""Most modes that a reconstruction keeps."""
 STEER_STEPS = 150
 """Steps of a descent in the page: half of the command line's, after which little changes."""
-_SETTLED = 0.5
-"""Seconds that a revision stays the last one before its tables are made: sliders are dragged."""
+_NAME = 50
+"""Characters of what is opened in the name of a field that is kept."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +38,9 @@ class StudioConfig:
     model: str | None = None
     """Folder or name of a Stable Audio pipeline for edits by words; that of the hub's cache where there is one."""
     modes: int = MODES
+    """Most modes that a reconstruction keeps."""
     steps: int = STEER_STEPS
+    """Steps of a descent towards a recording or words."""
 
 
 class Studio:
@@ -61,28 +55,24 @@ class Studio:
         self.session = Session(opened.home, self.showcase.show)
         self.jobs = Jobs()
         self.model = words_model(self.config.model)
-        self._finder: tuple[int, Finder] | None = None
-        self._ahead: asyncio.Task[None] | None = None
-        self._busy, self._threads = 0, Lock()
-        # One edit, one search at a time; recordings are taken in meanwhile.
-        self._computing, self._writing = anyio.CapacityLimiter(1), anyio.CapacityLimiter(1)
+        self.threads = Threads()
+        self.searches = Searches(self.session, self.showcase, self.book, self.threads)
         self.session.open(None if opened.field is None else load(opened.field))
 
     @property
     def busy(self) -> bool:
         """Whether a thread computes, which nothing can interrupt."""
-        return self._busy > 0
+        return self.threads.busy
 
     async def begin(self) -> None:
         """Start what can be done ahead of time."""
-        self._prepare_ahead()
+        self.searches.prepare_ahead()
         if shows_more(self.opened):
             self.make_object()
 
     async def close(self) -> None:
         """Stop what runs."""
-        if self._ahead is not None:
-            self._ahead.cancel()
+        self.searches.close()
         await self.jobs.close()
 
     def manifest(self) -> dict[str, Any]:
@@ -92,30 +82,30 @@ class Studio:
 
     async def locate(self, content: bytes) -> dict[str, Any]:
         """Return where the blows of a recording fell on the current revision. Raises LocationError, CaptureError."""
-        recording = await self._written(read_upload, content)
+        recording = await self.threads.read(read_upload, content)
         revision = self.session.current
-        finder = self._finder_of(revision)
-        blows = await self._computed(finder.locate, recording)
+        finder = self.searches.finder_of(revision)
+        blows = await self.threads.compute(finder.locate, recording)
         return {"revision": revision.number, "blows": blows}
 
     async def edit(self, words: dict[str, Any]) -> dict[str, Any]:
         """Set the sliders, or start to lead the field towards a recording or words. Raises as edits do."""
         base = base_of(words)
-        if words.get("like") is not None or words.get("prompt") is not None:
+        if is_wish(words):
             return await self._lead(base, words)
         sliders = Sliders.read(words)
-        return self._changed(await self._computed(self.session.edit, base, sliders))
+        return self._changed(await self.threads.compute(self.session.edit, base, sliders))
 
     async def undo(self, words: dict[str, Any]) -> dict[str, Any]:
         """Go back by one revision."""
-        return self._changed(await self._computed(self.session.undo, base_of(words)))
+        return self._changed(await self.threads.compute(self.session.undo, base_of(words)))
 
     async def save(self, words: dict[str, Any]) -> dict[str, Any]:
         """Write the field to a new file."""
         name = words.get("name")
         if not isinstance(name, str):
             raise RefusedError(400, f'"name": expected the new file\'s name, found {name!r}')
-        path, revision = await self._computed(self.session.save, base_of(words), name)
+        path, revision = await self.threads.compute(self.session.save, base_of(words), name)
         return {"file": str(path), **self._changed(revision)}
 
     async def capture(self) -> dict[str, Any]:
@@ -124,14 +114,14 @@ class Studio:
         shown = find_object(self.opened)
         running = self.jobs.current
         return {
-            **await self._written(book.describe),
+            **await self.threads.read(book.describe),
             "object": None if shown is None else shown.name,
             "job": None if running is None else running.identifier,
         }
 
     async def with_book(self, act: Callable[[StrikeBook], Result]) -> Result:
         """Do something with the capture's strikes, one after another. Raises RefusedError (404) without a capture."""
-        return await self._written(act, self.expect_book())
+        return await self.threads.write(act, self.expect_book())
 
     def expect_book(self) -> StrikeBook:
         """Return the capture's strikes. Raises RefusedError (404) without a capture."""
@@ -142,7 +132,7 @@ class Studio:
     async def reconstruct(self) -> Job:
         """Begin to make a field of the capture, which is heard when it is done."""
         book = self.expect_book()
-        strikes = await self._written(book.strikes)
+        strikes = await self.threads.read(book.strikes)
         try:
             refuse_few(len(strikes))
         except CaptureError as error:
@@ -159,78 +149,51 @@ class Studio:
     async def _lead(self, base: int, words: dict[str, Any]) -> dict[str, Any]:
         self.session.expect_current(base)
         field = self.session.current.expect_field()
+        wish = Wish.read(words, model=self.model)
+        if wish.like is not None:
+            await self.threads.read(read_upload, wish.like)
+        self.jobs.expect_none()
         place = Path(tempfile.mkdtemp(prefix="lead-", dir=self.folder))
-        task: Event = {"task": "lead", "field": str(place / "field"), "output": str(place / "led")}
-        task["steps"] = self.config.steps
-        if words.get("prompt") is not None:
-            if self.model is None:
-                raise EditError(
-                    "editing by words needs the extra and the model: pip install 'avmsf[text]' and start avmsf studio "
-                    "with --model FOLDER"
-                )
-            prompt = words["prompt"]
-            if not isinstance(prompt, str) or not prompt.strip():
-                raise RefusedError(400, 'prompt: expected a description such as "a wooden bowl is hit", found none')
-            task |= {"prompt": prompt, "model": self.model}
-        else:
-            recording = _unpacked(words["like"])
-            await self._written(read_upload, recording)
-            (place / "like.wav").write_bytes(recording)
-            task["recording"] = str(place / "like.wav")
-        await self._computed(save, field, place / "field")
-        return {"job": self.jobs.start("lead the sound", task, partial(self._take_led, base)).identifier}
+        try:
+            task = wish.task(place, steps=self.config.steps, model=self.model)
+            await self.threads.compute(save, field, place / "field")
+            return {"job": self.jobs.start("lead the sound", task, partial(self._take_led, base)).identifier}
+        except BaseException:
+            shutil.rmtree(place, ignore_errors=True)
+            raise
 
     async def _take_field(self, result: Event) -> Event:
         path = Path(result["field"])
-        revision = await self._computed(lambda: self.session.open(load(path)))
+        revision = await self.threads.compute(lambda: self.session.open(load(path)))
         return {**result, **self._changed(revision)}
 
     async def _take_object(self, result: Event) -> Event:
         current = self.session.current
         if current.field is None:
-            current = await self._computed(self.session.open, None)
+            current = await self.threads.compute(self.session.open, None)
         return {**result, **self._changed(current)}
 
     async def _take_led(self, base: int, result: Event) -> Event:
-        def take() -> Revision:
+        def take() -> Event:
             led = load(result["output"])
-            return self.session.lead(base, led, tuple(remarks(led.origin.report[EDITS][-1:], led)))
+            try:
+                revision = self.session.lead(base, led, tuple(remarks(led.origin.report[EDITS][-1:], led)))
+            except RefusedError:
+                # Minutes of work; what the other tab has done since is not to be overwritten either.
+                kept = self.session.keep(led, f"{self.opened.name[:_NAME]} led")
+                words = f"the field was changed while its sound was led, so that is kept beside it: open {kept}"
+                now = self.session.current
+                return {"file": str(kept), "revision": now.number, "remarks": [words, *now.remarks]}
+            return {"revision": revision.number, "remarks": list(revision.remarks)}
 
-        return self._changed(await self._computed(take))
+        done = await self.threads.compute(take)
+        self.searches.prepare_ahead()
+        return done
 
     def _changed(self, revision: Revision) -> dict[str, Any]:
         """Return what a page is told of a new revision."""
-        self._prepare_ahead()
+        self.searches.prepare_ahead()
         return {"revision": revision.number, "remarks": list(revision.remarks)}
-
-    def _finder_of(self, revision: Revision) -> Finder:
-        if self._finder is None or self._finder[0] != revision.number:
-            field = revision.expect_field()
-            points = self.showcase.current.sampled.points.double() * length_of(field)
-            settings = None if self.book is None else self.book.settings
-            self._finder = (revision.number, Finder(field, points.float(), length_of(field), settings))
-        return self._finder[1]
-
-    def _prepare_ahead(self) -> None:
-        if self._ahead is not None:
-            self._ahead.cancel()
-        if self.session.current.field is not None:
-            self._ahead = asyncio.create_task(self._prepare(self.session.current))
-
-    async def _prepare(self, revision: Revision) -> None:
-        await asyncio.sleep(_SETTLED)
-        finder = self._finder_of(revision)
-        await anyio.to_thread.run_sync(partial(self._counted, finder.prepare))
-
-    def _counted(self, act: Callable[..., Result], *arguments: Any) -> Result:
-        """Do something in a thread that may outlive the server."""
-        with self._threads:
-            self._busy += 1
-        try:
-            return act(*arguments)
-        finally:
-            with self._threads:
-                self._busy -= 1
 
     def _live(self, revision: Revision) -> dict[str, Any]:
         abilities = []
@@ -251,24 +214,8 @@ class Studio:
             "rows": rows,
             "materials": list(MATERIAL_NAMES),
             "job": None if running is None else running.identifier,
+            "jobKind": None if running is None else running.kind,
         }
-
-    async def _computed(self, act: Callable[..., Result], *arguments: Any) -> Result:
-        return await anyio.to_thread.run_sync(partial(self._counted, act, *arguments), limiter=self._computing)
-
-    async def _written(self, act: Callable[..., Result], *arguments: Any) -> Result:
-        return await anyio.to_thread.run_sync(partial(act, *arguments), limiter=self._writing)
-
-
-def words_model(given: str | None) -> str | None:
-    """Return the model for edits by words: the given one, that of the hub's cache, or None where none can be used."""
-    if any(find_spec(name) is None for name in ("diffusers", "torchsde", "transformers")):
-        return None
-    if given is not None:
-        return given
-    from huggingface_hub import try_to_load_from_cache
-
-    return STABLE_AUDIO if isinstance(try_to_load_from_cache(STABLE_AUDIO, "model_index.json"), str) else None
 
 
 def base_of(words: dict[str, Any]) -> int:
@@ -277,10 +224,3 @@ def base_of(words: dict[str, Any]) -> int:
     if not isinstance(base, int) or isinstance(base, bool):
         raise RefusedError(400, f'"base": expected the revision that the change is of, found {base!r}: reload the page')
     return base
-
-
-def _unpacked(text: Any) -> bytes:
-    try:
-        return base64.b64decode(text, validate=True)
-    except (TypeError, ValueError, binascii.Error) as error:
-        raise RefusedError(400, "like: expected a recording as base64, found what is none: reload the page") from error

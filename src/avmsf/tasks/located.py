@@ -1,5 +1,6 @@
 """All that is found out about a located blow, as plain values for programs and pages."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -24,6 +25,16 @@ def symmetries_of(field: SoundField) -> Symmetries | None:
         )
     except AvmsfError:
         return None
+
+
+def enlarged(symmetries: Symmetries, factor: float) -> Symmetries:
+    """Return the symmetries of an object `factor` times as large about the origin."""
+    return replace(
+        symmetries,
+        rotations=tuple(replace(each, point=each.point * factor) for each in symmetries.rotations),
+        mirrors=tuple(replace(each, point=each.point * factor) for each in symmetries.mirrors),
+        spacing=symmetries.spacing * factor,
+    )
 
 
 def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: float) -> dict[str, Any]:

@@ -7,18 +7,23 @@
 //
 // Between inputs a mode is run as y[n] = 2 Re(z) y[n-1] - |z|^2 y[n-2] within a block and its complex state is carried
 // from block to block by z^block, so that rounding does not add up over seconds. All in double precision.
+//
+// All of it is one module that imports nothing, long as it is: an audio thread loads a page's worklet as one file, and
+// from a page that is itself one file there is nothing else to be had.
 
 /** Amplitude, over that of a blow's loudest mode, below which all that is left out of a blow lies: -120 dB. */
 const INAUDIBLE = 1e-6;
-/** Loudest sample that leaves. Below it the limiter changes nothing, not by one bit. */
+/** Loudest sample that leaves. */
 const CEILING = 0.98;
+/** Louder than any sound, in either direction: what is, and what is no number, is a fault and left out. */
+const ABSURD = 1e9;
 /** Seconds in which the limiter lets go. */
 const RELEASE = 0.1;
 /** Seconds in which a blow that has to make room, or a field that was replaced, fades. */
 const FADE = 0.01;
 /** Seconds in which the noise fades behind the end of its draw. */
 const NOISE_FADE = 0.05;
-/** Seconds between two reports to the page. */
+/** Seconds between two words to the page on whether the limiter is at work. */
 const REPORT = 0.05;
 
 /** Modes with their states. */
@@ -167,6 +172,9 @@ export class Bank {
     this.spare = [];
     this.scratch = new Float64Array(block);
     this.begun = [];
+    // Of what rings in shared resonators: the lowest floor of the blows that have a part in it, and its end.
+    this.floor = Infinity;
+    this.until = 0;
   }
 
   strike(blow) {
@@ -177,7 +185,7 @@ export class Bank {
   render(out, frame) {
     if (this.waiting.length) this.begin(frame);
     const { shared, block } = this;
-    if (shared !== null) shared.run(out, block, this.floor());
+    if (shared !== null) shared.run(out, block, this.floor);
     for (const voice of this.sounding) {
       const target = voice.leaving === Infinity ? out : this.scratch.fill(0);
       const begin = Math.max(0, voice.frame - frame);
@@ -211,8 +219,11 @@ export class Bank {
         voice.resonators = this.spare.pop() ?? new Resonators(this.modes);
         voice.resonators.tune(this.field.frequency, blow.damping, this.rate, this.block);
       }
-      // Long enough for the slowest mode to sink below the floor.
-      voice.until = voice.frame + blow.force.length + this.lasting(voice);
+      if (this.shared !== null) {
+        this.floor = Math.min(this.floor, voice.floor);
+        // Long enough for the slowest mode to sink below the floor.
+        this.until = Math.max(this.until, voice.frame + blow.force.length + this.lasting(voice));
+      }
       this.sounding.push(voice);
       this.begun.push({ id: blow.id, frame: voice.frame });
     }
@@ -220,7 +231,7 @@ export class Bank {
   }
 
   lasting(voice) {
-    const damping = voice.damping ?? this.field.damping;
+    const { damping } = this.field;
     let longest = 0;
     for (let mode = 0; mode < this.modes; mode++) {
       const size = Math.hypot(voice.sine[mode], voice.cosine[mode]);
@@ -229,19 +240,12 @@ export class Bank {
     return longest * this.rate;
   }
 
-  /** The lowest floor of all blows that sound, for any of them may have a part in a shared resonator. */
-  floor() {
-    let least = Infinity;
-    for (const voice of this.sounding) least = Math.min(least, voice.floor);
-    return least;
-  }
-
   makeRoom() {
     let quietest = null, least = Infinity;
     for (const voice of this.sounding) {
       if (voice.leaving !== Infinity) continue;
       // One that is still being fed would be cut at its loudest.
-      const energy = voice.fed < voice.force.length ? Number.MAX_VALUE : (voice.resonators?.energy ?? voice.until);
+      const energy = voice.fed < voice.force.length ? Number.MAX_VALUE : (voice.resonators?.energy ?? voice.frame);
       if (energy < least) [quietest, least] = [voice, energy];
     }
     if (quietest !== null) quietest.leaving = Math.round(FADE * this.rate);
@@ -274,37 +278,58 @@ export class Bank {
     const fade = NOISE_FADE * this.rate, length = this.field.noise.length;
     for (const voice of this.sounding) {
       const noise = this.noisy && voice.heard < length + Math.min(fade, length);
-      const rings = voice.resonators === null ? frame < voice.until : voice.resonators.count > 0;
-      // What has faded is over, but for its part in shared resonators, which goes on.
-      const stays = voice.leaving > 0 ? noise || rings || voice.fed < voice.force.length : voice.resonators === null && rings;
+      const own = voice.resonators, feeding = voice.fed < voice.force.length;
+      // What a blow has given to shared resonators rings on without it; it is only waited for until it is fed.
+      const stays = voice.leaving > 0 ? noise || feeding || own?.count > 0 : own === null && feeding;
       if (stays) this.sounding[kept++] = voice;
-      else if (voice.resonators !== null) this.spare.push(voice.resonators);
+      else if (own !== null) this.spare.push(own);
     }
     this.sounding.length = kept;
-    if (kept === 0 && this.shared !== null) this.shared.silence();
-  }
-
-  get ringing() {
-    if (this.shared !== null) return this.shared.count;
-    return this.sounding.reduce((sum, voice) => sum + voice.resonators.count, 0);
+    if (this.shared !== null && kept === 0 && (frame >= this.until || this.shared.count === 0)) {
+      this.shared.silence();
+      this.floor = Infinity;
+    }
   }
 }
 
-/** Holds samples under the ceiling: as they are below it, else turned down at once and let up slowly. */
+/**
+ * Holds samples under the ceiling: turned down before the peak comes and let up slowly. Below the ceiling, less what is
+ * let up during the delay, they leave as they are, to the bit. All are late by `ahead` samples.
+ */
 export class Limiter {
-  constructor(rate) {
+  constructor(rate, ahead) {
     this.release = Math.exp(-1 / (RELEASE * rate));
+    // A peak is remembered this much smaller when the samples that it belongs to leave.
+    this.most = CEILING * this.release ** ahead;
+    this.span = ahead + 1;
+    this.late = new Float64Array(this.span);
+    // By how much each of the last samples asked for less, and their sum: the mean of them slopes down to a peak.
+    this.less = new Float64Array(this.span);
+    this.sum = 0;
+    this.untouched = 0;
+    this.place = 0;
     this.peak = 0;
     this.limited = false;
   }
 
   hold(samples, block) {
+    const { late, less, span, release, most } = this;
     for (let n = 0; n < block; n++) {
-      this.peak = Math.max(Math.abs(samples[n]), this.peak * this.release);
-      if (this.peak > CEILING) {
-        samples[n] *= CEILING / this.peak;
+      const { place } = this;
+      late[place] = Math.abs(samples[n]) < ABSURD ? samples[n] : 0;
+      this.peak = Math.max(Math.abs(late[place]), this.peak * release);
+      const wanted = this.peak > most ? 1 - most / this.peak : 0;
+      this.sum += wanted - less[place];
+      less[place] = wanted;
+      if (wanted > 0) {
         this.limited = true;
+        this.untouched = 0;
+      } else if (++this.untouched >= span) {
+        // Not what rounding has left of the sum.
+        this.sum = 0;
       }
+      this.place = place + 1 === span ? 0 : place + 1;
+      samples[n] = late[this.place] * (1 - this.sum / span);
     }
     // Long silence must not creep towards the smallest of numbers, which are slow.
     if (this.peak < 1e-30) this.peak = 0;
@@ -316,25 +341,25 @@ if (typeof AudioWorkletProcessor !== "undefined") {
   const BLOCK = 128;
 
   class ModalBankProcessor extends AudioWorkletProcessor {
-    constructor({ processorOptions: { field, level, voices, blows } }) {
+    constructor({ processorOptions: { field, level, voices, blows, ahead } }) {
       super();
       this.voices = voices;
       this.bank = new Bank(field, sampleRate, BLOCK, voices);
       for (const blow of blows) this.bank.strike(blow);
       this.leaving = [];
-      this.limiter = new Limiter(sampleRate);
+      this.limiter = new Limiter(sampleRate, ahead);
+      this.ahead = ahead;
       this.level = this.wanted = level;
       this.mix = new Float64Array(BLOCK);
       this.old = new Float64Array(BLOCK);
       this.reported = 0;
-      this.quiet = true;
+      this.said = false;
       this.port.onmessage = ({ data }) => this.heed(data);
     }
 
     heed(message) {
       if (message.type === "strike") this.bank.strike(message.blow);
       else if (message.type === "level") this.wanted = message.level;
-      else if (message.type === "hush") this.replace(this.bank.field);
       else if (message.type === "field") this.replace(message.field);
     }
 
@@ -370,13 +395,13 @@ if (typeof AudioWorkletProcessor !== "undefined") {
     }
 
     report() {
-      for (const blow of this.bank.begun) this.port.postMessage({ type: "begun", ...blow });
+      for (const { id, frame } of this.bank.begun) this.port.postMessage({ type: "begun", id, frame: frame + this.ahead });
       this.bank.begun.length = 0;
-      const voices = this.bank.sounding.length;
-      if (currentFrame - this.reported < REPORT * sampleRate || (this.quiet && voices === 0)) return;
-      this.port.postMessage({ type: "state", voices, modes: this.bank.ringing, limited: this.limiter.limited });
+      if (currentFrame - this.reported < REPORT * sampleRate) return;
+      const { limited } = this.limiter;
+      if (limited !== this.said) this.port.postMessage({ type: "limited", limited });
       this.reported = currentFrame;
-      this.quiet = voices === 0;
+      this.said = limited;
       this.limiter.limited = false;
     }
   }

@@ -26,12 +26,14 @@ export class BlowInput {
     canvas.setAttribute("role", "application");
     canvas.setAttribute(
       "aria-label",
-      "The object. Click to strike it, drag to turn it. By keys: arrows turn it, Enter strikes what is in the middle.",
+      "The object. Click to strike it, drag to turn it. By keys: arrows turn it, Enter strikes what is in the middle, " +
+        "Shift and Enter strikes it hardest.",
     );
     canvas.addEventListener("pointerdown", (event) => this.#down(event));
     canvas.addEventListener("pointermove", (event) => this.#move(event));
     canvas.addEventListener("pointerup", (event) => this.#up(event));
     canvas.addEventListener("pointercancel", () => this.#end());
+    canvas.addEventListener("lostpointercapture", () => this.#end());
     canvas.addEventListener("pointerleave", () => this.hover(null));
     canvas.addEventListener("keydown", (event) => this.#key(event));
   }
@@ -42,8 +44,9 @@ export class BlowInput {
     if (this.atPress()) {
       const hit = this.view.pick(x, y);
       if (hit) {
-        // A press on the object plays; beside it, it turns the object.
+        // A press on the object plays; beside it, it turns the object. Wherever it ends, the object can be turned again.
         this.view.controls.enabled = false;
+        this.view.canvas.setPointerCapture(event.pointerId);
         this.strike(hit, pressure(event), event);
       }
       return;
@@ -71,7 +74,6 @@ export class BlowInput {
   }
 
   #up(event) {
-    this.view.controls.enabled = true;
     const press = this.#press;
     this.#end();
     if (!press) return;
@@ -80,6 +82,7 @@ export class BlowInput {
   }
 
   #end() {
+    this.view.controls.enabled = true;
     this.#press?.ring.remove();
     this.#press = null;
   }
@@ -100,9 +103,10 @@ export class BlowInput {
     const turns = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
     if (event.key in turns) this.view.turn(...turns[event.key].map((step) => step * 0.12));
     else if (event.key === "Enter" || event.key === " ") {
+      // A key that is held strikes once: it repeats faster than anyone strikes.
       const box = this.view.canvas.getBoundingClientRect();
-      const hit = this.view.pick(box.left + box.width / 2, box.top + box.height / 2);
-      if (hit) this.strike(hit, 1, event);
+      const hit = event.repeat ? null : this.view.pick(box.left + box.width / 2, box.top + box.height / 2);
+      if (hit) this.strike(hit, event.shiftKey ? HARDEST : 1, event);
     } else return;
     event.preventDefault();
   }

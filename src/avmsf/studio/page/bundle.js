@@ -47,8 +47,13 @@ function readTensor(buffer, offset, dtype, shape, what) {
   if (bytes === undefined) throw new Error(`${what} is of type ${dtype}, which this page does not know`);
   if (offset + count * bytes > buffer.byteLength)
     throw new Error(`${what} is cut short: expected ${offset + count * bytes} bytes, found ${buffer.byteLength}: export the page again`);
-  if (dtype === "float16") return Float32Array.from(new Uint16Array(buffer, offset, count), halfToNumber);
-  return new ARRAYS[dtype](buffer, offset, count);
+  const tensor = dtype === "float16"
+    ? Float32Array.from(new Uint16Array(buffer, offset, count), halfToNumber) : new ARRAYS[dtype](buffer, offset, count);
+  for (let place = 0; place < count; place++) {
+    if (!Number.isFinite(tensor[place]))
+      throw new Error(`${what}: expected numbers, found ${tensor[place]} at place ${place}: export the page again`);
+  }
+  return tensor;
 }
 
 function halfToNumber(bits) {

@@ -97,7 +97,7 @@ export function say(words, { name = words, bad = false, answers = [], seconds = 
   );
   const word = element(
     "div",
-    { className: bad ? "word bad" : "word", "data-name": name, role: bad ? "alert" : "status" },
+    { className: bad ? "word bad" : "word", "data-name": name },
     element("div", {}, words, answers.length ? element("div", { className: "answers" }, ...actions) : null),
     button("×", close, { className: "small", "aria-label": "Close this message" }),
   );

@@ -1,9 +1,10 @@
 /** The tab that edits: sliders heard at once, undo, saved as a new field. */
 
-import { button, element, filePicker, say, Slider, unsay } from "./dom.js";
+import { Changes } from "./changes.js";
+import { button, element, say, Slider } from "./dom.js";
+import { leadGroup } from "./lead.js";
 import { server } from "./server.js";
 
-const SETTLED_MS = 200;
 const factor = (value) => `× ${value.toPrecision(3)}`;
 const decibel = (value) => `${value > 0 ? "+" : ""}${value.toFixed(1)} dB`;
 const WHOLE = {
@@ -22,10 +23,10 @@ const SINGLE = {
 };
 const MATERIALS = ["ceramic", "glass", "wood", "plastic", "iron", "polycarbonate", "steel"];
 
-/** `reload()` fetches the server's present bundle and takes it. */
-export function editSheet(studio, reload) {
+/** `load()` fetches the server's present bundle and takes it. */
+export function editSheet(studio, load) {
   const single = new Map();
-  const onInput = () => changed();
+  const onInput = () => changes.moved();
   const makeSliders = (which, onInput) =>
     Object.fromEntries(
       Object.entries(which).map(([name, [words, options]]) => [name, new Slider(words, { ...options, onInput })]),
@@ -34,7 +35,7 @@ export function editSheet(studio, reload) {
   const modeSliders = makeSliders(SINGLE, () => {
     const values = Object.fromEntries(Object.entries(modeSliders).map(([name, slider]) => [name, slider.value]));
     single.set(studio.bank, values);
-    changed();
+    changes.moved();
   });
   const names = studio.live.materials ?? MATERIALS;
   const select = (label, none) =>
@@ -54,66 +55,7 @@ export function editSheet(studio, reload) {
     modes: [...single].filter(([, values]) => !atRest(values)).map(([mode, values]) => ({ mode, ...values })),
   });
 
-  // One request at a time: while one runs, the newest wish waits and older ones are forgotten.
-  let [running, waiting, timer] = [false, false, null];
-  const changed = () => {
-    clearTimeout(timer);
-    timer = setTimeout(send, SETTLED_MS);
-  };
-  const send = async () => {
-    if (running) {
-      waiting = true;
-      return;
-    }
-    running = true;
-    const answer = await attemptEdit(() => server.edit(studio.revision, asked()), send);
-    if (answer) {
-      await show(answer);
-      studio.strike(studio.row ?? studio.modes.loudestRow);
-    }
-    running = false;
-    if (waiting) {
-      waiting = false;
-      await send();
-    }
-  };
   const tell = (words) => remarks.replaceChildren(...words.map((word) => element("p", { className: "faint" }, word)));
-  const show = async ({ revision }) => {
-    studio.revision = revision;
-    await reload();
-  };
-
-  /** Do what changes the field; where another tab was faster, nothing is overwritten, and the user chooses. */
-  const attemptEdit = async (action, again) => {
-    busy.hidden = false;
-    try {
-      const answer = await action();
-      unsay("edit");
-      return answer;
-    } catch (error) {
-      if (error.stale) {
-        say(`Another tab changed this field meanwhile. ${error.message}`, {
-          name: "edit",
-          bad: true,
-          answers: [
-            ["Show its change", () => takeTheirs(error.revision)],
-            ["Put mine in its place", () => ((studio.revision = error.revision), again())],
-          ],
-        });
-      } else {
-        const answers = error.unreachable ? [["Try again", again]] : [];
-        say(error.message, { name: "edit", bad: true, answers });
-      }
-      return undefined;
-    } finally {
-      busy.hidden = true;
-    }
-  };
-  const takeTheirs = async (revision) => {
-    studio.revision = revision;
-    await reload();
-    takeSliders();
-  };
   /** Put the sliders where the server has them. */
   const takeSliders = () => {
     const there = studio.live.sliders ?? {};
@@ -124,23 +66,50 @@ export function editSheet(studio, reload) {
     for (const { mode, ...values } of there.modes ?? []) single.set(mode, { ...values, db: values.db ?? -40 });
     showMode();
   };
-
-  const undo = button("Undo", async () => {
-    const answer = await attemptEdit(
-      () => server.undo(studio.revision),
-      () => undo.click(),
-    );
-    if (!answer) return;
-    await show(answer);
-    takeSliders();
-    studio.strike(studio.row ?? studio.modes.loudestRow);
+  const changes = new Changes(studio, {
+    load,
+    wish: asked,
+    takeSliders,
+    onBusy: (yes) => {
+      busy.hidden = !yes;
+    },
   });
+
+  // What changes the field from under the sliders holds them until it is done; work of minutes holds the buttons too.
+  const held = { moments: 0, minutes: 0 };
+  const showHolds = () => {
+    const all = [...Object.values(sliders), ...Object.values(modeSliders)].map(({ input }) => input);
+    for (const control of [...all, from, to]) control.disabled = held.moments + held.minutes > 0;
+    for (const control of [undo, reset, save]) control.disabled = held.minutes > 0;
+    undo.disabled ||= !studio.live?.undo;
+  };
+  const hold = async (work, time = "moments") => {
+    held[time] += 1;
+    showHolds();
+    try {
+      await work();
+    } finally {
+      held[time] -= 1;
+      showHolds();
+    }
+  };
+
+  const undo = button("Undo", () =>
+    hold(() =>
+      changes.queue(async () => {
+        if (!(await changes.settle())) return;
+        const again = () => undo.click();
+        const answer = await changes.ask(() => server.undo(studio.revision), { again, mine: false });
+        if (answer && (await changes.show(answer, { sliders: true }))) studio.strikeAgain();
+      }),
+    ),
+  );
   const reset = button("All at rest", () => {
     Object.values(sliders).forEach((slider) => slider.reset());
     [from.value, to.value] = ["", ""];
     single.clear();
     showMode();
-    changed();
+    changes.moved();
   });
 
   const name = element("input", { type: "text", "aria-label": "Name of the new field", placeholder: "new-name" });
@@ -151,12 +120,16 @@ export function editSheet(studio, reload) {
       name.focus();
       return;
     }
-    const answer = await attemptEdit(
-      () => server.save(studio.revision, wanted),
-      () => save.click(),
+    await hold(() =>
+      changes.queue(async () => {
+        if (!(await changes.settle())) return;
+        const again = () => save.click();
+        const answer = await changes.ask(() => server.save(studio.revision, wanted), { again });
+        if (!answer) return;
+        if (answer.revision !== undefined) await changes.show(answer, { sliders: true });
+        say(`Saved: ${answer.file}`, { name: "saved" });
+      }),
     );
-    if (answer) say(`Saved: ${answer.file}`, { name: "saved" });
-    if (answer?.revision) await show({ revision: answer.revision }).then(takeSliders);
   });
 
   const modeTitle = element("p", { className: "faint" });
@@ -175,7 +148,7 @@ export function editSheet(studio, reload) {
   };
   studio.on("mode", showMode);
   studio.on("bundle", () => {
-    undo.disabled = !studio.live?.undo;
+    showHolds();
     tell(studio.live?.remarks ?? []);
   });
 
@@ -194,7 +167,7 @@ export function editSheet(studio, reload) {
     busy,
     remarks,
   );
-  if (studio.can("like")) sheet.append(leadGroup(studio, show));
+  if (studio.can("like")) sheet.append(leadGroup(studio, changes, hold));
   if (studio.can("save"))
     sheet.append(
       element("div", { className: "group" }, element("h2", {}, "Save"), element("div", { className: "row" }, name, save)),
@@ -204,54 +177,3 @@ export function editSheet(studio, reload) {
 }
 
 const atRest = ({ db, pitch, decay }) => db === 0 && pitch === 1 && decay === 1;
-
-/** Lead the sound towards a recording or words: minutes of work, so with progress and a way to stop. */
-function leadGroup(studio, show) {
-  const progress = element("progress", { hidden: true, "aria-label": "Progress" });
-  const stage = element("small", { "aria-live": "polite" });
-  let job = null;
-  const complain = (error) => say(error.message, { name: "edit", bad: true });
-  const stop = button("Stop", () => server.cancel(job).catch(complain), { hidden: true });
-  const lead = async (towards) => {
-    try {
-      ({ job } = await server.edit(studio.revision, towards));
-    } catch (error) {
-      complain(error);
-      return;
-    }
-    [progress.hidden, stop.hidden] = [false, false];
-    server.follow(job, async (message, ended) => {
-      if (message.total) [progress.max, progress.value] = [message.total, message.done ?? 0];
-      stage.textContent = [message.stage, message.words].filter(Boolean).join(": ");
-      if (!ended) return;
-      [job, progress.hidden, stop.hidden] = [null, true, true];
-      if (message.error) complain(new Error(message.error));
-      else if (message.revision !== undefined) {
-        await show(message);
-        studio.strike(studio.row ?? studio.modes.loudestRow);
-      }
-    });
-  };
-  const leadLike = async (file) => lead({ like: await base64(file) });
-  const rows = [filePicker("Towards a recording …", ".wav,audio/wav", leadLike)];
-  if (studio.can("words")) {
-    const placeholder = "a wooden bowl is hit";
-    const text = element("input", { type: "text", "aria-label": "What it should sound like", placeholder });
-    rows.push(text, button("Towards these words", () => lead({ prompt: text.value })));
-  }
-  return element(
-    "div",
-    { className: "group" },
-    element("h2", {}, "Lead the sound"),
-    element("div", { className: "row" }, ...rows, stop),
-    progress,
-    stage,
-  );
-}
-
-async function base64(file) {
-  const bytes = new Uint8Array(await file.arrayBuffer());
-  let letters = "";
-  for (const byte of bytes) letters += String.fromCharCode(byte);
-  return btoa(letters);
-}

@@ -2,45 +2,38 @@
 
 import { amountScale } from "./colours.js";
 import { attempt, button, element, filePicker, millimetres, say } from "./dom.js";
-import { MicrophoneError, Recorder } from "./recorder.js";
+import { RecordButton } from "./recordbutton.js";
 import { numbers, server } from "./server.js";
-import { looksLikeWav } from "./wav.js";
+import { expectWav } from "./wav.js";
 
 export function findSheet(studio) {
   const results = element("div", { className: "group", "aria-live": "polite" });
-  const level = element("meter", { min: 0, max: 1, high: 0.95, "aria-label": "Microphone level" });
-  const heard = element("small", {}, "");
   const busy = element("progress", { hidden: true, "aria-label": "Locating" });
   let painted = null;
+  const record = new RecordButton({ done: (blob) => locate(blob, "the recording") });
 
-  const recorder = new Recorder(({ peak, seconds, struck }) => {
-    level.value = peak;
-    heard.textContent = `${seconds.toFixed(1)} s, ${struck ? "blow heard" : "waiting for the blow"}`;
-  });
-  const record = button("● Record", async () => {
-    if (recorder.recording) {
-      recorder.stop();
-      return;
-    }
-    record.textContent = "■ Stop";
-    record.classList.add("recording");
-    try {
-      const { blob } = await recorder.record();
-      await locate(blob, "the recording");
-    } catch (error) {
-      if (!(error instanceof MicrophoneError)) throw error;
-      say(error.message, { name: "microphone", bad: true });
-    } finally {
-      record.textContent = "● Record";
-      record.classList.remove("recording");
-    }
-  });
-
+  // One search at a time: while one runs, the newest recording waits and older ones are forgotten.
+  let [running, wanted] = [false, null];
   const locate = async (blob, name) => {
-    busy.hidden = false;
-    const answer = await attempt(() => server.locate(blob), "locate");
-    busy.hidden = true;
-    if (answer) show(answer.blows, name);
+    wanted = { blob, name };
+    if (running) return;
+    [running, busy.hidden] = [true, false];
+    while (wanted) {
+      const asked = wanted;
+      wanted = null;
+      const answer = await attempt(() => server.locate(asked.blob), "locate");
+      if (!answer || wanted) continue;
+      if (answer.revision === undefined || answer.revision === studio.revision) show(answer.blows, asked.name);
+      else tellStale(answer.revision, asked);
+    }
+    [running, busy.hidden] = [false, true];
+  };
+  /** Where a blow fell on another field than the one that is shown is not where it fell on this one. */
+  const tellStale = (revision, { blob, name }) => {
+    const words = `The field was changed while ${name} was looked for, so what was found is not shown.`;
+    const again = ["Look for it again", () => locate(blob, name)];
+    const load = ["Show the changed field", () => location.reload()];
+    say(words, { name: "locate", bad: true, answers: [revision > studio.revision ? load : again] });
   };
 
   const show = (blows, name) => {
@@ -61,12 +54,8 @@ export function findSheet(studio) {
   };
 
   const take = async (file) => {
-    if (!(await looksLikeWav(file))) {
-      const words = `${file.name}: expected a WAV file, found another kind. Save the sound as WAV and drop it again.`;
-      say(words, { name: "locate", bad: true });
-      return;
-    }
-    await locate(file, file.name);
+    const fine = await attempt(() => expectWav(file).then(() => true), "locate");
+    if (fine) await locate(file, file.name);
   };
 
   // Paint and found places belong to the field as it was when it was asked.
@@ -81,9 +70,8 @@ export function findSheet(studio) {
     "section",
     {},
     element("p", { className: "faint" }, "Strike the real object near the microphone, or drop a WAV file anywhere."),
-    element("div", { className: "row" }, record, filePicker("Choose a WAV file …", ".wav,audio/wav", take)),
-    level,
-    heard,
+    element("div", { className: "row" }, record.button, filePicker("Choose a WAV file …", ".wav,audio/wav", take)),
+    record.level,
     busy,
     results,
   );

@@ -73,6 +73,9 @@ async function startSound(studio) {
 
 async function fieldTabs(studio) {
   const strike = strikeSheet(studio);
+  studio.on("bundle", () => {
+    for (const control of strike.element.querySelectorAll("button")) control.disabled = studio.modes.points === 0;
+  });
   const sheets = [
     { name: "strike", words: "Strike", ...strike },
     { name: "modes", words: "Modes", ...modeTable(studio) },
@@ -86,9 +89,9 @@ async function fieldTabs(studio) {
   const adding = () => capture !== undefined && !capture.element.hidden;
   return {
     atPress: () => !adding() && strike.atPress(),
-    struck: (hit, factor, event) => {
+    struck: (hit, factor) => {
       if (adding()) capture.choose(hit);
-      else studio.strike(hit.row, { factor, since: event.timeStamp });
+      else studio.strike(hit.row, { factor });
     },
     take: find && ((file) => (adding() ? capture.take(file) : (show("find"), find.take(file)))),
   };
@@ -104,13 +107,9 @@ async function captureTabs(studio) {
 
 /** Fetch what the server now has; after an edit, say, or when another tab was faster. */
 async function reload(studio) {
-  try {
-    const bundle = await loadBundle();
-    await studio.view?.replace(bundle);
-    studio.take(bundle);
-  } catch (error) {
-    say(error.message, { name: "reload", bad: true });
-  }
+  const bundle = await loadBundle();
+  await studio.view?.replace(bundle);
+  studio.take(bundle);
 }
 
 async function showObject(studio, { atPress, struck }, library) {
@@ -128,9 +127,9 @@ async function showObject(studio, { atPress, struck }, library) {
   }
   at("stage").append(element("div", { className: "crosshair" }));
   new BlowInput(studio.view, {
-    strike: (hit, factor, event) => {
+    strike: (hit, factor) => {
       at("hint").hidden = true;
-      struck(hit, factor, event);
+      struck(hit, factor);
     },
     hover: (hit) => studio.view.canvas.classList.toggle("over-object", hit !== null),
     atPress,
@@ -148,15 +147,15 @@ async function showObject(studio, { atPress, struck }, library) {
   });
 }
 
-/** A WAV file may be dropped anywhere, where there is something to do with it. */
+/** A WAV file may be dropped anywhere, where there is something to do with it; elsewhere it must not replace the page. */
 function takeDrops({ take }) {
-  if (!take) return;
   const target = at("drop-target");
   const files = ({ dataTransfer }) => [...(dataTransfer?.types ?? [])].includes("Files");
   window.addEventListener("dragover", (event) => {
     if (!files(event)) return;
     event.preventDefault();
-    target.hidden = false;
+    if (take) target.hidden = false;
+    else event.dataTransfer.dropEffect = "none";
   });
   window.addEventListener("dragleave", (event) => {
     if (event.relatedTarget === null) target.hidden = true;
@@ -165,7 +164,9 @@ function takeDrops({ take }) {
     event.preventDefault();
     target.hidden = true;
     const [file] = event.dataTransfer?.files ?? [];
-    if (file) take(file);
+    if (!file) return;
+    if (take) take(file);
+    else say("This page has no server that could find a blow: open the field by avmsf studio to drop recordings on it.");
   });
 }
 

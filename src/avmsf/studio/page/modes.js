@@ -33,7 +33,7 @@ export class Modes {
     return Math.hypot(this.tensors.sine[at], this.tensors.cosine[at]);
   }
 
-  /** Levels of all modes at a contact, dB below the loudest. */
+  /** Levels of all modes at a contact, dB below the loudest; NaN where there is no contact. */
   levels(row) {
     const amplitudes = Array.from({ length: this.count }, (_, mode) => this.amplitude(mode, row));
     const loudest = Math.max(...amplitudes);

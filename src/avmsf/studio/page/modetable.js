@@ -10,6 +10,8 @@ const COLUMNS = [
   ["level", "Level, dB", "Below the loudest mode, at the contact struck last"],
 ];
 
+const lineOf = (part) => part.closest("tr");
+
 export function modeTable(studio) {
   let order = { column: "frequency", down: false };
   const body = element("tbody");
@@ -42,34 +44,31 @@ export function modeTable(studio) {
       if (cell.dataset.column === order.column) cell.setAttribute("aria-sort", order.down ? "descending" : "ascending");
       else cell.removeAttribute("aria-sort");
     }
+    const focused = body.contains(document.activeElement) ? lineOf(document.activeElement).dataset.mode : null;
     body.replaceChildren(
       ...rows.map(({ mode, frequency, decay, level }) => {
-        const cells = [mode, frequency.toFixed(1), decay.toPrecision(3), level.toFixed(1)];
-        const line = element(
+        const title = `Paint where the mode at ${frequency.toFixed(1)} Hz is loud`;
+        const pressed = String(mode === studio.mode);
+        const numbers = [frequency.toFixed(1), decay.toPrecision(3), level.toFixed(1)];
+        // The button is for keys and for who does not see; a click anywhere in its line presses it.
+        const choose = button(String(mode), () => {}, { className: "small", title, "aria-pressed": pressed });
+        choose.setAttribute("aria-label", title);
+        return element(
           "tr",
-          {
-            tabIndex: 0,
-            title: `Paint where the mode at ${frequency.toFixed(1)} Hz is loud`,
-            "data-mode": mode,
-            onclick: () => studio.choose(studio.mode === mode ? null : mode),
-            onkeydown: (event) => {
-              if (event.key !== "Enter" && event.key !== " ") return;
-              event.preventDefault();
-              studio.choose(studio.mode === mode ? null : mode);
-            },
-          },
-          ...cells.map((words) => element("td", {}, String(words))),
+          { "data-mode": mode, onclick: () => studio.choose(studio.mode === mode ? null : mode) },
+          element("td", {}, choose),
+          ...numbers.map((words) => element("td", {}, words === "NaN" ? "–" : words)),
         );
-        line.setAttribute("aria-selected", String(mode === studio.mode));
-        return line;
       }),
     );
+    if (focused !== null) body.querySelector(`[data-mode="${focused}"] button`)?.focus();
   };
 
   studio.on("bundle struck", fill);
   studio.addEventListener("mode", () => {
     const { mode, modes } = studio;
-    for (const line of body.children) line.setAttribute("aria-selected", String(Number(line.dataset.mode) === mode));
+    for (const press of body.querySelectorAll("button"))
+      press.setAttribute("aria-pressed", String(Number(lineOf(press).dataset.mode) === mode));
     // Paint of another kind, such as where a blow was found, is not this table's to take off.
     if (mode === null && painted) studio.paint(null);
     painted = mode !== null;

@@ -1,6 +1,16 @@
 /** Which of many points lies nearest to a place: the points sorted into cubes. */
 
+/** Cubes that are looked up by their numbers, without an object for each: a table twice as long as there are points. */
+const EMPTY = -1;
+
 export class PointGrid {
+  #keys;
+  #firsts;
+  #nexts;
+  #mask;
+  #rows = new Int32Array(1);
+  #distances = new Float64Array(1);
+
   /** `points`: x, y, z of each, one after another. */
   constructor(points) {
     this.points = points;
@@ -16,67 +26,80 @@ export class PointGrid {
     // Points lie on a surface: about two in each cube that the surface passes through.
     this.cell = Math.max(this.diagonal * Math.sqrt(1 / Math.max(this.count, 1)), this.diagonal / 500);
     this.sizes = sides.map((side) => Math.floor(side / this.cell) + 1);
-    this.cells = new Map();
-    for (let row = 0; row < this.count; row++) {
-      const key = this.#key(...this.#cellOf(points[3 * row], points[3 * row + 1], points[3 * row + 2]));
-      const there = this.cells.get(key);
-      if (there) there.push(row);
-      else this.cells.set(key, [row]);
+    this.#fill();
+  }
+
+  #fill() {
+    const { points, count, low, cell, sizes } = this;
+    const places = 2 ** Math.ceil(Math.log2(2 * count + 2));
+    this.#mask = places - 1;
+    this.#keys = new Int32Array(places).fill(EMPTY);
+    this.#firsts = new Int32Array(places).fill(EMPTY);
+    this.#nexts = new Int32Array(count);
+    // From the last on, so that each cube lists its rows in their order.
+    for (let row = count - 1; row >= 0; row--) {
+      const [i, j, k] = [0, 1, 2].map((axis) => Math.floor((points[3 * row + axis] - low[axis]) / cell));
+      const key = i + sizes[0] * (j + sizes[1] * k);
+      const place = this.#placeOf(key);
+      this.#keys[place] = key;
+      this.#nexts[row] = this.#firsts[place];
+      this.#firsts[place] = row;
     }
   }
 
-  #cellOf(...place) {
-    return place.map((value, axis) => Math.floor((value - this.low[axis]) / this.cell));
-  }
-
-  #key(i, j, k) {
-    return i + this.sizes[0] * (j + this.sizes[1] * k);
+  /** Where a cube is in the table, or would be. */
+  #placeOf(key) {
+    let place = Math.imul(key, 0x9e3779b1) >>> 7 & this.#mask;
+    while (this.#keys[place] !== key && this.#keys[place] !== EMPTY) place = (place + 1) & this.#mask;
+    return place;
   }
 
   /** The `count` nearest rows, nearest first, each as {row, distance}. */
   nearest(x, y, z, count = 1) {
-    const place = [x, y, z];
-    const middle = this.#cellOf(x, y, z).map((cell, axis) => Math.min(Math.max(cell, 0), this.sizes[axis] - 1));
-    const widest = Math.max(...this.sizes);
-    const found = [];
-    for (let reach = 0; reach < widest; reach++) {
-      this.#visitShell(middle, reach, (row) => {
-        const [dx, dy, dz] = [x - this.points[3 * row], y - this.points[3 * row + 1], z - this.points[3 * row + 2]];
-        const distance = Math.sqrt(dx * dx + dy * dy + dz * dz);
-        if (found.length === count && distance >= found[count - 1].distance) return;
-        if (found.length === count) found.pop();
-        let rank = found.length;
-        while (rank > 0 && found[rank - 1].distance > distance) rank--;
-        found.splice(rank, 0, { row, distance });
-      });
-      // Whatever lies beyond this shell is at least as far as the nearest of its faces that has points behind it.
-      const face = Math.min(
-        ...place.map((value, axis) => {
-          const [first, last] = [middle[axis] - reach, middle[axis] + reach];
-          const below = first <= 0 ? Infinity : value - (this.low[axis] + first * this.cell);
-          const above = last >= this.sizes[axis] - 1 ? Infinity : this.low[axis] + (last + 1) * this.cell - value;
-          return Math.min(below, above);
-        }),
-      );
-      if (found.length === count && found[count - 1].distance <= face) break;
-    }
-    return found;
+    if (this.#rows.length < count) [this.#rows, this.#distances] = [new Int32Array(count), new Float64Array(count)];
+    const found = this.nearestInto(x, y, z, count, this.#rows, this.#distances);
+    return Array.from({ length: found }, (_, rank) => ({ row: this.#rows[rank], distance: this.#distances[rank] }));
   }
 
-  #visitShell([i, j, k], reach, visit) {
-    const bounds = [i, j, k].map((cell, axis) => [
-      Math.max(cell - reach, 0),
-      Math.min(cell + reach, this.sizes[axis] - 1),
-    ]);
-    for (let c = bounds[2][0]; c <= bounds[2][1]; c++)
-      for (let b = bounds[1][0]; b <= bounds[1][1]; b++) {
-        const inside = Math.abs(c - k) < reach && Math.abs(b - j) < reach;
-        const step = inside ? 2 * reach : 1;
-        for (let a = inside ? i - reach : bounds[0][0]; a <= (inside ? i + reach : bounds[0][1]); a += step) {
-          if (a < 0 || a >= this.sizes[0]) continue;
-          for (const row of this.cells.get(this.#key(a, b, c)) ?? []) visit(row);
+  /** Write the `count` nearest rows and their distances, nearest first; returns how many there are. */
+  nearestInto(x, y, z, count, rows, distances) {
+    const { points, low, cell, sizes } = this;
+    const [width, height, depth] = sizes;
+    const clamp = (value, axis) => Math.min(Math.max(Math.floor((value - low[axis]) / cell), 0), sizes[axis] - 1);
+    const i = clamp(x, 0), j = clamp(y, 1), k = clamp(z, 2);
+    const widest = Math.max(width, height, depth);
+    // Whatever lies beyond a shell is at least as far as the nearest of its faces that has points behind it.
+    const beyond = (value, axis, middle, reach) => Math.min(
+      middle - reach <= 0 ? Infinity : value - (low[axis] + (middle - reach) * cell),
+      middle + reach >= sizes[axis] - 1 ? Infinity : low[axis] + (middle + reach + 1) * cell - value,
+    );
+    let found = 0;
+    for (let reach = 0; reach < widest; reach++) {
+      for (let c = Math.max(k - reach, 0); c <= Math.min(k + reach, depth - 1); c++)
+        for (let b = Math.max(j - reach, 0); b <= Math.min(j + reach, height - 1); b++) {
+          const inside = Math.abs(c - k) < reach && Math.abs(b - j) < reach;
+          for (let a = i - reach; a <= i + reach; a += inside ? 2 * reach : 1) {
+            if (a < 0 || a >= width) continue;
+            let row = this.#firsts[this.#placeOf(a + width * (b + height * c))];
+            for (; row !== EMPTY; row = this.#nexts[row]) {
+              const dx = x - points[3 * row], dy = y - points[3 * row + 1], dz = z - points[3 * row + 2];
+              const distance = Math.sqrt(dx * dx + dy * dy + dz * dz);
+              if (found === count && distance >= distances[count - 1]) continue;
+              let rank = found === count ? count - 1 : found++;
+              for (; rank > 0 && distances[rank - 1] > distance; rank--) {
+                rows[rank] = rows[rank - 1];
+                distances[rank] = distances[rank - 1];
+              }
+              rows[rank] = row;
+              distances[rank] = distance;
+            }
+          }
         }
-      }
+      if (found < count) continue;
+      const face = Math.min(beyond(x, 0, i, reach), beyond(y, 1, j, reach), beyond(z, 2, k, reach));
+      if (distances[count - 1] <= face) break;
+    }
+    return found;
   }
 
   /** How far apart neighbours lie, in the middle of the list of some of them. */

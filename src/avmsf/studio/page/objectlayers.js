@@ -2,53 +2,12 @@
 
 import * as THREE from "three";
 
+import { Neighbours } from "./neighbours.js";
 import { subdivide } from "./subdivide.js";
+import { TriangleTree } from "./triangletree.js";
 
 /** Parts of the light that paint keeps of a Gaussian's own brightness, so that the shape stays to be seen. */
 const SHADING = 0.35;
-const NEIGHBOURS = 3;
-
-/** A layer paints what the contacts nearest to each of its places have: rows and weights of those. */
-class Neighbours {
-  constructor(grid, places) {
-    const count = places.length / 3;
-    this.rows = new Uint32Array(NEIGHBOURS * count);
-    this.weights = new Float32Array(NEIGHBOURS * count);
-    // Corners of neighbouring triangles are one place.
-    const known = new Map();
-    for (let place = 0; place < count; place++) {
-      const [x, y, z] = places.subarray(3 * place, 3 * place + 3);
-      const key = `${x},${y},${z}`;
-      const earlier = known.get(key);
-      if (earlier !== undefined) {
-        for (let neighbour = 0; neighbour < NEIGHBOURS; neighbour++) {
-          this.rows[NEIGHBOURS * place + neighbour] = this.rows[NEIGHBOURS * earlier + neighbour];
-          this.weights[NEIGHBOURS * place + neighbour] = this.weights[NEIGHBOURS * earlier + neighbour];
-        }
-        continue;
-      }
-      known.set(key, place);
-      const found = grid.nearest(x, y, z, NEIGHBOURS);
-      const near = found.map(({ distance }) => 1 / (distance + 1e-3 * grid.cell) ** 2);
-      const sum = near.reduce((total, value) => total + value, 0);
-      found.forEach(({ row }, neighbour) => {
-        this.rows[NEIGHBOURS * place + neighbour] = row;
-        this.weights[NEIGHBOURS * place + neighbour] = near[neighbour] / sum;
-      });
-    }
-  }
-
-  /** Bytes of `colours`, three for each contact, mixed for every place. */
-  mix(colours) {
-    const mixed = new Float32Array(this.rows.length);
-    for (let entry = 0; entry < this.rows.length; entry++) {
-      const place = Math.floor(entry / NEIGHBOURS);
-      for (let channel = 0; channel < 3; channel++)
-        mixed[3 * place + channel] += this.weights[entry] * colours[3 * this.rows[entry] + channel];
-    }
-    return mixed;
-  }
-}
 
 /** Contacts as round dots. */
 export class PointLayer {
@@ -123,11 +82,13 @@ export class MeshLayer {
       part.material.roughness = 0.8;
       if (!part.geometry.attributes.normal) part.geometry.computeVertexNormals();
     });
+    this.corners = cornersOf(scene);
+    this.tree = new TriangleTree(this.corners.position.array);
   }
 
-  hit(raycaster) {
-    const [first] = raycaster.intersectObject(this.scene, true);
-    return first ? first.point : null;
+  hit({ ray }) {
+    const along = this.tree.distance(ray.origin.toArray(), ray.direction.toArray());
+    return along === Infinity ? null : ray.at(along, new THREE.Vector3());
   }
 
   paint(colours) {
@@ -136,31 +97,16 @@ export class MeshLayer {
     if (!colours) return;
     this.painted ??= this.#finerCopy();
     const attribute = this.painted.geometry.attributes.color;
-    const mixed = this.neighbours.mix(colours);
-    const colour = new THREE.Color();
-    for (let corner = 0; corner < attribute.count; corner++) {
-      const [red, green, blue] = mixed.subarray(3 * corner, 3 * corner + 3);
-      colour.setRGB(red / 255, green / 255, blue / 255, THREE.SRGBColorSpace);
-      attribute.setXYZ(corner, colour.r, colour.g, colour.b);
-    }
+    attribute.array.set(this.neighbours.mix(colours, toLight));
     attribute.needsUpdate = true;
   }
 
   #finerCopy() {
-    const corners = { position: { array: [], size: 3 }, normal: { array: [], size: 3 } };
-    this.scene.traverse((part) => {
-      if (!part.isMesh) return;
-      const flat = (part.geometry.index ? part.geometry.toNonIndexed() : part.geometry.clone()).applyMatrix4(
-        part.matrixWorld,
-      );
-      for (const name of ["position", "normal"])
-        for (const value of flat.attributes[name].array) corners[name].array.push(value);
-    });
-    const fine = subdivide(corners, 1.5 * this.spacing);
+    const fine = subdivide(this.corners, 1.5 * this.spacing);
     const geometry = new THREE.BufferGeometry();
-    const position = Float32Array.from(fine.position.array);
+    const position = fine.position.array;
     geometry.setAttribute("position", new THREE.BufferAttribute(position, 3));
-    geometry.setAttribute("normal", new THREE.BufferAttribute(Float32Array.from(fine.normal.array), 3));
+    geometry.setAttribute("normal", new THREE.BufferAttribute(fine.normal.array, 3));
     geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(position.length), 3));
     this.neighbours = new Neighbours(this.grid, position);
     const material = new THREE.MeshLambertMaterial({ vertexColors: true, side: THREE.DoubleSide });
@@ -172,9 +118,37 @@ export class MeshLayer {
   dispose() {
     this.object.traverse((part) => {
       part.geometry?.dispose();
+      for (const value of Object.values(part.material ?? {})) if (value?.isTexture) value.dispose();
       part.material?.dispose();
     });
   }
+}
+
+/** Positions and normals of all corners of all triangles of a scene, in the world. */
+function cornersOf(scene) {
+  const parts = [];
+  scene.traverse((part) => {
+    if (!part.isMesh) return;
+    const flat = part.geometry.index ? part.geometry.toNonIndexed() : part.geometry.clone();
+    parts.push(flat.applyMatrix4(part.matrixWorld));
+  });
+  const joined = (name) => {
+    const arrays = parts.map(({ attributes }) => attributes[name].array);
+    const array = new Float32Array(arrays.reduce((sum, { length }) => sum + length, 0));
+    let at = 0;
+    for (const values of arrays) {
+      array.set(values, at);
+      at += values.length;
+    }
+    return { array, size: 3 };
+  };
+  return { position: joined("position"), normal: joined("normal") };
+}
+
+/** A byte of the screen's red, green or blue as an amount of light from 0 to 1, as three wants it. */
+function toLight(byte) {
+  const share = byte / 255;
+  return share <= 0.04045 ? share / 12.92 : ((share + 0.055) / 1.055) ** 2.4;
 }
 
 /** Gaussians, drawn by spark; painted, each keeps a part of its own brightness. */
@@ -241,6 +215,7 @@ export class SplatLayer {
   }
 
   dispose() {
+    this.rgba?.dispose();
     this.splats.dispose();
     this.sparkRenderer.dispose?.();
   }

@@ -1,14 +1,13 @@
 /** The object on the screen: turned, pointed at, painted, with marks that follow its surface. */
 
 import * as THREE from "three";
-import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 import { PointGrid } from "./nearest.js";
 import { MeshLayer, PointLayer, SplatLayer } from "./objectlayers.js";
+import { Viewpoint } from "./viewpoint.js";
 
 /** Contacts about a place among which one on the near side of a wall is sought. */
 const WALL_NEIGHBOURS = 16;
-const UPS = { z: [0, 0, 1], y: [0, 1, 0], x: [1, 0, 0] };
 
 /** The object cannot be shown; the message says why. */
 export class ViewError extends Error {}
@@ -21,8 +20,10 @@ export class ObjectView {
       renderer = new THREE.WebGLRenderer({ antialias: bundle.manifest.object.kind !== "gaussians", alpha: true });
     } catch {
       throw new ViewError(
-        "This browser shows no 3D (WebGL is missing or switched off), so the object cannot be seen. Sounds work all " +
-          "the same: strike contacts by the buttons in the panel.",
+        "This browser shows no 3D (WebGL is missing or switched off), so the object cannot be seen." +
+          (bundle.tensors.points?.length
+            ? " Sounds work all the same: strike contacts by the buttons in the panel."
+            : ""),
       );
     }
     const view = new ObjectView(host, overlay, renderer);
@@ -36,15 +37,10 @@ export class ObjectView {
     this.renderer = renderer;
     this.marks = new Map();
     this.scene = new THREE.Scene();
-    this.camera = new THREE.PerspectiveCamera(35, 1, 0.001, 100);
-    this.camera.up.set(...UPS.z);
-    // A lamp that goes with the eye: whatever one looks at is lit.
-    const lamp = new THREE.DirectionalLight(0xffffff, 1.4);
-    lamp.position.set(0.4, 0.6, 1);
-    this.camera.add(lamp);
+    this.eye = new Viewpoint(renderer.domElement, () => this.redraw());
+    this.camera = this.eye.camera;
     this.scene.add(this.camera, new THREE.AmbientLight(0xffffff, 1.9));
     host.append(renderer.domElement);
-    this.#follow();
     new ResizeObserver(() => this.#resize()).observe(host);
     this.#resize();
   }
@@ -53,10 +49,12 @@ export class ObjectView {
     return this.renderer.domElement;
   }
 
-  #follow() {
-    this.controls?.dispose();
-    this.controls = new OrbitControls(this.camera, this.canvas);
-    this.controls.addEventListener("change", () => this.redraw());
+  get controls() {
+    return this.eye.controls;
+  }
+
+  get up() {
+    return this.eye.up;
   }
 
   /** Show another bundle, from where one looked at the last if its contacts are the same. */
@@ -65,7 +63,7 @@ export class ObjectView {
     if (!points?.length) {
       throw new ViewError(
         "This field has no geometry: it holds no place on an object that could be shown. Give it one with " +
-          "`avmsf studio FIELD --object MESH`, or strike contacts by the buttons in the panel.",
+          "`avmsf studio FIELD --object MESH`.",
       );
     }
     const same = this.grid?.count === points.length / 3 && points.every((value, at) => value === this.grid.points[at]);
@@ -80,6 +78,9 @@ export class ObjectView {
     if (this.layer) {
       this.scene.remove(this.layer.object);
       this.layer.dispose();
+      // A new layer bears no paint, and a legend without paint would tell nothing.
+      this.painted = null;
+      document.getElementById("legend").hidden = true;
     }
     this.layer = layer;
     this.object = bundle.manifest.object;
@@ -99,52 +100,17 @@ export class ObjectView {
 
   /** Look at the whole object from above its side, with this axis upwards. */
   look(up = "z") {
-    this.up = up;
-    const { low, points } = this.grid;
-    const high = [-Infinity, -Infinity, -Infinity];
-    for (let at = 0; at < points.length; at++) high[at % 3] = Math.max(high[at % 3], points[at]);
-    const middle = low.map((value, axis) => (value + high[axis]) / 2);
-    const away = { z: [0.75, -1, 0.85], y: [0.75, 0.85, 1], x: [0.85, 0.75, -1] }[up];
-    const distance = (0.62 * this.grid.diagonal) / Math.sin((this.camera.fov * Math.PI) / 360);
-    const fit = Math.max(1, 1 / this.camera.aspect) * distance;
-    this.camera.up.set(...UPS[up]);
-    this.camera.position.set(...away).setLength(fit).add(new THREE.Vector3(...middle));
-    this.camera.near = fit / 100;
-    this.camera.far = fit * 10;
-    this.camera.updateProjectionMatrix();
-    // The controls take the upward axis when they are made.
-    this.#follow();
-    this.controls.target.set(...middle);
-    this.controls.minDistance = this.grid.diagonal / 20;
-    this.controls.maxDistance = fit * 5;
-    this.controls.update();
-    this.redraw();
+    this.eye.look(this.grid, up);
   }
 
   /** Turn about the object by angles, radians: to the right, and up. */
   turn(right, up) {
-    const offset = this.camera.position.clone().sub(this.controls.target);
-    const toUp = new THREE.Quaternion().setFromUnitVectors(this.camera.up, new THREE.Vector3(0, 1, 0));
-    offset.applyQuaternion(toUp);
-    const sphere = new THREE.Spherical().setFromVector3(offset);
-    sphere.theta += right;
-    sphere.phi -= up;
-    offset.setFromSpherical(sphere.makeSafe()).applyQuaternion(toUp.invert());
-    this.camera.position.copy(this.controls.target).add(offset);
-    this.controls.update();
-    this.redraw();
+    this.eye.turn(right, up);
   }
 
   /** Look at the object from the side on which a place lies, a little from above. */
   face(place) {
-    const { target } = this.controls;
-    const distance = this.camera.position.distanceTo(target);
-    const outward = new THREE.Vector3(...place).sub(target).divideScalar(this.grid.diagonal / 2);
-    outward.addScaledVector(this.camera.up, 0.5);
-    if (outward.lengthSq() === 0) return;
-    this.camera.position.copy(target).add(outward.setLength(distance));
-    this.controls.update();
-    this.redraw();
+    this.eye.face(place, this.grid.diagonal);
   }
 
   /** What lies under a place on the screen: {row, place, normal}, the nearest contact's row; null beside the object. */
@@ -171,7 +137,9 @@ export class ObjectView {
     for (let row = 0; row < count; row++) {
       const [x, y, z] = [points[3 * row] - ox, points[3 * row + 1] - oy, points[3 * row + 2] - oz];
       const along = x * dx + y * dy + z * dz;
-      const beside = Math.hypot(x - along * dx, y - along * dy, z - along * dz);
+      const [ax, ay, az] = [x - along * dx, y - along * dy, z - along * dz];
+      // Math.hypot is tenfold slower, and this runs for every contact.
+      const beside = Math.sqrt(ax * ax + ay * ay + az * az);
       // Among neighbours on the near side, the one that the ray comes closest to.
       const cost = along + 3 * beside;
       if (beside <= reach && cost < best) [best, nearest] = [cost, row];

@@ -3,68 +3,94 @@
 const NAME = "avmsf-outbox";
 const STORE = "recordings";
 
-function openStore() {
-  return new Promise((resolve, reject) => {
-    const request = indexedDB.open(NAME, 1);
-    request.onupgradeneeded = () => request.result.createObjectStore(STORE, { keyPath: "key" });
-    request.onsuccess = () => resolve(request.result);
-    request.onerror = () => reject(request.error);
-  });
-}
-
-function done(request) {
+function answered(request) {
   return new Promise((resolve, reject) => {
     request.onsuccess = () => resolve(request.result);
     request.onerror = () => reject(request.error);
   });
 }
 
-/** A box of entries {key, …}; outlives the page where the browser can, and lives as long as the page where not. */
+function openDatabase() {
+  const request = indexedDB.open(NAME, 1);
+  request.onupgradeneeded = () => request.result.createObjectStore(STORE, { keyPath: "key" });
+  return answered(request);
+}
+
+/** A box of entries {key, made, …}, `made` in ms; outlives the page where the browser can, and lives as long as the page where not. */
 export class Outbox {
   #entries = new Map();
   #database = null;
+  #owner = null;
+  #lasting = false;
 
-  /** Open the box of one opened folder, `owner`, with what an earlier page left in it. */
-  static async open(owner) {
+  static async open() {
     const box = new Outbox();
-    box.owner = owner;
-    try {
-      box.#database = await openStore();
-      const left = await done(box.#store("readonly").getAll());
-      for (const entry of left) if (entry.owner === owner) box.#entries.set(entry.key, entry);
-    } catch {
-      box.#database = null;
-    }
+    box.#database = await openDatabase().catch(() => null);
     return box;
   }
 
-  #store(mode) {
-    return this.#database.transaction(STORE, mode).objectStore(STORE);
+  /**
+   * Say whose recordings these are, by a name that outlives the server; what an earlier page left under it comes back.
+   * Until then entries live in the page alone. Gives what came back, oldest first.
+   */
+  async belongTo(owner) {
+    if (this.#owner === owner) return [];
+    this.#owner = owner;
+    if (!this.#database) return [];
+    const here = this.entries;
+    let left;
+    try {
+      left = await answered(this.#database.transaction(STORE).objectStore(STORE).getAll());
+    } catch {
+      return [];
+    }
+    const mine = left.filter((entry) => entry.owner === owner).sort((one, other) => one.made - other.made);
+    this.#entries = new Map([...mine, ...here].map((entry) => [entry.key, entry]));
+    this.#lasting = true;
+    for (const entry of here) await this.put(entry);
+    return mine;
+  }
+
+  /** Do something to the store, and wait until it is written, which a request's success does not promise. */
+  async #change(action) {
+    const transaction = this.#database.transaction(STORE, "readwrite", { durability: "strict" });
+    const written = new Promise((resolve, reject) => {
+      transaction.oncomplete = resolve;
+      transaction.onabort = () => reject(transaction.error);
+    });
+    action(transaction.objectStore(STORE));
+    await written;
   }
 
   /** Whether the entries outlive a reload. */
   get lasting() {
-    return this.#database !== null;
+    return this.#lasting;
   }
 
   get entries() {
     return [...this.#entries.values()];
   }
 
+  has(key) {
+    return this.#entries.has(key);
+  }
+
   async put(entry) {
     this.#entries.set(entry.key, entry);
-    if (!this.#database) return;
+    if (!this.#lasting) return;
     try {
-      await done(this.#store("readwrite").put({ ...entry, owner: this.owner }));
+      await this.#change((store) => store.put({ ...entry, owner: this.#owner }));
     } catch {
       // Full or forbidden: it still lives in the page.
-      this.#database = null;
+      this.#lasting = false;
     }
   }
 
   async remove(key) {
     this.#entries.delete(key);
-    if (this.#database) await done(this.#store("readwrite").delete(key)).catch(() => {});
+    // Also from a store that takes nothing new: what was sent must not come back. Where even this fails, the server
+    // knows the recording by its key, or by what it was to replace.
+    if (this.#database) await this.#change((store) => store.delete(key)).catch(() => {});
   }
 }
 

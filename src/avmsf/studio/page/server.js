@@ -29,10 +29,12 @@ async function ask(method, place, { body, headers, signal } = {}) {
     throw new ServerError(GONE);
   }
   const text = await answer.text().catch(() => "");
-  let content = null;
+  let content;
   try {
-    content = text ? JSON.parse(text) : null;
+    content = JSON.parse(text);
   } catch {
+    // The server says everything in JSON: what is none was cut on its way, and nobody knows what it said.
+    if (answer.ok) throw new ServerError(GONE);
     content = null;
   }
   if (answer.ok) return content;
@@ -46,8 +48,10 @@ const OUTCOMES = ["error", "field", "object", "revision"];
 const json = (content) => ({ body: JSON.stringify(content), headers: { "Content-Type": "application/json" } });
 const wav = (body, headers = {}) => ({ body, headers: { "Content-Type": "audio/wav", ...headers } });
 
+const expecting = (digest) => (digest ? { "If-Match": digest } : {});
+
 /** A strike's address; its file may lie in a folder of its own. */
-const strikePlace = (file) => `capture/strikes/${file.split("/").map(encodeURIComponent).join("/")}`;
+export const strikePlace = (file) => `capture/strikes/${file.split("/").map(encodeURIComponent).join("/")}`;
 
 /** Numbers that came as base64 of float32, little endian. */
 export function numbers(text) {
@@ -75,11 +79,12 @@ export const server = {
     if (direction) ["nx", "ny", "nz"].forEach((axis, place) => query.set(axis, direction[place]));
     return ask("POST", `capture/strikes?${query}`, wav(recording, { "Idempotency-Key": key }));
   },
-  redoStrike: (file, recording, { key }) =>
-    ask("PUT", strikePlace(file), wav(recording, { "Idempotency-Key": key })),
-  removeStrike: (file) => ask("DELETE", strikePlace(file)),
+  // With the strike's digest, as `capture` tells it, it is changed only if no other tab was faster.
+  redoStrike: (file, recording, { key, digest }) =>
+    ask("PUT", strikePlace(file), wav(recording, { "Idempotency-Key": key, ...expecting(digest) })),
+  removeStrike: (file, { digest } = {}) => ask("DELETE", strikePlace(file), { headers: expecting(digest) }),
 
-  reconstruct: (settings = {}) => ask("POST", "reconstruct", json(settings)),
+  reconstruct: () => ask("POST", "reconstruct"),
   cancel: (job) => ask("DELETE", `jobs/${encodeURIComponent(job)}`),
 
   /** Hear of a job's progress; `heard` gets every message, the last of which holds what came of it or "error". */
@@ -97,6 +102,5 @@ export const server = {
       if (source.readyState === EventSource.CLOSED) heard({ error: GONE }, true);
       else heard({ words: "The connection broke; listening again …" }, false);
     };
-    return () => source.close();
   },
 };

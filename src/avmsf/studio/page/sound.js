@@ -8,6 +8,10 @@ const PROCESSOR = "avmsf-modal-bank";
 const VOICES = 64;
 /** Peak that the loudest contact's blow of force 1 is brought to, over full scale. */
 const COMFORTABLE = 0.5;
+/** Seconds by which the live limiter knows what is to come; all that is heard is late by as much. */
+const AHEAD = 0.0015;
+/** Seconds after a blow until it is said that the browser holds the sound back. */
+const PATIENCE = 1;
 /** Contacts, and seconds of their sound, that the loudest is sought among. */
 const LOUD_CONTACTS = 8, LOUD_SECONDS = 0.03;
 
@@ -92,8 +96,8 @@ function passedBy(pulse, angle) {
   return Math.hypot(sumRe, sumIm);
 }
 
-function bankNode(context, tuned, { level, voices = VOICES, blows = [] }) {
-  const processorOptions = { field: tuned.field, level, voices, blows };
+function bankNode(context, tuned, { level, voices = VOICES, blows = [], ahead = 0 }) {
+  const processorOptions = { field: tuned.field, level, voices, blows, ahead };
   return new AudioWorkletNode(context, PROCESSOR, {
     numberOfInputs: 1, numberOfOutputs: 1, outputChannelCount: [1],
     channelCount: 1, channelCountMode: "explicit", channelInterpretation: "speakers", processorOptions,
@@ -148,16 +152,21 @@ export class SoundEngine {
     this.tuned = new Tuned(bundle, context.sampleRate);
     this.volume = 1;
     this.comfortable = COMFORTABLE / (this.tuned.loudest() || 1);
-    this.node = bankNode(context, this.tuned, { level: this.comfortable });
+    const ahead = Math.round(AHEAD * context.sampleRate);
+    this.node = bankNode(context, this.tuned, { level: this.comfortable, ahead });
     this.analyser = new AnalyserNode(context, { fftSize: 8192, smoothingTimeConstant: 0 });
     this.node.connect(this.analyser).connect(context.destination);
     this.next = 1;
-    this.state = { voices: 0, modes: 0, limited: false };
-    /** Called with {id, time} when a blow's first sample is made; `time` is the context's, seconds. */
+    /** Called with {id, time} when a blow is taken up; `time`, the context's seconds, is that of its first sample. */
     this.onbegin = null;
-    /** Called with {voices, modes, limited} while anything sounds. */
-    this.onstate = null;
+    /** Called with true once what sounds has to be turned down to fit, and with false when it fits again. */
+    this.onlimited = null;
+    /** Called with true when the browser goes on holding the sound back after a blow, and with false when it plays. */
+    this.onheld = null;
     this.node.port.onmessage = ({ data }) => this.hear(data);
+    context.addEventListener("statechange", () => {
+      if (context.state === "running") this.onheld?.(false);
+    });
   }
 
   /** What samples are multiplied by on their way out: the volume, over the loudest contact's peak. */
@@ -171,16 +180,26 @@ export class SoundEngine {
   }
 
   /**
-   * Strike the contact in a row of the bundle's points. `force` in newtons where the field knows them, else relative to
-   * an average recorded blow; `contactTime` in seconds, 0 for the recorded hammer; `when` in seconds of the context's
-   * time, at once without it. Returns the blow's number.
+   * Strike the contact in a row of the bundle's points, at once. `force` in newtons where the field knows them, else
+   * relative to an average recorded blow; `contactTime` in seconds, 0 for the recorded hammer. Returns the blow's number.
    */
-  strike(row, { force = 1, contactTime = 0, shape = "half-sine", when } = {}) {
+  strike(row, { force = 1, contactTime = 0, shape = "half-sine" } = {}) {
     const id = this.next++;
-    const frame = when === undefined ? 0 : Math.round(when * this.context.sampleRate);
-    this.node.port.postMessage({ type: "strike", blow: this.tuned.blow(row, { force, contactTime, shape }, frame, id) });
-    if (this.context.state === "suspended") this.context.resume();
+    this.node.port.postMessage({ type: "strike", blow: this.tuned.blow(row, { force, contactTime, shape }, 0, id) });
+    this.wake();
     return id;
+  }
+
+  /** Have the sound go on: browsers hold it back before the first touch, and again after a call or in the background. */
+  wake() {
+    const { context } = this;
+    if (context.state === "running" || context.state === "closed") return;
+    // Refused, it is still held, which is what is looked at.
+    context.resume().catch(() => {});
+    clearTimeout(this.waking);
+    this.waking = setTimeout(() => {
+      if (context.state !== "running" && context.state !== "closed") this.onheld?.(true);
+    }, 1000 * PATIENCE);
   }
 
   renderOffline(blows, seconds, options) {
@@ -199,25 +218,18 @@ export class SoundEngine {
     const source = new AudioBufferSourceNode(this.context, { buffer: audioBuffer });
     source.connect(this.node);
     source.start(when);
-    if (this.context.state === "suspended") this.context.resume();
+    this.wake();
     return source;
   }
 
-  /** Let everything that sounds fade. */
-  hush() {
-    this.node.port.postMessage({ type: "hush" });
-  }
-
   async close() {
+    clearTimeout(this.waking);
     this.node.disconnect();
     await this.context.close();
   }
 
   hear({ type, ...data }) {
     if (type === "begun") this.onbegin?.({ id: data.id, time: data.frame / this.context.sampleRate });
-    if (type === "state") {
-      this.state = data;
-      this.onstate?.(data);
-    }
+    if (type === "limited") this.onlimited?.(data.limited);
   }
 }

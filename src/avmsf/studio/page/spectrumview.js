@@ -1,5 +1,7 @@
 /** Spectrum and decay of what sounds, drawn while it sounds; two spectra side by side to compare. */
 
+import { Chart } from "./chart.js";
+import { say, unsay } from "./dom.js";
 import { decibels } from "./modes.js";
 
 const LOW = 40;
@@ -8,93 +10,12 @@ const RANGE_DB = 80;
 /** What a Blackman window and the halves of a real spectrum take from a sine's level in the browser's analyser. */
 const ANALYSER_DB = 20 * Math.log10(2 / 0.42);
 const QUIET_SECONDS = 0.6;
+/** Seconds between two looks at what is heard from which on no line is drawn from one to the other. */
+const GAP_SECONDS = 0.05;
+/** Seconds for which the word that a sound was turned down stays to be read. */
+const LIMITED_SECONDS = 2;
+const HELD = "The browser holds the sound back: click anywhere on the page, or close what else uses the loudspeaker.";
 const LABELLED = [100, 1000, 10000];
-const MARGIN = { left: 34, right: 8, top: 8, bottom: 20 };
-
-/** A canvas that is as sharp as the screen, with axes in the page's own colours. */
-class Chart {
-  constructor(canvas) {
-    this.canvas = canvas;
-    this.context = canvas.getContext("2d");
-  }
-
-  begin() {
-    const { canvas, context } = this;
-    const ratio = devicePixelRatio;
-    this.width = canvas.clientWidth;
-    this.height = canvas.clientHeight;
-    if (canvas.width !== Math.round(this.width * ratio) || canvas.height !== Math.round(this.height * ratio)) {
-      canvas.width = Math.round(this.width * ratio);
-      canvas.height = Math.round(this.height * ratio);
-    }
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.clearRect(0, 0, this.width, this.height);
-    const style = getComputedStyle(canvas);
-    this.ink = Object.fromEntries(
-      ["faint", "line", "accent", "second"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]),
-    );
-    context.font = `11px ${style.fontFamily}`;
-    context.lineWidth = 1;
-  }
-
-  x(share) {
-    return MARGIN.left + share * (this.width - MARGIN.left - MARGIN.right);
-  }
-
-  y(share) {
-    return MARGIN.top + share * (this.height - MARGIN.top - MARGIN.bottom);
-  }
-
-  axes(across, down) {
-    const { context, ink } = this;
-    context.strokeStyle = ink.line;
-    context.fillStyle = ink.faint;
-    context.beginPath();
-    for (const { share, words } of down) {
-      const y = Math.round(this.y(share)) + 0.5;
-      context.moveTo(this.x(0), y);
-      context.lineTo(this.x(1), y);
-      context.textAlign = "right";
-      context.textBaseline = "middle";
-      context.fillText(words, this.x(0) - 5, y);
-    }
-    for (const { share, words } of across) {
-      const x = Math.round(this.x(share)) + 0.5;
-      context.moveTo(x, this.y(0));
-      context.lineTo(x, this.y(1));
-      context.textAlign = share > 0.9 ? "right" : "center";
-      context.textBaseline = "bottom";
-      context.fillText(words, share > 0.9 ? this.x(1) : x, this.height - 3);
-    }
-    context.stroke();
-  }
-
-  curve(shares, colour, { width = 1.5, dash = [], fill = false } = {}) {
-    const { context } = this;
-    context.save();
-    context.beginPath();
-    context.rect(this.x(0), this.y(0), this.x(1) - this.x(0), this.y(1) - this.y(0));
-    context.clip();
-    context.beginPath();
-    shares.forEach(([across, down], place) => {
-      const [x, y] = [this.x(across), this.y(Math.min(Math.max(down, -0.1), 1.1))];
-      if (place) context.lineTo(x, y);
-      else context.moveTo(x, y);
-    });
-    context.strokeStyle = colour;
-    context.lineWidth = width;
-    context.setLineDash(dash);
-    context.stroke();
-    if (fill) {
-      context.lineTo(this.x(shares.at(-1)[0]), this.y(1));
-      context.lineTo(this.x(shares[0][0]), this.y(1));
-      context.globalAlpha = 0.16;
-      context.fillStyle = colour;
-      context.fill();
-    }
-    context.restore();
-  }
-}
 
 const across = (frequency) => Math.log(frequency / LOW) / Math.log(HIGH / LOW);
 const named = (frequency) => (frequency >= 1000 ? `${frequency / 1000} kHz` : `${frequency} Hz`);
@@ -121,6 +42,10 @@ export class SpectrumView {
     this.modes = modes;
     this.engine = engine;
     this.analyser = engine?.analyser ?? null;
+    if (engine) {
+      engine.onlimited = tellLimited;
+      engine.onheld = (held) => (held ? say(HELD, { name: "held", bad: true }) : unsay("held"));
+    }
     this.#blow = null;
     this.#draw();
   }
@@ -226,7 +151,7 @@ export class SpectrumView {
         const place = across(frequency);
         // What it was at the blow stays to be seen, faintly.
         for (const [height, colour, width] of [
-          [level, chart.ink.line, 3],
+          [level, chart.ink.faint, 1],
           [now, chart.ink.accent, 2],
         ]) {
           if (height < top - RANGE_DB) continue;
@@ -255,8 +180,10 @@ export class SpectrumView {
       [0, 0.25, 0.5, 0.75, 1].map((share) => ({ share, words: `${Math.round(top - share * RANGE_DB)}` })),
     );
     if (this.#trace.length > 1) {
-      const shares = this.#trace.map(([at, level]) => [at / seconds, down(level)]);
-      chart.curve(shares, chart.ink.second, { fill: true });
+      for (const piece of unbroken(this.#trace)) {
+        const shares = piece.map(([at, level]) => [at / seconds, down(level)]);
+        chart.curve(shares, chart.ink.second, { fill: true });
+      }
     }
     if (this.#blow) {
       const shares = Array.from({ length: 101 }, (_, step) => {
@@ -270,6 +197,25 @@ export class SpectrumView {
       chart.curve(shares, chart.ink.accent, { dash: [5, 4] });
     }
   }
+}
+
+/** The pieces of a row of [seconds, level] between which nobody looked for too long. */
+function unbroken(trace) {
+  const pieces = [[]];
+  trace.forEach((point, place) => {
+    if (place && point[0] - trace[place - 1][0] > GAP_SECONDS) pieces.push([]);
+    pieces.at(-1).push(point);
+  });
+  return pieces;
+}
+
+let forgetting;
+
+function tellLimited(limited) {
+  const word = document.getElementById("limited");
+  clearTimeout(forgetting);
+  if (limited) word.hidden = false;
+  else forgetting = setTimeout(() => (word.hidden = true), 1000 * LIMITED_SECONDS);
 }
 
 /** Seconds that show the modes' sound fall by the range of the chart, or most of it. */

@@ -1,6 +1,7 @@
 /** The blows that were measured: marked on the object, each to be heard beside the model's sound. */
 
 import { attempt, button, element } from "./dom.js";
+import { PointGrid } from "./nearest.js";
 import { soundSpectrum } from "./spectrum.js";
 import { SpectrumView } from "./spectrumview.js";
 
@@ -69,53 +70,52 @@ export function measuredStrikes(studio) {
   return box;
 }
 
-/** Recording and model of one strike, to hear one after the other and to see over each other. */
+/** Recording and model of one strike, to hear one after the other and to see over each other; one strike at a time. */
 class Comparison {
   #buffers = new Map();
+  #serial = 0;
+  #source = null;
+  #timer = null;
 
   constructor(studio) {
     this.studio = studio;
-    studio.addEventListener("bundle", () => this.#buffers.clear());
+    studio.on("bundle", () => {
+      this.#begin();
+      this.#buffers.clear();
+      this.grid = new PointGrid(studio.bundle.tensors.points);
+    });
   }
 
   row(strike) {
-    const { points } = this.studio.bundle.tensors;
-    let [best, nearest] = [Infinity, 0];
-    for (let row = 0; row < points.length / 3; row++) {
-      const distance = Math.hypot(...strike.contact.map((value, axis) => value - points[3 * row + axis]));
-      if (distance < best) [best, nearest] = [distance, row];
-    }
-    return nearest;
+    return this.grid.nearest(...strike.contact)[0].row;
   }
 
   async recording(strike) {
-    const { studio } = this;
+    const isLast = this.#begin();
     this.#expectSound();
     const buffer = await this.#buffer(strike);
-    studio.engine.play(buffer);
-    studio.spectra.heard();
+    if (isLast()) this.#play(buffer);
   }
 
   async model(strike) {
+    this.#begin();
     this.#expectSound();
     // As the recorded blow was: no harder, no softer.
     this.studio.strike(this.row(strike), { force: 1, contactTime: null });
   }
 
   async both(strike) {
+    const isLast = this.#begin();
     const { studio } = this;
     this.#expectSound();
     const buffer = await this.#buffer(strike);
+    if (!isLast()) return;
     const row = this.row(strike);
     const length = Math.min(buffer.duration, LONGEST_SECONDS);
-    studio.engine.play(buffer);
-    studio.strikeSoon?.cancel();
-    const timer = setTimeout(
-      () => studio.engine.strike(row, { force: 1 }),
-      1000 * (length + PAUSE_SECONDS),
-    );
-    studio.strikeSoon = { cancel: () => clearTimeout(timer) };
+    this.#play(buffer);
+    this.#timer = setTimeout(() => studio.engine.strike(row, { force: 1 }), 1000 * (length + PAUSE_SECONDS));
     const model = await studio.engine.renderOffline([{ row, force: 1 }], length);
+    if (!isLast()) return;
     const { sampleRate } = studio.bundle.manifest;
     const part = buffer.getChannelData(0).subarray(0, Math.round(length * buffer.sampleRate));
     studio.spectra.compare(
@@ -123,6 +123,20 @@ class Comparison {
       { levels: soundSpectrum(model, sampleRate, SpectrumView.range) },
     );
     document.getElementById("blow-facts").textContent = `${strike.name}: recording and model`;
+  }
+
+  /** End what the one before still plays or was going to; gives whether none has begun since. */
+  #begin() {
+    this.#source?.stop();
+    this.#source = null;
+    clearTimeout(this.#timer);
+    const serial = ++this.#serial;
+    return () => serial === this.#serial;
+  }
+
+  #play(buffer) {
+    this.#source = this.studio.engine.play(buffer);
+    this.studio.spectra.heard();
   }
 
   #expectSound() {

@@ -20,6 +20,7 @@ export class Studio extends EventTarget {
 
   /** Show and sound another bundle, such as an edited field. */
   take(bundle) {
+    if (!sameNumbers(this.bundle?.tensors.points, bundle.tensors.points)) this.row = null;
     this.bundle = bundle;
     this.modes = new Modes(bundle);
     this.revision = bundle.manifest.live?.revision ?? null;
@@ -39,13 +40,13 @@ export class Studio extends EventTarget {
   }
 
   /** Strike a contact, with `factor` times the force that is set. */
-  strike(row, { factor = 1, force = this.force * factor, contactTime = this.contactTime, when, since } = {}) {
-    this.row = row;
-    if (this.engine) {
-      this.engine.strike(row, { force, contactTime: contactTime ?? 0, shape: this.pulse, when });
-      // From the finger to the message that the sound's thread gets.
-      if (since !== undefined) this.milliseconds = performance.now() - since;
+  strike(row, { factor = 1, force = this.force * factor, contactTime = this.contactTime } = {}) {
+    if (!this.modes.points) {
+      say("This field holds no contact that could be struck.", { name: "strike", bad: true });
+      return;
     }
+    this.row = row;
+    this.engine?.strike(row, { force, contactTime: contactTime ?? 0, shape: this.pulse });
     this.last = { row, force, contactTime };
     this.spectra?.struck(row, force);
     this.#markBlow(row);
@@ -53,6 +54,11 @@ export class Studio extends EventTarget {
     const mallet = contactTime === null ? "" : `, ${seconds(contactTime)}`;
     document.getElementById("blow-facts").textContent = `${where}, ${force.toPrecision(2)}${this.forceUnit}${mallet}`;
     this.#tell("struck");
+  }
+
+  /** Strike where one struck last; before the first blow, where the field is loudest. */
+  strikeAgain() {
+    this.strike(this.row ?? this.modes.loudestRow);
   }
 
   #markBlow(row) {
@@ -106,3 +112,5 @@ export class Studio extends EventTarget {
     this.dispatchEvent(new Event(name));
   }
 }
+
+const sameNumbers = (one, other) => one?.length === other?.length && one.every((value, at) => value === other[at]);

@@ -1,6 +1,6 @@
 /** One recording before it is kept: what it looks like, how loud it is, when it begins, whether it is cut off. */
 
-import { button, element, seconds } from "./dom.js";
+import { attempt, button, element, seconds } from "./dom.js";
 
 /** What the server measured, in words; `report` as `capture/check` gives it. */
 export function measures(report) {
@@ -43,13 +43,38 @@ export async function drawTake(canvas, blob, onset) {
   context.fillRect((onset * sampleRate * width) / samples.length, 0, 2 * devicePixelRatio, height);
 }
 
-export async function decode(blob) {
+async function decode(blob) {
   const bytes = await blob.arrayBuffer();
   const buffer = await new OfflineAudioContext(1, 1, 48000).decodeAudioData(bytes);
   return { samples: buffer.getChannelData(0), sampleRate: buffer.sampleRate };
 }
 
-/** A button that plays a recording, by the browser's own player. */
-export function listenButton(address, words = "Listen") {
-  return button(words, () => new Audio(address()).play().catch(() => {}), { className: "small" });
+let playing = null;
+
+/** A button that plays a recording, a blob or an address, by the browser's own player; one recording at a time. */
+export function listenButton(sound) {
+  return button("Listen", () => attempt(() => listen(sound), "listen"), { className: "small" });
+}
+
+async function listen(sound) {
+  playing?.end();
+  const address = sound instanceof Blob ? URL.createObjectURL(sound) : sound;
+  const player = new Audio(address);
+  const mine = {
+    end() {
+      player.pause();
+      if (address !== sound) URL.revokeObjectURL(address);
+      if (playing === mine) playing = null;
+    },
+  };
+  playing = mine;
+  player.addEventListener("ended", mine.end);
+  try {
+    await player.play();
+  } catch (error) {
+    // Another was begun before this one was read.
+    if (playing !== mine) return;
+    mine.end();
+    throw new Error(`The recording cannot be played here (${error.message}).`);
+  }
 }

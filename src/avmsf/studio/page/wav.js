@@ -26,9 +26,12 @@ export function encodeWav(samples, sampleRate) {
   return new Blob([bytes], { type: "audio/wav" });
 }
 
-/** Whether the file begins as a WAV does; the server looks closer. */
-export async function looksLikeWav(file) {
+/** Throw the words to be said where a file does not begin as a WAV does; the server looks closer. */
+export async function expectWav(file) {
   const head = new Uint8Array(await file.slice(0, 12).arrayBuffer());
   const letters = String.fromCharCode(...head);
-  return letters.startsWith("RIFF") && letters.endsWith("WAVE");
+  if (letters.startsWith("RIFF") && letters.endsWith("WAVE")) return;
+  throw new Error(
+    `${file.name}: expected a WAV file, found another kind. Save the sound as WAV and choose it again.`,
+  );
 }

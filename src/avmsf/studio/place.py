@@ -1,0 +1,55 @@
+"""Where a blow fell, as the page says it."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from avmsf.capture.table import DIRECTION, FARTHEST, REQUIRED
+from avmsf.studio.refusal import RefusedError
+
+
+@dataclass(frozen=True)
+class Place:
+    """One blow's contact, and how it was struck."""
+
+    contact: tuple[float, float, float]
+    """Object frame, metres."""
+    direction: tuple[float, float, float] | None = None
+    """Along which the hammer moved, into the object; any length but zero."""
+    newtons: float | None = None
+    """Peak force, where it is known."""
+
+    @classmethod
+    def read(cls, query: Mapping[str, str]) -> "Place":
+        """Return the place of a request's query x, y, z, perhaps nx, ny, nz, newtons. Raises RefusedError (400)."""
+        contact = _vector(query, REQUIRED[1:])
+        if contact is None:
+            raise RefusedError(400, "expected the contact as x, y and z in metres, found none: click the object first")
+        if max(map(abs, contact)) > FARTHEST:
+            raise RefusedError(400, f"expected a contact within {FARTHEST:g} m of the origin, found {contact}")
+        direction = _vector(query, DIRECTION)
+        if direction is not None and math.hypot(*direction) == 0:
+            raise RefusedError(400, "nx, ny, nz: expected a direction, found the zero vector")
+        newtons = None
+        if "newtons" in query:
+            newtons = _finite(query, "newtons")
+            if newtons <= 0:
+                raise RefusedError(400, f"newtons: expected a peak force above 0, found {newtons:g}")
+        return cls(contact, direction, newtons)
+
+
+def _vector(query: Mapping[str, str], names: Sequence[str]) -> tuple[float, float, float] | None:
+    if not any(name in query for name in names):
+        return None
+    x, y, z = (_finite(query, name) for name in names)
+    return (x, y, z)
+
+
+def _finite(query: Mapping[str, str], name: str) -> float:
+    try:
+        value = float(query[name])
+    except (KeyError, ValueError):
+        value = math.nan
+    if not math.isfinite(value):
+        raise RefusedError(400, f"{name}: expected a number, found {query.get(name, 'none')!r}")
+    return value

@@ -1,0 +1,53 @@
+"""The tables that blows are located by, of the current revision: begun as soon as the sliders rest."""
+
+import asyncio
+from collections import defaultdict
+
+from avmsf.studio.capturing import StrikeBook
+from avmsf.studio.locating import Finder, Likeness
+from avmsf.studio.sampling import length_of
+from avmsf.studio.session import Revision, Session
+from avmsf.studio.showing import Showcase
+from avmsf.studio.threads import Threads
+
+_SETTLED = 0.5
+"""Seconds that a revision stays the last one before its tables are made: sliders are dragged."""
+
+
+class Searches:
+    """The finders of one server. Its methods are called on the event loop."""
+
+    def __init__(self, session: Session, showcase: Showcase, book: StrikeBook | None, threads: Threads) -> None:
+        self.session, self.showcase, self.book, self.threads = session, showcase, book, threads
+        self._finder: tuple[int, Finder] | None = None
+        self._likenesses: defaultdict[int, Likeness] = defaultdict(Likeness)
+        self._ahead: asyncio.Task[None] | None = None
+
+    def finder_of(self, revision: Revision) -> Finder:
+        """Return what locates blows on a revision; its tables are made when they are first asked for."""
+        if self._finder is None or self._finder[0] != revision.number:
+            field = revision.expect_field()
+            points = self.showcase.current.sampled.points.double() * length_of(field)
+            settings = None if self.book is None else self.book.settings
+            likeness = self._likenesses[revision.opening]
+            self._finder = (revision.number, Finder(field, points.float(), length_of(field), likeness, settings))
+        return self._finder[1]
+
+    def prepare_ahead(self) -> None:
+        """Make the current revision's tables, once what is under way is done, and no stale one's."""
+        if self._ahead is None or self._ahead.done():
+            self._ahead = asyncio.create_task(self._prepare())
+
+    def close(self) -> None:
+        """Begin with nothing more."""
+        if self._ahead is not None:
+            self._ahead.cancel()
+
+    async def _prepare(self) -> None:
+        # One task for all revisions: one that is cancelled would leave its thread running beside the next one's.
+        prepared = None
+        while (revision := self.session.current) is not prepared and revision.field is not None:
+            await asyncio.sleep(_SETTLED)
+            if self.session.current is revision:
+                await self.threads.compute_ahead(self.finder_of(revision).prepare)
+                prepared = revision

@@ -1,0 +1,101 @@
+"""A capture's recordings on disk, and the note of what was written under which of the page's keys."""
+
+import hashlib
+import io
+import json
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import soundfile
+
+from avmsf.capture.audio import Recording
+from avmsf.errors import CaptureError
+from avmsf.files import write_whole
+from avmsf.pipeline.reconstruct import CACHE
+from avmsf.studio.refusal import RefusedError
+
+JOURNAL, REMOVED = "studio.json", "removed"
+"""In the capture's cache: what was written under which key, and the recordings that were redone or taken out."""
+WAV = ".wav"
+_NUMBERED = re.compile(r"(\d{1,6})\.wav", re.IGNORECASE)
+_KEPT_KEYS = 10_000
+
+
+@dataclass(frozen=True)
+class StrikeFiles:
+    """The recordings of one capture folder, by the names that its table gives them."""
+
+    folder: Path
+    """Without links."""
+
+    def readable(self, file: str) -> Path:
+        """Return a recording's path. Raises RefusedError (404) for one that leads out of the folder by a link."""
+        path = (self.folder / file).resolve()
+        if not path.is_relative_to(self.folder):
+            raise RefusedError(404, f"{file}: lies outside the capture folder: copy it there")
+        return path
+
+    def own(self, file: str) -> Path:
+        """Return the path of a recording to change. Raises RefusedError (409) for a link, or one behind a link.
+
+        What a link leads to may be another strike's, or nothing of this capture.
+        """
+        path = self.folder / file
+        if path.resolve() != path:
+            raise RefusedError(409, f"{file}: expected the recording itself, found a link to it: copy it there first")
+        return path
+
+    def digest(self, file: str) -> str | None:
+        """Return what tells a recording from every other; None where it is not there."""
+        path = self.readable(file)
+        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+
+    def is_free(self, file: str) -> bool:
+        """Whether nothing is called this."""
+        return not os.path.lexists(self.folder / file)
+
+    def next_name(self, taken: Iterable[str]) -> str:
+        """Return a number that no recording here has, and none of those `taken`."""
+        names = [*(path.name for path in self.folder.iterdir()), *taken]
+        numbers = [int(found[1]) for name in names if (found := _NUMBERED.fullmatch(name))]
+        return f"{max(numbers, default=0) + 1:03d}{WAV}"
+
+    def write(self, file: str, content: bytes, recording: Recording) -> None:
+        """Write what was sent, to the last bit where it is a wav file, else the same samples as one."""
+        if not (content[:4] == b"RIFF" and content[8:12] == b"WAVE"):
+            memory = io.BytesIO()
+            samples = recording.channels.T.astype(np.float32)
+            soundfile.write(memory, samples, round(recording.sample_rate), subtype="FLOAT", format="WAV")
+            content = memory.getvalue()
+        write_whole(self.own(file), lambda place: place.write_bytes(content), raising=CaptureError)
+
+    def set_aside(self, file: str, *, keep: bool) -> None:
+        """Keep a recording in the cache, and with `keep` where it is too, until another takes its place."""
+        path = self.own(file)
+        if not path.is_file():
+            return
+        content = path.read_bytes()
+        digest = hashlib.sha256(content).hexdigest()[:12]
+        kept = self.folder / CACHE / REMOVED / f"{path.stem}-{digest}{path.suffix}"
+        write_whole(kept, lambda place: place.write_bytes(content), raising=CaptureError)
+        if not keep:
+            os.unlink(path)
+
+    def journal(self) -> dict[str, dict[str, Any]]:
+        """Return what was written under which key; nothing where the note is damaged."""
+        try:
+            known = json.loads((self.folder / CACHE / JOURNAL).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return known if isinstance(known, dict) else {}
+
+    def write_journal(self, journal: Mapping[str, Any]) -> None:
+        """Note what is about to be written, or was."""
+        text = json.dumps(dict(list(journal.items())[-_KEPT_KEYS:]))
+        path = self.folder / CACHE / JOURNAL
+        write_whole(path, lambda place: place.write_text(text, encoding="utf-8"), raising=CaptureError)

@@ -1,0 +1,431 @@
+"""The page changes a field: nothing that a slider says is lost, no other tab's change is overwritten."""
+
+import contextlib
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import torch
+
+from avmsf.export.sampledfield import SampledField
+from avmsf.field.store import load
+from avmsf.studio.modules import MODULES_VARIABLE
+from opened_plate import open_plate, plate_field
+from page_plate import lay_out, page_modules, plate_table
+from plate_page import LIVE, Open, Serve, answer, plate_site, upload, visiting, words_on
+from served import served
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Locator, Page, Request, Route
+
+
+@pytest.fixture(scope="module")
+def modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return page_modules(tmp_path_factory.mktemp("npm"))
+
+
+@pytest.fixture(scope="module")
+def site(serve: Callable[[Path], str], modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Serve:
+    return plate_site(serve, modules, tmp_path_factory)
+
+
+@pytest.fixture
+def visit(browser: "Browser", site: Serve) -> Iterator[Open]:
+    with visiting(browser, site) as visit:
+        yield visit
+
+
+class EditServer:
+    """Answers the page's changes as the studio does, one tab among others, and remembers what it was asked."""
+
+    def __init__(self, page: "Page", first: dict[str, Any], edited: dict[str, Any], live: dict[str, Any]) -> None:
+        self.asked: list[tuple[str, dict[str, Any]]] = []
+        self.revision, self.taken = 1, set[str]()
+        self.state: tuple[dict[str, Any], dict[str, Any]] = ({}, first)
+        """The sliders, and the manifest of what is heard."""
+        self.past: list[tuple[dict[str, Any], dict[str, Any]]] = []
+        self.edited, self.live = edited["manifest"], live
+        self.slow = False
+        """Whether answers to edits wait until `let_go`."""
+        self.then: Callable[[], None] | None = None
+        """What happens once between the next answer and what the page fetches upon it."""
+        self._waiting: list[Callable[[], None]] = []
+        page.route("**/manifest.json", lambda route: answer(route, self.manifest()))
+        page.route("**/edited.bin", lambda route: route.fulfill(body=edited["content"]))
+        page.route("**/jobs/j9/events", lambda route: self._waiting.append(lambda: self._lead(route)))
+        for what in ("edit", "undo", "save"):
+            page.route(f"**/{what}", self.hear)
+
+    def manifest(self) -> dict[str, Any]:
+        sliders, shown = self.state
+        now = {"revision": self.revision, "undo": bool(self.past), "sliders": sliders}
+        return {**shown, "live": {**LIVE, **self.live, **now}}
+
+    def change(self, **sliders: Any) -> None:
+        """Do what an edit does, of this tab or another one."""
+        self.past.append(self.state)
+        self.state = (sliders, self.edited)
+        self.revision += 1
+
+    def let_go(self) -> None:
+        self.slow = False
+        while self._waiting:
+            self._waiting.pop(0)()
+
+    def hear(self, route: "Route", request: "Request") -> None:
+        what, words = request.url.rsplit("/", 1)[1], request.post_data_json
+        self.asked.append((what, words))
+        if words["base"] != self.revision:
+            answer(route, {"error": "expected the last revision", "revision": self.revision}, 409)
+        elif what == "save" and words["name"] in self.taken:
+            answer(route, {"error": f"{words['name']} is there: choose another"}, 409)
+        elif "like" in words:
+            answer(route, {"job": "j9"}, 202)
+        else:
+            self._do(what, words)
+            done = {"revision": self.revision, "remarks": [], **({"file": words["name"]} if what == "save" else {})}
+            send = lambda: answer(route, done)  # noqa: E731
+            if self.then is not None:
+                self.then()
+                self.then = None
+            if self.slow and what == "edit":
+                self._waiting.append(send)
+            else:
+                send()
+
+    def _do(self, what: str, words: dict[str, Any]) -> None:
+        if what == "edit":
+            self.change(**{name: value for name, value in words.items() if name != "base"})
+            return
+        self.revision += 1
+        if what == "undo":
+            self.state = self.past.pop()
+        else:
+            self.taken.add(words["name"])
+            self.state = ({}, self.state[1])
+
+    def _lead(self, route: "Route") -> None:
+        self.change()
+        body = f'data: {{"revision": {self.revision}, "remarks": []}}\n\n'
+        route.fulfill(content_type="text/event-stream", body=body)
+
+
+@pytest.fixture
+def edits(visit: Open, site: Serve, tmp_path: Path, modules: Path) -> Callable[..., tuple["Page", EditServer]]:
+    """Return a function that opens the page's tab of edits, with its server."""
+
+    def bundle_of(table: SampledField, name: str) -> dict[str, Any]:
+        folder = lay_out(tmp_path / name, table, modules)
+        return {
+            "manifest": json.loads((folder / "manifest.json").read_text()),
+            "content": (folder / "field.bin").read_bytes(),
+        }
+
+    first, edited = bundle_of(plate_table(), "first"), bundle_of(plate_table(pitch=1.25), "edited")
+    for tensor in edited["manifest"]["tensors"].values():
+        tensor["file"] = "edited.bin"
+
+    def opened(**live: Any) -> tuple["Page", EditServer]:
+        servers: list[EditServer] = []
+        page = visit(live=LIVE, before=lambda page: servers.append(EditServer(page, first["manifest"], edited, live)))
+        page.click("#tab-edit")
+        return page, servers[0]
+
+    return opened
+
+
+def slider(page: "Page", name: str) -> "Locator":
+    return page.locator("#sheet-edit .slider", has_text=name).first
+
+
+def move(page: "Page", name: str) -> None:
+    """Move a slider by one step to the right."""
+    slider(page, name).locator("input").focus()
+    page.keyboard.press("ArrowRight")
+
+
+def shown(page: "Page", *names: str) -> list[str]:
+    """Return what sliders say."""
+    return [slider(page, name).locator("output").inner_text() for name in names]
+
+
+def wait_until(page: "Page", true: Callable[[], bool]) -> None:
+    for _ in range(100):
+        if true():
+            return
+        page.wait_for_timeout(50)
+    raise AssertionError("waited in vain")
+
+
+def pitch_of_page(page: "Page") -> float:
+    """Return the first mode's pitch in what the page would play now, Hz."""
+    page.wait_for_function("avmsf.studio.engine.bundle === avmsf.studio.bundle")
+    sound = page.evaluate("avmsf.renderOffline([{ row: 0 }], 0.5).then((sound) => [...sound])")
+    spectrum = np.abs(np.fft.rfft(np.hanning(len(sound)) * np.array(sound)))
+    return float(np.argmax(spectrum[: round(700 * 0.5)]) / 0.5)
+
+
+STEP = 4.0 ** (1 / 200)
+"""Pitch of one step to the right."""
+
+
+def test_an_edit_is_heard_undone_and_saved(edits: Any) -> None:
+    page, server = edits()
+    assert pitch_of_page(page) == pytest.approx(400.0, abs=3)
+    move(page, "Pitch")
+    page.wait_for_function("avmsf.studio.revision === 2 && avmsf.studio.last !== undefined")
+    what, words = server.asked[0]
+    assert (what, words["base"], words["size"], words["modes"], words["material"]) == ("edit", 1, 1.0, [], None)
+    assert words["pitch"] == pytest.approx(STEP, rel=1e-6)
+    assert pitch_of_page(page) == pytest.approx(500.0, abs=3)
+    page.click("#sheet-edit >> text=Undo")
+    page.wait_for_function("avmsf.studio.revision === 3")
+    assert pitch_of_page(page) == pytest.approx(400.0, abs=3)
+    assert shown(page, "Pitch") == ["× 1.00"], "the sliders go back with the field"
+    assert page.is_disabled("#sheet-edit >> text=Undo")
+    page.fill("#sheet-edit input[type=text]", "higher")
+    page.click("text=Save as")
+    page.wait_for_selector("text=Saved: higher")
+    page.click("text=Save as")
+    page.wait_for_selector("text=higher is there: choose another")
+    assert [(what, words["base"]) for what, words in server.asked] == [
+        ("edit", 1),
+        ("undo", 2),
+        ("save", 3),
+        ("save", 4),
+    ]
+
+
+def test_what_a_slider_says_when_save_is_clicked_is_saved(browser: "Browser", modules: Path, tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as opened:
+        patch.setenv(MODULES_VARIABLE, str(modules))
+        server = opened.enter_context(served(open_plate(tmp_path / "home"), tmp_path / "scratch"))
+        page = browser.new_context().new_page()
+        opened.callback(page.context.close)
+        page.goto(f"http://127.0.0.1:{server.port}/{server.token}/")
+        page.evaluate("window.avmsf.ready.then(() => null)")
+        page.click("#tab-edit")
+        page.fill("#sheet-edit input[aria-label='Name of the new field']", "higher")
+        for _ in range(10):
+            move(page, "Pitch")
+        page.click("text=Save as")
+        page.wait_for_selector("text=Saved:")
+        saved = load(tmp_path / "home" / "higher.safetensors")
+        torch.testing.assert_close(saved.bank.frequency, plate_field().bank.frequency * STEP**10, rtol=1e-6, atol=0)
+        # The new file is what the sliders are relative to from then on, and nothing is sent after it.
+        assert shown(page, "Pitch") == ["× 1.00"]
+        page.wait_for_timeout(400)
+        heard = server.manifest()["live"]
+        assert heard["sliders"]["pitch"] == 1.0
+        assert page.evaluate("avmsf.studio.revision") == heard["revision"]
+        expected = (saved.bank.frequency[saved.audible]).tolist()
+        assert page.evaluate("[...avmsf.studio.bundle.tensors.frequency]") == pytest.approx(expected, rel=1e-9)
+
+
+def test_another_tabs_edit_is_not_overwritten_in_silence(edits: Any) -> None:
+    page, server = edits()
+    server.change(size=2.0)
+    page.select_option("#sheet-edit select >> nth=1", "glass")
+    page.wait_for_selector("text=Another tab changed this field meanwhile")
+    assert [words["base"] for _, words in server.asked] == [1]
+    assert server.revision == 2
+    page.click("text=Put mine in its place")
+    page.wait_for_function("avmsf.studio.revision === 3")
+    assert server.asked[-1][1]["base"] == 2
+    assert server.asked[-1][1]["material"] == {"from": None, "to": "glass"}
+
+
+def test_another_tabs_edit_is_shown_when_it_is_chosen(edits: Any) -> None:
+    page, server = edits()
+    server.change(size=2.0)
+    move(page, "Pitch")
+    page.click("text=Show its change")
+    page.wait_for_function("avmsf.studio.revision === 2")
+    assert shown(page, "Size", "Pitch") == ["× 2.00", "× 1.00"]
+    assert pitch_of_page(page) == pytest.approx(500.0, abs=3)
+    page.wait_for_timeout(400)
+    assert len(server.asked) == 1, "what was given up is not sent"
+
+
+def test_saving_after_another_tabs_edit_saves_ones_own(edits: Any) -> None:
+    page, server = edits()
+    server.change(size=2.0)
+    page.fill("#sheet-edit input[type=text]", "mine")
+    page.click("text=Save as")
+    page.click("text=Put mine in its place")
+    page.wait_for_selector("text=Saved: mine")
+    assert [(what, words["base"]) for what, words in server.asked] == [("save", 1), ("edit", 2), ("save", 3)]
+    assert server.asked[1][1]["size"] == 1.0
+
+
+def test_another_tabs_edit_after_ones_own_is_told_and_kept(edits: Any) -> None:
+    page, server = edits()
+    server.then = lambda: server.change(size=2.0, pitch=1.0)
+    move(page, "Pitch")
+    page.wait_for_selector("text=Another tab changed this field after your change")
+    assert shown(page, "Size", "Pitch") == ["× 2.00", "× 1.00"]
+    move(page, "Decay time")
+    page.wait_for_function("avmsf.studio.revision === 4")
+    assert (server.asked[1][1]["base"], server.asked[1][1]["size"]) == (3, 2.0), "on top of the other tab's"
+
+
+def test_a_slider_that_moves_on_does_not_adopt_another_tabs_revision(edits: Any) -> None:
+    page, server = edits()
+    server.slow = True
+    server.then = lambda: server.change(size=2.0)
+    move(page, "Pitch")
+    wait_until(page, lambda: len(server.asked) == 1)
+    move(page, "Decay time")
+    server.let_go()
+    page.wait_for_selector("text=Another tab changed this field meanwhile")
+    assert [words["base"] for _, words in server.asked] == [1, 2]
+    assert server.state[0] == {"size": 2.0}
+
+
+def test_undo_waits_for_the_edit_that_it_undoes(edits: Any) -> None:
+    page, server = edits()
+    move(page, "Size")
+    page.wait_for_function("avmsf.studio.revision === 2")
+    server.slow = True
+    move(page, "Pitch")
+    wait_until(page, lambda: len(server.asked) == 2)
+    page.click("#sheet-edit >> text=Undo")
+    page.wait_for_timeout(100)
+    server.let_go()
+    page.wait_for_function("avmsf.studio.revision === 4")
+    assert [(what, words["base"]) for what, words in server.asked] == [("edit", 1), ("edit", 2), ("undo", 3)]
+    assert shown(page, "Size", "Pitch") == ["× 1.01", "× 1.00"]
+    assert words_on(page) == ""
+
+
+def test_leading_takes_the_sliders_along_and_holds_them_meanwhile(edits: Any) -> None:
+    page, server = edits()
+    move(page, "Pitch")
+    page.set_input_files("#sheet-edit input[type=file]", upload())
+    page.wait_for_selector("#sheet-edit button:visible:has-text('Stop')")
+    assert [sorted(words)[0] for _, words in server.asked] == ["base", "base"], "the slider first, then the recording"
+    assert server.asked[0][1]["pitch"] == pytest.approx(STEP)
+    assert slider(page, "Pitch").locator("input").is_disabled()
+    assert page.is_disabled("#sheet-edit >> text=Undo")
+    server.let_go()
+    page.wait_for_function("avmsf.studio.revision === 3")
+    assert shown(page, "Pitch") == ["× 1.00"]
+    move(page, "Size")
+    page.wait_for_function("avmsf.studio.revision === 4")
+    assert (server.asked[-1][1]["pitch"], server.asked[-1][1]["base"]) == (1.0, 3)
+
+
+@pytest.mark.parametrize("live", [{}, {"jobKind": "lead the sound", "abilities": ["edit", "like", "reconstruct"]}])
+def test_a_lead_under_way_is_followed_by_a_page_opened_later(edits: Any, live: dict[str, Any]) -> None:
+    page, server = edits(job="j9", **live)
+    assert page.locator("#sheet-edit button:visible", has_text="Stop").count() == 1
+    assert slider(page, "Pitch").locator("input").is_disabled()
+    server.let_go()
+    page.wait_for_function("avmsf.studio.revision === 2")
+    assert not slider(page, "Pitch").locator("input").is_disabled()
+    assert pitch_of_page(page) == pytest.approx(500.0, abs=3)
+
+
+def test_another_kind_of_job_is_not_taken_for_a_lead(edits: Any) -> None:
+    page, _ = edits(job="j9", jobKind="reconstruct", abilities=["edit", "like", "reconstruct"])
+    assert page.locator("#sheet-edit button:visible", has_text="Stop").count() == 0
+    assert not slider(page, "Pitch").locator("input").is_disabled()
+
+
+def test_an_answer_that_is_cut_is_no_success(edits: Any) -> None:
+    page, server = edits()
+
+    def cut(route: "Route", request: "Request") -> None:
+        server.change(**{name: value for name, value in request.post_data_json.items() if name != "base"})
+        route.fulfill(status=200, content_type="application/json", body='{"revi')
+        page.unroute("**/edit", cut)
+
+    page.route("**/edit", cut)
+    move(page, "Pitch")
+    page.wait_for_selector("text=The server does not answer")
+    page.click("text=Try again")
+    page.wait_for_selector("text=The change whose answer was lost was made, or another tab")
+    page.click("text=Show its change")
+    page.wait_for_function("avmsf.studio.revision === 2")
+    assert shown(page, "Pitch") == ["× 1.01"]
+
+
+def test_an_edit_that_is_refused_is_taken_back(edits: Any) -> None:
+    page, server = edits()
+    refuse = {"error": "pitch: expected modes below half the sample rate"}
+    page.route("**/edit", lambda route: answer(route, refuse, 422))
+    move(page, "Pitch")
+    page.wait_for_selector("text=expected modes below half the sample rate")
+    page.fill("#sheet-edit input[type=text]", "mine")
+    page.click("text=Save as")
+    page.wait_for_timeout(200)
+    assert server.taken == set(), "what is not heard is not saved"
+    page.click("text=Take it back")
+    assert shown(page, "Pitch") == ["× 1.00"]
+
+
+def test_a_measured_strike_is_compared_with_the_model(visit: Open) -> None:
+    page = visit(strikes=True)
+    page.click("#sheet-strike >> text=100.wav")
+    page.wait_for_function("document.getElementById('blow-facts').textContent.includes('recording and model')")
+    compared = page.evaluate(
+        "(({ recording, model }) => [[...recording.levels], [...model.levels]])(avmsf.studio.spectra.compared)"
+    )
+    recording, model = torch.tensor(compared)
+    # Its recording is the model's own sound: a picture of both shows one line, with its peaks at the modes' pitches.
+    near = recording > recording.max() - 60
+    torch.testing.assert_close(model[near], recording[near], atol=0.1, rtol=0)
+    peak = 40 * 500 ** (float(recording.argmax() + 0.5) / len(recording))
+    assert min(abs(peak - 400 * order) for order in range(1, 7)) < 0.02 * peak
+    assert page.locator(".mark .dot[data-strike]").count() == 2
+    assert page.locator(".mark .dot[data-strike].chosen").count() == 1
+    page.uncheck("text=Mark them on the object")
+    assert page.locator(".mark .dot[data-strike]").count() == 0
+
+
+def test_strikes_compared_one_after_another_do_not_pile_up(visit: Open) -> None:
+    page = visit(strikes=True)
+    page.evaluate(
+        """() => {
+             const { engine } = avmsf.studio, [play, strike] = [engine.play.bind(engine), engine.strike.bind(engine)];
+             window.heard = { begun: 0, playing: [], rows: [] };
+             engine.play = (buffer) => {
+               const source = play(buffer), stop = source.stop.bind(source);
+               heard.playing.push(source);
+               heard.begun += 1;
+               source.stop = () => { heard.playing = heard.playing.filter((other) => other !== source); stop(); };
+               return source;
+             };
+             engine.strike = (row, options) => { heard.rows.push(row); return strike(row, options); };
+           }"""
+    )
+    # Within the page: between clicks from without, a busy machine lets a whole recording pass.
+    page.evaluate(
+        """async () => {
+             const buttons = document.querySelectorAll("#sheet-strike .listing .grow");
+             for (const place of [0, 1, 0, 1]) {
+               const before = heard.begun;
+               buttons[place].click();
+               while (heard.begun === before) await new Promise((passed) => setTimeout(passed, 5));
+             }
+           }"""
+    )
+    page.wait_for_function("heard.rows.length > 0")
+    page.wait_for_timeout(900)
+    assert page.evaluate("[heard.playing.length, ...heard.rows]") == [1, 500]
+
+
+def test_a_recording_is_heard(visit: Open) -> None:
+    page = visit(strikes=True)
+    page.click("#sheet-strike li:has-text('100.wav') >> text=Recording")
+    page.wait_for_function(
+        """() => {
+             const samples = new Float32Array(avmsf.studio.engine.analyser.fftSize);
+             avmsf.studio.engine.analyser.getFloatTimeDomainData(samples);
+             return samples.some((value) => Math.abs(value) > 1e-3);
+           }"""
+    )
+    assert page.evaluate("avmsf.studio.last === undefined"), "without a blow of the model"

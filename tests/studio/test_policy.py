@@ -1,0 +1,52 @@
+"""What the page may run: all that it needs, in a browser that tells of what it refuses, and nothing more."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from avmsf.studio.modules import MODULES_VARIABLE
+from avmsf.studio.opening import open_target
+from avmsf.studio.policy import policy_of
+from avmsf.studio.routes import PAGE
+from opened_plate import open_plate
+from page_plate import page_modules, plate_object
+from served import served
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+HEARD = "window.refused = []; addEventListener('securitypolicyviolation', (e) => refused.push(e.violatedDirective));"
+
+
+def test_the_libraries_of_a_network_are_allowed_by_their_host_alone() -> None:
+    policy = policy_of((PAGE / "index.html").read_text())
+    scripts = next(part for part in policy.split("; ") if part.startswith("script-src"))
+    assert scripts.split()[-1] == "https://cdn.jsdelivr.net"
+    assert "unsafe-inline" not in policy
+    assert "'unsafe-eval'" not in policy
+
+
+@pytest.mark.parametrize("kind", ["mesh", "gaussians"])
+def test_the_page_needs_no_more_than_it_is_allowed(
+    browser: "Browser", kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(MODULES_VARIABLE, str(page_modules(tmp_path / "npm")))
+    shown = plate_object(kind, tmp_path)
+    opened = open_plate(tmp_path / "home")
+    with served(open_target(opened.field, object=shown), tmp_path / "scratch") as server:
+        context = browser.new_context()
+        page = context.new_page()
+        page.set_default_timeout(30_000)
+        page.add_init_script(HEARD)
+        page.goto(f"http://127.0.0.1:{server.port}/{server.token}/")
+        page.evaluate("window.avmsf.ready.then(() => null)")
+        sound = page.evaluate("avmsf.renderOffline([{ row: 5 }]).then((sound) => Math.max(...sound))")
+        assert sound > 0
+        assert page.evaluate("refused") == []
+        page.evaluate(
+            "() => { const script = document.createElement('script'); script.textContent = 'window.evil = 1';"
+            "document.body.append(script); return new Promise((done) => setTimeout(done, 50)) }"
+        )
+        assert page.evaluate("[window.evil ?? null, refused]") == [None, ["script-src-elem"]]
+        context.close()
