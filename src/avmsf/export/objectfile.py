@@ -107,10 +107,10 @@ def _shown(scene: trimesh.Scene, points: Float[Tensor, "points 3"], what: str, m
     expect_alike(places, points, what)
     if faces <= most:
         return ObjectFile("mesh", "object.glb", _as_glb(scene))
-    reduced = trimesh.Scene([reduced(mesh, most / faces, what) for mesh in meshes])
-    left = sum(len(mesh.faces) for mesh in reduced.geometry.values())
+    smaller = trimesh.Scene([reduced(mesh, most / faces, what) for mesh in meshes])
+    left = sum(len(mesh.faces) for mesh in smaller.geometry.values())
     remark = f"{what} has {faces:,} triangles, too many for a browser: {left:,} are shown, without its textures"
-    return ObjectFile("mesh", "object.glb", _as_glb(reduced), (remark,))
+    return ObjectFile("mesh", "object.glb", _as_glb(smaller), (remark,))
 
 
 def _as_glb(scene: trimesh.Scene) -> bytes:
