@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo example test lint install clean
+.PHONY: demo example test page lint install clean
 
 install: .venv/developed
 
@@ -25,6 +25,10 @@ example: .venv/developed
 
 test: .venv/developed
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto
+
+# What the page does, in Debian's chromium: minutes in real time, which `test` has the centre of.
+page: .venv/developed
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto -m page tests/studio
 
 lint: .venv/developed
 	$(BIN)/ruff check .

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page, Request, Route
 
 
+pytestmark = pytest.mark.page
+
+
 @pytest.fixture(scope="module")
 def modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return page_modules(tmp_path_factory.mktemp("npm"))

@@ -14,6 +14,8 @@ from plate_page import Open, Serve, on_screen, plate_site, visiting, words_on
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
+pytestmark = pytest.mark.page
+
 MIDDLE = (0.0, 0.0, SIDES[2] / 2)
 CORNER = (0.1, 0.06, SIDES[2] / 2)
 

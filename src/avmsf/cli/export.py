@@ -37,7 +37,7 @@ _POINTS = {"web": MOST_POINTS, "gltf": 2000, "faust": 64, "avmsf-demo": 10_000, 
 
 @dataclass(frozen=True)
 class Options:
-    """Write a field for other tools.
+    """Write a field for other tools: web page, glTF, Faust, samplers, modal analysis.
 
     web: a page on which it is struck, a folder for any static host or one .html file. gltf: a .glb that any viewer
     shows, with the draft extension KHR_audio_rigid_bodies. faust: a .dsp with controls, or a .lib without. avmsf-demo:
