@@ -1,9 +1,10 @@
 """Jobs: what is heard of them, that one runs at a time, and that nothing of them is left."""
 
 import asyncio
+import gc
 import sys
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,19 @@ import pytest
 from avmsf.errors import CaptureError
 from avmsf.studio.jobs import Job, Jobs
 from avmsf.studio.refusal import RefusedError
+
+# A loop that a test closes right after a process was killed leaves pipes for the collector, which warns of them.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+@pytest.fixture(autouse=True)
+def _collected() -> Iterator[None]:
+    """Let the collector warn here, not in some later test."""
+    yield
+    gc.collect()
 
 
 def script(text: str) -> tuple[str, ...]:

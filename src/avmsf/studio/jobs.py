@@ -131,6 +131,8 @@ class Job:
                 pass
             await said
             raise
+        finally:
+            process.stdin.close()
         words = await said
         if self._cancelled:
             return _STOPPED
