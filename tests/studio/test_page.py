@@ -18,6 +18,8 @@ from plate_page import LIVE, Open, Serve, answer, on_screen, plate_site, upload,
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page, Request, Route
 
+pytestmark = pytest.mark.page
+
 SPACING = SIDES[0] / 30
 """Between neighbouring contacts, metres."""
 LIVE_CAPTURE = {"revision": 1, "undo": False, "abilities": ["capture", "reconstruct"], "mode": "capture", "job": None}
