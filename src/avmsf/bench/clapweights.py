@@ -1,14 +1,13 @@
 """Where CLAP's weights come from: the hub or its cache, or a local folder; what else lies there is refused by name."""
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Any, Final
-from urllib.request import Request, urlopen
 
 from torch import nn
 
 from avmsf.errors import EvaluationError
+from avmsf.hub import HUB_SECONDS, expect_answer, is_hub_name, read_settings
 
 MODELS: Final = ("laion/clap-htsat-unfused", "laion/clap-htsat-fused", "laion/larger_clap_general")
 """Names under which the hub has networks that fit."""
@@ -17,8 +16,6 @@ _EXTRACTORS = (_EXTRACTOR, "processor_config.json")
 """Either holds the feature extractor's settings; which one depends on the transformers that wrote the folder."""
 _WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 """Either will do."""
-_SECONDS = 5.0
-"""How long to wait for the hub's first word."""
 
 
 def find_clap(source: str | Path) -> Path:
@@ -30,8 +27,7 @@ def find_clap(source: str | Path) -> Path:
     if folder.is_dir():
         return folder
     name = str(source)
-    # A name of the hub is an owner and a model; everything else is a path.
-    if not (name.count("/") == 1 and not name.startswith((".", "/", "~")) and all(name.split("/"))):
+    if not is_hub_name(source):
         raise EvaluationError(
             f"{name}: expected a folder that holds a CLAP model, or a name such as {', '.join(MODELS)}; found no such "
             "folder: check the path"
@@ -70,14 +66,14 @@ def transformers_clap(folder: Path) -> tuple[nn.Module, Any, str]:
 def _expect_clap(folder: Path) -> Path:
     """Return the file of a folder's weights. Raises EvaluationError unless it holds a CLAP model."""
     if (folder / "model_index.json").is_file():
-        kind = _record(folder / "model_index.json").get("_class_name")
+        kind = read_settings(folder / "model_index.json", raising=EvaluationError).get("_class_name")
         raise EvaluationError(
             f"{folder}: expected a CLAP model, found a pipeline of diffusers, {kind}: that one makes sounds, and what "
             f"judges them is another model, such as {MODELS[0]}"
         )
     lacking = [] if (folder / _CONFIG).is_file() else [_CONFIG]
     if not lacking:
-        kind = _record(folder / _CONFIG).get("model_type")
+        kind = read_settings(folder / _CONFIG, raising=EvaluationError).get("model_type")
         if kind != "clap":
             raise EvaluationError(f"{folder / _CONFIG}: expected a model of type 'clap' (ClapModel), found {kind!r}")
     lacking += [
@@ -93,7 +89,7 @@ def _expect_clap(folder: Path) -> Path:
 def _from_hub(name: str) -> Path:
     """Return the folder of a model in the hub's cache, after downloading it where it is not there."""
     _transformers()
-    from huggingface_hub import constants, snapshot_download
+    from huggingface_hub import snapshot_download
 
     settings = ["*.json", "*.txt"]
     try:
@@ -103,12 +99,9 @@ def _from_hub(name: str) -> Path:
     except Exception:  # not in the cache: the hub's client has an error of its own for each way of not being there
         pass
     try:
-        if not constants.HF_HUB_OFFLINE:
-            # Without a network the hub's client tries again for half a minute; one question tells at once.
-            question = Request(f"{constants.ENDPOINT}/{name}/resolve/main/{_CONFIG}", method="HEAD")
-            urlopen(question, timeout=_SECONDS).close()
+        expect_answer(name, _CONFIG)
         for weights in _WEIGHTS:
-            folder = Path(snapshot_download(name, allow_patterns=[*settings, weights], etag_timeout=_SECONDS))
+            folder = Path(snapshot_download(name, allow_patterns=[*settings, weights], etag_timeout=HUB_SECONDS))
             if (folder / weights).is_file():
                 return folder
         raise FileNotFoundError(f"it holds neither {' nor '.join(_WEIGHTS)}")
@@ -124,16 +117,6 @@ def _how_to_download(name: str) -> str:
         f"Where there is a network, say: hf download {name} --local-dir FOLDER; copy FOLDER here, and give its path in "
         "place of the name"
     )
-
-
-def _record(path: Path) -> dict[str, Any]:
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise EvaluationError(f"{path}: cannot be read as JSON ({error}): copy it again") from error
-    if not isinstance(record, dict):
-        raise EvaluationError(f"{path}: expected a JSON object, found {type(record).__name__}: copy it again")
-    return record
 
 
 def _transformers() -> Any:

@@ -1,10 +1,8 @@
 """DINOv2 through transformers (extra `vision`): by name, from the hub or its cache, or from a local folder."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
-from urllib.request import Request, urlopen
 
 import torch
 from jaxtyping import Float, UInt8
@@ -12,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from avmsf.errors import SceneError
+from avmsf.hub import HUB_SECONDS, expect_answer, read_settings
 from avmsf.scene.encode import unit_image
 
 MODELS: Final = tuple(
@@ -21,8 +20,6 @@ MODELS: Final = tuple(
 IMAGENET_MEAN: Final = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION: Final = (0.229, 0.224, 0.225)
 _CONFIG, _WEIGHTS, _PREPROCESSOR = "config.json", "model.safetensors", "preprocessor_config.json"
-_SECONDS = 5.0
-"""How long to wait for the hub's first word."""
 
 
 class DinoEncoder:
@@ -138,18 +135,15 @@ def _find(source: str | Path) -> tuple[Path, str]:
 def _from_hub(name: str) -> Path:
     """Return the folder of a model in the hub's cache, after downloading it where it is not there."""
     _transformers()
-    from huggingface_hub import constants, hf_hub_download, try_to_load_from_cache
+    from huggingface_hub import hf_hub_download, try_to_load_from_cache
 
     wanted = (_CONFIG, _PREPROCESSOR, _WEIGHTS)
     cached = [try_to_load_from_cache(name, file) for file in wanted]
     if all(isinstance(path, str) for path in cached):
         return Path(str(cached[0])).parent
     try:
-        if not constants.HF_HUB_OFFLINE:
-            # Without a network the hub's client tries again for half a minute; one question tells at once.
-            question = Request(f"{constants.ENDPOINT}/{name}/resolve/main/{_CONFIG}", method="HEAD")
-            urlopen(question, timeout=_SECONDS).close()
-        paths = [hf_hub_download(name, file, etag_timeout=_SECONDS) for file in wanted]
+        expect_answer(name, _CONFIG)
+        paths = [hf_hub_download(name, file, etag_timeout=HUB_SECONDS) for file in wanted]
     except Exception as error:  # the hub's client raises whatever the network beneath it does
         raise SceneError(
             f"{name}: not in the cache of downloaded models, and it cannot be downloaded ({type(error).__name__}: "
@@ -168,7 +162,7 @@ def _load_model(folder: Path, device: torch.device, dtype: torch.dtype) -> nn.Mo
             f"{folder}: expected a DINOv2 model, found no {' and no '.join(lacking)}: copy {_CONFIG}, {_WEIGHTS} and "
             f"{_PREPROCESSOR} of a model such as {MODELS[0]} there"
         )
-    kind = _record(folder / _CONFIG).get("model_type")
+    kind = read_settings(folder / _CONFIG, raising=SceneError).get("model_type")
     classes = {"dinov2": "Dinov2Model", "dinov2_with_registers": "Dinov2WithRegistersModel"}
     if kind not in classes:
         raise SceneError(f"{folder / _CONFIG}: expected a model of type {' or '.join(classes)}, found {kind!r}")
@@ -192,7 +186,7 @@ def _constants(path: Path) -> tuple[Sequence[float], Sequence[float]]:
     """Return the mean and deviation of colours that a preprocessor's file asks for, ImageNet's without one."""
     if not path.is_file():
         return IMAGENET_MEAN, IMAGENET_DEVIATION
-    record = _record(path)
+    record = read_settings(path, raising=SceneError)
     found = record.get("image_mean", list(IMAGENET_MEAN)), record.get("image_std", list(IMAGENET_DEVIATION))
     if not all(isinstance(each, list) and len(each) == 3 and all(map(_is_number, each)) for each in found):
         raise SceneError(f"{path}: expected image_mean and image_std of three numbers, found {found}: copy it again")
@@ -201,16 +195,6 @@ def _constants(path: Path) -> tuple[Sequence[float], Sequence[float]]:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, float | int)
-
-
-def _record(path: Path) -> dict[str, Any]:
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise SceneError(f"{path}: cannot be read as JSON ({error}): copy it again") from error
-    if not isinstance(record, dict):
-        raise SceneError(f"{path}: expected a JSON object, found {type(record).__name__}: copy it again")
-    return record
 
 
 def _transformers() -> Any:

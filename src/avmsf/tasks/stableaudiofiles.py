@@ -6,13 +6,12 @@ import warnings
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
-from urllib.error import HTTPError
-from urllib.request import Request, urlopen
 
 import torch
 from torch import nn
 
 from avmsf.errors import EditError
+from avmsf.hub import expect_answer, is_hub_name, read_settings
 
 STABLE_AUDIO: Final = "stabilityai/stable-audio-open-1.0"
 """The model that the paper edits with, by its name on the hub."""
@@ -24,8 +23,6 @@ _SAMPLED = 64
 """Numbers of each weight that a digest looks at, evenly spaced."""
 _ON_SAVING: Final = ("architectures", "dtype", "torch_dtype", "transformers_version")
 """Settings that transformers adds when it saves: they say nothing that the weights do not."""
-_SECONDS = 5.0
-"""How long to wait for the hub's first word."""
 
 
 def load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
@@ -36,7 +33,7 @@ def load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
     kind = _pipeline_class()
     folder = Path(source).expanduser()
     named = not folder.is_dir()
-    if named and not _is_name(source):
+    if named and not is_hub_name(source):
         raise EditError(
             f"{source}: expected a folder with a {_CLASS}, or a name of the hub such as {STABLE_AUDIO}; found no such "
             "folder: check the path"
@@ -84,22 +81,14 @@ def digest(pipeline: Any) -> str:
     return found.hexdigest()
 
 
-def _is_name(source: str | Path) -> bool:
-    words = str(source).split("/")
-    return isinstance(source, str) and len(words) == 2 and all(words) and words[0] not in (".", "..", "~")
-
-
 def _from_hub(kind: Any, name: str) -> Path:
     """Return the folder of a pipeline in the hub's cache, after downloading it where it is not there."""
-    from huggingface_hub import constants
-
     try:
         return Path(kind.download(name, local_files_only=True))
     except Exception:  # not there, or not whole; the client raises whatever it does
         pass
     try:
-        if not constants.HF_HUB_OFFLINE:
-            _expect_network(f"{constants.ENDPOINT}/{name}/resolve/main/{_INDEX}")
+        expect_answer(name, _INDEX)
         return Path(kind.download(name))
     except Exception as error:  # the hub's client raises whatever the network beneath it does
         raise EditError(
@@ -111,15 +100,6 @@ def _from_hub(kind: Any, name: str) -> Path:
         ) from error
 
 
-def _expect_network(address: str) -> None:
-    """Ask once, for without a network the hub's client tries again for half a minute."""
-    try:
-        urlopen(Request(address, method="HEAD"), timeout=_SECONDS).close()
-    except HTTPError:
-        # It answers; the client asks again with the user's token.
-        return
-
-
 def _expect_pipeline(folder: Path) -> None:
     """Raise `EditError` for a folder that holds another model or lacks a part."""
     index = folder / _INDEX
@@ -129,13 +109,9 @@ def _expect_pipeline(folder: Path) -> None:
             f"{folder}: expected a {_CLASS} as diffusers saves it, with {_INDEX} and the folders {', '.join(_PARTS)}; "
             f"found {found}: give the folder that holds {_INDEX}"
         )
-    try:
-        record = json.loads(index.read_text(encoding="utf-8"))
-        found = record["_class_name"]
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise EditError(f"{index}: cannot be read as a pipeline's index ({error!r}): copy it again") from error
-    if found != _CLASS:
-        raise EditError(f"{folder}: expected a {_CLASS}, found a {found}: give the folder of a Stable Audio model")
+    kind = read_settings(index, raising=EditError).get("_class_name")
+    if kind != _CLASS:
+        raise EditError(f"{folder}: expected a {_CLASS}, found a {kind}: give the folder of a Stable Audio model")
     lacking = [part for part in _PARTS if not (folder / part).is_dir()]
     if lacking:
         raise EditError(f"{folder}: the model lacks its {' and its '.join(lacking)}: copy the missing folders there")

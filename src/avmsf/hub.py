@@ -1,0 +1,45 @@
+"""Folders of other people's models: names that the hub has them under, whether it answers, and their settings."""
+
+import json
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+from avmsf.errors import AvmsfError
+
+HUB_SECONDS = 5.0
+"""How long to wait for the hub's first word."""
+
+
+def is_hub_name(source: str | Path) -> bool:
+    """Return whether a source that is no folder may be a model's name: an owner and a model, where paths differ."""
+    words = str(source).split("/")
+    return isinstance(source, str) and len(words) == 2 and all(words) and words[0][0] not in ".~"
+
+
+def expect_answer(name: str, file: str) -> None:
+    """Ask the hub once for a model's file, unless its client is told to stay offline; raise OSError where nobody is.
+
+    Without a network the hub's own client tries again for half a minute. A refusal is an answer too: the client asks
+    again with the user's token. Needs the package huggingface_hub.
+    """
+    from huggingface_hub import constants
+
+    if constants.HF_HUB_OFFLINE:
+        return
+    try:
+        urlopen(Request(f"{constants.ENDPOINT}/{name}/resolve/main/{file}", method="HEAD"), timeout=HUB_SECONDS).close()
+    except HTTPError:
+        return
+
+
+def read_settings(path: Path, *, raising: type[AvmsfError]) -> dict[str, Any]:
+    """Return the JSON object in a model's file. Raises `raising` for anything else."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise raising(f"{path}: cannot be read as JSON ({error}): copy it again") from error
+    if not isinstance(record, dict):
+        raise raising(f"{path}: expected a JSON object, found {type(record).__name__}: copy it again")
+    return record

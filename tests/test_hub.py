@@ -1,0 +1,88 @@
+"""Names of the hub are told from paths, one question says whether it answers, and settings are JSON objects."""
+
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+
+from avmsf.errors import SceneError
+from avmsf.hub import expect_answer, is_hub_name, read_settings
+
+constants = pytest.importorskip("huggingface_hub.constants")
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Paths that a hub of our own is asked for; it refuses all, as the hub does gated models."""
+    paths: list[str] = []
+
+    class Gate(BaseHTTPRequestHandler):
+        def do_HEAD(self) -> None:
+            paths.append(self.path)
+            self.send_error(401)
+
+        def log_message(self, *_: object) -> None:
+            return
+
+    with HTTPServer(("127.0.0.1", 0), Gate) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        monkeypatch.setattr(constants, "ENDPOINT", f"http://127.0.0.1:{server.server_port}")
+        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+        yield paths
+        server.shutdown()
+
+
+@pytest.mark.parametrize("name", ["laion/clap-htsat-unfused", "stabilityai/stable-audio-open-1.0"])
+def test_an_owner_and_a_model_are_a_name(name: str) -> None:
+    assert is_hub_name(name)
+
+
+@pytest.mark.parametrize("source", ["./model", "../model", "~/model", "/model", "model/", "model", "a/b/c", "", "/"])
+def test_a_path_is_no_name(source: str) -> None:
+    assert not is_hub_name(source)
+
+
+def test_a_path_object_is_no_name() -> None:
+    assert not is_hub_name(Path("owner/model"))
+
+
+def test_a_refusal_is_an_answer(asked: list[str]) -> None:
+    expect_answer("owner/model", "config.json")
+    assert asked == ["/owner/model/resolve/main/config.json"]
+
+
+def test_offline_nobody_is_asked(asked: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    expect_answer("owner/model", "config.json")
+    assert asked == []
+
+
+def test_where_nobody_answers_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+    with pytest.raises(OSError, match="refused"):
+        expect_answer("owner/model", "config.json")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        pytest.param(b"{", "cannot be read as JSON .*: copy it again", id="cut short"),
+        pytest.param(b"\xff", "cannot be read as JSON", id="no text"),
+        pytest.param(b"[1]", "expected a JSON object, found list", id="a list"),
+        pytest.param(None, "cannot be read as JSON .*No such file", id="missing"),
+    ],
+)
+def test_settings_that_are_none_are_named(tmp_path: Path, content: bytes | None, message: str) -> None:
+    path = tmp_path / "config.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SceneError, match=f"config.json: {message}"):
+        read_settings(path, raising=SceneError)
+
+
+def test_settings_are_read(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text('{"model_type": "clap"}', encoding="utf-8")
+    assert read_settings(tmp_path / "config.json", raising=SceneError) == {"model_type": "clap"}
