@@ -20,18 +20,18 @@ from avmsf.simulate.simulation import simulate_object
 from benchmarks.material import capture_in_place, surface_features
 from benchmarks.report import Options, Report, Table, tell
 
-FIRST, LAST = 6, 20
-"""Strikes to begin with, and when there are enough."""
-JUDGED = (8, 10, 12, 14, 17, 20)
-"""Numbers of strikes at which both ways are judged."""
+FIRST = 6
+"""Strikes to begin with."""
+ROUNDS = (8, 10, 12, 14, 17, 20)
+"""Strikes after each round, when both ways are judged."""
 STARTS = 3
 """First strikes, spread evenly over the table."""
 SIM20_OBJECTS = ("plate-ceramic", "mug-ceramic", "skillet-iron", "blob-polycarbonate")
 CONVENTIONS = (
     "error: relative STFT error, mean over the recordings that neither way has learnt from; physics, no steps end to "
     "end, modes extracted and the field fitted anew for every number of strikes.",
-    f"both ways begin with the same {FIRST} strikes, spread as far apart as they go; then one more at a time, of those "
-    "that were recorded: the farthest from all others, or the one that suggest names.",
+    f"both ways begin with the same {FIRST} strikes, spread as far apart as they go; then some more at a time, of "
+    "those recorded: the farthest from all others, or those that suggest names; after each round both are judged.",
     "ratio: mean error of suggested strikes over that of farthest ones, all numbers and starts together.",
 )
 
@@ -86,21 +86,17 @@ def _paths(
     impacts: Impacts, features: FeatureField, recipe: Physics, start: int, options: Options
 ) -> list[tuple[int, float, float]]:
     """Return the numbers of strikes with the errors of suggested and of farthest ones."""
-    last = FIRST + 1 if options.quick_look else LAST
-    judged = (last,) if options.quick_look else JUDGED
-    farthest = farthest_points(impacts.contacts, last, start=start).tolist()
+    rounds = ROUNDS[:1] if options.quick_look else ROUNDS
+    farthest = farthest_points(impacts.contacts, rounds[-1], start=start).tolist()
     rows, found = farthest[:FIRST], []
-    field = _fitted(impacts, rows, features, recipe)
-    for count in range(FIRST + 1, last + 1):
-        following = suggest(field, 1, candidates=impacts.contacts, directions=impacts.directions)
-        rows = [*rows, int(following.rows[0])]
-        field = _fitted(impacts, rows, features, recipe)
-        if count in judged:
-            others = farthest[:count]
-            test = impacts.take(sorted(set(range(len(impacts))) - set(rows) - set(others)))
-            spread = _fitted(impacts, others, features, recipe)
-            errors = [evaluate(each, test).mean()["relative_stft"] for each in (field, spread)]
-            found.append((count, errors[0], errors[1]))
+    ours = _fitted(impacts, rows, features, recipe)
+    for count in rounds:
+        following = suggest(ours, count - len(rows), candidates=impacts.contacts, directions=impacts.directions)
+        rows, others = [*rows, *following.rows.tolist()], farthest[:count]
+        test = impacts.take(sorted(set(range(len(impacts))) - set(rows) - set(others)))
+        ours, spread = (_fitted(impacts, each, features, recipe) for each in (rows, others))
+        errors = [evaluate(each, test).mean()["relative_stft"] for each in (ours, spread)]
+        found.append((count, errors[0], errors[1]))
     return found
 
 
