@@ -1,0 +1,92 @@
+"""A shared page takes three and spark from a network: the very files that it was tried with, or none."""
+
+import base64
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from avmsf.export.webpage import write_webpage
+from avmsf.studio.modules import PINNED
+from page_plate import PAGE, page_modules, plate_object, plate_table
+from plate_page import words_on
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page, Route
+
+NETWORK = "https://cdn.jsdelivr.net/npm/"
+TAMPERED = "three.core.js"
+
+
+@pytest.fixture(scope="module")
+def modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return page_modules(tmp_path_factory.mktemp("npm"))
+
+
+def digests() -> dict[str, str]:
+    """Return what the page's import map says that each file's content must be."""
+    found = re.search(r'<script type="importmap"[^>]*>(.*?)</script>', (PAGE / "index.html").read_text(), re.DOTALL)
+    assert found is not None
+    known: dict[str, str] = json.loads(found[1])["integrity"]
+    return known
+
+
+def local(address: str, modules: Path) -> Path:
+    path = address.removeprefix(NETWORK)
+    for package, version in PINNED.items():
+        path = path.replace(f"{package}@{version}/", f"{package}/", 1)
+    return modules / path
+
+
+def opened(page: "Page", address: str, modules: Path, *, tampered: str | None = None) -> list[str]:
+    """Open the page with the network's files taken from here, and return which it asked for."""
+    asked = []
+
+    def serve(route: "Route") -> None:
+        asked.append(route.request.url)
+        content = local(route.request.url, modules).read_bytes()
+        changed = tampered is not None and route.request.url.endswith(tampered)
+        headers = {"Content-Type": "text/javascript", "Access-Control-Allow-Origin": "*"}
+        route.fulfill(body=content + b"\nwindow.evil = 1;" if changed else content, headers=headers)
+
+    page.route(f"{NETWORK}**", serve)
+    page.goto(address)
+    page.evaluate("window.avmsf.ready.then(() => null)")
+    return asked
+
+
+def test_the_import_map_knows_each_file_by_its_content(modules: Path) -> None:
+    for address, digest in digests().items():
+        found = hashlib.sha384(local(address, modules).read_bytes()).digest()
+        assert digest == f"sha384-{base64.b64encode(found).decode()}", address
+
+
+@pytest.mark.parametrize(("kind", "name"), [("mesh", "page.html"), ("gaussians", "page.html"), ("mesh", "folder")])
+def test_every_file_that_the_page_fetches_is_known(
+    browser: "Browser", modules: Path, kind: str, name: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    write_webpage(plate_table(), tmp_path / name, object=plate_object(kind, tmp_path))
+    place = (tmp_path / name).as_uri()
+    if name == "folder":
+        place = request.getfixturevalue("serve")(tmp_path / name)
+    page = browser.new_page()
+    asked = opened(page, place, modules)
+    assert page.evaluate("avmsf.studio.view !== null && avmsf.studio.view !== undefined")
+    assert asked
+    assert set(asked) <= digests().keys()
+    page.close()
+
+
+def test_another_content_is_not_run_and_the_panel_works_without(
+    browser: "Browser", modules: Path, tmp_path: Path
+) -> None:
+    write_webpage(plate_table(), tmp_path / "page.html", object=plate_object("mesh", tmp_path))
+    page = browser.new_page()
+    opened(page, (tmp_path / "page.html").as_uri(), modules, tampered=TAMPERED)
+    assert page.evaluate("window.evil ?? null") is None
+    assert "3D" in words_on(page)
+    assert page.evaluate("avmsf.renderOffline([{ row: 5 }]).then((sound) => Math.max(...sound))") > 0
+    page.close()
