@@ -11,7 +11,7 @@ from avmsf.errors import LocationError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise
-from avmsf.tasks.listening import Blow, Listener
+from avmsf.tasks.listening import WINDOW, Blow, Listener
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.ringing import Ringing
 from made_fields import BANK, spline
@@ -88,9 +88,9 @@ def test_blocks_do_not_matter() -> None:
 
 def test_the_answer_waits_for_its_window_and_little_more() -> None:
     for blow in heard(Listener(locator()), stream(), block=80):
-        assert blow.heard == pytest.approx(0.05)
+        assert blow.heard == pytest.approx(WINDOW)
         # The stream's part of the latency: window, two hops of 2.5 ms and a block of 10 ms. The rest is computing.
-        assert blow.latency >= 0.05
+        assert blow.latency >= WINDOW
     tardy = Listener(locator()).hear(stream())
     assert tardy[0].latency > (len(stream()) - BEGINS[0]) / RATE
 

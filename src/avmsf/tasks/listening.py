@@ -22,7 +22,7 @@ from avmsf.tasks.locate import judge_fit
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.ringing import Ringing
 
-WINDOW = 0.05
+WINDOW = 0.04
 """Seconds of a blow that its first answer rests on."""
 _HOP, _FEWEST = 0.0025, 16
 """Seconds, and samples at least, that are taken at once."""
