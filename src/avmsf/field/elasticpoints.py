@@ -6,12 +6,15 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float32, Float64, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from avmsf.scene.points import farthest_points
 from avmsf.simulate.elastic import ElasticModes
 
+PLACES = 500
+"""Points that stand for the whole surface where all would be too many."""
 _NEIGHBOURS = 4
 """Points that a place's shapes are interpolated between."""
 
@@ -52,6 +55,11 @@ class ElasticPoints:
     def size(self) -> float:
         """Diagonal of the box around the points, metres."""
         return float((self.points.amax(0) - self.points.amin(0)).norm())
+
+    @cached_property
+    def spread(self) -> Int[Tensor, " places"]:
+        """Rows of `PLACES` points that lie as far apart as they go, or of all where there are fewer."""
+        return farthest_points(self.points, min(PLACES, len(self.points)))
 
     def along(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None

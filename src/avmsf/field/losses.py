@@ -108,9 +108,7 @@ def _distance(
     frames = padded.unfold(1, fft_size, hop)
     # A hop more than the sound, for the last column of hops that `_overlap_add` fills only in part.
     gradient = padded.new_zeros(padded.shape[0], padded.shape[1] + hop)
-    # The one-sided inverse transform counts every bin but the two ends twice; the gradient counts each once.
-    once = torch.full((fft_size // 2 + 1,), 0.5, dtype=sounds.dtype, device=sounds.device)
-    once[0] = once[-1] = 1.0
+    half_window = 0.5 * window
     distance = sounds.new_zeros(())
     for row, part in _chunks(frames.shape[0], frames.shape[1], fft_size):
         spectrum = torch.fft.rfft(frames[row, part] * window)
@@ -118,8 +116,11 @@ def _distance(
         difference = magnitude - target[row, part]
         distance += difference.abs().sum()
         if with_slope:
-            spectrum *= difference.sign_().div_(magnitude).mul_(once)
-            slopes = torch.fft.irfft(spectrum, fft_size, norm="forward").mul_(window)
+            spectrum *= difference.sign_().div_(magnitude)
+            # The one-sided inverse transform counts every bin but the two ends twice; the gradient counts each once.
+            spectrum[:, 0] *= 2.0
+            spectrum[:, -1] *= 2.0
+            slopes = torch.fft.irfft(spectrum, fft_size, norm="forward").mul_(half_window)
             _overlap_add(gradient[row], slopes, part.start * hop, hop)
     if not with_slope:
         return distance, None

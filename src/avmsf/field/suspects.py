@@ -9,7 +9,6 @@ from torch import Tensor
 
 from avmsf.field.bodychoice import ChosenBody, MeasuredGains
 from avmsf.field.hypotheses import NOISES, REMAINDERS, WIDTHS
-from avmsf.scene.points import farthest_points
 
 _DOUBT = 1e6
 """Factor on the noise of a strike that counts for nothing."""
@@ -36,8 +35,6 @@ _LAG = 12.0
 """Nats of evidence that a body may lack of the likeliest."""
 _NATS = 10.0
 """Log likelihood of frequencies that counts as much as one strike that is foretold no better than by silence."""
-_PLACES = 500
-"""Places at which a suspect is looked for."""
 _FLOOR = 1e-3
 """Least scatter of a mode's gains, over their mean square."""
 _NEAR = 0.05
@@ -179,7 +176,7 @@ class _Judge:
         errors = (solved / torch.diagonal(inverse, dim1=1, dim2=2)[..., None]).square().sum(2).T
         scatter = self._scatter(errors, speaking)
         surface = self.body.surface
-        rows = farthest_points(surface.points, min(_PLACES, len(surface.points)))
+        rows = surface.spread
         places = torch.cat([self.measured.contacts[row : row + 1].double(), surface.points[rows].double()])
         directions = torch.cat([self.field.directions[row : row + 1], surface.inward[rows].double()])
         cross = self.field.covariance_with(places, directions, *_HYPOTHESIS)[:, :, speaking]
