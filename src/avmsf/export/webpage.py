@@ -21,18 +21,28 @@ from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, generator, write_file, write_folder
 from avmsf.field.soundfield import SoundField
 
-_IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
+IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
+"""Where the page says from where three and spark come."""
 _STYLE = re.compile(r'<link\b[^>]*\bhref="(?:\./)?page/(\w+\.css)"[^>]*>')
 _START = re.compile(r'<script type="module" src="(?:\./)?page/(\w+\.js)"[^>]*></script>')
 _IMPORTED = re.compile(r"""(\bfrom\s*|\bimport\s*\(\s*|\bimport\s+)(["'])\./(\w+\.js)\2""")
-_TYPES = {
-    ".json": "application/json",
-    ".js": "text/javascript",
-    ".wav": "audio/wav",
-    ".glb": "model/gltf-binary",
-    ".ply": "application/octet-stream",
+MEDIA_TYPES = {
+    ".aif": "audio/aiff",
+    ".aiff": "audio/aiff",
     ".bin": "application/octet-stream",
+    ".css": "text/css",
+    ".flac": "audio/flac",
+    ".glb": "model/gltf-binary",
+    ".js": "text/javascript",
+    ".json": "application/json",
+    ".mjs": "text/javascript",
+    ".mp3": "audio/mpeg",
+    ".ogg": "audio/ogg",
+    ".ply": "application/octet-stream",
+    ".wasm": "application/wasm",
+    ".wav": "audio/wav",
 }
+"""What the page has use for, by suffix: nothing else is carried or served."""
 
 
 def write_webpage(
@@ -73,7 +83,7 @@ def single_file(bundle: Bundle, page: Mapping[str, bytes] | None = None) -> str:
     html = page["index.html"].decode()
     modules = {name.removeprefix("page/"): each.decode() for name, each in page.items() if name.endswith(".js")}
     imports = {f"avmsf/{name}": _data_url(_bare(source)) for name, source in modules.items()}
-    html = _once(_IMPORT_MAP, html, lambda found: found[1] + _with_imports(found[2], imports) + found[3], "import map")
+    html = _once(IMPORT_MAP, html, lambda found: found[1] + _with_imports(found[2], imports) + found[3], "import map")
     html = _STYLE.sub(lambda found: f"<style>\n{page[f'page/{found[1]}'].decode()}</style>", html)
     carried = {"manifest.json": json.dumps(bundle.manifest).encode(), "page/bank.js": page["page/bank.js"]}
     inlined = {name: _carried(name, content) for name, content in {**carried, **bundle.files}.items()}
@@ -101,7 +111,7 @@ def _data_url(source: str) -> str:
 
 
 def _carried(name: str, content: bytes) -> dict[str, str]:
-    return {"type": _TYPES[Path(name).suffix], "base64": base64.b64encode(content).decode()}
+    return {"type": MEDIA_TYPES[Path(name).suffix], "base64": base64.b64encode(content).decode()}
 
 
 def _once(pattern: re.Pattern[str], text: str, change: Any, what: str) -> str:

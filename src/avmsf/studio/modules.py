@@ -12,12 +12,12 @@ import subprocess
 from pathlib import Path
 
 from avmsf.errors import StudioError
+from avmsf.export.webpage import IMPORT_MAP
 
 PINNED = {"three": "0.187.0", "@sparkjsdev/spark": "2.2.0"}
 """Packages of npm, and the one version of each that the page was tried with."""
 MODULES_VARIABLE = "AVMSF_PAGE_MODULES"
 """Environment variable that names a folder node_modules to take before the cache."""
-_IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
 _REMOTE = re.compile(r"https://[^/]+/(?:npm/)?(?P<package>@?[^@]+)@(?P<version>[^/]+)/(?P<rest>.*)")
 """An address of a package's file on a content network."""
 _SECONDS = 600.0
@@ -75,12 +75,12 @@ def fetch_modules() -> Path:
 
 def with_local_modules(page: str) -> str:
     """Return the page's HTML with its import map pointing to `modules/` beside it. Raises StudioError."""
-    found = _IMPORT_MAP.findall(page)
+    found = IMPORT_MAP.findall(page)
     if len(found) != 1:
         raise StudioError(f"expected one import map in the page, found {len(found)}: install avmsf again")
     imports = {name: _local(address) for name, address in json.loads(found[0][1])["imports"].items()}
     words = json.dumps({"imports": imports}, indent=2)
-    return _IMPORT_MAP.sub(lambda script: f"{script[1]}\n{words}\n{script[3]}", page)
+    return IMPORT_MAP.sub(lambda script: f"{script[1]}\n{words}\n{script[3]}", page)
 
 
 def _local(address: str) -> str:

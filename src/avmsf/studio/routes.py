@@ -14,6 +14,7 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Respon
 from starlette.routing import Route
 
 from avmsf.errors import AvmsfError
+from avmsf.export.webpage import MEDIA_TYPES
 from avmsf.studio.guard import LARGEST_UPLOAD, contained, read_words
 from avmsf.studio.modules import find_modules, with_local_modules
 from avmsf.studio.place import Place
@@ -22,24 +23,7 @@ from avmsf.studio.refusal import RefusedError, response_to
 from avmsf.studio.studio import Studio
 
 PAGE = Path(__file__).parent / "page"
-_TYPES = {
-    ".aif": "audio/aiff",
-    ".aiff": "audio/aiff",
-    ".bin": "application/octet-stream",
-    ".css": "text/css",
-    ".flac": "audio/flac",
-    ".glb": "model/gltf-binary",
-    ".js": "text/javascript",
-    ".json": "application/json",
-    ".mjs": "text/javascript",
-    ".mp3": "audio/mpeg",
-    ".ogg": "audio/ogg",
-    ".ply": "application/octet-stream",
-    ".wasm": "application/wasm",
-    ".wav": "audio/wav",
-}
-"""What is served, and as what: nothing else is."""
-_SOUNDS = tuple(suffix for suffix, kind in _TYPES.items() if kind.startswith("audio/"))
+_SOUNDS = tuple(suffix for suffix, kind in MEDIA_TYPES.items() if kind.startswith("audio/"))
 _GONE = 499
 """Nobody reads it: the page has hung up."""
 Handler = Callable[[Request], Awaitable[Response]]
@@ -214,7 +198,7 @@ async def _send_from(folder: Path, request: Request) -> Response:
 def _file(folder: Path, request: Request, *, only: Sequence[str] = ()) -> Response:
     """Return a file of a folder. Raises RefusedError (404) for other kinds than pages have use for."""
     path = contained(folder, request.path_params["path"])
-    kind = _TYPES.get(path.suffix.lower())
+    kind = MEDIA_TYPES.get(path.suffix.lower())
     hidden = any(part.startswith(".") for part in path.relative_to(folder.resolve()).parts)
     if kind is None or hidden or (only and path.suffix.lower() not in only):
         raise RefusedError(404, "there is nothing at this address")
