@@ -24,6 +24,9 @@ _QUIET = 1e-12
 """Least power of the noise, of sounds of mean power one: rounding of what is recorded without any."""
 _LEAST_FALL = 0.3
 """A mode that falls by fewer nepers over the whole sound is not told from hum."""
+_LEAST_TURN = 0.5
+"""Radians by which a mode turns against half the sample rate while it falls by 1/e: with fewer its samples are all but
+nothing in sine phase, and the gain of what is heard would be enormous."""
 _PERIODS = 50
 """How many periods of the lowest frequency the sounds last: with fewer, a mode is not told from rumble."""
 
@@ -74,7 +77,8 @@ class HighResolution:
         bank = self._sift(sounds.to(torch.float64), found, noise, sample_rate, lowest)
         # Hum and thuds are fitted beside the modes, or modes that are not there would stand in for them.
         toned = math.pi * bank.frequency > self.least_quality * bank.damping
-        return _take(bank, toned & (bank.damping >= _LEAST_FALL * sample_rate / samples))
+        turning = math.pi * sample_rate - 2 * math.pi * bank.frequency > _LEAST_TURN * bank.damping
+        return _take(bank, toned & turning & (bank.damping >= _LEAST_FALL * sample_rate / samples))
 
     def _sift(
         self,
