@@ -41,6 +41,25 @@ def test_loss_and_gradient_are_those_of_autograd_through_the_transform(sizes, ho
     torch.testing.assert_close(made.grad, plain.grad, rtol=0, atol=1e-12 * float(plain.grad.abs().max()))
 
 
+@pytest.mark.parametrize(("first", "every"), [(0, 2), (1, 2), (2, 3), (4, 5), (9, 50)])
+@pytest.mark.parametrize("samples", [1000, 40])
+def test_frames_whose_turn_it_is_are_compared_alone(first, every, samples):
+    recorded = sounds(samples=samples, seed=1)
+    made, plain = (sounds(samples=samples).requires_grad_() for _ in range(2))
+    loss = spectral_loss(made, spectral_target(recorded, fft_sizes=SIZES, hops=HOPS), first=first, every=every)
+    expected = torch.zeros((), dtype=plain.dtype)
+    for fft_size, hop in zip(SIZES, HOPS, strict=True):
+        truth, found = (magnitude_stft(each, fft_size=fft_size, hop=hop) for each in (recorded, plain))
+        # Of fewer frames than turns each has its turn.
+        turns = min(every, truth.shape[2])
+        chosen = (..., slice(first % turns, None, turns))
+        expected = expected + (found - truth)[chosen].abs().sum() / truth[chosen].sum()
+    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-12)
+    loss.backward()
+    expected.backward()
+    torch.testing.assert_close(made.grad, plain.grad, rtol=0, atol=1e-12 * float(plain.grad.abs().max()))
+
+
 def test_frames_that_do_not_fit_one_chunk_are_none_the_worse(monkeypatch):
     recorded, made = sounds(seed=1), sounds().requires_grad_()
     target = spectral_target(recorded, fft_sizes=SIZES, hops=HOPS)

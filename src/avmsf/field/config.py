@@ -21,6 +21,7 @@ _LEAST = {
     "steps": 0,
     "patience": 0,
     "hop": 0,
+    "interleave": 1,
     "early": 1,
     "early_weight": 0,
     "seed": 0,
@@ -63,6 +64,8 @@ class FitConfig:
     """Resolutions of the spectral loss, samples at 44.1 and 48 kHz; other rates scale them in octaves."""
     hop: int = 0
     """Samples between frames at 44.1 and 48 kHz; 0 takes a quarter of each FFT size (paper: 64)."""
+    interleave: int = 2
+    """Steps among which the frames are shared out in turn; 1 compares all of them at every step, as the paper does."""
     early: int = 8192
     """Length of the beginning that is compared once more, samples at 44.1 and 48 kHz."""
     early_weight: float = 1.0
@@ -136,6 +139,7 @@ PAPER = FitConfig(
     steps=10000,
     fft_sizes=(2048, 1024, 512, 256),
     hop=64,
+    interleave=1,
     early_weight=1.0,
     phase="sine",
 )

@@ -58,11 +58,15 @@ def spectral_target(
     return SpectralTarget(tuple(magnitudes), tuple(hops), cut.shape[1])
 
 
-def spectral_loss(sounds: Float[Tensor, "contacts samples"], target: SpectralTarget) -> Float[Tensor, ""]:
+def spectral_loss(
+    sounds: Float[Tensor, "contacts samples"], target: SpectralTarget, *, first: int = 0, every: int = 1
+) -> Float[Tensor, ""]:
     """Return the L1 distance of magnitudes over the target's L1 norm, summed over resolutions (paper, eq. 14).
 
     The division makes the resolutions weigh alike and the loss read as a relative error; differentiable in `sounds`.
-    Raises ValueError for other sounds than the target's, in number, or shorter ones.
+    Only frame `first` and `every` so many after it are compared: the mean of the losses from each first frame below
+    `every` on is the loss of all frames, about, for an `every`th of the work each. Raises ValueError for other sounds
+    than the target's, in number, or shorter ones.
     """
     contacts = len(target.magnitudes[0])
     if len(sounds) != contacts or sounds.shape[1] < target.samples:
@@ -70,18 +74,26 @@ def spectral_loss(sounds: Float[Tensor, "contacts samples"], target: SpectralTar
             f"expected {contacts} sounds of {target.samples} samples or more, as the target's, found {len(sounds)} of "
             f"{sounds.shape[1]}"
         )
-    loss: Float[Tensor, ""] = _SpectralL1.apply(sounds[:, : target.samples], target)  # type: ignore[no-untyped-call]
+    loss: Float[Tensor, ""] = _SpectralL1.apply(  # type: ignore[no-untyped-call]
+        sounds[:, : target.samples], target, first, every
+    )
     return loss
 
 
 class _SpectralL1(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, sounds: Float[Tensor, "contacts samples"], target: SpectralTarget) -> Float[Tensor, ""]:
+    def forward(
+        ctx: Any, sounds: Float[Tensor, "contacts samples"], target: SpectralTarget, first: int, every: int
+    ) -> Float[Tensor, ""]:
         loss = sounds.new_zeros(())
         gradient = torch.zeros_like(sounds)
         for magnitude, hop in zip(target.magnitudes, target.hops, strict=True):
-            norm = magnitude.sum().clamp_min(torch.finfo(sounds.dtype).tiny)
-            distance, slope = _distance(sounds, magnitude, hop, with_slope=ctx.needs_input_grad[0])
+            # Short sounds may have fewer frames than are skipped.
+            step = min(every, magnitude.shape[1])
+            start = first % step
+            asked = magnitude[:, start::step]
+            norm = asked.sum().clamp_min(torch.finfo(sounds.dtype).tiny)
+            distance, slope = _distance(sounds, asked, start * hop, step * hop, with_slope=ctx.needs_input_grad[0])
             loss += distance / norm
             if slope is not None:
                 gradient += slope / norm
@@ -89,23 +101,24 @@ class _SpectralL1(torch.autograd.Function):
         return loss
 
     @staticmethod
-    def backward(ctx: Any, outer: Float[Tensor, ""]) -> tuple[Tensor, None]:
+    def backward(ctx: Any, outer: Float[Tensor, ""]) -> tuple[Tensor, None, None, None]:
         (gradient,) = ctx.saved_tensors
-        return outer * gradient, None
+        return outer * gradient, None, None, None
 
 
 def _distance(
     sounds: Float[Tensor, "contacts samples"],
     target: Float[Tensor, "contacts frames bins"],
+    start: int,
     hop: int,
     *,
     with_slope: bool,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "contacts samples"] | None]:
-    """Return the L1 distance to `target` and, on demand, its gradient."""
+    """Return the L1 distance to `target` and, on demand, its gradient; the first frame's centre is sample `start`."""
     fft_size = 2 * (target.shape[2] - 1)
     window = torch.hann_window(fft_size, dtype=sounds.dtype, device=sounds.device)
     padded = _padded(sounds, fft_size)
-    frames = padded.unfold(1, fft_size, hop)
+    frames = padded[:, start:].unfold(1, fft_size, hop)
     # A hop more than the sound, for the last column of hops that `_overlap_add` fills only in part.
     gradient = padded.new_zeros(padded.shape[0], padded.shape[1] + hop)
     half_window = 0.5 * window
@@ -121,7 +134,7 @@ def _distance(
             spectrum[:, 0] *= 2.0
             spectrum[:, -1] *= 2.0
             slopes = torch.fft.irfft(spectrum, fft_size, norm="forward").mul_(half_window)
-            _overlap_add(gradient[row], slopes, part.start * hop, hop)
+            _overlap_add(gradient[row], slopes, start + part.start * hop, hop)
     if not with_slope:
         return distance, None
     return distance, gradient[:, fft_size // 2 : fft_size // 2 + sounds.shape[1]]

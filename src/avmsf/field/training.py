@@ -189,10 +189,16 @@ class TrainingRun:
         return float(loss.detach())
 
     def spectral_loss(self, targets: Targets) -> Float[Tensor, ""]:
-        """Return the loss on whole sounds and on their beginnings (paper, eq. 14), and the gain field's penalty."""
-        sounds = self.sounds(targets.rows)
-        early = spectral_loss(sounds, targets.early)
-        return spectral_loss(sounds, targets.whole) + self.config.early_weight * early + self.network.penalty()
+        """Return the loss on whole sounds and on their beginnings (paper, eq. 14), and the gain field's penalty.
+
+        Of the frames those are compared whose turn it is.
+        """
+        sounds, every = self.sounds(targets.rows), self.config.interleave
+        whole, early = (
+            spectral_loss(sounds, target, first=self.step % every, every=every)
+            for target in (targets.whole, targets.early)
+        )
+        return whole + self.config.early_weight * early + self.network.penalty()
 
     def _warmup_loss(self, targets: Targets) -> Float[Tensor, ""]:
         """Return the squared error of the gains (paper, eq. 13), over their mean square.
