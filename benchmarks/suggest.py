@@ -4,6 +4,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+import torch
+
 from avmsf.bench.evaluation import evaluate
 from avmsf.capture import Capture, Impacts
 from avmsf.field.config import FitConfig
@@ -22,22 +24,25 @@ from benchmarks.report import Options, Report, Table, tell
 
 FIRST = 6
 """Strikes to begin with."""
-ROUNDS = (8, 10, 12, 14, 17, 20)
-"""Strikes after each round, when both ways are judged."""
+ROUNDS = (8, 11, 15, 20)
+"""Strikes after each round, when all ways are judged."""
+JUDGING = 3
+"""One strike of so many is kept to judge by, drawn at random."""
 STARTS = 3
 """First strikes, spread evenly over the table."""
-SIM20_OBJECTS = ("plate-ceramic", "mug-ceramic", "skillet-iron", "blob-polycarbonate")
+WAYS = ("suggested", "farthest", "random")
+SIM20_OBJECTS = ("plate-ceramic", "mug-ceramic", "bracket-steel", "blob-polycarbonate")
 CONVENTIONS = (
-    "error: relative STFT error, mean over the recordings that neither way has learnt from; physics, no steps end to "
-    "end, modes extracted and the field fitted anew for every number of strikes.",
-    f"both ways begin with the same {FIRST} strikes, spread as far apart as they go; then some more at a time, of "
-    "those recorded: the farthest from all others, or those that suggest names; after each round both are judged.",
+    f"error: relative STFT error, mean over one of {JUDGING} recordings, drawn with seed 0, of which no way learns; "
+    "physics, no steps end to end, modes extracted and the field fitted anew for every number of strikes.",
+    f"all ways begin with the same {FIRST} strikes, spread as far apart as they go; then some more at a time, of those "
+    "recorded: those that suggest names, the farthest from all others, or any (seed: the start's number).",
     "ratio: mean error of suggested strikes over that of farthest ones, all numbers and starts together.",
 )
 
 
 def measure(options: Options) -> Report:
-    """Return both ways' errors on the chosen parts."""
+    """Return all ways' errors on the chosen parts."""
     report = Report(CONVENTIONS)
     for part in options.parts:
         report += PARTS[part](options)
@@ -59,44 +64,48 @@ def _sim20(options: Options) -> Report:
 
 def _compare(key: str, captures: dict[str, Capture], wall: float | None, options: Options) -> Report:
     rows: list[list[str | float]] = []
-    suggested, farthest = [], []
+    found: list[tuple[float, ...]] = []
     for name, capture in captures.items():
         assert capture.surface is not None
         features = surface_features(capture)
+        judging = torch.randperm(len(capture.impacts), generator=torch.Generator().manual_seed(0))
+        judging = judging[: len(judging) // JUDGING].sort().values
+        test = capture.impacts.take(judging.tolist())
+        pool = capture.impacts.take(sorted(set(range(len(capture.impacts))) - set(judging.tolist())))
         with tempfile.TemporaryDirectory() as cache:
             recipe = physics_of(capture.surface, BodyConfig(wall=wall), cache=Path(cache))
-            starts = [number * len(capture.impacts) // STARTS for number in range(1 if options.quick_look else STARTS)]
-            for start in starts:
-                for count, ours, others in _paths(capture.impacts, features, recipe, start, options):
-                    rows.append([f"{name}, start {start}", count, ours, others])
-                    suggested.append(ours)
-                    farthest.append(others)
-                    tell(f"suggest.{key}: {name}, start {start}, {count} strikes: {ours:.3f} and {others:.3f}")
-    ratio = sum(suggested) / sum(farthest)
-    figures = {
-        f"suggest.{key}": ratio,
-        f"suggest.{key}.suggested": sum(suggested) / len(suggested),
-        f"suggest.{key}.farthest": sum(farthest) / len(farthest),
-    }
+            for number in range(1 if options.quick_look else STARTS):
+                for count, errors in _paths(pool, test, features, recipe, number, options):
+                    rows.append([f"{name}, start {number}", count, *errors])
+                    found.append(errors)
+                    words = ", ".join(f"{way} {error:.3f}" for way, error in zip(WAYS, errors, strict=True))
+                    tell(f"suggest.{key}: {name}, start {number}, {count} strikes: {words}")
+    means = [sum(each) / len(found) for each in zip(*found, strict=True)]
+    figures = {f"suggest.{key}.{way}": value for way, value in zip(WAYS, means, strict=True)}
+    ratio = means[0] / means[1]
     title = f"suggest.{key}: error with suggested strikes over that with farthest ones {ratio:.3f}"
-    return Report(tables=(Table(title, ("object", "strikes", "suggested", "farthest"), rows),), figures=figures)
+    return Report(
+        tables=(Table(title, ("object", "strikes", *WAYS), rows),), figures={f"suggest.{key}": ratio, **figures}
+    )
 
 
 def _paths(
-    impacts: Impacts, features: FeatureField, recipe: Physics, start: int, options: Options
-) -> list[tuple[int, float, float]]:
-    """Return the numbers of strikes with the errors of suggested and of farthest ones."""
-    rounds = ROUNDS[:1] if options.quick_look else ROUNDS
-    farthest = farthest_points(impacts.contacts, rounds[-1], start=start).tolist()
+    pool: Impacts, test: Impacts, features: FeatureField, recipe: Physics, number: int, options: Options
+) -> list[tuple[int, tuple[float, ...]]]:
+    """Return the numbers of strikes with the errors of each way."""
+    rounds = [count for count in ROUNDS[: 1 if options.quick_look else None] if count <= len(pool)]
+    farthest = farthest_points(pool.contacts, rounds[-1], start=number * len(pool) // STARTS).tolist()
+    drawn = torch.randperm(len(pool), generator=torch.Generator().manual_seed(number)).tolist()
+    anywhere = farthest[:FIRST] + [row for row in drawn if row not in farthest[:FIRST]]
     rows, found = farthest[:FIRST], []
-    ours = _fitted(impacts, rows, features, recipe)
+    suggested = _fitted(pool, rows, features, recipe)
     for count in rounds:
-        following = suggest(ours, count - len(rows), candidates=impacts.contacts, directions=impacts.directions)
-        rows, others = [*rows, *following.rows.tolist()], farthest[:count]
-        test = impacts.take(sorted(set(range(len(impacts))) - set(rows) - set(others)))
-        ours, spread = (_fitted(impacts, each, features, recipe) for each in (rows, others))
-        errors = [evaluate(each, test).mean()["relative_stft"] for each in (ours, spread)]
-        found.append((count, errors[0], errors[1]))
+        following = suggest(suggested, count - len(rows), candidates=pool.contacts, directions=pool.directions)
+        rows = [*rows, *following.rows.tolist()]
+        suggested = _fitted(pool, rows, features, recipe)
+        others = (_fitted(pool, each[:count], features, recipe) for each in (farthest, anywhere))
+        errors = tuple(evaluate(each, test).mean()["relative_stft"] for each in (suggested, *others))
+        found.append((count, errors))
     return found
 
 
