@@ -55,7 +55,7 @@ def test_a_missing_file_is_named_and_guessed(tmp_path: Path) -> None:
 def test_mixed_rates_are_refused_with_their_counts(tmp_path: Path) -> None:
     folder = fill(tmp_path)
     soundfile.write(folder / "c.wav", ring(), RATE + 1)
-    with pytest.raises(CaptureError, match=r"8000 Hz \(2 files, a.wav the first\), 8001 Hz \(1 files, c.wav"):
+    with pytest.raises(CaptureError, match=r"8000 Hz \(2 files, a.wav the first\), 8001 Hz \(1 file, c.wav"):
         read_capture(folder)
 
 
@@ -100,7 +100,7 @@ def test_eight_bits_are_read_with_a_warning(tmp_path: Path) -> None:
 
 
 def test_a_clipped_recording_is_read_with_a_warning(tmp_path: Path) -> None:
-    with pytest.warns(CaptureWarning, match=r"1 of 3 recordings look wrong: b\.wav: \d+ clipped samples"):
+    with pytest.warns(CaptureWarning, match=r"1 of 3 recordings looks wrong: b\.wav: \d+ clipped samples"):
         read_capture(fill(tmp_path, replace={"b.wav": np.clip(8 * ring(), -1, 1)}))
 
 

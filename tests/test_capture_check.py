@@ -69,9 +69,17 @@ def test_it_goes_on_past_everything_that_is_broken(tmp_path: Path) -> None:
     assert report.recordings[2].double_hit_seconds == pytest.approx(0.4, abs=0.01)
     everything = "; ".join(report.problems)
     assert "different sample rates: 8000 Hz (3 files" in everything
-    assert "1 wav files have no row in impacts.csv: stray.wav" in everything
+    assert "1 wav file has no row in impacts.csv: stray.wav" in everything
     # What the command line prints as JSON.
     assert json.loads(json.dumps(asdict(report), allow_nan=False))["recordings"][1]["clipped"] > 3
+
+
+def test_wav_files_in_hidden_folders_are_none_of_the_captures(tmp_path: Path) -> None:
+    folder = fill(tmp_path / ".work" / "cup")
+    for name in (".avmsf/removed/002-ac4f8f352f81.wav", "takes/.trash/001.wav", "._a.wav", "takes/1.wav", "more.wav"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        soundfile.write(folder / name, ring(), RATE)
+    assert check(folder).problems == ("2 wav files have no row in impacts.csv: more.wav, takes/1.wav",)
 
 
 BROKEN = [

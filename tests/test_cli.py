@@ -131,6 +131,18 @@ def test_check_of_a_good_capture_ends_with_0(capture: Path, capsys: Streams) -> 
     assert err == ""
 
 
+@pytest.mark.parametrize(("strays", "said"), [((), "1 warning"), (("stray.wav",), "2 warnings")])
+def test_check_counts_its_warnings(tmp_path: Path, capsys: Streams, strays: tuple[str, ...], said: str) -> None:
+    folder = fill_plate(tmp_path / "plate")
+    sound, rate = soundfile.read(folder / "004.wav")
+    clipped = np.clip(5 * sound / np.abs(sound).max(), -1, 1)
+    soundfile.write(folder / "004.wav", clipped, rate, subtype="FLOAT")
+    for name in strays:
+        soundfile.write(folder / name, sound, rate)
+    assert main(["check", str(folder)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"readable, with {said}"
+
+
 def test_check_shows_every_problem_and_ends_with_2_where_it_cannot_be_read(tmp_path: Path, capsys: Streams) -> None:
     folder = fill_plate(tmp_path / "plate")
     (folder / "003.wav").unlink()

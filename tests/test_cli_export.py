@@ -186,6 +186,50 @@ def refused(words: list[str], capsys: Streams) -> str:
     return capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("to", "name", "written"),
+    [
+        ("wavs", "s2.wav", "a folder with a wav file for each blow, a table and an SFZ instrument"),
+        ("avmsf-demo", "bowl.ZIP", "a folder in the layout of the paper's demo"),
+        ("web", "page.glb", "a page as a folder, or as one file whose name ends in .html"),
+    ],
+)
+def test_a_files_name_is_no_folders(
+    to: str, name: str, written: str, field_file: Path, tmp_path: Path, capsys: Streams
+) -> None:
+    place = tmp_path / name
+    said = refused([str(field_file), "--to", to, "--output", str(place)], capsys)
+    assert said == (
+        f"avmsf export: {place}: expected a folder's name, for --to {to} writes {written}, found one that ends in "
+        f"{place.suffix}: say --output {place.with_suffix('')}\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_may_have_a_dot_in_its_name(field_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "old.wav").mkdir()
+    for name in ("bowl-1.2", "name.github.io", "old.wav"):
+        words = ["--to", "wavs", "--output", str(tmp_path / name), "--points", "1", "--seconds", "0.01"]
+        assert main(["export", str(field_file), *words]) == 0
+        assert (tmp_path / name / "strikes.csv").is_file()
+
+
+@pytest.mark.parametrize(
+    ("to", "name", "expected"),
+    [
+        ("gltf", "a.wav", "ends in .glb, found '.wav': name it a.glb"),
+        ("faust", "a", "ends in .dsp or .lib, found no ending: name it a.dsp"),
+        ("uff", "a.txt", "ends in .uff or .unv, found '.txt': name it a.uff"),
+    ],
+)
+def test_a_wrong_ending_is_refused_before_anything_else_is_said(
+    to: str, name: str, expected: str, field_file: Path, tmp_path: Path, capsys: Streams
+) -> None:
+    place = tmp_path / name
+    said = refused([str(field_file), "--to", to, "--output", str(place)], capsys)
+    assert said == f"avmsf export: {place}: expected a name that {expected}\n"
+
+
 def test_what_cannot_be_exported_is_said(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
     field, out = str(field_file), str(tmp_path / "out")
     assert "expected 1 or more" in refused([field, "--to", "wavs", "--output", out, "--points", "0"], capsys)

@@ -1,11 +1,31 @@
 """Files that are either as they were or as they shall be, never in between."""
 
+import errno
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from avmsf.errors import AvmsfError, FieldFileError
+
+_WAYS_OUT: Mapping[int | None, str] = {
+    errno.ENOSPC: "free some space or choose another place",
+    errno.EDQUOT: "free some space or choose another place",
+    errno.EACCES: "make the folder one that you may write to, or choose another place",
+    errno.EPERM: "make the folder one that you may write to, or choose another place",
+    errno.EROFS: "choose another place, on a disk that can be written to",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ENOENT: "no file can be made there, choose another place",
+    errno.EEXIST: "a file is where a folder has to be, choose another place",
+    errno.ENOTDIR: "a file is where a folder has to be, choose another place",
+    errno.EISDIR: "a folder of this name is there, name a file in it or choose another place",
+}
+"""What to do where a file or a folder cannot be written, by what the system says."""
+
+
+def way_out(error: OSError) -> str:
+    """Return what a user can do where a file or a folder could not be written."""
+    return _WAYS_OUT.get(error.errno, "choose another place")
 
 
 def write_whole(path: Path, write: Callable[[Path], object], *, raising: type[AvmsfError] = FieldFileError) -> None:
@@ -30,8 +50,7 @@ def write_whole(path: Path, write: Callable[[Path], object], *, raising: type[Av
         os.replace(temporary, path)
     except OSError as error:
         raise raising(
-            f"{path}: cannot be written ({error.strerror or error}); what was there is untouched: free some space or "
-            "choose another place"
+            f"{path}: cannot be written ({error.strerror or error}); what was there is untouched: {way_out(error)}"
         ) from error
     finally:
         if temporary is not None:

@@ -268,7 +268,7 @@ def test_a_recording_that_cannot_be_used_is_refused_in_words(tmp_path: Path, con
 def test_another_rate_is_refused_at_once(tmp_path: Path) -> None:
     strikes = book(tmp_path)
     strikes.add(blow(), place(0.1), key=key(0))
-    with pytest.raises(CaptureError, match="expected 8000 Hz, as the 1 recordings before, found 16000 Hz"):
+    with pytest.raises(CaptureError, match="expected 8000 Hz, as the 1 recording before, found 16000 Hz"):
         strikes.judge(wav(ring(rate=16000), rate=16000))
     # Where it is the only one it may change.
     assert strikes.redo("001.wav", wav(ring(rate=16000), rate=16000))["sample_rate"] == 16000

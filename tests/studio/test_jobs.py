@@ -62,8 +62,27 @@ def test_a_job_that_fails_says_why() -> None:
     assert run("say(error='expected two strikes, found one')") == [{"error": "expected two strikes, found one"}]
     [last] = run("raise MemoryError('no more')")
     assert last["error"] == "test ended with status 1 and no result: MemoryError: no more"
-    [killed] = run("os.kill(os.getpid(), 9)")
-    assert killed["error"] == "test ended with status -9 and no result: it said nothing"
+
+
+@pytest.mark.parametrize(("number", "name"), [(9, "SIGKILL"), (6, "SIGABRT"), (40, "signal 40")])
+def test_a_job_that_was_killed_says_by_what_and_not_what_its_process_said(number: int, name: str) -> None:
+    [last] = run(f"print('<no Python frame>', file=sys.stderr, flush=True)\nos.kill(os.getpid(), {number})")
+    assert last["error"] == (
+        f"test: the work was ended from outside or crashed ({name}): try it again, and close other programs first "
+        "where memory is short"
+    )
+
+
+def test_a_stage_is_named_once() -> None:
+    told = ["capture: reading the recordings", "choice: physics, 1 of 6", "128 elastic modes"]
+    heard = run(
+        f"from avmsf.studio.worker import Voice\nfor words in {told}: Voice(sys.stdout).tell(words)\nsay(result=0)"
+    )
+    assert [(event["stage"], event["words"]) for event in heard[:-1]] == [
+        ("capture", "reading the recordings"),
+        ("choice", "physics, 1 of 6"),
+        ("128 elastic modes", ""),
+    ]
 
 
 def test_a_result_that_cannot_be_used_is_an_error() -> None:

@@ -11,6 +11,7 @@ from avmsf.capture.surface import find_surface
 from avmsf.capture.table import TABLE, Row, Strike, read_rows, refuse_repeated_files, understand
 from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_surface, refuse_few
 from avmsf.errors import CaptureError
+from avmsf.wording import counted
 
 
 @dataclass(frozen=True)
@@ -49,14 +50,18 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
     except CaptureError as error:
         refused.append(str(error))
     listed = {report.file for report in reports}
-    present = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.wav"))
-    stray = [name for name in present if name not in listed]
+    stray = [name for name in _wav_files(folder) if name not in listed]
     if stray:
-        problems.append(
-            f"{len(stray)} wav files have no row in {TABLE}: {', '.join(stray[:5])}{', …' * (len(stray) > 5)}"
-        )
+        lack = f"{counted(len(stray), 'wav file')} {'has' if len(stray) == 1 else 'have'} no row in {TABLE}"
+        problems.append(f"{lack}: {', '.join(stray[:5])}{', …' * (len(stray) > 5)}")
     readable = not refused and all(report.readable for report in reports)
     return CaptureReport(readable, tuple(reports), tuple(refused + problems))
+
+
+def _wav_files(folder: Path) -> list[str]:
+    """Return the names of a capture's wav files; hidden ones, such as what the studio has removed, are none of it."""
+    names = (path.relative_to(folder) for path in folder.rglob("*.wav"))
+    return sorted(name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts))
 
 
 def _check_row(

@@ -183,4 +183,5 @@ def _summary(reports: list[RecordingReport], folder: Path) -> list[str]:
         return []
     shown = "; ".join(f"{report.file}: {', '.join(report.problems)}" for report in wrong[:5])
     more = f"; and {len(wrong) - 5} more" if len(wrong) > 5 else ""
-    return [f"{len(wrong)} of {len(reports)} recordings look wrong: {shown}{more}. `avmsf check {folder}` shows all"]
+    look = "looks" if len(wrong) == 1 else "look"
+    return [f"{len(wrong)} of {len(reports)} recordings {look} wrong: {shown}{more}. `avmsf check {folder}` shows all"]

@@ -9,6 +9,7 @@ from avmsf.capture.audio import EIGHT_BIT, Recording, clipped_samples
 from avmsf.capture.onset import SECONDS_BEFORE, find_second_blow, find_second_push
 from avmsf.capture.prepare import Prepared
 from avmsf.capture.settings import CaptureSettings
+from avmsf.wording import counted
 
 HIGHEST_NOISE_DB = -20.0
 """Noise above this, against the peak, leaves too little of the decay to measure."""
@@ -61,7 +62,7 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         second = find_second_blow(response, prepared.onset, sample_rate=rate, seconds=settings.seconds)
     problems = []
     if clipped:
-        problems.append(f"{clipped} clipped samples: turn the gain down and record it again")
+        problems.append(f"{counted(clipped, 'clipped sample')}: turn the gain down and record it again")
     if second is not None:
         problems.append(f"a second blow at {second / rate:.3f} s: record it again, or keep fewer seconds")
     if noise > HIGHEST_NOISE_DB:

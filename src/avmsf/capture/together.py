@@ -13,6 +13,7 @@ from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.capture.surface import Surface
 from avmsf.capture.table import TABLE, Strike, fitting_units
 from avmsf.errors import CaptureError
+from avmsf.wording import counted
 
 WIDEST = 10.0
 """Metres across beyond which contacts are more likely in another unit."""
@@ -23,7 +24,9 @@ NARROWEST = 1e-3
 def refuse_few(count: int) -> None:
     """Raise `CaptureError` for fewer than two recordings: nothing can be learned about where one strikes."""
     if count < 2:
-        raise CaptureError(f"{TABLE} lists {count} recording; a capture needs at least 2, at different contacts")
+        raise CaptureError(
+            f"{TABLE} lists {counted(count, 'recording')}; a capture needs at least 2, at different contacts"
+        )
 
 
 def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:
@@ -31,7 +34,7 @@ def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:
     counts = Counter(rates)
     if len(counts) > 1:
         found = [
-            f"{rate:g} Hz ({count} files, {names[list(rates).index(rate)]} the first)"
+            f"{rate:g} Hz ({counted(count, 'file')}, {names[list(rates).index(rate)]} the first)"
             for rate, count in counts.most_common()
         ]
         raise CaptureError(

@@ -8,6 +8,7 @@ import tyro
 
 from avmsf.capture import CaptureReport, CaptureSettings, RecordingReport, check
 from avmsf.cli.printing import console, decimals, print_json, say, table
+from avmsf.wording import counted
 
 UNREADABLE = 2
 
@@ -48,7 +49,7 @@ def run(options: Options) -> int:
         say(f"avmsf check: {options.capture} cannot be read as it is: mend what is listed and check again")
         return UNREADABLE
     wrong = sum(bool(row.problems) for row in report.recordings) + len(report.problems)
-    screen.print("no problem found" if not wrong else f"readable, with {wrong} warnings", soft_wrap=True)
+    screen.print("no problem found" if not wrong else f"readable, with {counted(wrong, 'warning')}", soft_wrap=True)
     return 0
 
 

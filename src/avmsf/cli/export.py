@@ -1,23 +1,22 @@
 """`avmsf export`: a field in the formats of other tools."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import torch
 import tyro
 
 from avmsf.capture.folder import read_capture, settings_of
 from avmsf.capture.surface import find_surface_file
+from avmsf.cli.exportoptions import POINTS, Options, refuse_idle, refuse_name
 from avmsf.cli.printing import figure, say
 from avmsf.cli.render import METRES
 from avmsf.errors import ExportError
-from avmsf.export.bundle import MOST_POINTS
 from avmsf.export.faust import fitted, write_faust
 from avmsf.export.gltf import write_gltf
 from avmsf.export.look import Look, read_look
-from avmsf.export.modaldemo import SCENE, Precision, is_demo, read_demo, write_demo
+from avmsf.export.modaldemo import SCENE, is_demo, read_demo, write_demo
 from avmsf.export.objectfile import holds_gaussians, read_object
 from avmsf.export.sampledfield import SampledField, spread_rows
 from avmsf.export.universal import write_universal
@@ -26,59 +25,8 @@ from avmsf.export.webpage import write_webpage
 from avmsf.export.written import Written, expect_free, write_file
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
-from avmsf.modal.pulse import PulseShape
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats
-
-Format = Literal["web", "gltf", "faust", "avmsf-demo", "wavs", "uff"]
-_POINTS = {"web": MOST_POINTS, "gltf": 2000, "faust": 64, "avmsf-demo": 10_000, "wavs": 16, "uff": 1000}
-"""Points that are written unless others are asked for: as many as the format's tools take without effort."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """Write a field for other tools: web page, glTF, Faust, samplers, modal analysis.
-
-    web: a page on which it is struck, a folder for any static host or one .html file. gltf: a .glb that any viewer
-    shows, with the draft extension KHR_audio_rigid_bodies. faust: a .dsp with controls, or a .lib without. avmsf-demo:
-    the layout of the paper's own demo. wavs: a grid of blows with a table and an SFZ instrument, for samplers. uff: the
-    universal file format, for modal analysis. What a format cannot hold is said.
-    """
-
-    field: tyro.conf.Positional[Path]
-    """Field file, as `avmsf fit` writes it; or a folder in the layout of the paper's demo."""
-    to: Format
-    """What is written."""
-    output: Path
-    """Where: a folder, or a file for gltf (.glb), faust (.dsp or .lib), uff (.uff), a page in one file (.html)."""
-    object: Path | None = None
-    """What is shown: a mesh, or Gaussians as a .ply. Without it the capture's surface, or else the field's points."""
-    object_unit: Literal["m", "cm", "mm", "in", "ft"] = "m"
-    """What the coordinates of the object's mesh count."""
-    capture: Path | None = None
-    """Capture folder: its surface is shown, and on a page its recorded strikes stand beside the model's."""
-    points: int | None = None
-    """Most contacts that are written, spread over the object; as the format's tools like it where it is not given."""
-    force: bool = False
-    """Write over files that no export wrote. Files of other names are left alone."""
-    forces: tuple[float, ...] = (1.0,)
-    """wavs: forces of the layers, from soft to hard, in newtons where the field knows forces, else relative."""
-    contact_times: tuple[float, ...] = (0.0,)
-    """wavs: how long the hammer of each layer touches, seconds; one for all, or as many as forces."""
-    seconds: float | None = None
-    """wavs: length of the sounds; that of the training sounds where it is not given."""
-    pulse: PulseShape = "half-sine"
-    """wavs: how the force rises and falls over that time, as in `avmsf render`."""
-    no_noise: bool = False
-    """faust: the modes alone."""
-    functions: int = 16
-    """uff: points whose frequency response functions are written beside the mode shapes."""
-    variant: str | None = None
-    """avmsf-demo: name of the sound among those of one object, to write ("original") or to read."""
-    precision: Precision = "float32"
-    """avmsf-demo: how gains are written."""
-    rate: float | None = None
-    """Samples per second, Hz, of a field in the demo's layout, which does not say."""
 
 
 def parse(words: Sequence[str]) -> Options:
@@ -90,7 +38,8 @@ def run(options: Options) -> int:
     """Read, write, and say how large it is and what it lacks."""
     if options.points is not None and options.points < 1:
         raise ExportError(f"--points is {options.points}; expected 1 or more")
-    _refuse_idle(options)
+    refuse_idle(options)
+    refuse_name(options)
     field = _read(options)
     written = _WRITERS[options.to](field, options)
     for remark in written.remarks:
@@ -103,17 +52,6 @@ def run(options: Options) -> int:
     files = f"{len(written.sizes)} files, the largest {largest.name}" if len(written.sizes) > 1 else "one file"
     print(f"wrote {options.output}: {options.to}, {written.size / 1e6:.3g} MB, {files}")
     return 0
-
-
-def _refuse_idle(options: Options) -> None:
-    """Raise `ExportError` for a setting that says nothing to this format."""
-    heeded = _HEEDED[options.to] + (("variant", "rate") if options.field.is_dir() else ())
-    for each in fields(options):
-        if each.name in _OF_SOME and each.name not in heeded and getattr(options, each.name) != each.default:
-            others = ", ".join(name for name, known in _HEEDED.items() if each.name in known) or "the demo's folders"
-            raise ExportError(
-                f"--{each.name.replace('_', '-')} says nothing to --to {options.to}, only to {others}: leave it out"
-            )
 
 
 def _read(options: Options) -> SoundField | SampledField:
@@ -129,7 +67,7 @@ def _read(options: Options) -> SoundField | SampledField:
 
 
 def _sampled(field: SoundField | SampledField, options: Options) -> SampledField:
-    most = options.points or _POINTS[options.to]
+    most = options.points or POINTS[options.to]
     if isinstance(field, SoundField):
         sampled, held = SampledField.of(field, limit=most), len(field.gain_field.points)
     else:
@@ -163,7 +101,7 @@ def _web(field: SoundField | SampledField, options: Options) -> Written:
         object=source,
         metres=metres,
         strikes=None if options.capture is None else read_capture(options.capture).impacts,
-        limit=options.points or _POINTS["web"],
+        limit=options.points or POINTS["web"],
         force=options.force,
     )
 
@@ -196,7 +134,7 @@ def _faust(field: SoundField | SampledField, options: Options) -> Written:
 def _demo(field: SoundField | SampledField, options: Options) -> Written:
     scene = options.field / SCENE
     source = scene if options.object is None and scene.is_file() else options.object
-    most = options.points or _POINTS["avmsf-demo"]
+    most = options.points or POINTS["avmsf-demo"]
     sampled = _sampled(field, options)
     cloud = _gaussians(source, 1.0, sampled)
     if cloud is None and source is not None:
@@ -242,16 +180,6 @@ def _uff(field: SoundField | SampledField, options: Options) -> Written:
     return write_universal(_sampled(field, options), options.output, functions=options.functions, force=options.force)
 
 
-_HEEDED: dict[Format, tuple[str, ...]] = {
-    "web": ("object", "object_unit", "capture"),
-    "gltf": ("object", "object_unit", "capture"),
-    "faust": ("no_noise",),
-    "avmsf-demo": ("object", "variant", "precision"),
-    "wavs": ("forces", "contact_times", "pulse", "seconds"),
-    "uff": ("functions",),
-}
-"""The settings that each format heeds, beside those that all do."""
-_OF_SOME = {"rate"}.union(*_HEEDED.values())
 _WRITERS: dict[str, Callable[[SoundField | SampledField, Options], Written]] = {
     "web": _web,
     "gltf": _gltf,

@@ -22,8 +22,9 @@ class Options:
     """
 
     target: tyro.conf.Positional[Annotated[Path | None, tyro.conf.arg(metavar="FIELD|FOLDER|MESH")]] = None
-    """A field file, a capture folder, a folder that shows the object, or a mesh: a folder of the mesh's name beside it
-    becomes its capture."""
+    """A field file, a capture folder, a folder that shows the object, or a mesh. Of a mesh, a folder of its name beside
+    it becomes the capture and gets a copy; but surface.obj, .ply, .glb or .stl, and Gaussians called splats.ply or
+    point_cloud.ply, open the folder that they lie in as the capture. --capture names another one for either."""
     object: Annotated[Path | None, tyro.conf.arg(metavar="MESH|PLY")] = None
     """Mesh, in metres, or Gaussians to show; what the capture folder has where it is not given."""
     capture: Path | None = None

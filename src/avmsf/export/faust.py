@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf.errors import ExportError
 from avmsf.export.sampledfield import SampledField
-from avmsf.export.written import Written, generator, write_file
+from avmsf.export.written import Written, expect_ending, generator, write_file
 
 SUFFIXES = (".dsp", ".lib")
 _FEWEST = 16
@@ -31,9 +31,7 @@ def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, fo
     compiles in reasonable time.
     """
     path = Path(path)
-    if path.suffix not in SUFFIXES:
-        found = repr(path.suffix) if path.suffix else "no ending"
-        raise ExportError(f"{path}: expected a name that ends in .dsp or .lib, found {found}")
+    expect_ending(path, SUFFIXES)
     with_noise = noise and bool(field.noise.any())
     text = faust_library(field, noise=with_noise)
     if path.suffix == ".dsp":

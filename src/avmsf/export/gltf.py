@@ -23,8 +23,9 @@ from avmsf.errors import ExportError
 from avmsf.export.look import Look
 from avmsf.export.onephase import deviation, importance, shared_dampings, signed_amplitudes
 from avmsf.export.sampledfield import SampledField
-from avmsf.export.written import Written, generator, write_file
+from avmsf.export.written import Written, expect_ending, generator, write_file
 
+SUFFIXES = (".glb",)
 EXTENSION = "KHR_audio_rigid_bodies"
 _FLOAT, _UNSIGNED = 5126, 5125
 _POINTS, _TRIANGLES = 0, 4
@@ -38,10 +39,7 @@ def write_gltf(sampled: SampledField, path: str | Path, *, look: Look | None = N
     Raises `ExportError` for a name that does not end in .glb, and a field without modes.
     """
     path = Path(path)
-    if path.suffix != ".glb":
-        raise ExportError(
-            f"{path}: expected a name that ends in .glb, found {repr(path.suffix) if path.suffix else 'no ending'}"
-        )
+    expect_ending(path, SUFFIXES)
     if not len(sampled.frequency):
         raise ExportError("expected a field with modes that sound below half the sample rate, found none to export")
     damping = shared_dampings(sampled)

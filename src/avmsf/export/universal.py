@@ -21,8 +21,9 @@ from torch import Tensor
 from avmsf.errors import ExportError
 from avmsf.export.onephase import shared_dampings
 from avmsf.export.sampledfield import SampledField
-from avmsf.export.written import Written, generator, write_file
+from avmsf.export.written import Written, expect_ending, generator, write_file
 
+SUFFIXES = (".uff", ".unv")
 _NORMAL_MODE, _COMPLEX_MODE = 2, 3
 _TRANSLATION = 2
 _STRAIGHT = 1.0
@@ -41,9 +42,7 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
     or .unv, and where pyuff is missing.
     """
     path = Path(path)
-    if path.suffix not in (".uff", ".unv"):
-        found = repr(path.suffix) if path.suffix else "no ending"
-        raise ExportError(f"{path}: expected a name that ends in .uff or .unv, found {found}")
+    expect_ending(path, SUFFIXES)
     if functions < 0:
         raise ExportError(f"expected 0 response functions or more, found {functions}: say how many are wanted")
     pyuff = _pyuff()

@@ -21,6 +21,8 @@ from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, generator, write_file, write_folder
 from avmsf.field.soundfield import SoundField
 
+SUFFIXES = (".html", ".htm")
+"""Endings of a page in one file."""
 IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
 """Where the page says from where three and spark come."""
 _STYLE = re.compile(r'<link\b[^>]*\bhref="(?:\./)?page/(\w+\.css)"[^>]*>')
@@ -62,7 +64,7 @@ def write_webpage(
     """
     output = Path(output)
     bundle = make_bundle(field, object=object, metres=metres, strikes=strikes, limit=limit)
-    if output.suffix.lower() in (".html", ".htm"):
+    if output.suffix.lower() in SUFFIXES:
         return Written(write_file(output, single_file(bundle).encode(), force=force), bundle.remarks)
     content = {**page_files(), **bundle.files}
     sizes = write_folder(output, lambda place: write_files(content, place), dict(bundle.manifest), force=force)

@@ -5,13 +5,13 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
 from avmsf.errors import ExportError
-from avmsf.files import write_whole
+from avmsf.files import way_out, write_whole
 
 MANIFEST = "manifest.json"
 _READ = 4096
@@ -48,6 +48,16 @@ class Written:
 def generator() -> str:
     """Return what files say of who made them."""
     return f"avmsf {version('avmsf')}"
+
+
+def expect_ending(path: Path, endings: Sequence[str]) -> None:
+    """Raise `ExportError` for a file's name that has none of these endings, dots included."""
+    if path.suffix not in endings:
+        found = repr(path.suffix) if path.suffix else "no ending"
+        raise ExportError(
+            f"{path}: expected a name that ends in {' or '.join(endings)}, found {found}: name it "
+            f"{path.stem or 'object'}{endings[0]}"
+        )
 
 
 def write_file(path: Path, content: bytes, *, force: bool = False) -> dict[Path, int]:
@@ -96,9 +106,7 @@ def write_folder(
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
     except OSError as error:
-        raise ExportError(
-            f"{folder}: cannot be written ({error.strerror or error}): free some space or choose another place"
-        ) from error
+        raise ExportError(f"{folder}: cannot be written ({error.strerror or error}): {way_out(error)}") from error
     return sizes
 
 

@@ -26,6 +26,7 @@ from avmsf.studio.place import Place
 from avmsf.studio.refusal import RefusedError
 from avmsf.studio.strikefiles import WAV, StrikeFiles
 from avmsf.studio.striketable import StrikeTable, file_of
+from avmsf.wording import counted
 
 _KEY = re.compile(r"[\x21-\x7e]{8,128}")
 
@@ -203,7 +204,7 @@ class StrikeBook:
         usual = max(set(rates), key=rates.count) if rates else recording.sample_rate
         if recording.sample_rate != usual:
             raise CaptureError(
-                f"{recording.name}: expected {usual:g} Hz, as the {len(rates)} recordings before, found "
+                f"{recording.name}: expected {usual:g} Hz, as the {counted(len(rates), 'recording')} before, found "
                 f"{recording.sample_rate:g} Hz: record at that rate, or convert it"
             )
         return report, settings

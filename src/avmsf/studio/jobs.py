@@ -136,6 +136,11 @@ class Job:
         words = await said
         if self._cancelled:
             return _STOPPED
+        if result is None and status < 0:
+            return {
+                "error": f"{self.kind}: the work was ended from outside or crashed ({_signal_name(-status)}): try it "
+                "again, and close other programs first where memory is short"
+            }
         if result is None:
             ending = words.strip().splitlines()[-1:] or ["it said nothing"]
             return {"error": f"{self.kind} ended with status {status} and no result: {ending[0]}"}
@@ -201,6 +206,13 @@ class Jobs:
             await self.current.cancel()
         if self._running is not None:
             await asyncio.gather(self._running, return_exceptions=True)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:  # a real-time signal has no name
+        return f"signal {number}"
 
 
 def _understand(line: bytes) -> Event | None:

@@ -52,8 +52,9 @@ class Voice:
         self.say({"stage": stage, "done": done, "total": total, "words": words})
 
     def tell(self, words: str) -> None:
-        """Say that a stage begins, which stands before the colon."""
-        self.say({"stage": words.partition(":")[0], "done": 0, "total": 0, "words": words})
+        """Say that a stage begins, which stands before the colon, and after it what of it."""
+        stage, _, rest = words.partition(": ")
+        self.step(stage, 0, 0, rest)
 
     @property
     def listener(self) -> Listener:
