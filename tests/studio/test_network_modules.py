@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -89,4 +90,36 @@ def test_another_content_is_not_run_and_the_panel_works_without(
     assert page.evaluate("window.evil ?? null") is None
     assert "3D" in words_on(page)
     assert page.evaluate("avmsf.renderOffline([{ row: 5 }]).then((sound) => Math.max(...sound))") > 0
+    page.close()
+
+
+def test_a_page_without_a_network_says_what_is_missing_and_the_rest_works(browser: "Browser", tmp_path: Path) -> None:
+    write_webpage(plate_table(), tmp_path / "page.html", object=plate_object("mesh", tmp_path))
+    page = browser.new_page()
+    page.route(f"{NETWORK}**", lambda route: route.abort())
+    page.goto((tmp_path / "page.html").as_uri())
+    page.evaluate("window.avmsf.ready.then(() => null)")
+    said = words_on(page)
+    assert "three and spark, which draw the object, could not be fetched from the network" in said
+    assert "All but the picture works" in said
+    assert "base64" not in said, "browsers say in full which module they could not fetch, and here that is all of it"
+    assert "http.server" not in said, "one file needs no server"
+    page.click("text=Strike somewhere")
+    assert page.evaluate("avmsf.studio.last.force") == 1
+    page.close()
+
+
+def test_a_folder_that_is_opened_without_a_server_says_so(
+    browser: "Browser", modules: Path, tmp_path: Path, serve: Callable[[Path], str]
+) -> None:
+    write_webpage(plate_table(), tmp_path / "folder")
+    page = browser.new_page()
+    page.goto((tmp_path / "folder" / "index.html").as_uri())
+    page.wait_for_timeout(300)
+    assert page.inner_text("h1") == "Nothing to show"
+    for words in ("from a web server alone", "python -m http.server", "--to web --output page.html"):
+        assert words in words_on(page)
+    opened(page, serve(tmp_path / "folder"), modules)
+    assert page.inner_text("h1") == "Plate"
+    assert words_on(page) == ""
     page.close()

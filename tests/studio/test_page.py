@@ -511,3 +511,40 @@ def test_all_fits_on_a_telephone(visit: Open) -> None:
     for name in ("modes", "find", "edit"):
         page.click(f"#tab-{name}")
         assert page.evaluate("document.getElementById('sheets').scrollWidth") <= 390
+
+
+def test_what_was_found_goes_when_another_recording_is_looked_for(visit: Open) -> None:
+    probability = torch.exp(-torch.arange(plate_table().points.shape[0]) / 50.0)
+    region = {"level": 0.9, "radius_metres": 0.012, "share": 0.031}
+    found = {"place": [0.0, 0.0, 0.01], "row": 5, "probability": packed(probability), "region": region}
+    silence = {"error": "the recording: expected a blow, found noise alone: record it again"}
+    answers = [({"blows": [found]}, 200), (silence, 422), ({"blows": [found]}, 200)]
+    page = visit(live=LIVE, before=lambda page: page.route("**/locate", lambda route: answer(route, *answers.pop(0))))
+    page.click("#tab-find")
+
+    def expect_found(name: str) -> None:
+        page.set_input_files("#sheet-find input[type=file]", upload(name))
+        page.wait_for_selector(f"text={name}: one blow")
+        assert page.evaluate("avmsf.painted() !== null && avmsf.studio.view.marks.has('found')")
+
+    def expect_nothing() -> None:
+        assert "one blow" not in page.inner_text("#sheet-find")
+        assert page.evaluate("avmsf.painted() === null && !avmsf.studio.view.marks.has('found')")
+
+    expect_found("first.wav")
+    page.set_input_files("#sheet-find input[type=file]", upload("noise.wav"))
+    page.wait_for_selector("text=found noise alone")
+    expect_nothing()
+    expect_found("second.wav")
+    page.set_input_files("#sheet-find input[type=file]", upload("table.csv", b"file,x,y,z"))
+    page.wait_for_selector("text=table.csv: expected a WAV file")
+    expect_nothing()
+
+
+def test_all_sliders_have_names(visit: Open) -> None:
+    page = visit(live=LIVE)
+    names = ["Force of a click", "Contact time", "Volume", "Size", "Pitch", "Decay time", "Brightness", "Level"]
+    known = {name: page.get_by_role("slider", name=name, include_hidden=True).count() for name in names}
+    # Of pitch and decay time there is one for all modes and one for a single one.
+    assert known == {**dict.fromkeys(names, 1), "Pitch": 2, "Decay time": 2}
+    assert page.locator("input[type=range]").count() == sum(known.values())

@@ -221,7 +221,8 @@ def test_another_tabs_strike_is_neither_overwritten_nor_taken_out(capturing: Any
     page.wait_for_selector("text=was not taken: 001.wav: expected theirs, found d1")
     page.wait_for_selector("text=001.wav -12.3 dB")
     assert server.strikes[0]["digest"] == "theirs"
-    page.click("text=Put mine in its place")
+    with page.expect_response("**/capture"):
+        page.click("text=Put mine in its place")
     page.wait_for_function("!document.body.textContent.includes('was not taken')")
     assert server.asked[-1] == ("PUT", "001.wav", "theirs")
 
@@ -343,8 +344,47 @@ def test_a_place_found_on_another_field_is_not_painted_and_searches_do_not_meet(
     page.evaluate("avmsf.studio.revision = 2")
     answer(held[2], found(3, 1))
     page.wait_for_selector("text=The field was changed while late.wav was looked for")
-    assert "third.wav: one blow" in page.inner_text("#sheet-find")
+    assert "one blow" not in page.inner_text("#sheet-find"), "what was found before is not what was looked for"
     page.click("text=Look for it again")
     wait_for(4)
     answer(held[3], found(4, 2))
     page.wait_for_selector("text=late.wav: one blow")
+
+
+def test_a_recording_that_the_server_refuses_is_not_offered_to_be_kept(capturing: Any) -> None:
+    page, _ = capturing()
+    silent = {"error": "the recording: expected a blow, found silence: record it again"}
+    page.route("**/capture/check", lambda route: answer(route, silent, 422))
+    page.mouse.click(*on_screen(page, HERE))
+    page.set_input_files("#sheet-capture input[type=file]", upload())
+    page.wait_for_selector("text=It cannot be kept: the recording: expected a blow, found silence")
+    keep, redo = (page.locator("#sheet-capture button", has_text=words).first for words in ("Keep it", "Redo"))
+    assert keep.is_disabled()
+    assert "main" not in (keep.get_attribute("class") or "")
+    assert "main" in (redo.get_attribute("class") or "")
+    redo.click()
+    page.unroute("**/capture/check")
+    page.route("**/capture/check", lambda route: route.abort())
+    page.set_input_files("#sheet-capture input[type=file]", upload())
+    page.wait_for_selector("text=Measure again")
+    assert keep.is_enabled(), "a server that does not answer has refused nothing"
+
+
+@pytest.mark.parametrize("gone", [None, {"error": "there is nothing at this address"}])
+def test_a_studio_that_was_started_again_is_told_to_be_elsewhere(capturing: Any, gone: dict[str, str] | None) -> None:
+    page, server = capturing()
+    page.mouse.click(*on_screen(page, HERE))
+    page.route("**/capture/**", lambda route: route.abort() if gone is None else answer(route, gone, 404))
+    page.set_input_files("#sheet-capture input[type=file]", upload())
+    page.wait_for_selector("text=Measure again")
+    told = page.inner_text("#sheet-capture .group:has(> .waveform) .warning")
+    assert "prints a new address" in told
+    assert "kept in this browser" in told
+    page.click("text=Keep it")
+    page.wait_for_selector("text=The recording is not lost")
+    assert "prints a new address" in words_on(page)
+    assert page.evaluate(STORED) == [[FOLDER, True]]
+    page.unroute("**/capture/**")
+    page.reload()
+    page.wait_for_selector("text=1 strike")
+    assert len(server.strikes) == 1, "under the new address it is sent by itself, for nobody has refused it"

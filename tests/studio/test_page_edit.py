@@ -13,10 +13,12 @@ import torch
 from avmsf.export.sampledfield import SampledField
 from avmsf.field.store import load
 from avmsf.studio.modules import MODULES_VARIABLE
+from avmsf.studio.refusal import RefusedError
+from avmsf.studio.session import Session
 from opened_plate import open_plate, plate_field
 from page_plate import lay_out, page_modules, plate_table
 from plate_page import LIVE, Open, Serve, answer, plate_site, upload, visiting, words_on
-from served import served
+from served import Served, served
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page, Request, Route
@@ -41,6 +43,9 @@ def visit(browser: "Browser", site: Serve) -> Iterator[Open]:
         yield visit
 
 
+STALE = "expected a change of revision 2, found one of revision 1: another tab has changed the field"
+
+
 class EditServer:
     """Answers the page's changes as the studio does, one tab among others, and remembers what it was asked."""
 
@@ -55,6 +60,8 @@ class EditServer:
         """Whether answers to edits wait until `let_go`."""
         self.then: Callable[[], None] | None = None
         """What happens once between the next answer and what the page fetches upon it."""
+        self.led: list[str] = []
+        """What the steps of a lead say."""
         self._waiting: list[Callable[[], None]] = []
         page.route("**/manifest.json", lambda route: answer(route, self.manifest()))
         page.route("**/edited.bin", lambda route: route.fulfill(body=edited["content"]))
@@ -82,7 +89,7 @@ class EditServer:
         what, words = request.url.rsplit("/", 1)[1], request.post_data_json
         self.asked.append((what, words))
         if words["base"] != self.revision:
-            answer(route, {"error": "expected the last revision", "revision": self.revision}, 409)
+            answer(route, {"error": STALE, "revision": self.revision}, 409)
         elif what == "save" and words["name"] in self.taken:
             answer(route, {"error": f"{words['name']} is there: choose another"}, 409)
         elif "like" in words:
@@ -112,7 +119,9 @@ class EditServer:
 
     def _lead(self, route: "Route") -> None:
         self.change()
-        body = f'data: {{"revision": {self.revision}, "remarks": []}}\n\n'
+        steps = [{"stage": "edit", "done": number, "words": words} for number, words in enumerate(self.led, start=1)]
+        events = [*steps, {"revision": self.revision, "remarks": []}]
+        body = "".join(f"data: {json.dumps(event)}\n\n" for event in events)
         route.fulfill(content_type="text/event-stream", body=body)
 
 
@@ -202,15 +211,27 @@ def test_an_edit_is_heard_undone_and_saved(edits: Any) -> None:
     ]
 
 
-def test_what_a_slider_says_when_save_is_clicked_is_saved(browser: "Browser", modules: Path, tmp_path: Path) -> None:
+@contextlib.contextmanager
+def edited_plate(browser: "Browser", modules: Path, home: Path) -> Iterator[tuple["Page", Served]]:
+    """Yield the page's tab of edits with its real server."""
     with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as opened:
         patch.setenv(MODULES_VARIABLE, str(modules))
-        server = opened.enter_context(served(open_plate(tmp_path / "home"), tmp_path / "scratch"))
-        page = browser.new_context().new_page()
+        server = opened.enter_context(served(open_plate(home / "home"), home / "scratch"))
+        # The driver waits by evaluating words in the page, which its policy forbids.
+        page = browser.new_context(bypass_csp=True).new_page()
         opened.callback(page.context.close)
-        page.goto(f"http://127.0.0.1:{server.port}/{server.token}/")
-        page.evaluate("window.avmsf.ready.then(() => null)")
-        page.click("#tab-edit")
+        visit_edits(page, server)
+        yield page, server
+
+
+def visit_edits(page: "Page", server: Served) -> None:
+    page.goto(f"http://127.0.0.1:{server.port}/{server.token}/")
+    page.evaluate("window.avmsf.ready.then(() => null)")
+    page.click("#tab-edit")
+
+
+def test_what_a_slider_says_when_save_is_clicked_is_saved(browser: "Browser", modules: Path, tmp_path: Path) -> None:
+    with edited_plate(browser, modules, tmp_path) as (page, server):
         page.fill("#sheet-edit input[aria-label='Name of the new field']", "higher")
         for _ in range(10):
             move(page, "Pitch")
@@ -432,3 +453,71 @@ def test_a_recording_is_heard(visit: Open) -> None:
            }"""
     )
     assert page.evaluate("avmsf.studio.last === undefined"), "without a blow of the model"
+
+
+def test_the_heading_says_which_field_is_heard(browser: "Browser", modules: Path, tmp_path: Path) -> None:
+    with edited_plate(browser, modules, tmp_path) as (page, server):
+        before = page.inner_text("h1")
+        move(page, "Pitch")
+        page.wait_for_function("avmsf.studio.last !== undefined")
+        page.wait_for_timeout(3000)
+        picture = "document.getElementById('decay').toDataURL()"
+        drawn = page.evaluate(picture)
+        page.fill("#sheet-edit input[aria-label='Name of the new field']", "higher")
+        page.click("text=Save as")
+        page.wait_for_selector("text=Saved:")
+        assert page.inner_text("h1") == "higher"
+        assert page.title().startswith("higher")
+        assert page.evaluate(picture) == drawn, "what is heard is the same as before"
+        other = page.context.new_page()
+        visit_edits(other, server)
+        assert other.inner_text("h1") == "higher"
+        page.click("#sheet-edit >> text=Undo")
+        page.wait_for_function(f"document.querySelector('h1').textContent === {json.dumps(before)}")
+        assert before != "higher"
+
+
+def test_remarks_speak_of_the_pages_own_controls(browser: "Browser", modules: Path, tmp_path: Path) -> None:
+    with edited_plate(browser, modules, tmp_path) as (page, server):
+        page.get_by_label("New material").select_option("glass")
+        said = page.locator("#words, #sheet-edit [aria-live]", has_text='"Material it is of"')
+        said.first.wait_for()
+        assert '"from"' not in page.inner_text("body")
+        page.get_by_label("Material it is of").select_option("wood")
+        page.get_by_label("New material").select_option("")
+        move(page, "Size")
+        page.wait_for_function("avmsf.studio.live.sliders.size > 1")
+        # What it is of counts for another size too.
+        assert server.manifest()["live"]["sliders"]["material"] == {"from": "wood", "to": None}
+        assert said.count() == 0
+
+
+def test_a_lead_says_at_once_that_it_begins_and_at_its_end_what_changed(edits: Any) -> None:
+    page, server = edits()
+    server.led = ["loss 0.92, pitch x 1.01", "loss 0.75, pitch x 1.1", "loss 0.31, pitch x 1.249"]
+    page.set_input_files("#sheet-edit input[type=file]", upload())
+    page.wait_for_selector("text=It has begun")
+    server.let_go()
+    page.wait_for_selector("text=The sound was led: its pitch is × 1.25, and how far it is off fell from 0.92 to 0.31")
+
+
+def test_an_undo_that_another_tab_forestalls_shows_what_there_is(edits: Any) -> None:
+    page, server = edits()
+    move(page, "Pitch")
+    page.wait_for_function("avmsf.studio.revision === 2")
+    server.change(size=2.0)
+    page.click("#sheet-edit >> text=Undo")
+    page.wait_for_selector("text=Another tab changed this field meanwhile. You see and hear what it is now: do it")
+    assert shown(page, "Size", "Pitch") == ["× 2.00", "× 1.00"]
+    assert (server.revision, [what for what, _ in server.asked]) == (3, ["edit", "undo"])
+
+
+def test_words_on_another_tabs_change_hold_no_numbers_of_revisions(edits: Any) -> None:
+    page, server = edits()
+    server.change(size=2.0)
+    move(page, "Pitch")
+    page.wait_for_selector("text=Nothing was overwritten: show its change and make yours again")
+    assert "revision" not in words_on(page)
+    with pytest.raises(RefusedError, match="make the change again") as refused:
+        Session(Path(), lambda revision: None).expect_current(1)
+    assert "revision" not in str(refused.value)

@@ -431,3 +431,34 @@ def test_a_field_without_contacts_is_not_told_to_be_struck(visit: Open) -> None:
     said = words_on(page, ".bad")
     assert "This field has no geometry" in said
     assert "strike" not in said
+
+
+def test_a_recording_is_drawn_from_its_beginning_beside_the_model_of_its_own_contact(visit: Open) -> None:
+    page = visit(strikes=True)
+    recording = "#sheet-strike li:has-text('100.wav') >> text=Recording"
+    page.evaluate("avmsf.strike(325)")
+    page.wait_for_timeout(1500)
+    page.click(recording)
+    page.wait_for_timeout(700)
+    assert page.inner_text("#blow-facts") == "100.wav: recording"
+    heard = np.flatnonzero(np.isfinite(columns(page, "decay", "second")))
+    # The chart's axis is 2.3 s long; before, the recording was drawn 1.5 s into the blow elsewhere.
+    assert heard.min() < column_of(page, 0.5 / 2.3)
+
+    def lines() -> np.ndarray:
+        """Return how far down the model's lines began at the blow, however far they have fallen; 1 for none."""
+        page.wait_for_timeout(200)
+        both = np.fmin(columns(page, "spectrum", "accent"), columns(page, "spectrum", "faint"))
+        about = [both[column_of(page, share_of(400.0 * order)) + np.arange(-1, 2)] for order in range(1, 7)]
+        return np.nan_to_num(np.array(about), nan=1.0).min(axis=1)
+
+    page.evaluate("avmsf.studio.spectra.listen(avmsf.studio.modes, null)")
+    page.evaluate("avmsf.strike(325)")
+    elsewhere = lines()
+    page.click(recording)
+    beside = lines()
+    page.evaluate("avmsf.strike(100)")
+    # Two of the chart's 124 pixels: how a line's end is coloured depends on the time since the blow.
+    np.testing.assert_allclose(beside, lines(), atol=2.1 / 124, rtol=0)
+    # In the middle of the plate most modes have a node.
+    assert (elsewhere - beside > 0.3).sum() >= 2

@@ -27,6 +27,7 @@ from avmsf.cli import main
 from avmsf.errors import AvmsfError, StudioError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
+from avmsf.pipeline.sources import SPLATS
 from avmsf.scene.ply import write_splats
 from avmsf.scene.start import StartPoints, starting_cloud
 from avmsf.scene.symmetrysearch import find_symmetries
@@ -34,7 +35,7 @@ from avmsf.simulate.material import CERAMIC, WOOD
 from avmsf.studio import leading, locating, modules, server, studio
 from avmsf.studio.locating import Finder
 from avmsf.studio.modules import find_modules, with_local_modules
-from avmsf.studio.opening import Opened, find_object, open_target
+from avmsf.studio.opening import MESHES, Opened, find_object, open_target
 from avmsf.studio.routes import PAGE
 from avmsf.studio.server import serve
 from avmsf.tasks.located import enlarged
@@ -432,6 +433,23 @@ def test_what_can_be_opened_and_what_not(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr("avmsf.studio.opening.LARGEST_MESH", 10)
     with pytest.raises(StudioError, match="expected a mesh of at most"):
         open_target(mesh)
+
+
+def test_a_mesh_called_as_a_captures_own_opens_the_folder_that_it_lies_in(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mesh = tmp_path / "surface.ply"
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(mesh)
+    assert open_target(mesh).capture == tmp_path.resolve()
+    assert list(tmp_path.iterdir()) == [mesh]
+    assert open_target(mesh, capture=tmp_path / "other").capture == (tmp_path / "other").resolve()
+    with pytest.raises(SystemExit):
+        main(["studio", "--help"])
+    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "a folder of its name beside it becomes the capture and gets a copy" in told
+    for name in ("surface.obj", *MESHES, *SPLATS):
+        assert name in told
+    assert "open the folder that they lie in as the capture" in told
 
 
 def wavefront(folder: Path) -> Path:

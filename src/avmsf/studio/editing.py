@@ -18,6 +18,8 @@ from avmsf.tasks.recast import LAWS, recast
 from avmsf.tasks.retune import retune
 
 _MATERIAL, _MODE = ("from", "to"), ("mode", "db", "pitch", "decay")
+_OLD_CONTROL = '"Material it is of"'
+"""What the page calls its choice of the old material."""
 _MOST = {"db": 120.0, "brightness": 40.0}
 """Decibels up or down: what is farther off float32 cannot bring back beside the other modes."""
 _SHOWN = 60
@@ -93,7 +95,7 @@ class Sliders:
         edited, words = ground, []
         if self.material is not None or self.size != 1.0:
             if self.old is None:
-                known = made_of(ground, option='"from"')
+                known = made_of(ground, option=_OLD_CONTROL)
                 old = known.material
                 words.append(known.words)
             else:

@@ -4,7 +4,6 @@ Whoever changes it says which revision that is based on; where another tab was f
 is told so. Numbers of revisions only grow, an undone one's is never given again.
 """
 
-import errno
 import os
 import re
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from threading import RLock
 from avmsf.errors import StudioError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
+from avmsf.files import way_out
 from avmsf.studio.editing import REST, Sliders
 from avmsf.studio.refusal import RefusedError
 
@@ -25,16 +25,6 @@ _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 _LONGEST_NAME = 200
 """Bytes: files' names have 255 at most, of which the ending and what a half-written file is called need some."""
 _MOST_ALIKE = 1000
-_HELP = {
-    errno.ENOSPC: "free some space",
-    errno.EDQUOT: "free some space",
-    errno.EACCES: "make the folder one that you may write to",
-    errno.EPERM: "make the folder one that you may write to",
-    errno.EROFS: "copy what is opened to a disk that can be written to",
-    errno.ENAMETOOLONG: "choose a shorter name",
-    errno.ENOENT: "the folder is gone: put it back",
-}
-"""What to do where a file cannot be made."""
 MOST_UNDONE = 100
 """Revisions that can be gone back to."""
 
@@ -54,6 +44,8 @@ class Revision:
     """What is heard."""
     remarks: tuple[str, ...] = ()
     """What its owner should know of it."""
+    name: str | None = None
+    """What it, or what it was made of, was saved as last; None for as it was opened."""
 
     def expect_field(self) -> SoundField:
         """Return what is heard. Raises RefusedError (409) before there is a field."""
@@ -96,13 +88,14 @@ class Session:
             ground = self._current.ground
             assert ground is not None
             field, remarks = sliders.apply(ground)
-            return self._remember(Revision(0, self._current.opening, ground, sliders, field, tuple(remarks)))
+            return self._remember(replace(self._current, sliders=sliders, field=field, remarks=tuple(remarks)))
 
     def lead(self, base: int, field: SoundField, remarks: tuple[str, ...]) -> Revision:
         """Take in what a descent has made of revision `base`; sliders are relative to it from then on."""
         with self._lock:
             self.expect_current(base)
-            return self._remember(Revision(0, self._current.opening, field, REST, field, remarks))
+            led = replace(self._current, ground=field, sliders=REST, field=field, remarks=remarks)
+            return self._remember(led)
 
     def undo(self, base: int) -> Revision:
         """Go back by one revision, under a new number. Raises RefusedError (409) as `edit`, and where there is none."""
@@ -124,7 +117,8 @@ class Session:
             field = self._current.expect_field()
             path = self.home / file_name(name)
             _write_new(field, path)
-            return path, self._advance(replace(self._current, ground=field, sliders=REST))
+            saved = replace(self._current, ground=field, sliders=REST, name=path.name.removesuffix(SUFFIX))
+            return path, self._advance(saved)
 
     def keep(self, field: SoundField, stem: str) -> Path:
         """Write a field that is not heard to a new file of the folder, `stem` with a number where that is taken."""
@@ -142,8 +136,8 @@ class Session:
         if base != self._current.number:
             raise RefusedError(
                 409,
-                f"expected a change of revision {self._current.number}, found one of revision {base}: another tab has "
-                "changed the field meanwhile, and nothing was overwritten; look at what it is now and change it again",
+                "another tab has changed the field meanwhile, and nothing was overwritten: look at what it is now and "
+                "make the change again",
                 revision=self._current.number,
             )
 
@@ -167,8 +161,8 @@ def _write_new(field: SoundField, path: Path) -> None:
     except FileExistsError as error:
         raise RefusedError(409, f"{path.name} is there already and stays: choose another name") from error
     except OSError as error:
-        way_out = _HELP.get(error.errno or 0, f"look at {path.parent}")
-        raise StudioError(f"{path}: cannot be written ({error.strerror}): {way_out}") from error
+        help = way_out(error) if path.parent.is_dir() else "the folder is gone: put it back"
+        raise StudioError(f"{path}: cannot be written ({error.strerror}): {help}") from error
     try:
         save(field, path)
     except BaseException:

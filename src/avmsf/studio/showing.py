@@ -85,7 +85,7 @@ class Showcase:
             mute = revision.field is None
             remarks += write_bundle(sampled, path, object=shown, metres=self.metres, strikes=strikes, mute=mute).remarks
             manifest = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
-            manifest["name"] = manifest["name"] or self.opened.name
+            manifest["name"] = revision.name or manifest["name"] or self.opened.name
             if fresh:
                 self._first_of_field = Shown(path, manifest, sampled, revision, remarks)
             assert self._first_of_field is not None

@@ -36,8 +36,9 @@ export async function loadBundle({ base = document.baseURI } = {}) {
 
 async function fetched(name, base) {
   const response = await fetch(fileUrl(name, { base }), { cache: "no-cache" }).catch(() => null);
-  if (response === null) throw new Error(`${name} cannot be reached: is the server still running?`);
-  if (!response.ok) throw new Error(`${name} cannot be read (${response.status}): export the page again`);
+  const moved = "a studio that was stopped and started again prints a new address to open";
+  if (response === null) throw new Error(`${name} cannot be reached: is the server still running? If not, ${moved}`);
+  if (!response.ok) throw new Error(`${name} cannot be read (${response.status}): export the page again; ${moved}`);
   return response;
 }
 

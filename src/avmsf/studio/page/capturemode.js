@@ -38,6 +38,7 @@ export async function captureSheet(studio) {
       if (!place.locked && place.now !== struckPlace) place.set(placeOf(made));
       record.button.focus();
     },
+    refuge: () => outbox.refuge,
   });
   const captured = new CapturedStrikes(studio, {
     redo: ({ file, contact, direction, digest }) => {

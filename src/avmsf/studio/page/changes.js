@@ -51,7 +51,8 @@ export class Changes {
 
   /**
    * Within the queue: do what changes the field; undefined where it failed, which is said. Where another tab was faster
-   * nothing is overwritten, and the user chooses; `mine` is false for what makes no sense on top of its change.
+   * nothing is overwritten, and the user chooses; `mine` is false for what makes no sense on top of its change, which
+   * is shown then.
    */
   async ask(action, { again, mine = true, refused = [] }) {
     this.onBusy(true);
@@ -61,7 +62,8 @@ export class Changes {
       unsay("edit");
       return answer;
     } catch (error) {
-      if (error.stale) this.#tellStale(error, mine && again);
+      if (error.stale && mine) this.#tellStale(error, again);
+      else if (error.stale) await this.#showStale(error);
       else say(error.message, { name: "edit", bad: true, answers: error.unreachable ? [["Try again", again]] : refused });
       this.#lost = Boolean(error.unreachable);
       return undefined;
@@ -93,10 +95,19 @@ export class Changes {
     return !theirs;
   }
 
-  #tellStale({ message, revision }, again) {
-    const meanwhile = this.#lost
+  get #meanwhile() {
+    return this.#lost
       ? "The change whose answer was lost was made, or another tab changed this field."
       : "Another tab changed this field meanwhile.";
+  }
+
+  async #showStale({ revision }) {
+    const meanwhile = this.#meanwhile;
+    if (await this.show({ revision }, { sliders: true }))
+      say(`${meanwhile} You see and hear what it is now: do it again if you still want to.`, { name: "edit" });
+  }
+
+  #tellStale({ revision }, again) {
     const answers = [["Show its change", () => this.queue(() => this.show({ revision }, { sliders: true }))]];
     const insist = () => {
       this.studio.revision = revision;
@@ -104,8 +115,9 @@ export class Changes {
       this.#unsent = true;
       again();
     };
-    if (again) answers.push(["Put mine in its place", insist]);
-    say(`${meanwhile} ${message}`, { name: "edit", bad: true, answers });
+    answers.push(["Put mine in its place", insist]);
+    const choice = "Nothing was overwritten: show its change and make yours again, or put yours in its place.";
+    say(`${this.#meanwhile} ${choice}`, { name: "edit", bad: true, answers });
   }
 
   #take() {

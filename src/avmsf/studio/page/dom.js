@@ -28,7 +28,8 @@ export class Slider {
     this.words = words;
     this.rest = value;
     this.steps = steps;
-    this.input = element("input", { type: "range", min: 0, max: steps, step: 1 });
+    // The label about it names its value's element, the first of the two that a label can name.
+    this.input = element("input", { type: "range", min: 0, max: steps, step: 1, "aria-label": name });
     this.output = element("output");
     this.element = element("label", { className: "slider" }, element("span", {}, name), this.output, this.input);
     this.input.addEventListener("input", () => {
@@ -85,6 +86,9 @@ export function filePicker(words, accept, onFile) {
   return element("label", { className: "file" }, input, words);
 }
 
+/** Words without addresses that hold a whole file: browsers say them in full where they tell what cannot be had. */
+const withoutFiles = (words) => words.replaceAll(/:?\s*\bdata:[\w.+/-]*(?:;[\w=-]+)*,[^\s"')]*/g, "");
+
 /** Say something over the object; `answers` are [words, action] buttons. One word of each `name` at a time. */
 export function say(words, { name = words, bad = false, answers = [], seconds = 0 } = {}) {
   const place = document.getElementById("words");
@@ -98,7 +102,7 @@ export function say(words, { name = words, bad = false, answers = [], seconds = 
   const word = element(
     "div",
     { className: bad ? "word bad" : "word", "data-name": name },
-    element("div", {}, words, answers.length ? element("div", { className: "answers" }, ...actions) : null),
+    element("div", {}, withoutFiles(words), answers.length ? element("div", { className: "answers" }, ...actions) : null),
     button("×", close, { className: "small", "aria-label": "Close this message" }),
   );
   unsay(name);

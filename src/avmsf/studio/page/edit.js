@@ -38,19 +38,19 @@ export function editSheet(studio, load) {
     changes.moved();
   });
   const names = studio.live.materials ?? MATERIALS;
-  const select = (label, none) =>
+  const select = (none) =>
     element(
       "select",
-      { "aria-label": label, onchange: onInput },
+      { onchange: onInput },
       element("option", { value: "" }, none),
       ...names.map((name) => element("option", { value: name }, name)),
     );
-  const from = select("Material it is of", "by its sound");
-  const to = select("New material", "as it is");
+  const from = select("by its sound");
+  const to = select("as it is");
   const remarks = element("div", { className: "group", "aria-live": "polite" });
   const busy = element("progress", { hidden: true, "aria-label": "Editing" });
   const asked = () => ({
-    material: to.value ? { from: from.value || null, to: to.value } : null,
+    material: from.value || to.value ? { from: from.value || null, to: to.value || null } : null,
     ...Object.fromEntries(Object.entries(sliders).map(([name, slider]) => [name, slider.value])),
     modes: [...single].filter(([, values]) => !atRest(values)).map(([mode, values]) => ({ mode, ...values })),
   });
@@ -159,7 +159,9 @@ export function editSheet(studio, load) {
       "div",
       { className: "group" },
       element("h2", {}, "Material"),
-      element("div", { className: "row" }, from, "→", to),
+      // The server's words on an edit call the first of them by this name.
+      element("label", { className: "choice" }, "Material it is of", from),
+      element("label", { className: "choice" }, "New material", to),
     ),
     element("div", { className: "group" }, ...Object.values(sliders).map((slider) => slider.element)),
     element("details", {}, element("summary", {}, "A single mode"), modeTitle, modeBox),

@@ -12,10 +12,19 @@ export function findSheet(studio) {
   let painted = null;
   const record = new RecordButton({ done: (blob) => locate(blob, "the recording") });
 
+  /** Take away what was found last. */
+  const forget = () => {
+    results.replaceChildren();
+    clearFound(studio);
+    if (painted && studio.view?.painted?.values === painted) studio.paint(null);
+    painted = null;
+  };
+
   // One search at a time: while one runs, the newest recording waits and older ones are forgotten.
   let [running, wanted] = [false, null];
   const locate = async (blob, name) => {
     wanted = { blob, name };
+    forget();
     if (running) return;
     [running, busy.hidden] = [true, false];
     while (wanted) {
@@ -54,17 +63,13 @@ export function findSheet(studio) {
   };
 
   const take = async (file) => {
+    forget();
     const fine = await attempt(() => expectWav(file).then(() => true), "locate");
     if (fine) await locate(file, file.name);
   };
 
-  // Paint and found places belong to the field as it was when it was asked.
-  studio.addEventListener("bundle", () => {
-    results.replaceChildren();
-    clearFound(studio);
-    if (painted && studio.view?.painted?.values === painted) studio.paint(null);
-    painted = null;
-  });
+  // Paint and found places belong to the recording, and to the field as it was when it was asked.
+  studio.addEventListener("bundle", forget);
 
   const sheet = element(
     "section",

@@ -13,17 +13,24 @@ export function leadGroup(studio, changes, hold) {
 
   const lead = (towards) =>
     hold(async () => {
+      progress.begin("It begins …");
       const start = () => server.edit(studio.revision, towards);
       const again = () => lead(towards);
       const begun = await changes.queue(async () => (await changes.settle()) && changes.ask(start, { again }));
       if (begun) await follow(begun.job);
+      else progress.end();
     }, "minutes");
   const follow = async (job) => {
-    const last = await progress.follow(job);
+    const steps = [];
+    const last = await progress.follow(job, (message) => {
+      const step = stepOf(message);
+      if (step) steps.push(step);
+    });
     if (last.error) say(last.error, { name: "edit", bad: true });
     else if (last.revision !== undefined) {
       const shown = await changes.queue(() => changes.show(last, { sliders: true }));
       if (shown) studio.strikeAgain();
+      say(summaryOf(steps), { name: "led" });
     }
   };
 
@@ -44,6 +51,23 @@ export function leadGroup(studio, changes, hold) {
     element("div", { className: "row" }, ...rows, progress.stop),
     progress.bar,
     progress.stage,
+  );
+}
+
+/** What a step of a descent says: {loss, pitch}; null for other messages. */
+function stepOf({ words = "" }) {
+  const [, loss, pitch] = /loss ([\d.e+-]+), pitch x ([\d.e+-]+)/.exec(words) ?? [];
+  return loss === undefined ? null : { loss: Number(loss), pitch: Number(pitch) };
+}
+
+/** What a descent of these steps has come to. */
+function summaryOf(steps) {
+  if (!steps.length) return "The sound was led.";
+  const [first, last] = [steps[0], steps.at(-1)];
+  const closer = last.loss < first.loss ? "fell" : "went";
+  return (
+    `The sound was led: its pitch is × ${last.pitch.toPrecision(3)}, and how far it is off ${closer} from ` +
+    `${first.loss.toPrecision(2)} to ${last.loss.toPrecision(2)}. Undo takes it back.`
   );
 }
 

@@ -22,7 +22,6 @@ async function open() {
   library.catch(() => {});
   const studio = new Studio(await loadBundle());
   window.avmsf.studio = studio;
-  const { manifest } = studio.bundle;
   const capturing = studio.live?.mode === "capture";
   showTitle(studio);
   const sound = capturing ? null : startSound(studio);
@@ -35,7 +34,6 @@ async function open() {
     ? "<strong>Click the object</strong> where you are about to strike it"
     : "<strong>Click the object</strong> to strike it. Hold longer: harder. Drag: turn.";
   takeDrops(sheets);
-  document.title = `${manifest.name} · avmsf studio`;
   // Struck it can be from now on, and seen from the next frame.
   await new Promise((drawn) => requestAnimationFrame(drawn));
   window.avmsf.readyAt = performance.now();
@@ -46,6 +44,7 @@ function showTitle(studio) {
   studio.on("bundle", () => {
     const { name, modes, points, sampleRate } = studio.bundle.manifest;
     at("name").textContent = name;
+    document.title = `${name} · avmsf studio`;
     const facts = [
       modes ? `${modes} modes` : null,
       points ? `${points.toLocaleString("en")} contacts` : null,
@@ -115,9 +114,12 @@ async function reload(studio) {
 async function showObject(studio, { atPress, struck }, library) {
   try {
     const { ObjectView } = await library.catch((error) => {
+      const from = studio.live
+        ? "For a page that needs no network, run avmsf studio --fetch-modules once."
+        : "With a network, load the page again.";
       throw new Error(
-        `The 3D library could not be loaded (${error.message}). Without a network, run avmsf studio --fetch-modules ` +
-          "once; sounds work all the same, by the buttons in the panel.",
+        "The 3D library could not be loaded: three and spark, which draw the object, could not be fetched from the " +
+          `network (${error.message}). All but the picture works, by the buttons in the panel. ${from}`,
       );
     });
     studio.view = await ObjectView.create(at("stage"), at("overlay"), studio.bundle);

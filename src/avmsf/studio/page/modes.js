@@ -13,6 +13,12 @@ export class Modes {
     this.tensors = tensors;
   }
 
+  /** Whether the rows of another field's contacts are those of this one's. */
+  sameContacts(other) {
+    const [here, there] = [this.tensors.points, other?.tensors.points];
+    return here?.length === there?.length && here.every((value, at) => value === there[at]);
+  }
+
   frequency(mode) {
     return this.tensors.frequency[mode];
   }

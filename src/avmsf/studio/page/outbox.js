@@ -67,6 +67,13 @@ export class Outbox {
     return this.#lasting;
   }
 
+  /** Where the entries are safe, in a sentence. */
+  get refuge() {
+    return this.#lasting
+      ? "What the server lacks is kept in this browser, even if you close the page; a restarted studio's page shows it again."
+      : "What the server lacks is kept in this open page alone: leave it open.";
+  }
+
   get entries() {
     return [...this.#entries.values()];
   }

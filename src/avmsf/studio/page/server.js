@@ -13,12 +13,25 @@ export class ServerError extends Error {
     return this.status === 409 && this.revision !== null;
   }
 
+  /** Whether the server has looked at what it was sent, and will not have it. */
+  get refusal() {
+    return this.status >= 400 && this.status < 500;
+  }
+
+  /** Whether nobody was there to say anything. */
   get unreachable() {
     return this.status === 0;
   }
 }
 
-const GONE = "The server does not answer. Is `avmsf studio` still running? Nothing is lost here: try again.";
+const GONE =
+  "The server does not answer. Is `avmsf studio` still running? Nothing is lost here: try again. One that was stopped " +
+  "and started again prints a new address: open that one.";
+/** What a server says to whoever does not know its present secret. */
+const NOTHING = "there is nothing at this address";
+const MOVED =
+  "The studio is no longer at this page's address: one that was stopped and started again prints a new address. Open " +
+  "that one.";
 
 async function ask(method, place, { body, headers, signal } = {}) {
   let answer;
@@ -38,6 +51,7 @@ async function ask(method, place, { body, headers, signal } = {}) {
     content = null;
   }
   if (answer.ok) return content;
+  if (answer.status === 404 && content?.error === NOTHING) throw new ServerError(MOVED);
   const words = content?.error ?? `The server answered ${answer.status} to ${method} ${place}.`;
   throw new ServerError(words, { status: answer.status, revision: content?.revision ?? null });
 }

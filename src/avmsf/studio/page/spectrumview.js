@@ -37,8 +37,9 @@ export class SpectrumView {
     new ResizeObserver(() => this.#running || this.#draw()).observe(spectrumCanvas);
   }
 
-  /** What is heard from now on: the field's modes, and the engine, or null without sound. */
+  /** What is heard from now on: the field's modes, and the engine, or null without sound. The last blow stays drawn. */
   listen(modes, engine) {
+    const before = modes.sameContacts(this.modes) ? this.#blow : null;
     this.modes = modes;
     this.engine = engine;
     this.analyser = engine?.analyser ?? null;
@@ -46,12 +47,20 @@ export class SpectrumView {
       engine.onlimited = tellLimited;
       engine.onheld = (held) => (held ? say(HELD, { name: "held", bad: true }) : unsay("held"));
     }
-    this.#blow = null;
+    this.compared = null;
+    this.#blow = before && this.#blowOf(before);
     this.#draw();
   }
 
-  /** A blow at a contact sounds from now on. */
+  /** A blow at a contact sounds from now on: the model's, or the recording of one. */
   struck(row, force) {
+    this.#blow = this.#blowOf({ row, force, at: performance.now() });
+    this.compared = null;
+    this.#run();
+  }
+
+  /** A blow of the field that is listened to, with what is drawn of it; `at` in ms. */
+  #blowOf({ row, force, at }) {
     const { modes } = this;
     const stems = Array.from({ length: modes.count }, (_, mode) => ({
       frequency: modes.frequency(mode),
@@ -59,15 +68,7 @@ export class SpectrumView {
       damping: modes.damping(mode, row),
     }));
     const loudest = Math.max(...stems.map(({ level }) => level));
-    this.#blow = { stems, at: performance.now(), top: Math.ceil((loudest + 6) / 10) * 10, seconds: spanOf(stems) };
-    this.compared = null;
-    this.#run();
-  }
-
-  /** Something else sounds, such as a recording: only what is heard is drawn. */
-  heard() {
-    this.compared = null;
-    this.#run();
+    return { row, force, at, stems, top: Math.ceil((loudest + 6) / 10) * 10, seconds: spanOf(stems) };
   }
 
   /** Draw two spectra over each other, each {label, levels} with levels in dB from LOW to HIGH. */
@@ -91,7 +92,7 @@ export class SpectrumView {
     if (this.#running) return;
     this.#running = true;
     const step = () => {
-      this.#running = this.#listenOnce() && !this.compared;
+      this.#running = this.#listenOnce();
       this.#draw();
       if (this.#running) requestAnimationFrame(step);
     };

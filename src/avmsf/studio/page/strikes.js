@@ -94,7 +94,7 @@ class Comparison {
     const isLast = this.#begin();
     this.#expectSound();
     const buffer = await this.#buffer(strike);
-    if (isLast()) this.#play(buffer);
+    if (isLast()) this.#play(strike, buffer);
   }
 
   async model(strike) {
@@ -112,7 +112,7 @@ class Comparison {
     if (!isLast()) return;
     const row = this.row(strike);
     const length = Math.min(buffer.duration, LONGEST_SECONDS);
-    this.#play(buffer);
+    this.#play(strike, buffer);
     this.#timer = setTimeout(() => studio.engine.strike(row, { force: 1 }), 1000 * (length + PAUSE_SECONDS));
     const model = await studio.engine.renderOffline([{ row, force: 1 }], length);
     if (!isLast()) return;
@@ -122,7 +122,7 @@ class Comparison {
       { levels: soundSpectrum(part, buffer.sampleRate, SpectrumView.range) },
       { levels: soundSpectrum(model, sampleRate, SpectrumView.range) },
     );
-    document.getElementById("blow-facts").textContent = `${strike.name}: recording and model`;
+    this.#tell(strike, "recording and model");
   }
 
   /** End what the one before still plays or was going to; gives whether none has begun since. */
@@ -134,9 +134,16 @@ class Comparison {
     return () => serial === this.#serial;
   }
 
-  #play(buffer) {
-    this.#source = this.studio.engine.play(buffer);
-    this.studio.spectra.heard();
+  /** Play a recording, with the model's lines of its own contact beside it from the moment at which it begins. */
+  #play(strike, buffer) {
+    const { engine, spectra } = this.studio;
+    this.#source = engine.play(buffer);
+    spectra.struck(this.row(strike), 1);
+    this.#tell(strike, "recording");
+  }
+
+  #tell({ name }, what) {
+    document.getElementById("blow-facts").textContent = `${name}: ${what}`;
   }
 
   #expectSound() {

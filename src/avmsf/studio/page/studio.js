@@ -20,9 +20,10 @@ export class Studio extends EventTarget {
 
   /** Show and sound another bundle, such as an edited field. */
   take(bundle) {
-    if (!sameNumbers(this.bundle?.tensors.points, bundle.tensors.points)) this.row = null;
+    const modes = new Modes(bundle);
+    if (!modes.sameContacts(this.modes)) this.row = null;
     this.bundle = bundle;
-    this.modes = new Modes(bundle);
+    this.modes = modes;
     this.revision = bundle.manifest.live?.revision ?? null;
     this.#tell("bundle");
   }
@@ -112,5 +113,3 @@ export class Studio extends EventTarget {
     this.dispatchEvent(new Event(name));
   }
 }
-
-const sameNumbers = (one, other) => one?.length === other?.length && one.every((value, at) => value === other[at]);

@@ -8,9 +8,9 @@ export class TakeCard {
   /** The recording that is shown, an entry of the outbox; null without one. */
   take = null;
 
-  /** `keep(take)` and `drop(take)` do what its buttons say. */
-  constructor({ keep, drop }) {
-    Object.assign(this, { keep, drop });
+  /** `keep(take)` and `drop(take)` do what its buttons say, `refuge()` tells where a take is without the server. */
+  constructor({ keep, drop, refuge }) {
+    Object.assign(this, { keep, drop, refuge });
     this.element = element("div", { className: "group", hidden: true });
   }
 
@@ -22,18 +22,14 @@ export class TakeCard {
       this.hide();
       return action(take);
     };
+    const keep = button(take.redo ? "Put it in place" : "Keep it", answer(this.keep), { className: "main" });
+    const redo = button("Redo", answer(this.drop));
     this.element.hidden = false;
     this.element.replaceChildren(
       element("h2", {}, "This recording"),
       canvas,
       verdict,
-      element(
-        "div",
-        { className: "row" },
-        button(take.redo ? "Put it in place" : "Keep it", answer(this.keep), { className: "main" }),
-        button("Redo", answer(this.drop)),
-        listenButton(take.blob),
-      ),
+      element("div", { className: "row" }, keep, redo, listenButton(take.blob)),
     );
     try {
       const report = await server.checkStrike(take.blob);
@@ -41,8 +37,17 @@ export class TakeCard {
       verdict.replaceChildren(measures(report));
       await drawTake(canvas, take.blob, report.onset_seconds).catch(() => {});
     } catch (error) {
-      verdict.replaceChildren(element("p", { className: "warning" }, error.message));
-      if (error.unreachable) verdict.append(button("Measure again", () => this.show(take), { className: "small" }));
+      const again = button("Measure again", () => this.show(take), { className: "small" });
+      const refused = error.refusal === true;
+      const words = refused
+        ? `It cannot be kept: ${error.message}`
+        : `${error.message} ${error.unreachable ? this.refuge() : ""}`;
+      verdict.replaceChildren(element("p", { className: "warning" }, words));
+      if (!refused) verdict.append(again);
+      // What the server would not take shall not look like what is to be done next.
+      keep.disabled = refused;
+      keep.classList.toggle("main", !refused);
+      redo.classList.toggle("main", refused);
     }
   }
 

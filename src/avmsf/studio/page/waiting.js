@@ -40,8 +40,8 @@ export class Waiting {
       else await server.addStrike(entry.blob, entry);
     } catch (error) {
       if (error.unreachable || error.status >= 500) {
-        const safe = this.outbox.lasting ? "kept in this browser, even if you close the page" : "kept in this open page";
-        say(`The recording is not lost: it is ${safe}, and sent again until the server answers.`, { name: "outbox" });
+        const words = `The recording is not lost, and sent again until the server answers. ${error.message}`;
+        say(`${words} ${this.outbox.refuge}`, { name: "outbox" });
         this.#timer = setTimeout(() => this.send(), RETRY_MS);
         return false;
       }
