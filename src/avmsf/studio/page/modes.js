@@ -9,6 +9,7 @@ export class Modes {
   constructor({ manifest, tensors }) {
     this.count = manifest.modes ?? 0;
     this.points = manifest.points ?? 0;
+    this.sampleRate = manifest.sampleRate;
     this.shared = manifest.damping !== "perContact";
     this.tensors = tensors;
   }

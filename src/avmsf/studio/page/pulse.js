@@ -20,6 +20,20 @@ export function pulseSamples(contactTime, sampleRate, shape = "half-sine") {
   return parts.map((part) => part / sum);
 }
 
+/** How strong a pulse of samples sets a damped mode swinging, over an impulse: |sum p_n exp((d - i w) n / rate)|. */
+export function excitation(pulse, frequency, damping, sampleRate) {
+  const grown = Math.exp(damping / sampleRate);
+  const turn = (-2 * Math.PI * frequency) / sampleRate;
+  const [real, imaginary] = [grown * Math.cos(turn), grown * Math.sin(turn)];
+  let [x, y, sumX, sumY] = [1, 0, 0, 0];
+  for (const part of pulse) {
+    sumX += part * x;
+    sumY += part * y;
+    [x, y] = [x * real - y * imaginary, x * imaginary + y * real];
+  }
+  return Math.hypot(sumX, sumY);
+}
+
 /** Integrate sin(pi t)^exponent, in u with t = (1 - cos u) / 2, in which both ends are smooth. */
 function impulse(from, to, exponent) {
   const start = Math.acos(1 - 2 * from), width = (Math.acos(1 - 2 * to) - start) / PANELS;

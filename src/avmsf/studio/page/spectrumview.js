@@ -3,6 +3,7 @@
 import { Chart } from "./chart.js";
 import { say, unsay } from "./dom.js";
 import { decibels } from "./modes.js";
+import { excitation, pulseSamples } from "./pulse.js";
 
 const LOW = 40;
 const HIGH = 20000;
@@ -52,23 +53,24 @@ export class SpectrumView {
     this.#draw();
   }
 
-  /** A blow at a contact sounds from now on: the model's, or the recording of one. */
-  struck(row, force) {
-    this.#blow = this.#blowOf({ row, force, at: performance.now() });
+  /** A blow at a contact sounds from now on: the model's, or the recording of one; the mallet as the engine has it. */
+  struck(row, force, { contactTime = 0, shape = "half-sine" } = {}) {
+    this.#blow = this.#blowOf({ row, force, contactTime, shape, at: performance.now() });
     this.compared = null;
     this.#run();
   }
 
   /** A blow of the field that is listened to, with what is drawn of it; `at` in ms. */
-  #blowOf({ row, force, at }) {
+  #blowOf({ row, force, contactTime, shape, at }) {
     const { modes } = this;
-    const stems = Array.from({ length: modes.count }, (_, mode) => ({
-      frequency: modes.frequency(mode),
-      level: decibels(force * modes.amplitude(mode, row)),
-      damping: modes.damping(mode, row),
-    }));
+    const pulse = pulseSamples(contactTime, modes.sampleRate, shape);
+    const stems = Array.from({ length: modes.count }, (_, mode) => {
+      const [frequency, damping] = [modes.frequency(mode), modes.damping(mode, row)];
+      const swing = force * modes.amplitude(mode, row) * excitation(pulse, frequency, damping, modes.sampleRate);
+      return { frequency, level: decibels(swing), damping };
+    });
     const loudest = Math.max(...stems.map(({ level }) => level));
-    return { row, force, at, stems, top: Math.ceil((loudest + 6) / 10) * 10, seconds: spanOf(stems) };
+    return { row, force, contactTime, shape, at, stems, top: Math.ceil((loudest + 6) / 10) * 10, seconds: spanOf(stems) };
   }
 
   /** Draw two spectra over each other, each {label, levels} with levels in dB from LOW to HIGH. */

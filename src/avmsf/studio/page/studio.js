@@ -47,13 +47,14 @@ export class Studio extends EventTarget {
       return;
     }
     this.row = row;
-    this.engine?.strike(row, { force, contactTime: contactTime ?? 0, shape: this.pulse });
+    const mallet = { contactTime: contactTime ?? 0, shape: this.pulse };
+    this.engine?.strike(row, { force, ...mallet });
     this.last = { row, force, contactTime };
-    this.spectra?.struck(row, force);
+    this.spectra?.struck(row, force, mallet);
     this.#markBlow(row);
     const where = this.view ? `contact ${row}` : `contact number ${row}`;
-    const mallet = contactTime === null ? "" : `, ${seconds(contactTime)}`;
-    document.getElementById("blow-facts").textContent = `${where}, ${force.toPrecision(2)}${this.forceUnit}${mallet}`;
+    const touch = contactTime === null ? "" : `, ${seconds(contactTime)}`;
+    document.getElementById("blow-facts").textContent = `${where}, ${force.toPrecision(2)}${this.forceUnit}${touch}`;
     this.#tell("struck");
   }
 
