@@ -1,12 +1,15 @@
 """The page and the studio's own server together: a field edited and saved, a capture made, by clicks alone."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from avmsf.capture import read_capture
 from avmsf.field.store import load
@@ -27,8 +30,10 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @contextmanager
-def opened_page(browser: "Browser", opened: Opened, scratch: Path) -> Iterator["Page"]:
+def opened_page(browser: "Browser", opened: Opened, scratch: Path, *, wait_for_jobs: bool = False) -> Iterator["Page"]:
     with served(opened, scratch) as server:
+        while wait_for_jobs and server.get("manifest.json").words["live"]["job"] is not None:
+            time.sleep(0.1)
         # The driver waits by evaluating words in the page, which its policy forbids; test_policy.py has that.
         context = browser.new_context(viewport={"width": 900, "height": 600}, bypass_csp=True)
         page = context.new_page()
@@ -37,6 +42,20 @@ def opened_page(browser: "Browser", opened: Opened, scratch: Path) -> Iterator["
         page.evaluate("window.avmsf.ready.then(() => null)")
         yield page
         context.close()
+
+
+def test_pictures_that_show_nothing_are_said_to_and_can_be_tried_again(
+    browser: "Browser", home: Path, tmp_path: Path
+) -> None:
+    (home / "images").mkdir(parents=True)
+    for number in range(3):
+        Image.fromarray(np.full((24, 32, 3), 128, dtype=np.uint8)).save(home / "images" / f"{number}.png")
+    with opened_page(browser, open_target(home), tmp_path / "scratch", wait_for_jobs=True) as page:
+        said = page.locator("#words .bad", has_text="none could be made of its pictures")
+        assert "images" in said.inner_text()
+        said.locator("text=Try again").click()
+        page.wait_for_selector("#words .word:has-text('appears here')")
+        assert page.evaluate("avmsf.studio.live.job") is not None
 
 
 def address(server: Served) -> str:

@@ -176,6 +176,11 @@ class Jobs:
         """The job that runs."""
         return next((job for job in self._jobs.values() if not job.ended), None)
 
+    def failure(self, kind: str) -> str | None:
+        """Return why the last job of a kind failed; None where it did not, or has not ended."""
+        last = next((job for job in reversed(self._jobs.values()) if job.kind == kind), None)
+        return last.events[-1].get("error") if last is not None and last.ended else None
+
     def expect_none(self) -> None:
         """Raise RefusedError (409) while a job runs."""
         current = self.current

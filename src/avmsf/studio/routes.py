@@ -69,6 +69,7 @@ def make_app(studio: Studio) -> Starlette:
         Route("/capture/strikes", calls.add_strike, methods=["POST"]),
         Route("/capture/strikes/{path:path}", calls.change_strike, methods=["GET", "PUT", "DELETE"]),
         Route("/reconstruct", calls.reconstruct, methods=["POST"]),
+        Route("/object", calls.make_object, methods=["POST"]),
         _get("/jobs/{job}/events", calls.hear_job),
         Route("/jobs/{job}", calls.cancel_job, methods=["DELETE"]),
     ]
@@ -158,6 +159,10 @@ class Calls:
     async def reconstruct(self, request: Request) -> Response:
         """Make a field of the capture."""
         return JSONResponse({"job": (await self.studio.reconstruct()).identifier}, 202)
+
+    async def make_object(self, request: Request) -> Response:
+        """Make something to click of the capture's pictures, once more where that has failed."""
+        return JSONResponse({"job": self.studio.make_object().identifier}, 202)
 
     async def hear_job(self, request: Request) -> Response:
         """What a job says, as server-sent events; a page that has lost the connection hears what it has missed."""

@@ -27,6 +27,8 @@ from avmsf.tasks.edits import EDITS, remarks
 MODES = 128
 STEER_STEPS = 150
 """Steps of a descent in the page: half of the command line's, after which little changes."""
+_MAKING = "make the object of its pictures"
+"""The kind of job that has something to click for its result."""
 _NAME = 50
 """Characters of what is opened in the name of a field that is kept."""
 
@@ -144,7 +146,7 @@ class Studio:
         """Begin to make Gaussians of the capture's pictures, to have something to click."""
         book = self.expect_book()
         task = {"task": "make_object", "folder": str(book.folder)}
-        return self.jobs.start("make the object of its pictures", task, self._take_object)
+        return self.jobs.start(_MAKING, task, self._take_object)
 
     async def _lead(self, base: int, words: dict[str, Any]) -> dict[str, Any]:
         self.session.expect_current(base)
@@ -215,6 +217,7 @@ class Studio:
             "materials": list(MATERIAL_NAMES),
             "job": None if running is None else running.identifier,
             "jobKind": None if running is None else running.kind,
+            "noObject": self.jobs.failure(_MAKING),
         }
 
 

@@ -2,11 +2,12 @@
 
 import { BlowInput } from "./blowinput.js";
 import { loadBundle } from "./bundle.js";
-import { element, makeTabs, say } from "./dom.js";
+import { attempt, element, makeTabs, say } from "./dom.js";
 import { editSheet } from "./edit.js";
 import { findSheet } from "./find.js";
 import { captureSheet } from "./capturemode.js";
 import { modeTable } from "./modetable.js";
+import { server } from "./server.js";
 import { SoundEngine } from "./sound.js";
 import { SpectrumView } from "./spectrumview.js";
 import { strikeSheet } from "./strikesheet.js";
@@ -99,9 +100,18 @@ async function fieldTabs(studio) {
 async function captureTabs(studio) {
   const capture = await captureSheet(studio);
   makeTabs([{ name: "capture", words: "Capture", ...capture }]);
-  if (studio.modes.points <= 1)
-    say("There is no object to click yet. Once it is made of its pictures it appears here; until then, type places.");
+  if (studio.modes.points <= 1) tellOfNoObject(studio.live);
   return { atPress: () => false, struck: (hit) => capture.choose(hit), take: capture.take };
+}
+
+function tellOfNoObject({ job, noObject }) {
+  const name = "object";
+  if (noObject) {
+    const again = async () => (await attempt(() => server.makeObject(), name)) && location.reload();
+    const words = `There is no object to click, for none could be made of its pictures: ${noObject}`;
+    say(words, { name, bad: true, answers: [["Try again", again]] });
+  } else if (job) say("There is no object to click yet. It is made of its pictures and appears here; until then, type places.", { name });
+  else say("There is no object to click: type places.", { name });
 }
 
 /** Fetch what the server now has; after an edit, say, or when another tab was faster. */

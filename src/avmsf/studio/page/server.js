@@ -99,6 +99,7 @@ export const server = {
   removeStrike: (file, { digest } = {}) => ask("DELETE", strikePlace(file), { headers: expecting(digest) }),
 
   reconstruct: () => ask("POST", "reconstruct"),
+  makeObject: () => ask("POST", "object"),
   cancel: (job) => ask("DELETE", `jobs/${encodeURIComponent(job)}`),
 
   /** Hear of a job's progress; `heard` gets every message, the last of which holds what came of it or "error". */
