@@ -80,9 +80,9 @@ def _compare(key: str, captures: dict[str, Capture], wall: float | None, options
                     found.append(errors)
                     words = ", ".join(f"{way} {error:.3f}" for way, error in zip(WAYS, errors, strict=True))
                     tell(f"suggest.{key}: {name}, start {number}, {count} strikes: {words}")
-    means = [sum(each) / len(found) for each in zip(*found, strict=True)]
-    figures = {f"suggest.{key}.{way}": value for way, value in zip(WAYS, means, strict=True)}
-    ratio = means[0] / means[1]
+    means = dict(zip(WAYS, (sum(each) / len(found) for each in zip(*found, strict=True)), strict=True))
+    figures = {f"suggest.{key}.{way}": value for way, value in means.items()}
+    ratio = means["suggested"] / means["farthest"]
     title = f"suggest.{key}: error with suggested strikes over that with farthest ones {ratio:.3f}"
     return Report(
         tables=(Table(title, ("object", "strikes", *WAYS), rows),), figures={f"suggest.{key}": ratio, **figures}

@@ -31,6 +31,14 @@ def surface() -> ElasticPoints:
     return ElasticPoints.of(plate(), on_top(3000))
 
 
+def test_spread_points_stand_for_the_whole_surface():
+    rows = surface().spread
+    assert len(rows) == len(rows.unique()) == 500
+    apart = torch.cdist(surface().points, surface().points[rows]).amin(1)
+    # Discs of this radius around 500 points cover the plate almost twice.
+    assert float(apart.max()) < 0.01
+
+
 def test_normals_point_out_of_the_nearest_side():
     places = torch.tensor([[0.1, 0.1, 0.0041], [0.1, 0.1, -0.0001], [0.25, 0.08, 0.002], [0.1, -0.01, 0.002]])
     expected = [[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1, 0]]

@@ -12,7 +12,7 @@ from avmsf.field.config import PAPER, FitConfig
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *product(["clusters", "width", "hidden", "early"], [0, -1]),
+        *product(["clusters", "width", "hidden", "early", "interleave"], [0, -1]),
         *product(["bands", "layers", "steps", "warmup_steps", "patience", "hop", "seed"], [-1]),
         *product(["correction_rate", "weight_decay", "early_weight"], [-0.1, math.inf, math.nan]),
         *product(["feature_scale", "warmup_rate", "learning_rate"], [0.0, -1.0, math.inf, math.nan]),
@@ -37,6 +37,7 @@ def test_resolutions_follow_the_sample_rate():
     # A structure at 400 Hz: a quarter, and even, as the transform needs it.
     assert config.resolutions(400.0) == ((512, 64), (128, 16), 2048)
     assert PAPER.resolutions(48000.0)[1] == (64, 64, 64, 64)
+    assert PAPER.interleave == 1, "the paper compares all frames at every step"
     assert FitConfig(fft_sizes=(24,)).resolutions(400.0)[0] == (6,)
 
 

@@ -11,6 +11,7 @@ from avmsf.bench.metrics import relative_stft_error
 from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import Progress, fit
+from avmsf.field.losses import spectral_loss
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.training import Targets, TrainingRun
@@ -316,3 +317,17 @@ def test_a_fit_that_diverges_says_so():
     config = replace(QUICK, learning_rate=1e30, warmup_steps=0)
     with pytest.raises(FitError, match=r"the fit diverged, its loss at step \d+ is (nan|inf): lower learning_rate"):
         fitted(config)
+
+
+@pytest.mark.parametrize(("every", "turns"), [(1, [0, 0, 0, 0]), (2, [0, 1, 0, 1]), (3, [1, 2, 0, 1])])
+def test_steps_take_turns_at_the_frames(monkeypatch, every, turns):
+    """Whole sounds and beginnings alike; the warm-up's four steps compare none, but count."""
+    asked = []
+
+    def noted(sounds, target, *, first=0, every=1):
+        asked.append((first, every))
+        return spectral_loss(sounds, target, first=first, every=every)
+
+    monkeypatch.setattr("avmsf.field.training.spectral_loss", noted)
+    fitted(replace(SHORT, interleave=every))
+    assert asked == [(turn, every) for turn in turns for _ in ("whole", "early")]

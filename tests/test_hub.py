@@ -4,24 +4,33 @@ import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from avmsf.errors import SceneError
 from avmsf.hub import expect_answer, is_hub_name, read_settings
 
-constants = pytest.importorskip("huggingface_hub.constants")
-
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """Paths that a hub of our own is asked for; it refuses all, as the hub does gated models."""
+def constants(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Return the settings of the hub's client, which may ask."""
+    found: ModuleType = pytest.importorskip("huggingface_hub.constants")
+    monkeypatch.setattr(found, "HF_HUB_OFFLINE", False)
+    return found
+
+
+@pytest.fixture(params=[401])
+def asked(
+    constants: ModuleType, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> Iterator[list[str]]:
+    """Paths that a hub of our own is asked for; it refuses all, as the hub does gated models, or otherwise."""
     paths: list[str] = []
 
     class Gate(BaseHTTPRequestHandler):
         def do_HEAD(self) -> None:
             paths.append(self.path)
-            self.send_error(401)
+            self.send_error(request.param)
 
         def log_message(self, *_: object) -> None:
             return
@@ -29,7 +38,6 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     with HTTPServer(("127.0.0.1", 0), Gate) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         monkeypatch.setattr(constants, "ENDPOINT", f"http://127.0.0.1:{server.server_port}")
-        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
         yield paths
         server.shutdown()
 
@@ -53,15 +61,21 @@ def test_a_refusal_is_an_answer(asked: list[str]) -> None:
     assert asked == ["/owner/model/resolve/main/config.json"]
 
 
-def test_offline_nobody_is_asked(asked: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("asked", [503], indirect=True)
+def test_a_hub_that_fails_does_not_answer(asked: list[str]) -> None:
+    with pytest.raises(OSError, match="503"):
+        expect_answer("owner/model", "config.json")
+    assert len(asked) == 1
+
+
+def test_offline_nobody_is_asked(asked: list[str], constants: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     expect_answer("owner/model", "config.json")
     assert asked == []
 
 
-def test_where_nobody_answers_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_nobody_answers_it_is_told(constants: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
-    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
     with pytest.raises(OSError, match="refused"):
         expect_answer("owner/model", "config.json")
 

@@ -21,8 +21,8 @@ def is_hub_name(source: str | Path) -> bool:
 def expect_answer(name: str, file: str) -> None:
     """Ask the hub once for a model's file, unless its client is told to stay offline; raise OSError where nobody is.
 
-    Without a network the hub's own client tries again for half a minute. A refusal is an answer too: the client asks
-    again with the user's token. Needs the package huggingface_hub.
+    Without a network, or where the hub itself fails, its client tries again for half a minute. A refusal is an answer:
+    the client asks again with the user's token. Needs the package huggingface_hub.
     """
     from huggingface_hub import constants
 
@@ -30,8 +30,10 @@ def expect_answer(name: str, file: str) -> None:
         return
     try:
         urlopen(Request(f"{constants.ENDPOINT}/{name}/resolve/main/{file}", method="HEAD"), timeout=HUB_SECONDS).close()
-    except HTTPError:
-        return
+    except HTTPError as refusal:
+        refusal.close()
+        if refusal.code >= 500:
+            raise
 
 
 def read_settings(path: Path, *, raising: type[AvmsfError]) -> dict[str, Any]:

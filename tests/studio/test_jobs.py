@@ -270,3 +270,25 @@ def test_a_worker_ends_where_its_server_was_killed() -> None:
         return status
 
     assert asyncio.run(orphan()) == -9
+
+
+@pytest.mark.parametrize(
+    ("words", "failure"),
+    [
+        pytest.param("say(result={})", None, id="done"),
+        pytest.param("say(error='no light')", "no light", id="failed"),
+        pytest.param("time.sleep(60)", "it was stopped", id="stopped"),
+    ],
+)
+def test_of_a_kind_the_last_job_says_what_came_of_it(words: str, failure: str | None) -> None:
+    async def end() -> list[str | None]:
+        jobs = Jobs()
+        job = jobs.start("make", {}, same, script(words))
+        running = jobs.failure("make")
+        if failure == "it was stopped":
+            await job.cancel()
+        async for _ in job.listen():
+            pass
+        return [running, jobs.failure("make"), jobs.failure("other")]
+
+    assert asyncio.run(asyncio.wait_for(end(), 20)) == [None, failure, None]

@@ -381,6 +381,22 @@ def test_a_page_without_a_server_offers_nothing_that_needs_one(plain: "Page") ->
     assert page.locator("#tabs button").all_inner_texts() == ["Strike", "Modes"]
 
 
+@pytest.mark.parametrize("live", [None, LIVE])
+def test_only_a_studios_page_is_told_of_one_that_was_stopped(visit: Open, live: Any) -> None:
+    page = visit(live=live)
+    load = """import(new URL("page/bundle.js", location.href))
+        .then(({ loadBundle }) => loadBundle()).catch((error) => error.message)"""
+    for hinder, said in (
+        (lambda route: route.abort(), "manifest.json cannot be reached: is the server still running?"),
+        (lambda route: route.fulfill(status=404), "manifest.json cannot be read (404)"),
+    ):
+        page.route("**/manifest.json", hinder)
+        told = page.evaluate(load)
+        assert told.startswith(said)
+        assert ("a studio that was stopped" in told) == (live is not None)
+        page.unroute("**/manifest.json")
+
+
 def block_webgl(page: "Page") -> None:
     page.add_init_script(
         """const get = HTMLCanvasElement.prototype.getContext;

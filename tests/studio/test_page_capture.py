@@ -351,6 +351,31 @@ def test_a_place_found_on_another_field_is_not_painted_and_searches_do_not_meet(
     page.wait_for_selector("text=late.wav: one blow")
 
 
+def test_a_file_that_is_no_recording_ends_the_search_before_it(visit: Open) -> None:
+    held: list[Route] = []
+    page = visit(live=LIVE, before=lambda page: page.route("**/locate", lambda route: held.append(route)))
+    page.click("#tab-find")
+    busy = "#sheet-find progress"
+    for outcome in ({"blows": []}, {"error": "found noise alone"}):
+        page.set_input_files("#sheet-find input[type=file]", upload("older.wav"))
+        page.wait_for_selector(busy)
+        page.set_input_files("#sheet-find input[type=file]", upload("table.csv", b"file,x,y,z"))
+        page.wait_for_selector("text=table.csv: expected a WAV file")
+        assert page.is_hidden(busy), "nothing is looked for any more"
+        with page.expect_response("**/locate"):
+            answer(held.pop(), outcome, 422 if "error" in outcome else 200)
+        page.wait_for_timeout(200)
+        assert "older.wav" not in page.inner_text("#sheet-find")
+        assert "table.csv: expected a WAV file" in words_on(page), "the last word is on the last file"
+        assert "noise alone" not in words_on(page)
+    page.set_input_files("#sheet-find input[type=file]", upload("newer.wav"))
+    page.wait_for_selector(busy)
+    page.wait_for_timeout(100)
+    answer(held.pop(), {"blows": []})
+    page.wait_for_selector("text=No blow was heard in it")
+    assert "newer.wav" in page.inner_text("#sheet-find")
+
+
 def test_a_recording_that_the_server_refuses_is_not_offered_to_be_kept(capturing: Any) -> None:
     page, _ = capturing()
     silent = {"error": "the recording: expected a blow, found silence: record it again"}
@@ -370,6 +395,22 @@ def test_a_recording_that_the_server_refuses_is_not_offered_to_be_kept(capturing
     assert keep.is_enabled(), "a server that does not answer has refused nothing"
 
 
+def test_what_the_check_refuses_may_still_be_put_in_place_of_what_it_does_not_know(capturing: Any) -> None:
+    page, server = capturing()
+    strike_once(page)
+    other = {"error": "the recording: expected 48000 Hz as the other strikes, found 16000 Hz"}
+    page.route("**/capture/check", lambda route: answer(route, other, 422))
+    page.click("[aria-label='Record 001.wav again']")
+    page.set_input_files("#sheet-capture input[type=file]", upload())
+    page.wait_for_selector("text=expected 48000 Hz as the other strikes, found 16000 Hz")
+    told = page.inner_text("#sheet-capture .group:has(> .waveform) .warning")
+    assert "cannot be kept" not in told
+    assert "in place of 001.wav" in told
+    page.click("text=Put it in place")
+    page.wait_for_function("!document.body.textContent.includes('waits for the server')")
+    assert server.asked == [("PUT", "001.wav", "d1")]
+
+
 @pytest.mark.parametrize("gone", [None, {"error": "there is nothing at this address"}])
 def test_a_studio_that_was_started_again_is_told_to_be_elsewhere(capturing: Any, gone: dict[str, str] | None) -> None:
     page, server = capturing()
@@ -380,11 +421,12 @@ def test_a_studio_that_was_started_again_is_told_to_be_elsewhere(capturing: Any,
     told = page.inner_text("#sheet-capture .group:has(> .waveform) .warning")
     assert "prints a new address" in told
     assert "kept in this browser" in told
+    assert "under the same port" in told, "a browser keeps what it stores by host and port"
     page.click("text=Keep it")
-    page.wait_for_selector("text=The recording is not lost")
+    page.wait_for_selector("text=The recording is not lost, and is sent again until the server answers")
     assert "prints a new address" in words_on(page)
     assert page.evaluate(STORED) == [[FOLDER, True]]
     page.unroute("**/capture/**")
     page.reload()
     page.wait_for_selector("text=1 strike")
-    assert len(server.strikes) == 1, "under the new address it is sent by itself, for nobody has refused it"
+    assert len(server.strikes) == 1, "a page of the same host and port sends it by itself, for nobody has refused it"

@@ -2,6 +2,8 @@
 
 import contextlib
 import json
+import math
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +17,8 @@ from avmsf.field.store import load
 from avmsf.studio.modules import MODULES_VARIABLE
 from avmsf.studio.refusal import RefusedError
 from avmsf.studio.session import Session
+from avmsf.studio.worker import Voice
+from avmsf.tasks.steer import SteerProgress
 from opened_plate import open_plate, plate_field
 from page_plate import lay_out, page_modules, plate_table
 from plate_page import LIVE, Open, Serve, answer, plate_site, upload, visiting, words_on
@@ -43,6 +47,7 @@ def visit(browser: "Browser", site: Serve) -> Iterator[Open]:
         yield visit
 
 
+KEPT = "the field was changed while its sound was led, so that is kept beside it: open "
 STALE = "expected a change of revision 2, found one of revision 1: another tab has changed the field"
 
 
@@ -60,8 +65,10 @@ class EditServer:
         """Whether answers to edits wait until `let_go`."""
         self.then: Callable[[], None] | None = None
         """What happens once between the next answer and what the page fetches upon it."""
-        self.led: list[str] = []
-        """What the steps of a lead say."""
+        self.led: list[SteerProgress] = []
+        """The steps of a lead."""
+        self.beside: str | None = None
+        """The file in which a lead is kept that another tab has forestalled; None where it is what is heard."""
         self._waiting: list[Callable[[], None]] = []
         page.route("**/manifest.json", lambda route: answer(route, self.manifest()))
         page.route("**/edited.bin", lambda route: route.fulfill(body=edited["content"]))
@@ -118,10 +125,21 @@ class EditServer:
             self.state = ({}, self.state[1])
 
     def _lead(self, route: "Route") -> None:
-        self.change()
-        steps = [{"stage": "edit", "done": number, "words": words} for number, words in enumerate(self.led, start=1)]
-        events = [*steps, {"revision": self.revision, "remarks": []}]
-        body = "".join(f"data: {json.dumps(event)}\n\n" for event in events)
+        with tempfile.TemporaryFile("w+") as told:
+            for step in self.led:
+                Voice(told).steering(step)
+            told.seek(0)
+            steps = told.read().splitlines()
+        if self.beside is None:
+            self.change()
+            last = {"remarks": []}
+        else:
+            last = {"file": self.beside, "remarks": [KEPT + self.beside, "a remark on what the other tab did"]}
+        lines = [*steps, json.dumps({"revision": self.revision, **last})]
+        if self.then is not None:
+            self.then()
+            self.then = None
+        body = "".join(f"data: {line}\n\n" for line in lines)
         route.fulfill(content_type="text/event-stream", body=body)
 
 
@@ -442,6 +460,30 @@ def test_strikes_compared_one_after_another_do_not_pile_up(visit: Open) -> None:
     assert page.evaluate("[heard.playing.length, ...heard.rows]") == [1, 500]
 
 
+def test_the_models_blow_is_drawn_from_its_own_beginning_beside_both_spectra(visit: Open) -> None:
+    page = visit(strikes=True)
+    page.evaluate(
+        """() => {
+             const { engine, spectra } = avmsf.studio;
+             const [strike, struck] = [engine.strike.bind(engine), spectra.struck.bind(spectra)];
+             window.told = [];
+             engine.strike = (row, options) => { told.push(["heard", row, options]); return strike(row, options); };
+             spectra.struck = (row, force, mallet) => {
+               told.push(["drawn", row, { force, ...mallet }]);
+               return struck(row, force, mallet);
+             };
+           }"""
+    )
+    page.evaluate("avmsf.studio.strike(100)")
+    page.click("#sheet-strike >> text=100.wav")
+    page.wait_for_function("told.length === 5")
+    (_, *as_recorded), _, recording, model, drawn = page.evaluate("told")
+    assert recording == drawn == ["drawn", *as_recorded], "as a blow of force 1, no harder, no softer"
+    assert model == ["heard", *as_recorded]
+    # The spectra of both stay to be compared.
+    assert page.evaluate("avmsf.studio.spectra.compared !== null")
+
+
 def test_a_recording_is_heard(visit: Open) -> None:
     page = visit(strikes=True)
     page.click("#sheet-strike li:has-text('100.wav') >> text=Recording")
@@ -492,13 +534,66 @@ def test_remarks_speak_of_the_pages_own_controls(browser: "Browser", modules: Pa
         assert said.count() == 0
 
 
+def test_what_an_object_is_of_changes_nothing_by_itself(edits: Any) -> None:
+    page, server = edits()
+    page.get_by_label("Material it is of").select_option("wood")
+    page.wait_for_timeout(500)
+    assert server.asked == []
+    move(page, "Pitch")
+    page.wait_for_function("avmsf.studio.revision === 2")
+    page.get_by_label("Material it is of").select_option("iron")
+    page.wait_for_timeout(500)
+    assert [words["material"] for _, words in server.asked] == [None], "the pitch is the same of any material"
+    move(page, "Size")
+    page.wait_for_function("avmsf.studio.revision === 3")
+    page.get_by_label("Material it is of").select_option("steel")
+    page.wait_for_function("avmsf.studio.revision === 4")
+    assert [words["material"] for _, words in server.asked[1:]] == [
+        {"from": "iron", "to": None},
+        {"from": "steel", "to": None},
+    ]
+
+
 def test_a_lead_says_at_once_that_it_begins_and_at_its_end_what_changed(edits: Any) -> None:
     page, server = edits()
-    server.led = ["loss 0.92, pitch x 1.01", "loss 0.75, pitch x 1.1", "loss 0.31, pitch x 1.249"]
+    server.led = led_by((math.nan, 1.0), (0.92, 1.01), (0.75, 1.1), (0.31, 1.249), (math.nan, 1.249))
     page.set_input_files("#sheet-edit input[type=file]", upload())
     page.wait_for_selector("text=It has begun")
     server.let_go()
     page.wait_for_selector("text=The sound was led: its pitch is × 1.25, and how far it is off fell from 0.92 to 0.31")
+    assert "Undo takes it back" in words_on(page)
+
+
+def led_by(*steps: tuple[float, float]) -> list[SteerProgress]:
+    """Return a descent of these losses, NaN for none, and pitches."""
+    count = len(steps)
+    return [SteerProgress(step, count, *each, 1.0, None) for step, each in enumerate(steps, start=1)]
+
+
+def test_a_lead_that_another_tab_forestalled_is_told_to_be_kept_beside(edits: Any) -> None:
+    page, server = edits()
+    server.led, server.beside = led_by((0.92, 1.01), (0.31, 1.249)), "/home/plate led.safetensors"
+    page.set_input_files("#sheet-edit input[type=file]", upload())
+    page.wait_for_selector("text=It has begun")
+    server.change(size=2.0)
+    server.let_go()
+    page.wait_for_selector(f"#words >> text={KEPT}/home/plate led.safetensors")
+    assert page.evaluate("avmsf.studio.revision") == 2
+    assert shown(page, "Size") == ["× 2.00"]
+    assert "was led:" not in words_on(page)
+    assert "Undo" not in words_on(page)
+
+
+def test_a_lead_that_is_no_longer_heard_is_not_said_to_be(edits: Any) -> None:
+    page, server = edits()
+    server.led = led_by((0.92, 1.01), (0.31, 1.249))
+    server.then = lambda: server.change(size=2.0)
+    page.set_input_files("#sheet-edit input[type=file]", upload())
+    page.wait_for_selector("text=It has begun")
+    server.let_go()
+    page.wait_for_selector("text=Another tab changed this field after your change")
+    page.wait_for_selector("#sheet-edit button:text-is('Undo'):enabled")
+    assert "The sound was led" not in words_on(page)
 
 
 def test_an_undo_that_another_tab_forestalls_shows_what_there_is(edits: Any) -> None:

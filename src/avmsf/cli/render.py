@@ -19,7 +19,7 @@ from avmsf.field.store import load
 from avmsf.modal.pulse import ForcePulse, PulseShape
 from avmsf.simulate.hammer import LONGEST
 
-MUCH_SOFTER = 20.0
+_MUCH_SOFTER = 20.0
 """Decibels under the recorded blow from which a softer mallet's are told of."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 
@@ -88,8 +88,10 @@ def run(options: Options) -> int:
     pulse = _pulse(options)
     sounds = render_sounds(field, contacts.places, force=options.force, seconds=options.seconds, pulse=pulse)
     if pulse is not None and options.normalise == "none" and options.level_db == 0:
-        hard = render_sounds(field, contacts.places, force=options.force, seconds=options.seconds)
-        _say_softer(hard, sounds, pulse.contact_time)
+        loudest = int(sounds.abs().amax(1).argmax())
+        place = contacts.places[loudest : loudest + 1]
+        hard = render_sounds(field, place, force=options.force, seconds=options.seconds)
+        _say_softer(hard[0], sounds[loudest], pulse.contact_time)
     sounds = sounds * Level(options.normalise, options.level_db).factor(sounds)
     peak = float(sounds.abs().max())
     if options.coding == "float32" and peak > 1:
@@ -104,12 +106,10 @@ def run(options: Options) -> int:
     return 0
 
 
-def _say_softer(
-    hard: Float[Tensor, "contacts samples"], soft: Float[Tensor, "contacts samples"], contact_time: float
-) -> None:
-    """Say how many decibels of the recorded blows' peak a softer mallet takes, where these are many."""
+def _say_softer(hard: Float[Tensor, " samples"], soft: Float[Tensor, " samples"], contact_time: float) -> None:
+    """Say how many decibels of the recorded blow's peak a softer mallet takes, where these are many."""
     loud, faint = (float(each.abs().max()) for each in (hard, soft))
-    if faint > 0 and (softer := 20 * math.log10(loud / faint)) > MUCH_SOFTER:
+    if faint > 0 and (softer := 20 * math.log10(loud / faint)) > _MUCH_SOFTER:
         say(
             f"note: with a contact of {1e3 * contact_time:.3g} ms the sound peaks {softer:.0f} dB lower than that of "
             "the recorded blow, and no level was changed: add --normalise peak or --level-db, or a shorter "

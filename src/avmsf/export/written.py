@@ -52,11 +52,11 @@ def generator() -> str:
 
 def expect_ending(path: Path, endings: Sequence[str]) -> None:
     """Raise `ExportError` for a file's name that has none of these endings, dots included."""
-    if path.suffix not in endings:
+    if path.suffix.lower() not in endings:
         found = repr(path.suffix) if path.suffix else "no ending"
         raise ExportError(
             f"{path}: expected a name that ends in {' or '.join(endings)}, found {found}: name it "
-            f"{path.stem or 'object'}{endings[0]}"
+            f"{path.stem if path.suffix[1:].isalpha() else path.name}{endings[0]}"
         )
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from avmsf.scene.points import farthest_points
 from avmsf.simulate.elastic import ElasticModes
 
-PLACES = 500
+_PLACES = 500
 """Points that stand for the whole surface where all would be too many."""
 _NEIGHBOURS = 4
 """Points that a place's shapes are interpolated between."""
@@ -58,8 +58,8 @@ class ElasticPoints:
 
     @cached_property
     def spread(self) -> Int[Tensor, " places"]:
-        """Rows of `PLACES` points that lie as far apart as they go, or of all where there are fewer."""
-        return farthest_points(self.points, min(PLACES, len(self.points)))
+        """Rows of 500 points that lie as far apart as they go, or of all where there are fewer."""
+        return farthest_points(self.points, min(_PLACES, len(self.points)))
 
     def along(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None

@@ -18,7 +18,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.records import count_of, like, record_of
 from avmsf.field.soundfield import Origin, SoundField
 
-FORMAT = 4
+FORMAT = 5
 """Number of this format; it grows with every change that older versions could not read."""
 
 

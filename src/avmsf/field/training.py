@@ -169,7 +169,7 @@ class TrainingRun:
         )
 
     def advance(self, targets: Targets) -> float:
-        """Take one step on all contacts and return the loss before it."""
+        """Take one step on all contacts and return the loss before it, of the frames whose turn it is."""
         if self.step < self.config.warmup_steps:
             loss = self._warmup_loss(targets)
             optimiser, done, rate = self.warmup, self.step / self.config.warmup_steps, self.config.warmup_rate

@@ -25,7 +25,7 @@ _QUIET = 1e-12
 _LEAST_FALL = 0.3
 """A mode that falls by fewer nepers over the whole sound is not told from hum."""
 _LEAST_TURN = 0.5
-"""Radians by which a mode turns against half the sample rate while it falls by 1/e: with fewer its samples are all but
+"""Radians by which a mode turns against half the sample rate while it falls to 1/e: with fewer its samples are all but
 nothing in sine phase, and the gain of what is heard would be enormous."""
 _PERIODS = 50
 """How many periods of the lowest frequency the sounds last: with fewer, a mode is not told from rumble."""

@@ -137,6 +137,7 @@ class Job:
         if self._cancelled:
             return _STOPPED
         if result is None and status < 0:
+            print(words, end="", file=sys.stderr)
             return {
                 "error": f"{self.kind}: the work was ended from outside or crashed ({_signal_name(-status)}): try it "
                 "again, and close other programs first where memory is short"
@@ -177,9 +178,11 @@ class Jobs:
         return next((job for job in self._jobs.values() if not job.ended), None)
 
     def failure(self, kind: str) -> str | None:
-        """Return why the last job of a kind failed; None where it did not, or has not ended."""
+        """Return why nothing came of the last job of a kind; None where something did, or it has not ended."""
         last = next((job for job in reversed(self._jobs.values()) if job.kind == kind), None)
-        return last.events[-1].get("error") if last is not None and last.ended else None
+        if last is None or not last.ended:
+            return None
+        return "it was stopped" if last.events[-1] == _STOPPED else last.events[-1].get("error")
 
     def expect_none(self) -> None:
         """Raise RefusedError (409) while a job runs."""

@@ -49,7 +49,8 @@ def open_target(target: Path, *, object: Path | None = None, capture: Path | Non
     """Return what is behind a path. Raises StudioError for a path from which there is nothing to see or hear.
 
     A mesh becomes the surface of a capture folder, `capture` or one beside it of the mesh's name, and stays what it is.
-    Without `capture`, one that is called as a capture's own, surface.* or splats.ply, opens the folder that it lies in.
+    Without `capture`, one that is called as a capture's own, surface.*, splats.ply or point_cloud.ply, opens the
+    folder that it lies in.
     """
     if object is not None and not object.is_file():
         raise StudioError(f"{object}: expected a mesh or Gaussians to show, found no such file: check --object")

@@ -161,8 +161,8 @@ def _write_new(field: SoundField, path: Path) -> None:
     except FileExistsError as error:
         raise RefusedError(409, f"{path.name} is there already and stays: choose another name") from error
     except OSError as error:
-        help = way_out(error) if path.parent.is_dir() else "the folder is gone: put it back"
-        raise StudioError(f"{path}: cannot be written ({error.strerror}): {help}") from error
+        advice = way_out(error) if path.parent.is_dir() else "the folder is gone: put it back"
+        raise StudioError(f"{path}: cannot be written ({error.strerror}): {advice}") from error
     try:
         save(field, path)
     except BaseException:

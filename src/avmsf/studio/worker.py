@@ -1,10 +1,12 @@
 """The process that does work of minutes for the page: `python -m avmsf.studio.worker`.
 
-It reads one line of JSON, the task, and writes lines of JSON: {"stage", "done", "total", "words"} as it goes, and
-{"result"} or {"error"} at the end. It ends with all that it has started where its standard input is closed.
+It reads one line of JSON, the task, and writes lines of JSON: {"stage", "done", "total", "words"} as it goes, with
+"loss", null for none, and "pitch" at each step of a lead, and {"result"} or {"error"} at the end. It ends with all
+that it has started where its standard input is closed.
 """
 
 import json
+import math
 import os
 import sys
 import threading
@@ -47,9 +49,9 @@ class Voice:
         self.stream.write(json.dumps(event) + "\n")
         self.stream.flush()
 
-    def step(self, stage: str, done: int, total: int, words: str) -> None:
-        """Say how far a stage is."""
-        self.say({"stage": stage, "done": done, "total": total, "words": words})
+    def step(self, stage: str, done: int, total: int, words: str, **numbers: float | None) -> None:
+        """Say how far a stage is; `numbers` are for programs, beside the words."""
+        self.say({"stage": stage, "done": done, "total": total, "words": words, **numbers})
 
     def tell(self, words: str) -> None:
         """Say that a stage begins, which stands before the colon, and after it what of it."""
@@ -75,7 +77,10 @@ class Voice:
 
     def steering(self, progress: SteerProgress) -> None:
         """Hear of an edit's descent."""
-        self.step("edit", progress.step, progress.steps, f"loss {progress.loss:.3g}, pitch x {progress.pitch:.4g}")
+        words = f"loss {progress.loss:.3g}, pitch x {progress.pitch:.4g}"
+        # In JSON there is no NaN.
+        loss = progress.loss if math.isfinite(progress.loss) else None
+        self.step("edit", progress.step, progress.steps, words, loss=loss, pitch=progress.pitch)
 
 
 def make_field(task: Values, voice: Voice) -> Values:

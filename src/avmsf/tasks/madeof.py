@@ -36,8 +36,8 @@ def made_of(field: SoundField, *, option: str) -> MadeOf:
     if not best.fits:
         raise EditError(
             f"{option} is not given, and no material's damping is that of the field's modes: {best.material.name} "
-            f"comes nearest, which half of them miss by a factor of {best.off:.3g} or more: say what the object is of, "
-            f"as {option} ceramic"
+            f"comes nearest, which half of them miss by a factor of {best.off:.3g} or more: say by {option} what the "
+            "object is of"
         )
     close = second.off < _CLOSE * best.off
     alike = f", and {second.material.name} fits as well ({second.off:.3g}), with which the loudness would differ"

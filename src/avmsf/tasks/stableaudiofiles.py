@@ -109,7 +109,7 @@ def _expect_pipeline(folder: Path) -> None:
             f"{folder}: expected a {_CLASS} as diffusers saves it, with {_INDEX} and the folders {', '.join(_PARTS)}; "
             f"found {found}: give the folder that holds {_INDEX}"
         )
-    kind = read_settings(index, raising=EditError).get("_class_name")
+    kind = read_settings(index, raising=EditError).get("_class_name", "pipeline of no named class")
     if kind != _CLASS:
         raise EditError(f"{folder}: expected a {_CLASS}, found a {kind}: give the folder of a Stable Audio model")
     lacking = [part for part in _PARTS if not (folder / part).is_dir()]

@@ -1,6 +1,8 @@
 // The field as the page reads it: a manifest and its tensors, from files beside the page or from within it.
 
 const FORMAT = 1;
+/** Whether what was read last came from a studio, as a page that was exported does not. */
+let live = false;
 const ARRAYS = { float64: Float64Array, float32: Float32Array };
 
 /** Return the URL of one of the page's files. A page that is one file carries them in `avmsfInlined`, as base64. */
@@ -23,6 +25,7 @@ export async function loadBundle({ base = document.baseURI } = {}) {
   const manifest = await (await fetched("manifest.json", base)).json();
   if (manifest.format !== FORMAT)
     throw new Error(`expected a field of format ${FORMAT}, found ${manifest.format}: export it again with this version`);
+  live = Boolean(manifest.live);
   const files = {};
   const tensors = {};
   for (const [name, { file, offset, dtype, shape }] of Object.entries(manifest.tensors)) {
@@ -36,10 +39,11 @@ export async function loadBundle({ base = document.baseURI } = {}) {
 
 async function fetched(name, base) {
   const response = await fetch(fileUrl(name, { base }), { cache: "no-cache" }).catch(() => null);
+  if (response?.ok) return response;
   const moved = "a studio that was stopped and started again prints a new address to open";
-  if (response === null) throw new Error(`${name} cannot be reached: is the server still running? If not, ${moved}`);
-  if (!response.ok) throw new Error(`${name} cannot be read (${response.status}): export the page again; ${moved}`);
-  return response;
+  if (response === null)
+    throw new Error(`${name} cannot be reached: is the server still running?${live ? ` If not, ${moved}` : ""}`);
+  throw new Error(`${name} cannot be read (${response.status}): ${live ? moved : "export the page again"}`);
 }
 
 function readTensor(buffer, offset, dtype, shape, what) {

@@ -64,7 +64,10 @@ export class Changes {
     } catch (error) {
       if (error.stale && mine) this.#tellStale(error, again);
       else if (error.stale) await this.#showStale(error);
-      else say(error.message, { name: "edit", bad: true, answers: error.unreachable ? [["Try again", again]] : refused });
+      else {
+        const answers = error.unreachable ? [["Try again", again]] : refused;
+        say(error.message, { name: "edit", bad: true, answers });
+      }
       this.#lost = Boolean(error.unreachable);
       return undefined;
     } finally {

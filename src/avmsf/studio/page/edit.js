@@ -38,19 +38,21 @@ export function editSheet(studio, load) {
     changes.moved();
   });
   const names = studio.live.materials ?? MATERIALS;
-  const select = (none) =>
+  const select = (none, onchange) =>
     element(
       "select",
-      { onchange: onInput },
+      { onchange },
       element("option", { value: "" }, none),
       ...names.map((name) => element("option", { value: name }, name)),
     );
-  const from = select("by its sound");
-  const to = select("as it is");
+  // What the object is of counts where it shall be of another material or size, and changes nothing by itself.
+  const recasts = () => to.value !== "" || sliders.size.value !== sliders.size.rest;
+  const from = select("by its sound", () => recasts() && onInput());
+  const to = select("as it is", onInput);
   const remarks = element("div", { className: "group", "aria-live": "polite" });
   const busy = element("progress", { hidden: true, "aria-label": "Editing" });
   const asked = () => ({
-    material: from.value || to.value ? { from: from.value || null, to: to.value || null } : null,
+    material: recasts() && (from.value || to.value) ? { from: from.value || null, to: to.value || null } : null,
     ...Object.fromEntries(Object.entries(sliders).map(([name, slider]) => [name, slider.value])),
     modes: [...single].filter(([, values]) => !atRest(values)).map(([mode, values]) => ({ mode, ...values })),
   });

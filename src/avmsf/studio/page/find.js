@@ -21,17 +21,26 @@ export function findSheet(studio) {
   };
 
   // One search at a time: while one runs, the newest recording waits and older ones are forgotten.
-  let [running, wanted] = [false, null];
-  const locate = async (blob, name) => {
-    wanted = { blob, name };
+  let [running, wanted, newest] = [false, null, 0];
+  /** Another recording is looked for, or shall be: nothing of those before it is shown or said; gives its number. */
+  const begin = () => {
     forget();
+    [wanted, busy.hidden] = [null, true];
+    return ++newest;
+  };
+  const locate = (blob, name) => search({ blob, name, number: begin() });
+  const search = async (recording) => {
+    [wanted, busy.hidden] = [recording, false];
     if (running) return;
-    [running, busy.hidden] = [true, false];
+    running = true;
     while (wanted) {
       const asked = wanted;
       wanted = null;
-      const answer = await attempt(() => server.locate(asked.blob), "locate");
-      if (!answer || wanted) continue;
+      const searched = server.locate(asked.blob);
+      await searched.catch(() => {});
+      if (asked.number !== newest) continue;
+      const answer = await attempt(() => searched, "locate");
+      if (!answer) continue;
       if (answer.revision === undefined || answer.revision === studio.revision) show(answer.blows, asked.name);
       else tellStale(answer.revision, asked);
     }
@@ -63,9 +72,9 @@ export function findSheet(studio) {
   };
 
   const take = async (file) => {
-    forget();
+    const number = begin();
     const fine = await attempt(() => expectWav(file).then(() => true), "locate");
-    if (fine) await locate(file, file.name);
+    if (fine && number === newest) await search({ blob: file, name: file.name, number });
   };
 
   // Paint and found places belong to the recording, and to the field as it was when it was asked.

@@ -23,18 +23,23 @@ export function leadGroup(studio, changes, hold) {
   const follow = async (job) => {
     const steps = [];
     const last = await progress.follow(job, (message) => {
-      const step = stepOf(message);
-      if (step) steps.push(step);
+      // Other stages have no loss, and a step that came to none says so.
+      if (Number.isFinite(message.loss)) steps.push(message);
     });
     if (last.error) say(last.error, { name: "edit", bad: true });
     else if (last.revision !== undefined) {
       const shown = await changes.queue(() => changes.show(last, { sliders: true }));
-      if (shown) studio.strikeAgain();
-      say(summaryOf(steps), { name: "led" });
+      // What another tab has changed meanwhile is heard; then the led sound is in a file, which the first remark names.
+      if (last.file !== undefined) say(last.remarks[0], { name: "led" });
+      else if (shown) {
+        studio.strikeAgain();
+        say(summaryOf(steps), { name: "led" });
+      }
     }
   };
 
-  const rows = [filePicker("Towards a recording …", ".wav,audio/wav", async (file) => lead({ like: await base64(file) }))];
+  const leadLike = async (file) => lead({ like: await base64(file) });
+  const rows = [filePicker("Towards a recording …", ".wav,audio/wav", leadLike)];
   if (studio.can("words")) {
     const placeholder = "a wooden bowl is hit";
     const text = element("input", { type: "text", "aria-label": "What it should sound like", placeholder });
@@ -54,13 +59,7 @@ export function leadGroup(studio, changes, hold) {
   );
 }
 
-/** What a step of a descent says: {loss, pitch}; null for other messages. */
-function stepOf({ words = "" }) {
-  const [, loss, pitch] = /loss ([\d.e+-]+), pitch x ([\d.e+-]+)/.exec(words) ?? [];
-  return loss === undefined ? null : { loss: Number(loss), pitch: Number(pitch) };
-}
-
-/** What a descent of these steps has come to. */
+/** What a descent of these steps, {loss, pitch} each, has come to. */
 function summaryOf(steps) {
   if (!steps.length) return "The sound was led.";
   const [first, last] = [steps[0], steps.at(-1)];

@@ -104,14 +104,18 @@ async function captureTabs(studio) {
   return { atPress: () => false, struck: (hit) => capture.choose(hit), take: capture.take };
 }
 
-function tellOfNoObject({ job, noObject }) {
+/** The job of the server that makes an object of pictures. */
+const MAKING = "make the object of its pictures";
+
+function tellOfNoObject({ job, jobKind, noObject }) {
   const name = "object";
-  if (noObject) {
-    const again = async () => (await attempt(() => server.makeObject(), name)) && location.reload();
-    const words = `There is no object to click, for none could be made of its pictures: ${noObject}`;
-    say(words, { name, bad: true, answers: [["Try again", again]] });
-  } else if (job) say("There is no object to click yet. It is made of its pictures and appears here; until then, type places.", { name });
-  else say("There is no object to click: type places.", { name });
+  const words = "There is no object to click";
+  const again = async () => (await attempt(() => server.makeObject(), name)) && location.reload();
+  const answers = [["Try again", again]];
+  if (job && jobKind === MAKING)
+    say(`${words} yet. It is made of its pictures and appears here; until then, type places.`, { name });
+  else if (noObject) say(`${words}, for none could be made of its pictures: ${noObject}`, { name, bad: true, answers });
+  else say(`${words}: type places.`, { name });
 }
 
 /** Fetch what the server now has; after an edit, say, or when another tab was faster. */

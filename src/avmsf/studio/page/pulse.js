@@ -20,18 +20,16 @@ export function pulseSamples(contactTime, sampleRate, shape = "half-sine") {
   return parts.map((part) => part / sum);
 }
 
-/** How strong a pulse of samples sets a damped mode swinging, over an impulse: |sum p_n exp((d - i w) n / rate)|. */
-export function excitation(pulse, frequency, damping, sampleRate) {
-  const grown = Math.exp(damping / sampleRate);
-  const turn = (-2 * Math.PI * frequency) / sampleRate;
-  const [real, imaginary] = [grown * Math.cos(turn), grown * Math.sin(turn)];
-  let [x, y, sumX, sumY] = [1, 0, 0, 0];
-  for (const part of pulse) {
-    sumX += part * x;
-    sumY += part * y;
-    [x, y] = [x * real - y * imaginary, x * imaginary + y * real];
-  }
-  return Math.hypot(sumX, sumY);
+/**
+ * How far a mode swings at a pulse's last sample, over what an impulse there would leave; `angle` and `decay` are the
+ * radians by which it turns and the nepers by which it falls from one sample to the next.
+ */
+export function swingAfter(pulse, angle, decay = 0) {
+  const radius = Math.exp(-decay);
+  const [turnRe, turnIm] = [radius * Math.cos(angle), radius * Math.sin(angle)];
+  let [re, im] = [0, 0];
+  for (const part of pulse) [re, im] = [turnRe * re - turnIm * im + part, turnRe * im + turnIm * re];
+  return Math.hypot(re, im);
 }
 
 /** Integrate sin(pi t)^exponent, in u with t = (1 - cos u) / 2, in which both ends are smooth. */

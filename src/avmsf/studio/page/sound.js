@@ -1,6 +1,6 @@
 // The sound engine: blows on the field's points, heard through the modal bank on the audio thread.
 
-import { pulseSamples } from "./pulse.js";
+import { pulseSamples, swingAfter } from "./pulse.js";
 import { resample } from "./resample.js";
 
 const PROCESSOR = "avmsf-modal-bank";
@@ -43,7 +43,7 @@ class Tuned {
     const pulse = pulseSamples(contactTime, this.rate, shape);
     let loudest = 0;
     for (let mode = 0; mode < sine.length; mode++) {
-      const passed = passedBy(pulse, (2 * Math.PI * this.frequency[mode]) / this.rate);
+      const passed = swingAfter(pulse, (2 * Math.PI * this.frequency[mode]) / this.rate);
       loudest = Math.max(loudest, Math.hypot(sine[mode], cosine[mode]) * passed * Math.abs(force));
     }
     const damping = this.shared ? null : this.pick(this.tensors.damping, row);
@@ -82,18 +82,6 @@ class Tuned {
     });
     return sound.reduce((peak, value) => Math.max(peak, Math.abs(value)), 0);
   }
-}
-
-/** Return how much of a vibration of `angle` radians a sample a pulse leaves. */
-function passedBy(pulse, angle) {
-  const turnRe = Math.cos(angle), turnIm = Math.sin(angle);
-  let re = 1, im = 0, sumRe = 0, sumIm = 0;
-  for (const part of pulse) {
-    sumRe += part * re;
-    sumIm += part * im;
-    [re, im] = [turnRe * re - turnIm * im, turnRe * im + turnIm * re];
-  }
-  return Math.hypot(sumRe, sumIm);
 }
 
 function bankNode(context, tuned, { level, voices = VOICES, blows = [], ahead = 0 }) {

@@ -3,7 +3,7 @@
 import { Chart } from "./chart.js";
 import { say, unsay } from "./dom.js";
 import { decibels } from "./modes.js";
-import { excitation, pulseSamples } from "./pulse.js";
+import { pulseSamples, swingAfter } from "./pulse.js";
 
 const LOW = 40;
 const HIGH = 20000;
@@ -60,17 +60,18 @@ export class SpectrumView {
     this.#run();
   }
 
-  /** A blow of the field that is listened to, with what is drawn of it; `at` in ms. */
+  /** A blow of the field that is listened to, with what is drawn of it: from when the mallet lets go, `free`; in ms. */
   #blowOf({ row, force, contactTime, shape, at }) {
     const { modes } = this;
-    const pulse = pulseSamples(contactTime, modes.sampleRate, shape);
+    const rate = modes.sampleRate;
+    const pulse = pulseSamples(contactTime, rate, shape);
     const stems = Array.from({ length: modes.count }, (_, mode) => {
       const [frequency, damping] = [modes.frequency(mode), modes.damping(mode, row)];
-      const swing = force * modes.amplitude(mode, row) * excitation(pulse, frequency, damping, modes.sampleRate);
-      return { frequency, level: decibels(swing), damping };
+      const left = swingAfter(pulse, (2 * Math.PI * frequency) / rate, damping / rate);
+      return { frequency, level: decibels(force * modes.amplitude(mode, row) * left), damping };
     });
     const loudest = Math.max(...stems.map(({ level }) => level));
-    return { row, force, contactTime, shape, at, stems, top: Math.ceil((loudest + 6) / 10) * 10, seconds: spanOf(stems) };
+    return { row, force, contactTime, shape, at, free: at + 1000 * contactTime, stems, top: Math.ceil((loudest + 6) / 10) * 10, seconds: spanOf(stems) };
   }
 
   /** Draw two spectra over each other, each {label, levels} with levels in dB from LOW to HIGH. */
@@ -103,7 +104,7 @@ export class SpectrumView {
 
   /** Take down the level of this moment; returns whether anything is to come. */
   #listenOnce() {
-    const seconds = this.#blow ? (performance.now() - this.#blow.at) / 1000 : 0;
+    const seconds = this.#blow ? (performance.now() - this.#blow.free) / 1000 : 0;
     if (!this.analyser) return this.#blow !== null && seconds < this.#blow.seconds;
     this.wave ??= new Float32Array(this.analyser.fftSize);
     this.lines ??= new Float32Array(this.analyser.frequencyBinCount);
@@ -147,7 +148,7 @@ export class SpectrumView {
       return;
     }
     if (this.#blow) {
-      const seconds = (performance.now() - this.#blow.at) / 1000;
+      const seconds = (performance.now() - this.#blow.free) / 1000;
       for (const { frequency, level, damping } of this.#blow.stems) {
         const now = level - decibels(Math.exp(1)) * damping * seconds;
         if (frequency < LOW || frequency > HIGH) continue;

@@ -113,8 +113,8 @@ class Comparison {
     const row = this.row(strike);
     const length = Math.min(buffer.duration, LONGEST_SECONDS);
     this.#play(strike, buffer);
-    this.#timer = setTimeout(() => studio.engine.strike(row, { force: 1 }), 1000 * (length + PAUSE_SECONDS));
-    const model = await studio.engine.renderOffline([{ row, force: 1 }], length);
+    this.#timer = setTimeout(() => this.#strikeModel(row), 1000 * (length + PAUSE_SECONDS));
+    const model = await studio.engine.renderOffline([{ row, force: 1, ...this.#mallet }], length);
     if (!isLast()) return;
     const { sampleRate } = studio.bundle.manifest;
     const part = buffer.getChannelData(0).subarray(0, Math.round(length * buffer.sampleRate));
@@ -134,11 +134,25 @@ class Comparison {
     return () => serial === this.#serial;
   }
 
+  /** Strike the model after a recording: its decay is drawn from its own beginning, the spectra of both stay. */
+  #strikeModel(row) {
+    const { engine, spectra } = this.studio;
+    const { compared } = spectra;
+    engine.strike(row, { force: 1, ...this.#mallet });
+    spectra.struck(row, 1, this.#mallet);
+    if (compared) spectra.compare(compared.recording, compared.model);
+  }
+
+  /** What the model is struck with: as the recorded blow was. */
+  get #mallet() {
+    return { contactTime: 0, shape: this.studio.pulse };
+  }
+
   /** Play a recording, with the model's lines of its own contact beside it from the moment at which it begins. */
   #play(strike, buffer) {
     const { engine, spectra } = this.studio;
     this.#source = engine.play(buffer);
-    spectra.struck(this.row(strike), 1);
+    spectra.struck(this.row(strike), 1, this.#mallet);
     this.#tell(strike, "recording");
   }
 

@@ -39,15 +39,18 @@ export class TakeCard {
     } catch (error) {
       const again = button("Measure again", () => this.show(take), { className: "small" });
       const refused = error.refusal === true;
-      const words = refused
-        ? `It cannot be kept: ${error.message}`
-        : `${error.message} ${error.unreachable ? this.refuge() : ""}`;
+      // The check does not know which strike is replaced, as that one's sample rate need not be kept: the server may
+      // still take what it refuses here.
+      const barred = refused && !take.redo;
+      let words = `${error.message} ${error.unreachable ? this.refuge() : ""}`;
+      if (barred) words = `It cannot be kept: ${error.message}`;
+      else if (refused) words = `${error.message}. That is said of a further strike; try it in place of ${take.redo}.`;
       verdict.replaceChildren(element("p", { className: "warning" }, words));
       if (!refused) verdict.append(again);
       // What the server would not take shall not look like what is to be done next.
-      keep.disabled = refused;
-      keep.classList.toggle("main", !refused);
-      redo.classList.toggle("main", refused);
+      keep.disabled = barred;
+      keep.classList.toggle("main", !barred);
+      redo.classList.toggle("main", barred);
     }
   }
 

@@ -40,7 +40,7 @@ export class Waiting {
       else await server.addStrike(entry.blob, entry);
     } catch (error) {
       if (error.unreachable || error.status >= 500) {
-        const words = `The recording is not lost, and sent again until the server answers. ${error.message}`;
+        const words = `The recording is not lost, and is sent again until the server answers. ${error.message}`;
         say(`${words} ${this.outbox.refuge}`, { name: "outbox" });
         this.#timer = setTimeout(() => this.send(), RETRY_MS);
         return false;
