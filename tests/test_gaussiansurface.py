@@ -65,6 +65,19 @@ def test_a_ball_of_gaussians_is_a_closed_ball(photographed: bool) -> None:
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.08)
 
 
+def test_a_slender_bar_is_kept_from_end_to_end() -> None:
+    """Thinner than two cells of as many as a ball has: a spoon's handle is."""
+    sides = (0.2, 0.015, 0.003)
+    bar = trimesh.creation.box(sides)
+    points, rows = trimesh.sample.sample_surface(bar, 3000, seed=1)
+    normals = torch.from_numpy(bar.face_normals[rows]).float()
+    surface = gaussian_surface(_discs(torch.from_numpy(np.asarray(points)).float(), normals), cells=64)
+    extent = surface.vertices.amax(0) - surface.vertices.amin(0)
+    assert extent[0] == pytest.approx(sides[0], rel=0.05)
+    assert _mesh(surface).is_watertight
+    assert _mesh(surface).body_count == 1
+
+
 def test_round_gaussians_need_no_normals() -> None:
     ball = _ball()
     round_ones = replace(ball, log_scales=ball.log_scales[:, :1].expand(-1, 3).clone())

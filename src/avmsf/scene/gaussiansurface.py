@@ -30,6 +30,8 @@ _FAINT = 0.05
 """Opacity below which a Gaussian shows nobody where the object is."""
 _MARGIN = 5
 """Cells of free room around the Gaussians."""
+_FINER = 4
+"""Times as many cells along the longest side of a slender object, at most."""
 _STEP = 1.0
 """Depth over which a view's word goes from "not free" to "free", cells: the depth that it sees lies in the middle."""
 _BLUR = 1.0
@@ -53,7 +55,8 @@ def gaussian_surface(
 
     Each camera sees a depth in each pixel; a place before it, or where the Gaussians cover less than half of the pixel,
     is free. What more than `agreement` of the cameras that have it in their image see free is not the object. `cells`
-    count along the longest side: walls of three cells are kept. `cameras` are best those of the photographs, for
+    count along the longest side, or up to four times as many while their number stays half their cube: slender objects
+    are thin. Walls of three cells are kept. `cameras` are best those of the photographs, for
     Gaussians are wrong where no photograph looked; without them 72 stand around the object. The surface has at most
     `faces` triangles, or twice or four times as many where fewer would pinch it open.
 
@@ -115,7 +118,9 @@ def _grid(cloud: GaussianCloud, cells: int) -> tuple[Float64[np.ndarray, " 3"], 
     """Return the middle of the first cell, the cells' edge and how many there are."""
     places = cloud.centers.cpu().double().numpy()
     low, extent = places.min(axis=0), np.ptp(places, axis=0)
-    spacing = float(extent.max()) / cells
+    # A cell's volume is the box's over half the cells' cube, where the box is slender enough for that to be finer.
+    share = float(np.prod(extent / extent.max()))
+    spacing = float(extent.max()) / cells * min(max((2.0 * share) ** (1 / 3), 1 / _FINER), 1.0)
     counts = np.ceil(extent / spacing).astype(int) + 2 * _MARGIN + 1
     return low - _MARGIN * spacing, spacing, (int(counts[0]), int(counts[1]), int(counts[2]))
 
