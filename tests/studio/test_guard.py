@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.studio.guard import LOOPBACK, Guard, contained, new_token
+from avmsf.studio.guard import LOOPBACK, NOTHING_HERE, Guard, contained, new_token
 from avmsf.studio.refusal import RefusedError
+from avmsf.studio.routes import PAGE
 from opened_plate import blow, open_plate
 from served import Served, served
 
@@ -36,6 +37,10 @@ def test_the_page_and_its_data_are_there_under_the_token(server: Served) -> None
     assert server.get("page/main.js").headers["content-type"].startswith("text/javascript")
     assert server.get("manifest.json").words["live"]["mode"] == "field"
     assert len(server.get("field.bin").content) > 1000
+
+
+def test_the_page_knows_the_words_of_an_address_that_is_not_its_studios_any_more() -> None:
+    assert f'const NOTHING = "{NOTHING_HERE}";' in (PAGE / "server.js").read_text()
 
 
 def test_without_the_token_nothing_is_told(server: Served) -> None:

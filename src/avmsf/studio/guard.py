@@ -18,6 +18,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from avmsf.studio.policy import NOTHING
 from avmsf.studio.refusal import RefusedError, response_to
 
+NOTHING_HERE = "there is nothing at this address"
+"""By this the page knows that its studio has moved: `server.js` has the same words."""
 LARGEST_UPLOAD = 64 << 20
 """Bytes of one request: a minute of stereo sound at 96 kHz, 32 bits."""
 LARGEST_WORDS = 1 << 20
@@ -79,10 +81,10 @@ class Guard:
             raise RefusedError(403, "expected a request of the studio's own page, found another site's")
         first, slash, rest = scope["path"].removeprefix("/").partition("/")
         if not secrets.compare_digest(first.encode(), self.token.encode()):
-            raise _nothing_here()
+            raise nothing_here()
         # Decoded already, so that %2e%2e is two dots here.
         if ".." in rest.split("/") or "\\" in rest or "\0" in rest:
-            raise _nothing_here()
+            raise nothing_here()
         length = headers.get("content-length", "0")
         if not length.isdigit() or int(length) > self.largest:
             raise too_large(self.largest)
@@ -128,9 +130,9 @@ def contained(folder: Path, name: str) -> Path:
         path = (home / name).resolve(strict=True)
         inside = path.is_relative_to(home) and path.is_file()
     except (OSError, ValueError, RuntimeError) as error:
-        raise _nothing_here() from error
+        raise nothing_here() from error
     if not inside:
-        raise _nothing_here()
+        raise nothing_here()
     return path
 
 
@@ -150,5 +152,6 @@ async def read_words(request: Request, *, largest: int = LARGEST_WORDS) -> dict[
     return words
 
 
-def _nothing_here() -> RefusedError:
-    return RefusedError(404, "there is nothing at this address")
+def nothing_here() -> RefusedError:
+    """Return what to raise where there is nothing, or nothing for who asks."""
+    return RefusedError(404, NOTHING_HERE)

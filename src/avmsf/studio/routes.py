@@ -15,11 +15,11 @@ from starlette.routing import Route
 
 from avmsf.errors import AvmsfError
 from avmsf.export.webpage import MEDIA_TYPES
-from avmsf.studio.guard import LARGEST_UPLOAD, contained, read_words
+from avmsf.studio.guard import LARGEST_UPLOAD, contained, nothing_here, read_words
 from avmsf.studio.modules import find_modules, with_local_modules
 from avmsf.studio.place import Place
 from avmsf.studio.policy import policy_of
-from avmsf.studio.refusal import RefusedError, response_to
+from avmsf.studio.refusal import response_to
 from avmsf.studio.studio import Studio
 
 PAGE = Path(__file__).parent / "page"
@@ -49,7 +49,7 @@ def make_app(studio: Studio) -> Starlette:
 
     async def send_module(request: Request) -> Response:
         if modules is None:
-            raise RefusedError(404, "there is nothing at this address")
+            raise nothing_here()
         return _file(modules, request)
 
     calls = Calls(studio)
@@ -206,7 +206,7 @@ def _file(folder: Path, request: Request, *, only: Sequence[str] = ()) -> Respon
     kind = MEDIA_TYPES.get(path.suffix.lower())
     hidden = any(part.startswith(".") for part in path.relative_to(folder.resolve()).parts)
     if kind is None or hidden or (only and path.suffix.lower() not in only):
-        raise RefusedError(404, "there is nothing at this address")
+        raise nothing_here()
     return FileResponse(path, media_type=kind)
 
 
