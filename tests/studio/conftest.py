@@ -11,8 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from page_plate import page_modules
+from plate_page import Open, Serve, plate_site, visiting
+
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    from playwright.sync_api import Browser, Page
 
 CHROMIUM = Path(os.environ.get("AVMSF_CHROMIUM", "/usr/bin/chromium"))
 ARGUMENTS = [
@@ -58,3 +61,29 @@ def serve() -> Iterator[Callable[[Path], str]]:
             return f"http://127.0.0.1:{server.server_address[1]}/"
 
         yield start
+
+
+@pytest.fixture(scope="session")
+def modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a node_modules with three and spark, or skip where none can be had."""
+    return page_modules(tmp_path_factory.mktemp("npm"))
+
+
+@pytest.fixture(scope="session")
+def site(serve: Callable[[Path], str], modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Serve:
+    """Return a function that gives the address of the plate's page."""
+    return plate_site(serve, modules, tmp_path_factory)
+
+
+@pytest.fixture
+def visit(browser: "Browser", site: Serve) -> Iterator[Open]:
+    """Return a function that opens the plate's page in a browser of its own."""
+    with visiting(browser, site) as open_page:
+        yield open_page
+
+
+@pytest.fixture(scope="module")
+def plain(browser: "Browser", site: Serve) -> Iterator["Page"]:
+    """Return one page of the plate's contacts without a server, for tests that leave no more behind than a blow."""
+    with visiting(browser, site) as open_page:
+        yield open_page()

@@ -3,16 +3,15 @@
 import base64
 import hashlib
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
-from avmsf.export.webpage import write_webpage
+from avmsf.export.webpage import IMPORT_MAP, write_webpage
 from avmsf.studio.modules import PINNED
-from page_plate import PAGE, page_modules, plate_object, plate_table
+from page_plate import PAGE, plate_object, plate_table
 from plate_page import words_on
 
 if TYPE_CHECKING:
@@ -22,16 +21,11 @@ NETWORK = "https://cdn.jsdelivr.net/npm/"
 TAMPERED = "three.core.js"
 
 
-@pytest.fixture(scope="module")
-def modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return page_modules(tmp_path_factory.mktemp("npm"))
-
-
 def digests() -> dict[str, str]:
     """Return what the page's import map says that each file's content must be."""
-    found = re.search(r'<script type="importmap"[^>]*>(.*?)</script>', (PAGE / "index.html").read_text(), re.DOTALL)
+    found = IMPORT_MAP.search((PAGE / "index.html").read_text())
     assert found is not None
-    known: dict[str, str] = json.loads(found[1])["integrity"]
+    known: dict[str, str] = json.loads(found[2])["integrity"]
     return known
 
 

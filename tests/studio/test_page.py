@@ -3,8 +3,7 @@
 import base64
 import io
 import json
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,40 +11,17 @@ import pytest
 import soundfile
 import torch
 
-from page_plate import SIDES, page_modules, plate_shapes, plate_table
-from plate_page import LIVE, Open, Serve, answer, on_screen, plate_site, upload, visiting, wav, words_on
+from page_plate import SIDES, plate_shapes, plate_table
+from plate_page import LIVE, Open, answer, on_screen, upload, wav, words_on
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page, Request, Route
+    from playwright.sync_api import Page, Request, Route
 
 pytestmark = pytest.mark.page
 
 SPACING = SIDES[0] / 30
 """Between neighbouring contacts, metres."""
 LIVE_CAPTURE = {"revision": 1, "undo": False, "abilities": ["capture", "reconstruct"], "mode": "capture", "job": None}
-
-
-@pytest.fixture(scope="session")
-def modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return page_modules(tmp_path_factory.mktemp("npm"))
-
-
-@pytest.fixture(scope="session")
-def site(serve: Callable[[Path], str], modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Serve:
-    return plate_site(serve, modules, tmp_path_factory)
-
-
-@pytest.fixture
-def visit(browser: "Browser", site: Serve) -> Iterator[Open]:
-    with visiting(browser, site) as visit:
-        yield visit
-
-
-@pytest.fixture(scope="module")
-def plain(browser: "Browser", site: Serve) -> Iterator["Page"]:
-    """Return one page of the plate's contacts without a server, for tests that leave nothing behind."""
-    with visiting(browser, site) as visit:
-        yield visit()
 
 
 def last_place(page: "Page") -> torch.Tensor:

@@ -1,16 +1,15 @@
 """The page records: what was heard is kept until the server has it, and lands where it was struck and nowhere else."""
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from page_plate import SIDES, page_modules
-from plate_page import LIVE, Open, Serve, answer, on_screen, plate_site, upload, visiting, words_on
+from page_plate import SIDES
+from plate_page import LIVE, Open, answer, on_screen, upload, words_on
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page, Request, Route
+    from playwright.sync_api import Page, Request, Route
 
 pytestmark = pytest.mark.page
 
@@ -66,22 +65,6 @@ STORED = """
         all.onsuccess = () => resolve(all.result.map(({ owner, kept }) => [owner, kept]));
       };
     })"""
-
-
-@pytest.fixture(scope="module")
-def modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return page_modules(tmp_path_factory.mktemp("npm"))
-
-
-@pytest.fixture(scope="module")
-def site(serve: Callable[[Path], str], modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Serve:
-    return plate_site(serve, modules, tmp_path_factory)
-
-
-@pytest.fixture
-def visit(browser: "Browser", site: Serve) -> Iterator[Open]:
-    with visiting(browser, site) as visit:
-        yield visit
 
 
 class Strikes:

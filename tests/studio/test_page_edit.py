@@ -20,8 +20,8 @@ from avmsf.studio.session import Session
 from avmsf.studio.worker import Voice
 from avmsf.tasks.steer import SteerProgress
 from opened_plate import open_plate, plate_field
-from page_plate import lay_out, page_modules, plate_table
-from plate_page import LIVE, Open, Serve, answer, plate_site, upload, visiting, words_on
+from page_plate import lay_out, plate_table
+from plate_page import LIVE, Open, Serve, answer, upload, words_on
 from served import Served, served
 
 if TYPE_CHECKING:
@@ -29,22 +29,6 @@ if TYPE_CHECKING:
 
 
 pytestmark = pytest.mark.page
-
-
-@pytest.fixture(scope="module")
-def modules(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return page_modules(tmp_path_factory.mktemp("npm"))
-
-
-@pytest.fixture(scope="module")
-def site(serve: Callable[[Path], str], modules: Path, tmp_path_factory: pytest.TempPathFactory) -> Serve:
-    return plate_site(serve, modules, tmp_path_factory)
-
-
-@pytest.fixture
-def visit(browser: "Browser", site: Serve) -> Iterator[Open]:
-    with visiting(browser, site) as visit:
-        yield visit
 
 
 KEPT = "the field was changed while its sound was led, so that is kept beside it: open "

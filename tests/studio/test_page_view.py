@@ -1,42 +1,21 @@
 """The page's pictures in a browser: the object that is hit and painted, the blow's input, spectrum and decay."""
 
 import io
-from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
-from page_plate import SIDES, page_modules
-from plate_page import Open, Serve, on_screen, plate_site, visiting, words_on
+from page_plate import SIDES
+from plate_page import Open, on_screen, words_on
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Page
 
 pytestmark = pytest.mark.page
 
 MIDDLE = (0.0, 0.0, SIDES[2] / 2)
 CORNER = (0.1, 0.06, SIDES[2] / 2)
-
-
-@pytest.fixture(scope="module")
-def site(serve: Any, tmp_path_factory: pytest.TempPathFactory) -> Serve:
-    modules: Path = page_modules(tmp_path_factory.mktemp("npm"))
-    return plate_site(serve, modules, tmp_path_factory)
-
-
-@pytest.fixture
-def visit(browser: "Browser", site: Serve) -> Iterator[Open]:
-    with visiting(browser, site) as visit:
-        yield visit
-
-
-@pytest.fixture(scope="module")
-def plain(browser: "Browser", site: Serve) -> Iterator["Page"]:
-    """Return one page of the plate's contacts, for tests that leave nothing behind but the last blow."""
-    with visiting(browser, site) as visit:
-        yield visit()
 
 
 def in_module(page: "Page", module: str, does: str, given: Any = None) -> Any:

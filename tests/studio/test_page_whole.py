@@ -16,7 +16,7 @@ from avmsf.field.store import load
 from avmsf.studio.modules import MODULES_VARIABLE
 from avmsf.studio.opening import Opened, open_target
 from opened_plate import RATE, open_plate, plate_field, wav
-from page_plate import SIDES, page_modules, plate_object
+from page_plate import SIDES, plate_object
 from served import Served, served
 
 if TYPE_CHECKING:
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(MODULES_VARIABLE, str(page_modules(tmp_path / "npm")))
+def home(modules: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv(MODULES_VARIABLE, str(modules))
     return tmp_path / "home"
 
 

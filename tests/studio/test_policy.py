@@ -10,7 +10,7 @@ from avmsf.studio.opening import open_target
 from avmsf.studio.policy import policy_of
 from avmsf.studio.routes import PAGE
 from opened_plate import open_plate
-from page_plate import page_modules, plate_object
+from page_plate import plate_object
 from served import served
 
 if TYPE_CHECKING:
@@ -29,9 +29,9 @@ def test_the_libraries_of_a_network_are_allowed_by_their_host_alone() -> None:
 
 @pytest.mark.parametrize("kind", ["mesh", "gaussians"])
 def test_the_page_needs_no_more_than_it_is_allowed(
-    browser: "Browser", kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    browser: "Browser", modules: Path, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(MODULES_VARIABLE, str(page_modules(tmp_path / "npm")))
+    monkeypatch.setenv(MODULES_VARIABLE, str(modules))
     shown = plate_object(kind, tmp_path)
     opened = open_plate(tmp_path / "home")
     with served(open_target(opened.field, object=shown), tmp_path / "scratch") as server:
