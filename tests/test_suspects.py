@@ -69,6 +69,20 @@ def test_a_direction_turned_round_is_found_as_such(row: int):
     assert found.best < 0.2
 
 
+@pytest.mark.parametrize(("seed", "row", "axis"), [(0, 0, 1), (1, 4, 0), (1, 8, 0), (2, 4, 0), (3, 0, 0)])
+def test_a_label_on_the_other_side_is_found_though_half_of_the_modes_are_as_strong_there(
+    seed: int, row: int, axis: int
+):
+    measured = struck(WALLS[1], 12, seed=seed)
+    contacts, directions = measured.contacts.clone(), measured.directions.clone()
+    contacts[row, axis] *= -1
+    directions[row, axis] *= -1
+    (found,) = find_suspects(plausible(measured), replace(measured, contacts=contacts, directions=directions))
+    assert found.row == row
+    assert found.is_elsewhere
+    assert found.distance == pytest.approx(2.0 * abs(float(contacts[row, axis])), abs=0.015)
+
+
 def test_where_no_directions_were_given_none_is_reversed():
     measured = struck(WALLS[1], 15, seed=1)
     values = measured.values.clone()
@@ -90,7 +104,7 @@ def test_too_few_strikes_accuse_none():
 
 def test_suspects_count_for_nothing():
     measured = struck(WALLS[1], 12)
-    silent = doubted(measured, [Suspect(4, 2.0, 0.1, False, 0.1)])
+    silent = doubted(measured, [Suspect(4, 2.0, 0.1, False, 0.1, 0.3)])
     wild = replace(silent, values=torch.where((torch.arange(12) == 4)[:, None, None], -silent.values, silent.values))
     body = likely(measured)[0]
     one, other = (body.fit(each).at(points()[:50]).mean for each in (silent, wild))
@@ -102,11 +116,14 @@ def test_suspects_count_for_nothing():
 @pytest.mark.parametrize(
     ("suspect", "words"),
     [
-        (Suspect(3, 2.1, 0.2, False, 0.1), "strike 3 fits best 0.2 m away (misfit 2.1 where it is said to be, 0.1"),
-        (Suspect(3, 4.0, 0.0, True, 0.1), "strike 3 fits best with its direction reversed (misfit 4"),
-        (Suspect(3, 4.0, 0.05, True, 0.1), "strike 3 fits best 0.05 m away with its direction reversed (misfit 4"),
-        (Suspect(3, 1.2, 0.3, False, 0.9), "strike 3 fits nowhere on the object (misfit 1.2"),
-        (Suspect(3, 0.5, 0.0, False, 0.5), "strike 3 fits its place badly"),
+        (
+            Suspect(3, 2.1, 0.2, False, 0.1, 1.0),
+            "strike 3 fits best 0.2 m away (misfit 2.1 where it is said to be, 0.1",
+        ),
+        (Suspect(3, 4.0, 0.0, True, 0.1, 1.0), "strike 3 fits best with its direction reversed (misfit 4"),
+        (Suspect(3, 4.0, 0.05, True, 0.1, 1.0), "strike 3 fits best 0.05 m away with its direction reversed (misfit 4"),
+        (Suspect(3, 1.2, 0.3, False, 0.9, 1.0), "strike 3 fits nowhere on the object (misfit 1.2"),
+        (Suspect(3, 0.5, 0.0, False, 0.5, 1.0), "strike 3 fits its place badly"),
     ],
 )
 def test_suspects_say_what_is_wrong_with_them(suspect: Suspect, words: str):

@@ -1,7 +1,9 @@
 """Strikes that disagree with all others: a wrong row in the table of contacts, or a direction turned round."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float64
@@ -41,8 +43,14 @@ _NEAR = 0.05
 """Distance over the object's size up to which a place is the label's own."""
 _NOWHERE = 0.55
 """Misfit beyond which a place does not explain a strike."""
-_BETTER = 0.35
-"""Misfit at the best place over that at the label, below which the label is wrong: few strikes tell little of one."""
+_FAR = 0.25
+"""Distance over the object's size from which on another place is quite another."""
+_BETTER_NEAR, _BETTER_FAR = 0.25, 0.35
+"""Misfit at the best place, near to the label or far, over that at the label, below which the label is wrong: few
+strikes tell little of one, and shapes that are a little off look like a place that is."""
+_BETTER_HEARD = 0.2
+"""The same of a far place, for a strike that fits its label well enough to speak: on the other side of a symmetric
+object half of the modes are as strong, and it is wrong all the same."""
 _SURELY = 2.0
 """Misfit from which on a strike is wrong even if no place explains it; else it may be one that nobody else tells of."""
 
@@ -61,11 +69,23 @@ class Suspect:
     """Whether they fit best with a blow against the direction that the label says."""
     best: float
     """Squared misfit there, over that of silence."""
+    size: float
+    """Of the object, metres."""
 
     @property
     def is_wrong(self) -> bool:
         """Whether the label is: another place explains the strike, or nothing could be worse."""
-        return self.best < _BETTER * self.misfit or self.misfit > _SURELY
+        better = _BETTER_FAR if self._far else _BETTER_NEAR
+        return self.best < better * self.misfit or self.misfit > _SURELY
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether the strike fits far better in quite another place, however well it fits its own."""
+        return self._far and self.best < _BETTER_HEARD * self.misfit
+
+    @property
+    def _far(self) -> bool:
+        return self.distance > _FAR * self.size
 
     def describe(self, names: Sequence[str]) -> str:
         """Say what is wrong with it."""
@@ -96,8 +116,9 @@ def find_suspects(bodies: Sequence[ChosenBody], measured: MeasuredGains) -> tupl
 
     A strike is foretold by all others that speak. Taking one out has to save a sum of misfits, its own and what it does
     to the others'; strikes are taken out, put back and exchanged as long as that helps, a quarter of them at most.
-    Judged by the strongest modes, and by those of the plausible `bodies` with which strikes agree best in the end, of
-    which most have to call a strike wrong. Evidence would ask the wrong bodies, for wrong strikes are part of it.
+    Then those follow that fit far better far away. Judged by the strongest modes, and by those of the plausible
+    `bodies` with which strikes agree best in the end, of which most have to call a strike wrong. Evidence would ask the
+    wrong bodies, for wrong strikes are part of it.
     """
     strong = measured.strongest()
     if len(strong.contacts) < _FEWEST:
@@ -108,7 +129,23 @@ def find_suspects(bodies: Sequence[ChosenBody], measured: MeasuredGains) -> tupl
         found = [witness.located(row, silent) for witness in witnesses]
         if 2 * sum(each.is_wrong for each in found) > len(found):
             wrong.append(next((each for each in found if each.is_wrong), found[0]))
+    wrong += _elsewhere(witnesses, wrong)
     return tuple(sorted(wrong, key=lambda each: -each.misfit))
+
+
+def _elsewhere(witnesses: Sequence["_Judge"], wrong: Sequence[Suspect]) -> list[Suspect]:
+    """Return more strikes that fit far better far away, the most telling first, once the wrong ones no longer speak."""
+    found: list[Suspect] = []
+    rows = range(len(witnesses[0].power))
+    while len(wrong) + len(found) < int(_MOST * len(rows)):
+        silent = frozenset(each.row for each in (*wrong, *found))
+        told = [[witness.located(row, silent | {row}) for witness in witnesses] for row in rows if row not in silent]
+        agreed = [each for each in told if 2 * sum(one.is_elsewhere for one in each) > len(each)]
+        if not agreed:
+            break
+        clearest = min(agreed, key=lambda each: math.prod(one.best / max(one.misfit, _FLOOR) for one in each))
+        found.append(next(one for one in clearest if one.is_elsewhere))
+    return found
 
 
 def _silenced(judges: Sequence["_Judge"]) -> tuple[list["_Judge"], frozenset[int]]:
@@ -176,11 +213,10 @@ class _Judge:
         errors = (solved / torch.diagonal(inverse, dim1=1, dim2=2)[..., None]).square().sum(2).T
         scatter = self._scatter(errors, speaking)
         surface = self.body.surface
-        rows = surface.spread
-        places = torch.cat([self.measured.contacts[row : row + 1].double(), surface.points[rows].double()])
-        directions = torch.cat([self.field.directions[row : row + 1], surface.inward[rows].double()])
-        cross = self.field.covariance_with(places, directions, *_HYPOTHESIS)[:, :, speaking]
-        there = (cross @ solved).transpose(0, 1)
+        places = torch.cat([self.measured.contacts[row : row + 1].double(), surface.points[surface.spread].double()])
+        directions = torch.cat([self.field.directions[row : row + 1], surface.inward[surface.spread].double()])
+        cross = torch.cat([self.covariance[:, row : row + 1], self.elsewhere], dim=1)
+        there = (cross[:, :, speaking] @ solved).transpose(0, 1)
         both = torch.stack([there, -there])
         squares = (self.measured.values[row] - both).square().sum(3)
         misfits = self._relative(squares, self.power[row], scatter)
@@ -192,7 +228,14 @@ class _Judge:
         # Elsewhere, or where no direction was given, a turned blow says nothing of the label's direction.
         near = distance <= _NEAR * surface.size
         against = against and near and self.measured.directions is not None
-        return Suspect(row, float(misfits[0, 0]), distance, against, float(misfits[turned, place]))
+        return Suspect(row, float(misfits[0, 0]), distance, against, float(misfits[turned, place]), surface.size)
+
+    @cached_property
+    def elsewhere(self) -> Float64[Tensor, "modes places contacts"]:
+        """Covariance of gains at places all over the surface, struck straight in, with those at the contacts."""
+        surface = self.body.surface
+        points, inward = surface.points[surface.spread].double(), surface.inward[surface.spread].double()
+        return self.field.covariance_with(points, inward, *_HYPOTHESIS)
 
     def _scatter(self, errors: Float64[Tensor, "speaking modes"], speaking: list[int]) -> Float64[Tensor, " modes"]:
         least = _FLOOR * self.power.mean(0)
