@@ -5,9 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from avmsf.field.doubt import widening
 from avmsf.field.fit import Progress, fit, gain_case
 from avmsf.field.recipes import SHARED, ThinPlate
 from avmsf.field.refinement import LinearGains, RefinedGains
+from avmsf.modal.extract import extract
 from made_fields import BANK, LINEAR, blows, places
 from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
 
@@ -145,3 +147,35 @@ def test_end_to_end_the_loss_falls_and_gains_move_no_farther_than_doubt_allows()
     assert float(shift.abs().max()) > 0
     # Nearer to the gains that the sounds have: .73 of the squared error was left.
     assert float((shift - truth).square().sum()) < 0.8 * float(truth.square().sum())
+
+
+@every_field
+def test_a_field_judges_itself_by_gains_whatever_their_signs_and_their_modes_turns(name):
+    field = LINEAR[name]()
+    contacts, modes, _ = field.values.shape
+    generator = torch.Generator().manual_seed(3)
+    off = field.values + 0.1 * field.noise * torch.randn(contacts, modes, 2, generator=generator, dtype=torch.float64)
+    signs = torch.where(torch.arange(contacts) % 3 == 0, -1.0, 1.0)
+    turn = torch.polar(torch.ones(modes).double(), torch.linspace(-0.5, 0.5, modes).double())
+    turned = torch.view_as_real(torch.view_as_complex(off.contiguous()) * turn) * signs[:, None, None]
+    order = torch.arange(modes)
+    plain = RefinedGains(field, BANK).judged(order, off)
+    judged = RefinedGains(field, BANK, signs=signs).judged(order, turned)
+    torch.testing.assert_close(judged.measured, plain.measured)
+    torch.testing.assert_close(judged.left_out(), plain.left_out())
+    # Without signs a third of the gains would be taken for their opposites.
+    wrong = RefinedGains(field, BANK).judged(order, turned)
+    assert float((wrong.measured - field.values).norm()) > 5.0 * float((plain.measured - field.values).norm())
+
+
+def test_a_spline_is_as_sure_whichever_side_was_struck():
+    train = plate_impacts()
+    assert train.directions is not None
+    sides = torch.where(torch.arange(len(train)) % 2 == 0, -1.0, 1.0)[:, None]
+    turned = replace(train, sounds=sides * train.sounds, directions=sides * train.directions)
+    one, other = (
+        widening(fit(each, plate_features(), extract(each), replace(QUICK, steps=3), gains=ThinPlate()))
+        for each in (train, turned)
+    )
+    # The noise that is drawn beside the modes does not turn with them.
+    assert other == pytest.approx(one, rel=0.15)

@@ -12,6 +12,7 @@ from avmsf.errors import FitError
 from avmsf.field.belief import deviation_of, energy_of, left_out, measured_gains, parts_of, scale_of
 from avmsf.field.doubtedgains import DoubtedGains
 from avmsf.field.soundfield import SoundField
+from avmsf.modal.phase import turned_like
 from avmsf.modal.synthesis import synthesise_phased
 
 LEVEL = 0.9
@@ -130,7 +131,8 @@ def coverage(
     """Return which part of the gains measured at other contacts lies in the interval of this level.
 
     `parts` as `GainCase.parts`: amplitudes along each of the field's modes' phases and a quarter of a period ahead, of
-    each contact up to their common sign where the field knows no directions of blows. The interval is that of a
+    each mode up to a phase that all contacts share, of each contact up to their common sign where the field knows no
+    directions of blows. The interval is that of a
     measured gain, so it holds the scatter of a blow as well as the field's doubt, and is as wide as `widening` says.
     Raises FitError for gains that know no doubt and for gains of other modes.
     """
@@ -149,6 +151,7 @@ def coverage(
             (1, 2), keepdim=True
         )
         parts = torch.where(agree < 0, -parts, parts)
+    parts = turned_like(parts, foretold)
     within = (parts - foretold).abs() <= widening(field, level=level) * spread
     energy = (scale * gains.values.square().mean(0) / (4.0 * field.bank.damping.double())[:, None]).expand_as(parts)
     return Coverage(float(within.double().mean()), float((within * energy).sum() / energy.sum()))

@@ -20,7 +20,7 @@ from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
 from avmsf.field.config import FitConfig
 from avmsf.field.losses import spectral_loss
 from avmsf.field.recipes import GainCase, GainRecipe, along_phase
-from avmsf.field.refinement import LinearGains
+from avmsf.field.refinement import RefinedGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.bank import ModalBank
@@ -94,9 +94,9 @@ def fit(
     report = {"gains": recipe.name, **told, **run.network.report, **report}
     bank = ModalBank(*(each.detach()[order] for each in (run.bank.frequency, run.bank.damping)))
     finished = run.network.finished(order)
-    if isinstance(finished, LinearGains):
+    if isinstance(run.network, RefinedGains):
         parts = fit_gains(train.sounds, bank, sample_rate=train.sample_rate)
-        finished = finished.judged_by(along_phase(*parts, case.phase[order]))
+        finished = run.network.judged(order, along_phase(*parts, case.phase[order]))
     return SoundField(
         bank,
         finished,

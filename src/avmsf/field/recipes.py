@@ -167,7 +167,7 @@ class ThinPlate:
             importance=1 / (4 * case.modes.bank.damping),
             points=case.features.points,
         )
-        return RefinedGains(field, case.modes.bank)
+        return RefinedGains(field, case.modes.bank, signs=case.signs)
 
     def rows(self, case: GainCase) -> Int[Tensor, " contacts"]:
         """Return the contacts themselves."""

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from avmsf.field.gainfield import GainField, Gains
 from avmsf.modal.bank import ModalBank
+from avmsf.modal.phase import turned_like
 
 _STEP = 200.0
 """Standard errors that a parameter of one stands for: so a learning rate made for networks moves gains in time."""
@@ -65,10 +66,14 @@ class RefinedGains(nn.Module):
     free: Float32[Tensor, "contacts 1 1"]
     share: Float32[Tensor, " modes"]
 
-    def __init__(self, field: LinearGains, bank: ModalBank) -> None:
-        """Start from a field of the modes of `bank`, whose energies say how much a gain matters."""
+    def __init__(self, field: LinearGains, bank: ModalBank, *, signs: Float[Tensor, " contacts"] | None = None) -> None:
+        """Start from a field of the modes of `bank`, whose energies say how much a gain matters.
+
+        `signs` are those by which the field's gains were taken, over the recordings'; all one without them.
+        """
         super().__init__()
         self.field = field
+        self.signs = torch.ones(len(field.values)) if signs is None else signs
         smoother = field.smoother()
         self.register_buffer("smoother", smoother.float())
         self.register_buffer("start", _applied(smoother, field.values).float())
@@ -106,6 +111,14 @@ class RefinedGains(nn.Module):
         """Return the field of the gains as they stand, with its modes in the given order."""
         moved = self.field.values + (self.noise * self._moved).detach().double()
         return self.field.with_values(moved).take(order)
+
+    def judged(self, order: Int[Tensor, " modes"], measured: Float64[Tensor, "contacts modes 2"]) -> LinearGains:
+        """Return the finished field, judging itself by the gains that its modes, in order, have in the recordings.
+
+        Frequencies that moved end to end have turned their modes, which says nothing of the gains.
+        """
+        finished = self.finished(order)
+        return finished.judged_by(turned_like(measured * self.signs.double()[:, None, None], finished.values))
 
 
 def _applied(smoother: Tensor, values: Tensor) -> Tensor:

@@ -20,3 +20,15 @@ def common_phase(
     """
     amplitudes = torch.complex(gains.double(), quadrature.double())
     return torch.angle(amplitudes.square().sum(dim=0)) / 2
+
+
+def turned_like(
+    parts: Float64[Tensor, "contacts modes 2"], others: Float64[Tensor, "contacts modes 2"]
+) -> Float64[Tensor, "contacts modes 2"]:
+    """Return gains in two parts with each mode turned, by one phase for all contacts, to where they suit others best.
+
+    A mode whose frequency has moved a little has turned for a sound as a whole, and has the same gains.
+    """
+    one, other = torch.view_as_complex(parts.contiguous()), torch.view_as_complex(others.contiguous())
+    turn = (one.conj() * other).sum(0)
+    return torch.view_as_real(one * torch.polar(torch.ones_like(turn.real), turn.angle()))
