@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
+from avmsf.field.descent import Descent, Group
 from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
 from avmsf.modal.bank import ModalBank
@@ -117,19 +118,14 @@ class TrainingRun:
         matrices = [parameter for parameter in network.parameters() if parameter.ndim == 2]
         vectors = [parameter for parameter in network.parameters() if parameter.ndim != 2]
 
-        def groups() -> list[dict[str, Any]]:
-            return [
-                {"params": matrices, "weight_decay": config.weight_decay},
-                {"params": vectors, "weight_decay": 0.0},
-            ]
+        def groups(rate: float) -> list[Group]:
+            return [Group(matrices, rate, config.weight_decay), Group(vectors, rate)]
 
-        self.warmup = torch.optim.AdamW(groups(), lr=config.warmup_rate)
-        corrections: list[dict[str, Any]] = [
-            {"params": [self.shift, self.decay], "weight_decay": 0.0, "rate": config.correction_rate}
-        ]
+        corrections = [Group([self.shift, self.decay], config.correction_rate)]
         if config.residual:
-            corrections.append({"params": [self.noise], "weight_decay": 0.0, "rate": config.noise_rate})
-        self.joint = torch.optim.AdamW([*groups(), *corrections], lr=config.learning_rate)
+            corrections.append(Group([self.noise], config.noise_rate))
+        self.warmup = Descent(groups(config.warmup_rate))
+        self.joint = Descent([*groups(config.learning_rate), *corrections])
         self.step = 0
         self.whole = True
         """False while parameters are being moved: an interruption then leaves a state that nothing can go on from."""
@@ -172,17 +168,14 @@ class TrainingRun:
         """Take one step on all contacts and return the loss before it, of the frames whose turn it is."""
         if self.step < self.config.warmup_steps:
             loss = self._warmup_loss(targets)
-            optimiser, done, rate = self.warmup, self.step / self.config.warmup_steps, self.config.warmup_rate
+            descent, done = self.warmup, self.step / self.config.warmup_steps
         else:
             loss = self.spectral_loss(targets)
-            optimiser, done = self.joint, (self.step - self.config.warmup_steps) / self.config.steps
-            rate = self.config.learning_rate
-        for group in optimiser.param_groups:
-            group["lr"] = group.get("rate", rate) * (0.55 + 0.45 * math.cos(math.pi * done))
-        optimiser.zero_grad()
+            descent, done = self.joint, (self.step - self.config.warmup_steps) / self.config.steps
+        descent.forget_slopes()
         torch.autograd.backward(loss)
         self.whole = False
-        optimiser.step()
+        descent.step(0.55 + 0.45 * math.cos(math.pi * done))
         self.step += 1
         self._chance = self.generator.get_state()
         self.whole = True
@@ -216,8 +209,8 @@ class TrainingRun:
         return {
             "network": self.network.state_dict(),
             "corrections": [each.detach().clone() for each in (self.shift, self.decay, self.noise)],
-            "warmup": self.warmup.state_dict(),
-            "joint": self.joint.state_dict(),
+            "warmup": self.warmup.state(),
+            "joint": self.joint.state(),
             "generator": self._chance,
             "step": self.step,
         }
@@ -228,8 +221,8 @@ class TrainingRun:
         with torch.no_grad():
             for parameter, value in zip((self.shift, self.decay, self.noise), state["corrections"], strict=True):
                 parameter.copy_(value)
-        self.warmup.load_state_dict(state["warmup"])
-        self.joint.load_state_dict(state["joint"])
+        self.warmup.resume(state["warmup"])
+        self.joint.resume(state["joint"])
         self._chance = state["generator"]
         self.generator.set_state(self._chance)
         self.step = state["step"]
