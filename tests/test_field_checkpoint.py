@@ -12,6 +12,7 @@ import torch
 from avmsf.errors import FieldFileError
 from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
 from avmsf.field.config import FitConfig
+from avmsf.field.descent import Descent
 from avmsf.field.fit import Progress, fit
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
@@ -110,7 +111,7 @@ def interrupt(patch: pytest.MonkeyPatch, owner: type, name: str, *, call: int) -
 
 
 @pytest.mark.parametrize(
-    ("owner", "name"), [(TrainingRun, "sounds"), (TrainingRun, "spectral_loss"), (torch.optim.AdamW, "step")]
+    ("owner", "name"), [(TrainingRun, "sounds"), (TrainingRun, "spectral_loss"), (Descent, "step")]
 )
 def test_an_interruption_in_the_middle_of_a_step_loses_no_more_than_it(tmp_path, monkeypatch, owner, name):
     """Ctrl-C falls inside the arithmetic nearly always: noise drawn, gradients made, parameters half moved."""
