@@ -49,10 +49,10 @@ class SameGains:
         return cls(tensors["gains"])
 
 
-def ringing_field(*, pitch: float = 1.0, decay: float = 1.0, seconds: float = 0.5, level: float = 1.0) -> SoundField:
-    frequency, damping = (torch.tensor(each, dtype=torch.float64) for each in (FREQUENCY, DAMPING))
+def ringing_field(*, pitch: float = 1.0, damping: float = 1.0, seconds: float = 0.5, level: float = 1.0) -> SoundField:
+    frequency, own = (torch.tensor(each, dtype=torch.float64) for each in (FREQUENCY, DAMPING))
     return SoundField(
-        ModalBank(pitch * frequency, decay * damping),
+        ModalBank(pitch * frequency, damping * own),
         SameGains(level * torch.tensor(GAINS)),
         torch.zeros(len(FREQUENCY), dtype=torch.float64),
         Residual(torch.zeros(17)),

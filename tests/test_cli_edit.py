@@ -23,6 +23,7 @@ from avmsf.tasks.edits import EDITS
 from avmsf.tasks.materialstatistics import MaterialStatistics
 from avmsf.tasks.recast import RATIO_ONLY, rayleigh_damping, recast
 from avmsf.tasks.retune import retune
+from made_audio import save_audio
 from made_fields import FIELDS, places
 
 Streams = pytest.CaptureFixture[str]
@@ -263,6 +264,37 @@ def test_settings_of_a_descent_want_something_to_lead_to(field: Path, capsys: St
     assert "--steps goes with --prompt, --like or --like-material" in capsys.readouterr().err
 
 
+def test_options_that_would_do_nothing_are_refused(field: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(match: str, *words: str) -> None:
+        with pytest.raises(AvmsfError, match=match):
+            edited(field, *words)
+
+    monkeypatch.setattr(edit, "load", lambda path: pytest.fail("a field was loaded"))
+    like = ("--like", "like.wav")
+    model = ["--negative", "wood", "--guidance", "5", "--model", "nowhere", "--device", "cpu", "--model-seconds", "1"]
+    named = "--model and --negative and --model-seconds and --device and --guidance"
+    refused(f"{named} go with --prompt, which is not given", *like, *model)
+    refused("--denoising and --batch go with --prompt", "--pitch", "2", "--denoising", "3", "--batch", "2")
+    refused("--law goes with --material, --size or a constant", "--pitch", "2", "--law", "ratio-only")
+    refused("--law goes with", "--like-material", "wood", "--law", "velocity")
+    refused("--at goes with --pictures, which is not given", "--pitch", "2", "--at", "0", "0", "0")
+
+
+def test_settings_of_a_model_that_cannot_be_meant_are_refused_before_it_is_loaded(
+    field: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(steering.StableAudio, "load", lambda *_, **__: pytest.fail("a model was loaded"))
+    for words, match in (
+        (("--guidance", "-5"), "guidance = -5: expected a number that is not negative"),
+        (("--denoising", "0"), "denoising = 0: expected 1 or more"),
+        (("--batch", "0"), "batch = 0: expected 1 or more"),
+        (("--model-seconds", "0"), "--model-seconds 0: expected more than 0"),
+        (("--model-seconds", "nan"), "--model-seconds nan: expected more than 0"),
+    ):
+        with pytest.raises(AvmsfError, match=match):
+            edited(field, "--prompt", "a bell", *words)
+
+
 def test_towards_words(field: Path, monkeypatch: pytest.MonkeyPatch, capsys: Streams) -> None:
     model = Echo(retune(ceramic(), pitch=1.02).render(PLACES[:1])[0])
     loaded = []
@@ -282,6 +314,41 @@ def test_towards_words(field: Path, monkeypatch: pytest.MonkeyPatch, capsys: Str
     assert "loss" in capsys.readouterr().err
 
 
+@pytest.mark.filterwarnings("ignore:`torch.nn.utils.weight_norm` is deprecated:FutureWarning")
+def test_towards_words_by_a_saved_model_and_an_interrupted_edit_goes_on(
+    field: Path, monkeypatch: pytest.MonkeyPatch, capsys: Streams
+) -> None:
+    pytest.importorskip("diffusers", reason="needs pip install 'avmsf[text]'")
+    pytest.importorskip("transformers")
+    model = save_audio(field.with_name("tiny-audio"))
+    words = ["--prompt", "a wooden bowl is hit", "--model", str(model), "--device", "cpu", "--denoising", "2"]
+    words += ["--steps", "2", "--contacts", "2", "--preview-every", "1", "--json"]
+
+    def edit_to(name: str) -> int:
+        return main(["edit", str(field), "--output", str(field.with_name(f"{name}.safetensors")), *words])
+
+    assert edit_to("whole") == 0
+    (told,) = json.loads(capsys.readouterr().out)["edits"]
+    assert (told["edit"], told["prompt"], told["model"]) == ("steer", "a wooden bowl is hit", "tiny-audio")
+    whole = load(field.with_name("whole.safetensors"))
+    assert bool((whole.bank.frequency != FREQUENCY).all())
+    shown = steering.SteerBar.show
+    steps = []
+
+    def impatient(bar: steering.SteerBar, progress: steering.SteerProgress) -> None:
+        shown(bar, progress)
+        steps.append(progress.step)
+        if steps == [1]:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(steering.SteerBar, "show", impatient)
+    assert edit_to("part") == 130
+    assert "give the same command again to go on" in capsys.readouterr().err
+    assert edit_to("part") == 0
+    assert steps == [1, 2]
+    expect_same(load(field.with_name("part.safetensors")), whole)
+
+
 def test_what_cannot_be_done_is_said_before_any_work(field: Path, capsys: Streams) -> None:
     def refused(match: str, *words: str) -> None:
         with pytest.raises(AvmsfError, match=match):
@@ -293,7 +360,7 @@ def test_what_cannot_be_done_is_said_before_any_work(field: Path, capsys: Stream
     refused("found --prompt and --like: edit by one, then by the other", "--prompt", "a bell", "--like", "like.wav")
     refused("found --like and --like-material: edit", "--like-material", "wood", "--like", "like.wav")
     refused("no material is called 'cheese'; there are ceramic, glass", "--like-material", "cheese")
-    refused("--prompt is empty: describe the sound", "--prompt", "  ")
+    refused("expected a prompt, found an empty one", "--prompt", "  ")
     refused("no material is called 'cheese'; there are ceramic, glass", "--material", "cheese")
     refused("young = -1 Pa: expected more than 0", "--from", "ceramic", "--young", "-1")
     refused(r"size = 0: expected the new object's lengths", "--from", "ceramic", "--size", "0")
@@ -302,5 +369,5 @@ def test_what_cannot_be_done_is_said_before_any_work(field: Path, capsys: Stream
     refused("steps = 0: expected 1 or more", "--like", "like.wav", "--steps", "0")
     assert main(["edit", str(field), "--output", str(field), "--pitch", "2"]) == 2
     assert "is the field itself, which would be lost: name another file" in capsys.readouterr().err
-    far = ["--pitch", "2", "--at", "100", "0", "0"]
+    far = ["--pitch", "2", "--pictures", str(field.with_name("look")), "--at", "100", "0", "0"]
     refused("the contact .* lies .* m outside an object", *far)

@@ -9,7 +9,7 @@ import torch
 
 from avmsf.errors import EditError
 from avmsf.tasks.clips import level, levelled
-from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, noised, partial_denoising
+from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, DistillationConfig, noised, partial_denoising
 from avmsf.tasks.steer import Guide, SteerConfig, steer
 from ringing_field import RATE, ringing_field, sound_of
 
@@ -72,7 +72,7 @@ class Gaussian(Known):
 
 
 def guide(model, **settings) -> DecoderDistillation:
-    return DecoderDistillation(model, "wood", sample_rate=RATE, **settings)
+    return DecoderDistillation(model, "wood", sample_rate=RATE, config=DistillationConfig(**settings))
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -138,7 +138,7 @@ def test_guidance_scales_the_update():
     found = [partial_denoising(model, latents, level_, None, steps=1, guidance=each) for each in (0.0, 1.0, 3.0)]
     torch.testing.assert_close(found[2] - found[0], 3 * (found[1] - found[0]), rtol=1e-4, atol=1e-5)
     far = [
-        float((guide(model, guidance=each, steps=1).targets(sounds, 0, seeded()) - wanted).abs().mean())
+        float((guide(model, guidance=each, denoising=1).targets(sounds, 0, seeded()) - wanted).abs().mean())
         for each in (0.0, 0.5, 1.0)
     ]
     assert far[0] > 1.2 * far[1] > 1.2 * far[2]
@@ -189,7 +189,7 @@ def test_what_tells_models_apart_tells_guides_apart():
 
 
 def test_a_field_is_steered_to_what_the_model_wants():
-    wanted = sound_of(ringing_field(pitch=1.02, decay=2.0))
+    wanted = sound_of(ringing_field(pitch=1.02, damping=2.0))
     before, seen = ringing_field(), []
     made = steer(
         before,
@@ -199,7 +199,7 @@ def test_a_field_is_steered_to_what_the_model_wants():
     )
     assert seen[-1].pitch == pytest.approx(1.02, abs=0.01)
     # Single modes' own dampings bring the rest.
-    assert 1.3 < seen[-1].decay < 2.2
+    assert 1.3 < 1 / seen[-1].decay < 2.2
     assert seen[-1].loss < 0.6 * seen[0].loss
     entry = made.origin.report["edits"][-1]
     assert (entry["prompt"], entry["model"], entry["guidance"]) == ("wood", "known", 0.9)
@@ -218,14 +218,14 @@ def test_it_is_what_the_protocols_ask_for():
     [
         ({"lowest": 0.0}, "expected 0 < lowest <= highest < 1"),
         ({"highest": 1.0}, "expected 0 < lowest <= highest < 1"),
-        ({"steps": 0}, "steps = 0: expected 1 or more"),
+        ({"denoising": 0}, "denoising = 0: expected 1 or more"),
         ({"batch": 0}, "batch = 0"),
         ({"guidance": math.nan}, "guidance = nan"),
     ],
 )
 def test_settings_that_cannot_be_meant(settings, words):
     with pytest.raises(EditError, match=words):
-        guide(Known(), **settings)
+        DistillationConfig(**settings)
 
 
 @pytest.mark.parametrize("prompt", ["", " \n"])

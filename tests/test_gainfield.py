@@ -14,7 +14,7 @@ from safetensors.torch import save as to_bytes
 from avmsf.bench.renderer import Renderer
 from avmsf.errors import FieldFileError
 from avmsf.field.attention import AttentionGains
-from avmsf.field.gainfield import GainField
+from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.refinement import RefinedGains
 from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import Origin, SoundField
@@ -54,6 +54,14 @@ def expect_close(found: list[torch.Tensor], expected: list[torch.Tensor], *, wit
     assert len(found) == len(expected)
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=within, atol=within * float(other.abs().max()))
+
+
+def test_power_is_the_same_whatever_the_phase():
+    size, turn = torch.tensor([[1.0, 2.0, 0.5]]), torch.tensor([0.3, -1.1, 2.0])
+    turned = Gains(size * torch.cos(turn), size * torch.sin(turn))
+    # The rounding of float32 amplitudes.
+    torch.testing.assert_close(turned.power, size.double().square(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(Gains(-size).power, size.double().square())
 
 
 @every_field

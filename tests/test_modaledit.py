@@ -38,8 +38,8 @@ def test_the_formula_of_the_paper():
     field, edit = made_field(), made_edit()
     bank = edit.of(field).bank
     torch.testing.assert_close(bank.frequency, 0.7 * field.bank.frequency * edit.shift.exp(), rtol=1e-13, atol=0)
-    torch.testing.assert_close(bank.damping, 3.0 * field.bank.damping * edit.decay_shift.exp(), rtol=1e-13, atol=0)
-    assert (edit.pitch_factor, edit.decay_factor) == (pytest.approx(0.7), pytest.approx(3.0))
+    torch.testing.assert_close(bank.damping, 3.0 * field.bank.damping * edit.damping_shift.exp(), rtol=1e-13, atol=0)
+    assert (edit.pitch_factor, edit.damping_factor) == (pytest.approx(0.7), pytest.approx(3.0))
 
 
 @pytest.mark.parametrize("kind", made_fields.FIELDS)
@@ -100,6 +100,8 @@ def test_an_edited_field_saves_loads_and_is_edited_again(tmp_path):
     assert [each.get("prompt") for each in entries] == ["wood", None]
     assert [each["edit"] for each in entries] == ["steer", "steer"]
     assert entries[0]["pitch"] == pytest.approx(0.7)
+    # As in an edit by hand: what rings a third as long.
+    assert entries[0]["decay"] == pytest.approx(1 / 3)
     assert again.origin.report["gains"] == "made"
 
 

@@ -9,7 +9,7 @@ import pytest
 import soundfile
 import torch
 
-from avmsf.errors import EditError
+from avmsf.errors import AvmsfWarning, EditError
 from avmsf.field.gainfield import Gains
 from avmsf.modal.bank import ModalBank
 from avmsf.simulate.material import CERAMIC, WOOD
@@ -69,7 +69,7 @@ def test_several_clips_each_sound_has_its_nearest(tmp_path):
 def test_where_a_clip_ends_nothing_is_asked():
     field = ringing_field()
     sound = sound_of(field)
-    reference = Reference.of(sound_of(ringing_field(decay=3.0))[:, :1000], sample_rate=RATE)
+    reference = Reference.of(sound_of(ringing_field(damping=3.0))[:, :1000], sample_rate=RATE)
     targets = reference.targets(sound, 0, torch.Generator())
     assert torch.equal(targets[:, 1000:], sound[:, 1000:])
     # Until the 10 ms before the end it is the clip alone.
@@ -78,31 +78,31 @@ def test_where_a_clip_ends_nothing_is_asked():
 
 
 @pytest.mark.parametrize(
-    ("pitch", "decay", "samples"),
+    ("pitch", "damping", "samples"),
     [(0.5, 4.0, 4000), (1.6, 0.5, 4000), (1.0, 10.0, 4000), (1.6, 0.5, 800), (1.0, 4.0, 400)],
 )
-def test_the_start_finds_a_common_change(pitch, decay, samples):
+def test_the_start_finds_a_common_change(pitch, damping, samples):
     # Clips of 800 and 400 samples end while they ring: of what comes later, nothing is known.
-    reference = Reference.of(sound_of(ringing_field(pitch=pitch, decay=decay))[:, :samples], sample_rate=RATE)
+    reference = Reference.of(sound_of(ringing_field(pitch=pitch, damping=damping))[:, :samples], sample_rate=RATE)
     found = reference.start(struck())
-    # Bands are a 24th of an octave, 3 %; decays are searched to a factor of 64^(1/32), 14 %.
+    # Bands are a 24th of an octave, 3 %; dampings are searched to a factor of 64^(1/32), 14 %.
     assert found.pitch_factor == pytest.approx(pitch, rel=0.04)
-    assert found.decay_factor == pytest.approx(decay, rel=0.35)
+    assert found.damping_factor == pytest.approx(damping, rel=0.35)
 
 
 def test_the_start_stays_within_its_range():
     # A hundredth of the damping is out of reach.
-    reference = Reference.of(sound_of(ringing_field(decay=1e-2, seconds=0.1)), sample_rate=RATE)
-    assert reference.start(struck(seconds=0.1)).decay_factor == pytest.approx(1 / 64)
+    reference = Reference.of(sound_of(ringing_field(damping=1e-2, seconds=0.1)), sample_rate=RATE)
+    assert reference.start(struck(seconds=0.1)).damping_factor == pytest.approx(1 / 64)
 
 
 def test_the_start_of_what_is_there_already():
     found = Reference.of(sound_of(ringing_field()), sample_rate=RATE).start(struck())
-    assert (found.pitch_factor, found.decay_factor) == (1.0, 1.0)
+    assert (found.pitch_factor, found.damping_factor) == (1.0, 1.0)
 
 
 def test_heard_spectra_shift_with_pitch_and_ignore_level():
-    one, double = (heard_spectrum(sound_of(ringing_field(pitch=pitch, decay=pitch))) for pitch in (0.5, 1.0))
+    one, double = (heard_spectrum(sound_of(ringing_field(pitch=pitch, damping=pitch))) for pitch in (0.5, 1.0))
     torch.testing.assert_close(one.sum(1), torch.ones(1))
     # An octave is 24 bands; each mode's width doubles with its frequency.
     torch.testing.assert_close(one.roll(24, 1)[:, 60:], double[:, 60:], rtol=0, atol=3e-3)
@@ -121,7 +121,7 @@ def test_resampling_keeps_a_tone():
 
 
 def test_level_hears_the_blow_not_the_ringing():
-    short, long = (sound_of(ringing_field(decay=decay)) for decay in (1.0, 0.25))
+    short, long = (sound_of(ringing_field(damping=damping)) for damping in (1.0, 0.25))
     ratio = float(level(long, sample_rate=RATE) / level(short, sample_rate=RATE))
     assert ratio == pytest.approx(1.0, abs=0.25)
     torch.testing.assert_close(level(3 * short, sample_rate=RATE), 3 * level(short, sample_rate=RATE))
@@ -141,6 +141,38 @@ def test_recordings_that_cannot_be_used(tmp_path):
         Reference.of(torch.stack([torch.ones(9), torch.zeros(9)]), sample_rate=RATE)
     with pytest.raises(EditError, match="finite"):
         Reference.of(torch.full((1, 9), math.nan), sample_rate=RATE)
+
+
+def test_what_holds_no_blow_is_refused(tmp_path):
+    noise = write(tmp_path / "noise.wav", torch.randn(4000, generator=torch.Generator().manual_seed(0)))
+    with pytest.raises(EditError, match=r"noise\.wav holds no blow: its loudest 10 ms stand .* expected 6 dB"):
+        Reference.read(noise, sample_rate=RATE)
+
+
+def test_of_two_blows_the_first_is_taken_and_that_is_said(tmp_path):
+    first, second = (sound_of(ringing_field(pitch=pitch, seconds=0.25))[0] for pitch in (1.0, 1.4))
+    both = write(tmp_path / "both.wav", torch.cat([first, second]), before=800)
+    with pytest.warns(
+        AvmsfWarning, match=r"both\.wav holds more than one blow, at 0\.100 s and at 0\.3.*: only the first"
+    ):
+        reference = Reference.read(both, sample_rate=RATE)
+    # The second blow is found to half a window of 10 ms, and none of it is left.
+    assert reference.lengths[0] == pytest.approx(2000, abs=40)
+    found = heard_spectrum(reference.clips[:, :1950])
+    torch.testing.assert_close(found, heard_spectrum(first[None, :1950]), rtol=0, atol=2e-3)
+
+
+def test_a_clipped_reference_is_said(tmp_path):
+    sound = sound_of(ringing_field())[0]
+    hard = write(tmp_path / "hard.wav", (4 * sound / sound.abs().max()).clamp(-1.0, 1.0), before=800)
+    with pytest.warns(AvmsfWarning, match=r"hard\.wav is clipped: \d+ samples \(.* %\) are cut off at 1"):
+        Reference.read(hard, sample_rate=RATE)
+
+
+def test_a_reference_that_lacks_what_the_field_holds_is_said(tmp_path):
+    low = write(tmp_path / "low.wav", sound_of(ringing_field())[0, ::8], rate=RATE / 8, before=100)
+    with pytest.warns(AvmsfWarning, match=r"low\.wav is at 1000 Hz and holds sound up to 450 Hz: .* record at 8000 Hz"):
+        Reference.read(low, sample_rate=RATE)
 
 
 def law(frequency: torch.Tensor, alpha: float, beta: float) -> torch.Tensor:
@@ -190,7 +222,7 @@ def test_another_material_of_the_same_object():
     assert (found.alpha, found.beta, found.name) == (WOOD.alpha, WOOD.beta, "wood")
     assert set(found.frequency.tolist()) <= set((ratio * field.bank.frequency).tolist())
     start = found.reference(samples=4000, sample_rate=RATE).start(struck())
-    assert start.decay_factor > 2.0
+    assert start.damping_factor > 2.0
 
 
 def test_statistics_of_a_folder(tmp_path):
@@ -201,7 +233,8 @@ def test_statistics_of_a_folder(tmp_path):
     off = (found.frequency[:, None] / modes - 1).abs().min(dim=1).values
     assert float(off.max()) < 5e-3
     generator = torch.Generator().manual_seed(0)
-    noise = write(tmp_path / "2.wav", torch.randn(1500, generator=generator))
+    # It begins as a blow does, and does not die away.
+    noise = write(tmp_path / "2.wav", torch.randn(1500, generator=generator), before=800)
     with pytest.raises(EditError, match=r"2\.wav: expected a blow that rings: no mode found"):
         MaterialStatistics.of_recordings(noise, sample_rate=RATE)
     with pytest.raises(EditError, match="expected modes of every object, found none"):
@@ -242,5 +275,5 @@ def test_a_modes_size_does_not_depend_on_its_phase():
 def test_an_edit_starts_where_nothing_moves_alone():
     bank = ringing_field().bank
     edit = ModalEdit.none(bank, pitch=math.log(2.0))
-    assert (edit.pitch_factor, edit.decay_factor) == (pytest.approx(2.0), 1.0)
-    assert not bool(edit.shift.any() or edit.scale.any() or edit.decay_shift.any())
+    assert (edit.pitch_factor, edit.damping_factor) == (pytest.approx(2.0), 1.0)
+    assert not bool(edit.shift.any() or edit.scale.any() or edit.damping_shift.any())

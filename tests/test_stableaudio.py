@@ -3,31 +3,33 @@
 import json
 import math
 import shutil
+import threading
 import warnings
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
 import torch
 
 from avmsf.errors import EditError
-from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, partial_denoising
+from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, DistillationConfig, partial_denoising
 from avmsf.tasks.modaledit import ModalEdit, Struck
 from avmsf.tasks.parameters import HIERARCHICAL
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
 from avmsf.tasks.stableaudiofiles import STABLE_AUDIO, _expect_weights
-from avmsf.tasks.steer import SteerConfig, steer
-from ringing_field import RATE, ringing_field, sound_of
+from avmsf.tasks.steer import SteerConfig, SteerProgress, steer
+from made_audio import DIM, FRAMES, RATE, save_audio, tiny_pipeline
+from ringing_field import ringing_field, sound_of
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     diffusers = pytest.importorskip("diffusers")
-    transformers = pytest.importorskip("transformers")
+    pytest.importorskip("transformers")
     from diffusers import StableAudioPipeline
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.nn.utils.weight_norm` is deprecated:FutureWarning")
-FRAMES, STRIDES, DIM = 512, [2, 4], 8
 
 
 @pytest.fixture(autouse=True)
@@ -36,51 +38,9 @@ def offline(monkeypatch) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
 
 
-def tiny() -> "StableAudioPipeline":
-    torch.manual_seed(0)
-    words = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", 0.0), ("▁", -2.0)]
-    words += [(letter, -3.0) for letter in "abcdefghijklmnopqrstuvwxyz"]
-    tokenizer = transformers.T5Tokenizer(vocab=words, extra_ids=0, model_max_length=16)
-    text_encoder = transformers.T5EncoderModel(
-        transformers.T5Config(vocab_size=40, d_model=16, d_kv=8, d_ff=16, num_layers=1, num_heads=2)
-    )
-    return StableAudioPipeline(
-        vae=diffusers.AutoencoderOobleck(
-            encoder_hidden_size=DIM,
-            downsampling_ratios=STRIDES,
-            channel_multiples=[1, 2],
-            decoder_channels=DIM,
-            decoder_input_channels=DIM // 2,
-            audio_channels=2,
-            sampling_rate=int(RATE),
-        ),
-        text_encoder=text_encoder,
-        projection_model=diffusers.StableAudioProjectionModel(
-            text_encoder_dim=16, conditioning_dim=16, min_value=0, max_value=32
-        ),
-        tokenizer=tokenizer,
-        transformer=diffusers.StableAudioDiTModel(
-            sample_size=FRAMES,
-            in_channels=DIM // 2,
-            num_layers=1,
-            attention_head_dim=8,
-            num_attention_heads=2,
-            num_key_value_attention_heads=1,
-            out_channels=DIM // 2,
-            cross_attention_dim=16,
-            time_proj_dim=8,
-            global_states_input_dim=32,
-            cross_attention_input_dim=16,
-        ),
-        scheduler=diffusers.CosineDPMSolverMultistepScheduler(),
-    )
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    place = tmp_path_factory.mktemp("model") / "tiny-audio"
-    tiny().save_pretrained(place)
-    return place
+    return save_audio(tmp_path_factory.mktemp("model") / "tiny-audio")
 
 
 @pytest.fixture(scope="module")
@@ -179,7 +139,7 @@ def test_words_are_embedded_as_the_pipeline_does(model):
 
 def test_gradient_reaches_the_modes_and_leaves_the_weights(model):
     field = ringing_field(seconds=0.2)
-    guide = DecoderDistillation(model, "a wooden bowl", sample_rate=RATE, steps=2)
+    guide = DecoderDistillation(model, "a wooden bowl", sample_rate=RATE, config=DistillationConfig(denoising=2))
     weights = {name: each.clone() for name, each in model.pipeline.transformer.state_dict().items()}
     weights |= {name: each.clone() for name, each in model.pipeline.vae.state_dict().items()}
     zero = ModalEdit.none(field.bank)
@@ -202,14 +162,18 @@ def test_gradient_reaches_the_modes_and_leaves_the_weights(model):
 
 def test_what_the_decoder_says_is_the_target(model, monkeypatch):
     # Latents of one sound are all that this denoiser ever sees: their decoded sound is as good as a recording.
-    wanted = sound_of(ringing_field(pitch=0.98, decay=2.0, seconds=0.2))
+    wanted = sound_of(ringing_field(pitch=0.98, damping=2.0, seconds=0.2))
     clean = model.encode((0.5 * wanted / wanted.abs().max())[:, None].expand(-1, 2, -1))
     monkeypatch.setattr(model, "denoised", lambda latents, *_, **__: clean.expand(len(latents), -1, -1))
-    guide = DecoderDistillation(model, "duller", sample_rate=RATE, steps=2)
+    guide = DecoderDistillation(model, "duller", sample_rate=RATE, config=DistillationConfig(denoising=2))
     reference = Reference.of(model.decode(clean, samples=1600).mean(dim=1), sample_rate=RATE)
     field, still = ringing_field(seconds=0.2), replace(HIERARCHICAL, searches=False)
     config = SteerConfig(steps=8, contacts=2, preview_every=0)
-    by_words, by_sound = (steer(field, each, config=config, parameters=still) for each in (guide, reference))
+    seen: list[SteerProgress] = []
+    by_words = steer(field, guide, config=config, parameters=still, progress=seen.append)
+    by_sound = steer(field, reference, config=config, parameters=still)
+    # A random autoencoder's decoded sound is far from any ring: eight steps take a twentieth off.
+    assert seen[-1].loss < 0.97 * seen[0].loss
     torch.testing.assert_close(by_words.bank.frequency, by_sound.bank.frequency, rtol=1e-5, atol=0)
     torch.testing.assert_close(by_words.bank.damping, by_sound.bank.damping, rtol=1e-4, atol=0)
     torch.testing.assert_close(by_words.gain_field.scale, by_sound.gain_field.scale, rtol=1e-4, atol=0)
@@ -217,7 +181,7 @@ def test_what_the_decoder_says_is_the_target(model, monkeypatch):
 
 
 def test_models_of_one_name_are_told_apart(model):
-    same, other = (StableAudio(tiny(), name="tiny-audio") for _ in range(2))
+    same, other = (StableAudio(tiny_pipeline(), name="tiny-audio") for _ in range(2))
     with torch.no_grad():
         other.pipeline.transformer.proj_in.weight[0, 0] += 1e-3
     assert same.describe() == model.describe() != other.describe()
@@ -245,6 +209,21 @@ def test_a_sound_from_words_alone(model):
     assert not torch.allclose(first, other)
     with pytest.raises(EditError, match="expected a prompt"):
         model.generate(" ", seconds=0.3, seed=0)
+
+
+def test_sounds_from_words_that_cannot_be_made(model, monkeypatch):
+    for seconds in (0.6, 0.0, math.nan):
+        with pytest.raises(
+            EditError, match=f"seconds = {seconds:g}: expected more than 0 and at most 0.512, which tiny"
+        ):
+            model.generate("wood", seconds=seconds, seed=0)
+
+    def full(*_, **__):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(model.pipeline.transformer, "forward", full)
+    with pytest.raises(EditError, match="tiny-audio runs out of memory on cpu while it makes a sound"):
+        model.generate("wood", seconds=0.3, seed=0, steps=2)
 
 
 def test_seconds_bound_the_window(folder):
@@ -281,6 +260,43 @@ def test_weights_that_are_not_here(monkeypatch, tmp_path):
         StableAudio.load()
     with pytest.raises(EditError, match="found no such folder: check the path"):
         StableAudio.load(tmp_path / "nowhere")
+
+
+def test_a_refusal_of_the_hub_is_told_with_the_way_in(monkeypatch, tmp_path):
+    asked = []
+
+    class Gate(BaseHTTPRequestHandler):
+        """Answers as the hub does for a gated model and nobody's token."""
+
+        def do_GET(self):
+            asked.append(self.path)
+            self.send_response(401)
+            self.send_header("X-Error-Code", "GatedRepo")
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+
+        def do_HEAD(self):
+            self.do_GET()
+
+        def log_message(self, *_):
+            return
+
+    monkeypatch.delenv("HF_HUB_OFFLINE")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with HTTPServer(("127.0.0.1", 0), Gate) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        here = f"http://127.0.0.1:{server.server_port}"
+        monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", here)
+        monkeypatch.setattr("huggingface_hub.hf_api.api.endpoint", here)
+        words = f"accept the licence at https://huggingface.co/{STABLE_AUDIO}, make a token .* and run: hf auth login"
+        with pytest.raises(EditError, match=words):
+            StableAudio.load()
+        server.shutdown()
+    # The client's own question was refused, after ours.
+    own = [path for path in asked if STABLE_AUDIO in path]
+    assert own[0] == f"/{STABLE_AUDIO}/resolve/main/model_index.json"
+    assert own[1] == f"/api/models/{STABLE_AUDIO}"
 
 
 def copied(folder: Path, place: Path) -> Path:

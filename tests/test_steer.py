@@ -11,6 +11,7 @@ from avmsf.tasks.clips import level
 from avmsf.tasks.modaledit import ModalEdit
 from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, SEARCHED
 from avmsf.tasks.reference import Reference
+from avmsf.tasks.retune import retune
 from avmsf.tasks.steer import Guide, SteerConfig, steer
 from ringing_field import RATE, SameGains, ringing_field, sound_of
 
@@ -24,6 +25,7 @@ class Towards:
     sound: torch.Tensor
     noise: float = 0.0
     spoilt: bool = False
+    sample_rate: float = RATE
 
     def describe(self):
         return {"towards": float(self.sound.square().sum()), "noise": self.noise}
@@ -50,15 +52,26 @@ def trace(field, guide, **arguments):
 
 
 def test_a_small_change_is_found_by_descent():
-    made, seen = trace(ringing_field(), towards(pitch=1.004, decay=1.5), config=replace(QUICK, steps=50))
-    wanted = ringing_field(pitch=1.004, decay=1.5).bank
+    made, seen = trace(ringing_field(), towards(pitch=1.004, damping=1.5), config=replace(QUICK, steps=50))
+    wanted = ringing_field(pitch=1.004, damping=1.5).bank
     # A quarter of the change, 1.7 cents; the dampings' own slopes are shallow.
     torch.testing.assert_close(made.bank.frequency, wanted.frequency, rtol=1e-3, atol=0)
     torch.testing.assert_close(made.bank.damping, wanted.damping, rtol=0.1, atol=0)
     assert seen[-1].loss < 0.2 * seen[0].loss
     # The common factors bring most of it.
-    assert seen[-1].decay == pytest.approx(1.5, rel=0.2)
+    assert seen[-1].decay == pytest.approx(1 / 1.5, rel=0.2)
     assert seen[-1].pitch == pytest.approx(1.004, abs=0.002)
+
+
+def test_decay_means_in_every_edit_how_long_it_rings():
+    made, seen = trace(ringing_field(), towards(damping=3.0), config=QUICK)
+    told = made.origin.report["edits"][-1]["decay"]
+    # Modes move by themselves, too: what they have in common is their median.
+    common = float((ringing_field().bank.damping / made.bank.damping).median())
+    assert told == seen[-1].decay == pytest.approx(common, rel=0.1)
+    by_hand = retune(ringing_field(), decay=told)
+    assert float((by_hand.bank.damping / made.bank.damping).median()) == pytest.approx(1.0, rel=0.1)
+    assert told < 0.9
 
 
 def test_a_target_that_is_met_moves_little():
@@ -70,11 +83,11 @@ def test_a_target_that_is_met_moves_little():
 
 def test_common_factors_cross_the_gap_that_single_modes_do_not():
     # An octave down and four times as damped: no mode is near one that is wanted.
-    field, reference = ringing_field(), Reference.of(sound_of(ringing_field(pitch=0.5, decay=4.0)), sample_rate=RATE)
+    field, reference = ringing_field(), Reference.of(sound_of(ringing_field(pitch=0.5, damping=4.0)), sample_rate=RATE)
     config = replace(QUICK, steps=15)
     ours, _ = trace(field, reference, config=config)
     alone, _ = trace(field, reference, config=config, parameters=INDEPENDENT)
-    wanted = ringing_field(pitch=0.5, decay=4.0).bank
+    wanted = ringing_field(pitch=0.5, damping=4.0).bank
     off = [float((made.bank.frequency / wanted.frequency).log().abs().max()) for made in (ours, alone)]
     assert off[0] < 0.01
     assert off[1] > 0.3
@@ -84,7 +97,7 @@ def test_level_is_no_part_of_the_edit():
     # Whatever the field's unit, and however loud what it shall sound like.
     for factor in (1.0, 1e-4):
         field = ringing_field(level=factor)
-        made = steer(field, towards(pitch=1.02, decay=2.0, level=factor), config=QUICK)
+        made = steer(field, towards(pitch=1.02, damping=2.0, level=factor), config=QUICK)
         before, after = (level(sound_of(each), sample_rate=RATE) for each in (field, made))
         torch.testing.assert_close(after, before, rtol=1e-4, atol=0)
 
@@ -110,11 +123,11 @@ def test_independent_modes_have_nothing_in_common():
 def test_what_does_not_move_stays_where_it_begins(parameters, pitch):
     class Proposing(Towards):
         def start(self, struck):
-            return ModalEdit.none(struck.bank, pitch=math.log(0.5), decay=math.log(2.0))
+            return ModalEdit.none(struck.bank, pitch=math.log(0.5), damping=math.log(2.0))
 
     guide = Proposing(sound_of(ringing_field(pitch=0.5)))
     made, seen = trace(ringing_field(), guide, config=replace(QUICK, steps=2, preview_every=0), parameters=parameters)
-    assert (seen[-1].pitch, seen[-1].decay) == (pytest.approx(pitch), pytest.approx(1 / pitch))
+    assert (seen[-1].pitch, seen[-1].decay) == (pytest.approx(pitch), pytest.approx(pitch))
     # Two steps of single modes are a 25th at most.
     ratio = made.bank.frequency / ringing_field().bank.frequency
     torch.testing.assert_close(ratio, torch.full_like(ratio, pitch), rtol=0.05, atol=0)
@@ -147,7 +160,7 @@ def test_previews_come_when_due_and_sound_as_the_field_will():
 
 @pytest.mark.parametrize("stop", [1, 7, 12])
 def test_an_interrupted_edit_goes_on_to_the_same_result(tmp_path, stop):
-    field, guide, place = ringing_field(), replace(towards(pitch=1.02, decay=1.3), noise=0.3), tmp_path / "state"
+    field, guide, place = ringing_field(), replace(towards(pitch=1.02, damping=1.3), noise=0.3), tmp_path / "state"
 
     def interrupt(progress) -> None:
         if progress.step == stop:
@@ -197,6 +210,13 @@ def test_nothing_but_spoilt_targets_ends_the_edit():
     guide = Towards(torch.full((1, 4000), math.nan))
     with pytest.raises(EditError, match=r"targets of 20 steps in a row .* lower the guidance"):
         steer(ringing_field(), guide, config=replace(QUICK, steps=40))
+
+
+@pytest.mark.parametrize("parameters", [HIERARCHICAL, INDEPENDENT], ids=lambda each: each.name)
+def test_a_guide_at_another_rate_is_refused(parameters):
+    reference = Reference.of(sound_of(ringing_field()), sample_rate=2 * RATE, name="bell.wav")
+    with pytest.raises(EditError, match=r"a guide of sounds at 16000 Hz and a field at 8000 Hz: .* sample_rate = 8000"):
+        steer(ringing_field(), reference, config=QUICK, parameters=parameters)
 
 
 def test_a_silent_field_is_refused():

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from avmsf.scene.symmetry import Symmetries
     from avmsf.scene.symmetrysearch import find_symmetries
     from avmsf.simulate.material import MATERIALS, Material
-    from avmsf.tasks.distillation import DecoderDistillation
+    from avmsf.tasks.distillation import DecoderDistillation, DistillationConfig
     from avmsf.tasks.listening import Listener
     from avmsf.tasks.locate import locate
     from avmsf.tasks.locator import Locator
@@ -71,6 +71,7 @@ __all__ = [
     "CaptureSettings",
     "DecoderDistillation",
     "DinoEncoder",
+    "DistillationConfig",
     "Extraction",
     "FeatureField",
     "FitConfig",
@@ -210,7 +211,10 @@ _HOMES = {
         "steer",
     ),
     "avmsf.tasks.reference": ("Reference",),
-    "avmsf.tasks.distillation": ("DecoderDistillation",),
+    "avmsf.tasks.distillation": (
+        "DecoderDistillation",
+        "DistillationConfig",
+    ),
     "avmsf.tasks.stableaudio": ("StableAudio",),
     "avmsf.tasks.materialstatistics": ("MaterialStatistics",),
     "avmsf.simulate.material": (

@@ -19,10 +19,13 @@ from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extract import HighResolution, extract_sounds
 from avmsf.simulate.material import MATERIALS
-from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation
+from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, DistillationConfig
 from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, SEARCHED, Parameterisation
 from avmsf.tasks.recast import recast
 from avmsf.tasks.steer import Guide, SteerConfig, steer
+
+GENERATED = 3.0
+"""Seconds of a sound that is made from words alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +114,7 @@ class Generation:
     """Direct generation (the paper's baseline): no object at all, and the modes extracted from what is made."""
 
     model: TextToAudio
-    seconds: float = 3.0
+    seconds: float = GENERATED
     name: str = "generation"
 
     def edit(self, task: EditTask) -> Edited:
@@ -141,18 +144,23 @@ def towards_reference(config: Mapping[str, Any] | None = None) -> tuple[EditMeth
 
 
 def towards_words(
-    model: AudioDiffusion, config: Mapping[str, Any] | None = None, **guidance: Any
+    model: AudioDiffusion,
+    config: Mapping[str, Any] | None = None,
+    *,
+    distillation: DistillationConfig | None = None,
+    generated: float = GENERATED,
 ) -> tuple[EditMethod, ...]:
     """Return the methods of the paper's table: as it was, generation (of a model that can), Audio-SDS, and ours.
 
-    `guidance` are settings of `DecoderDistillation`.
+    `config` are settings of `SteerConfig`; `generated` is how many seconds direct generation makes.
     """
 
     def guide(task: EditTask) -> Guide:
-        return DecoderDistillation(model, task.words(), sample_rate=task.object.sound_field.sample_rate, **guidance)
+        rate = task.object.sound_field.sample_rate
+        return DecoderDistillation(model, task.words(), sample_rate=rate, config=distillation)
 
     settings = config or {}
-    generation = (Generation(model),) if isinstance(model, TextToAudio) else ()
+    generation = (Generation(model, generated),) if isinstance(model, TextToAudio) else ()
     return (
         Untouched(),
         *generation,

@@ -38,10 +38,7 @@ class HeardModes:
         """Return those of a field."""
         points = field.gain_field.points
         known = field.known(points[:: max(1, -(-len(points) // _POINTS))])
-        power = known.mean.double().square()
-        if known.quadrature is not None:
-            power = power + known.quadrature.double().square()
-        size = torch.where(field.audible, power.mean(0).sqrt(), 0.0)
+        size = torch.where(field.audible, known.power.mean(0).sqrt(), 0.0)
         return cls(field.bank.frequency, np.log(1000.0) / field.bank.damping, size)
 
     def level_db(self, reference: float) -> Float64[Tensor, " modes"]:

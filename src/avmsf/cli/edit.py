@@ -171,7 +171,11 @@ def _edited(options: Options, field: SoundField) -> SoundField:
 
 def _expect(options: Options) -> None:
     """Raise before any work for what cannot be done or written."""
-    options.steering.expect_one()
+    options.steering.expect_usable()
+    if options.change.law != MaterialChange.law and not options.change.asked:
+        raise EditError("--law goes with --material, --size or a constant of a material, and none of them is given")
+    if options.at is not None and options.pictures is None:
+        raise EditError("--at goes with --pictures, which is not given: it is where their sounds are struck")
     if options.change.old is not None and not (options.change.asked or options.steering.like_material):
         raise EditError(
             "--from is given without anything to lead to: add --material, --size, a constant or --like-material"
@@ -197,11 +201,7 @@ def _contact(field: SoundField, at: tuple[float, float, float] | None) -> Float[
         return chosen.places[0].double()
     points = field.gain_field.points
     some = points[:: max(1, len(points) // _CANDIDATES)]
-    known = field.known(some)
-    power = known.mean.double().square()
-    if known.quadrature is not None:
-        power = power + known.quadrature.double().square()
-    energy = (power * field.audible / field.bank.damping).sum(1)
+    energy = (field.known(some).power * field.audible / field.bank.damping).sum(1)
     return some[int(energy.argmax())].double()
 
 

@@ -1,11 +1,12 @@
 """An edit towards words, recordings or a material's sound on the command line: its guide, progress and previews."""
 
 import dataclasses
+import math
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -16,7 +17,7 @@ from avmsf.cli.writing import Level, write_sound
 from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.simulate.material import Material, material_named
-from avmsf.tasks.distillation import DecoderDistillation
+from avmsf.tasks.distillation import DecoderDistillation, DistillationConfig, expect_prompt
 from avmsf.tasks.materialstatistics import MaterialStatistics
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
@@ -24,6 +25,8 @@ from avmsf.tasks.stableaudiofiles import STABLE_AUDIO
 from avmsf.tasks.steer import Guide, SteerConfig, SteerProgress, steer
 
 _PREVIEW = Level("peak", -1.0)
+_OF_THE_MODEL = ("--model", "--negative", "--model-seconds", "--device")
+"""Options that nothing but words needs."""
 
 
 @dataclass(frozen=True)
@@ -46,16 +49,11 @@ class Steering:
     """Folder that holds a Stable Audio pipeline, or its name on the hub."""
     negative: str | None = None
     """Words to lead away from."""
-    guidance: float = 15.0
-    """How many times the step from no words to the prompt is taken; up to 60 has been used."""
-    denoising: int = 4
-    """Denoising steps for a target, 2 to 10."""
-    batch: int = 10
-    """Sounds that the model is given at once; halved where memory runs out."""
     model_seconds: float | None = None
     """Seconds that the model works at; all that it was made for where not given, which costs in proportion."""
     device: str | None = None
     """Where the model computes: cuda, cpu; the GPU where there is one."""
+    distillation: tyro.conf.OmitArgPrefixes[DistillationConfig] = field(default_factory=DistillationConfig)
     config: tyro.conf.OmitArgPrefixes[SteerConfig] = field(default_factory=SteerConfig)
 
     @property
@@ -63,10 +61,10 @@ class Steering:
         """Whether there is anything to lead to."""
         return bool(self._guides)
 
-    def expect_one(self) -> None:
-        """Raise before a model is loaded: `EditError` for more than one guide and for an empty prompt.
+    def expect_usable(self) -> None:
+        """Raise before a field or a model is loaded, `SimulationError` for a material that is not known.
 
-        Raises `SimulationError` for a material that is not known.
+        And `EditError` for more than one guide, an empty prompt, and settings of a guide that is not given.
         """
         if len(self._guides) > 1:
             raise EditError(
@@ -76,17 +74,14 @@ class Steering:
         if self.like_material is not None:
             material_named(self.like_material)
         if not self._guides:
-            changed = [
-                f"--{each.name.replace('_', '-')}"
-                for each in dataclasses.fields(self.config)
-                if getattr(self.config, each.name) != each.default
-            ]
-            if changed:
-                raise EditError(
-                    f"{' and '.join(changed)} goes with --prompt, --like or --like-material, and none of them is given"
-                )
-        if self.prompt is not None and not self.prompt.strip():
-            raise EditError('--prompt is empty: describe the sound, such as "a wooden bowl is hit"')
+            _expect_unchanged(_changed(self.config), "--prompt, --like or --like-material, and none of them is given")
+        if self.prompt is None:
+            own = [name for name in _changed(self) if name in _OF_THE_MODEL]
+            _expect_unchanged([*own, *_changed(self.distillation)], "--prompt, which is not given")
+            return
+        expect_prompt(self.prompt)
+        if self.model_seconds is not None and not 0 < self.model_seconds < math.inf:
+            raise EditError(f"--model-seconds {self.model_seconds:g}: expected more than 0, such as 3")
 
     def apply(self, field: SoundField, *, output: Path, old: Material | None) -> SoundField:
         """Return the edited field; `output` is where it will be written, and its state and preview lie beside it.
@@ -117,10 +112,22 @@ class Steering:
             self.prompt,
             sample_rate=field.sample_rate,
             negative=self.negative,
-            guidance=self.guidance,
-            steps=self.denoising,
-            batch=self.batch,
+            config=self.distillation,
         )
+
+
+def _changed(options: Any) -> list[str]:
+    """Return which options of a dataclass are not at their defaults, as the command line calls them."""
+    return [
+        f"--{each.name.replace('_', '-')}"
+        for each in dataclasses.fields(options)
+        if each.default is not dataclasses.MISSING and getattr(options, each.name) != each.default
+    ]
+
+
+def _expect_unchanged(given: list[str], wanted: str) -> None:
+    if given:
+        raise EditError(f"{' and '.join(given)} {'goes' if len(given) == 1 else 'go'} with {wanted}")
 
 
 class SteerBar:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 
@@ -18,6 +18,12 @@ class Gains:
     """Signed amplitudes of what is a quarter of a period ahead of that; None where there is nothing of it."""
     damping: Float[Tensor, "contacts modes"] | None = None
     """Factors on the modes' dampings; None where these are the same everywhere."""
+
+    @property
+    def power(self) -> Float64[Tensor, "contacts modes"]:
+        """Squares of the amplitudes whatever their phase, gains and quadrature together."""
+        power = self.mean.double().square()
+        return power if self.quadrature is None else power + self.quadrature.double().square()
 
 
 @runtime_checkable

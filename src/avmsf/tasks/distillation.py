@@ -8,6 +8,7 @@ the model: the decoded result is a target like a recording.
 
 import math
 import warnings
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -113,6 +114,39 @@ def partial_denoising(
     return clean
 
 
+@dataclass(frozen=True)
+class DistillationConfig:
+    """How targets are drawn from a model. Raises `EditError` for values that cannot be meant."""
+
+    guidance: float = 15.0
+    """How many times the step from the negative words, or from none, to the prompt is taken; Audio-SDS is said to have
+    gone up to 60."""
+    denoising: int = 4
+    """Partial denoising steps for a target, 2 to 10."""
+    lowest: float = 0.025
+    """Least noise level that a target begins at, above 0."""
+    highest: float = 0.875
+    """Greatest noise level that a target begins at, below 1."""
+    batch: int = 10
+    """Sounds that the model is given at once; halved where memory runs out."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.lowest <= self.highest < 1:
+            raise EditError(f"noise levels {self.lowest:g} to {self.highest:g}: expected 0 < lowest <= highest < 1")
+        for name in ("denoising", "batch"):
+            if getattr(self, name) < 1:
+                raise EditError(f"{name} = {getattr(self, name)}: expected 1 or more")
+        if not (self.guidance >= 0 and math.isfinite(self.guidance)):
+            raise EditError(f"guidance = {self.guidance:g}: expected a number that is not negative, such as 15")
+
+
+def expect_prompt(prompt: str) -> str:
+    """Return a prompt without the blanks around it. Raises `EditError` for an empty one."""
+    if not prompt.strip():
+        raise EditError('expected a prompt, found an empty one: describe the sound, such as "a wooden bowl is hit"')
+    return prompt.strip()
+
+
 class DecoderDistillation:
     """A guide towards words (Audio-SDS's decoder variant with partial multi-step denoising)."""
 
@@ -123,30 +157,16 @@ class DecoderDistillation:
         *,
         sample_rate: float,
         negative: str | None = None,
-        guidance: float = 15.0,
-        steps: int = 4,
-        lowest: float = 0.025,
-        highest: float = 0.875,
-        batch: int = 10,
+        config: DistillationConfig | None = None,
     ) -> None:
-        """Set a prompt for sounds of `sample_rate` Hz, that of the field.
+        """Set a prompt for sounds of `sample_rate` Hz, that of the field, and words to lead away from.
 
-        `guidance` is how many times the step from the negative words to the prompt is taken (Audio-SDS is said to have
-        gone up to 60), `steps` the partial denoising steps (2 to 10 are usual), `lowest` and `highest` the noise levels
-        drawn between, `batch` how many sounds the model is given at once. Raises `EditError` for an empty prompt and
-        for settings that cannot be meant.
+        Raises `EditError` for an empty prompt.
         """
-        if not prompt.strip():
-            raise EditError('expected a prompt, found an empty one: describe the sound, such as "a wooden bowl is hit"')
-        if not 0 < lowest <= highest < 1:
-            raise EditError(f"noise levels {lowest:g} to {highest:g}: expected 0 < lowest <= highest < 1")
-        for name, count in (("steps", steps), ("batch", batch)):
-            if count < 1:
-                raise EditError(f"{name} = {count}: expected 1 or more")
-        if not (guidance >= 0 and math.isfinite(guidance)):
-            raise EditError(f"guidance = {guidance:g}: expected a number that is not negative, such as 15")
-        self.model, self.prompt, self.negative, self.sample_rate = model, prompt.strip(), negative, sample_rate
-        self.guidance, self.steps, self.lowest, self.highest, self.batch = guidance, steps, lowest, highest, batch
+        self.model, self.prompt, self.negative = model, expect_prompt(prompt), negative
+        self.sample_rate = sample_rate
+        self.config = DistillationConfig() if config is None else config
+        self.batch = self.config.batch
         self._conditioning: tuple[int, Any] | None = None
 
     def describe(self) -> dict[str, Any]:
@@ -156,9 +176,9 @@ class DecoderDistillation:
             "negative": self.negative,
             "model": self.model.name,
             **self.model.describe(),
-            "guidance": self.guidance,
-            "denoising_steps": self.steps,
-            "noise_levels": [self.lowest, self.highest],
+            "guidance": self.config.guidance,
+            "denoising_steps": self.config.denoising,
+            "noise_levels": [self.config.lowest, self.config.highest],
         }
 
     def start(self, struck: Struck) -> ModalEdit:
@@ -175,7 +195,8 @@ class DecoderDistillation:
         """
         with torch.no_grad():
             heard = resampled(sounds, sample_rate=self.sample_rate, wanted=self.model.sample_rate)
-            level = self.lowest + (self.highest - self.lowest) * torch.rand(len(sounds), generator=generator)
+            lowest, highest = self.config.lowest, self.config.highest
+            level = lowest + (highest - lowest) * torch.rand(len(sounds), generator=generator)
             # One seed a sound: what is drawn depends neither on the batch nor on the device.
             seeds = torch.randint(1 << 62, (len(sounds),), generator=generator).tolist()
             made: list[Tensor] = []
@@ -213,8 +234,8 @@ class DecoderDistillation:
             noised(latents, torch.stack(draws).to(latents), level),
             level,
             self._conditioning[1],
-            steps=self.steps,
-            guidance=self.guidance,
+            steps=self.config.denoising,
+            guidance=self.config.guidance,
         )
         return model.decode(clean, samples=samples).mean(dim=1).float().cpu()
 

@@ -1,6 +1,5 @@
 """A recorded blow as the recordings were that a field was fitted to: its channel, its onset, its rate."""
 
-import math
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -10,7 +9,8 @@ import torch
 from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
-from avmsf.capture.audio import Recording, clipped_samples
+from avmsf.capture.audio import Recording
+from avmsf.capture.blow import clipping, expect_sudden
 from avmsf.capture.onset import Pulse, find_second_blow, find_second_push
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
@@ -23,8 +23,6 @@ _HELD = 0.9
 """Part of half a sample rate up to which a recording of another rate still holds all of a sound."""
 _FINEST = 2000
 """Largest terms of the ratio between two rates."""
-_SUDDEN = 10 ** (6.0 / 20.0)
-"""How far the loudest hundredth of a second must stand above the quietest, 6 dB: the least that a blow does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +58,11 @@ def hear(
     notes = describe(whole, chosen)
     try:
         prepared = prepare(whole, chosen)
+        # Of one channel all is heard, the quiet before the blow too.
+        heard = whole.response() if len(whole.channels) == 1 else prepared.sound
+        expect_sudden(heard, sample_rate=whole.sample_rate, name=whole.name)
     except CaptureError as error:
         raise LocationError(str(error)) from error
-    _expect_sudden(prepared.sound, whole)
     sound = prepared.sound
     begin = prepared.onset if chosen.align else 0
     second = _second(whole, sound, begin, prepared.pulse, chosen)
@@ -110,14 +110,8 @@ def describe(recording: Recording, settings: CaptureSettings) -> list[str]:
         response = recording.response(settings.response_channel, force_channel=settings.force_channel)
     except CaptureError as error:
         raise LocationError(str(error)) from error
-    clipped = clipped_samples(response)
-    if not clipped:
-        return []
-    share = 100.0 * clipped / len(response)
-    return [
-        f"{recording.name} is clipped: {clipped} samples ({share:.2g} %) are cut off at {np.abs(response).max():.3g}, "
-        "which adds what no mode explains; turn the gain down"
-    ]
+    clipped = clipping(response, name=recording.name)
+    return [] if clipped is None else [clipped]
 
 
 def at_field_rate(
@@ -178,19 +172,3 @@ def _second(
         return find_second_push(force, pulse, sample_rate=rate, seconds=seconds)
     second = find_second_blow(sound, 0, sample_rate=rate, seconds=seconds)
     return None if second is None else begin + second
-
-
-def _expect_sudden(sound: Float64[np.ndarray, " samples"], recording: Recording) -> None:
-    """Raise LocationError for a sound that neither rises nor falls: a hum, or noise."""
-    whole = recording.response() if len(recording.channels) == 1 else sound
-    size = max(64, math.ceil(0.01 * recording.sample_rate))
-    if len(whole) < 8 * size:
-        return
-    frames = whole[: len(whole) // size * size].reshape(-1, size)
-    levels = np.sqrt(np.mean((frames - frames.mean(axis=1, keepdims=True)) ** 2, axis=1))
-    loudest, quietest = float(levels.max()), float(np.quantile(levels, 0.1))
-    if loudest < _SUDDEN * quietest:
-        raise LocationError(
-            f"{recording.name} holds no blow: its loudest 10 ms stand {20 * math.log10(loudest / quietest):.1f} dB "
-            "above its quietest, expected 6 dB at least: record a single blow with quiet before or after it"
-        )

@@ -118,9 +118,7 @@ class MaterialStatistics:
         ratio = math.sqrt(new.young / old.young * old.density / new.density)
         points = field.gain_field.points
         rows = torch.linspace(0, len(points) - 1, min(len(points), _POINTS)).long()
-        known = field.known(points[rows])
-        each = known.mean if known.quadrature is None else torch.hypot(known.mean, known.quadrature)
-        size = each.square().mean(dim=0).sqrt()
+        size = field.known(points[rows]).power.mean(dim=0).sqrt()
         moved = ModalBank(field.bank.frequency * ratio, field.bank.damping)
         found = cls.of_modes([moved], [size], name=new.name)
         return cls(new.name, found.frequency, new.alpha, new.beta, found.brightness)

@@ -1,4 +1,4 @@
-"""What an edit of an object's modes is: its pitch and decay as a whole, a little for each mode, never for a place."""
+"""What an edit of an object's modes is: its pitch and damping as a whole, a little for each mode, never for a place."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -29,18 +29,18 @@ class ModalEdit:
     """log alpha, of all frequencies."""
     shift: Float64[Tensor, " modes"]
     """delta, of each mode's frequency beside it."""
-    decay: Float64[Tensor, ""]
+    damping: Float64[Tensor, ""]
     """log kappa, of all dampings."""
-    decay_shift: Float64[Tensor, " modes"]
+    damping_shift: Float64[Tensor, " modes"]
     """epsilon, of each mode's damping beside it."""
     scale: Float64[Tensor, " modes"]
     """log gamma, of each mode's gains."""
 
     @classmethod
-    def none(cls, bank: ModalBank, *, pitch: float = 0.0, decay: float = 0.0) -> "ModalEdit":
+    def none(cls, bank: ModalBank, *, pitch: float = 0.0, damping: float = 0.0) -> "ModalEdit":
         """Return what leaves a bank's modes as they are, but for the logarithms of the factors common to all."""
         zero = torch.zeros_like(bank.frequency)
-        return cls(zero.new_tensor(pitch), zero, zero.new_tensor(decay), zero, zero)
+        return cls(zero.new_tensor(pitch), zero, zero.new_tensor(damping), zero, zero)
 
     @property
     def pitch_factor(self) -> float:
@@ -48,9 +48,14 @@ class ModalEdit:
         return float(self.pitch.detach().exp())
 
     @property
-    def decay_factor(self) -> float:
+    def damping_factor(self) -> float:
         """What all dampings are multiplied by, their own shifts left out: kappa."""
-        return float(self.decay.detach().exp())
+        return float(self.damping.detach().exp())
+
+    @property
+    def decay_factor(self) -> float:
+        """What the times in which all modes die away are multiplied by, as `retune`'s `decay`: 1 / kappa."""
+        return 1.0 / self.damping_factor
 
     def to(self, device: torch.device | str) -> "ModalEdit":
         """Return the edit on a device."""
@@ -64,7 +69,7 @@ class ModalEdit:
         """Return the edited modes, in the order of the given ones."""
         return ModalBank(
             torch.exp(self.pitch + bank.frequency.log() + self.shift),
-            bank.damping * torch.exp(self.decay + self.decay_shift),
+            bank.damping * torch.exp(self.damping + self.damping_shift),
         )
 
     def of(self, field: SoundField, *, told: Mapping[str, Any] | None = None) -> SoundField:
@@ -150,11 +155,8 @@ class Struck:
 
     def energy(self) -> Float64[Tensor, " modes"]:
         """Return each unedited mode's energy over time, gain^2 / (4 d), as the mean over the contacts."""
-        power = self.known.mean.double().square()
-        if self.known.quadrature is not None:
-            power = power + self.known.quadrature.double().square()
         damping = self.bank.damping if self.known.damping is None else self.bank.damping * self.known.damping
-        return torch.where(self.audible(self.bank), (power / (4 * damping)).mean(dim=0), 0.0)
+        return torch.where(self.audible(self.bank), (self.known.power / (4 * damping)).mean(dim=0), 0.0)
 
     def loudest(self, count: int) -> Int[Tensor, " edited"]:
         """Return which modes are loudest, at most `count` of them, ascending."""

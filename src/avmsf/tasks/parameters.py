@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avmsf.tasks.modaledit import ModalEdit
 
-_QUANTITIES = ("pitch", "shift", "decay", "decay_shift", "scale")
+_QUANTITIES = ("pitch", "shift", "damping", "damping_shift", "scale")
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,11 @@ class Parameterisation:
     """What the edit's report calls it."""
     pitch_rate: float
     """Of the common factor on frequencies."""
-    decay_rate: float
+    damping_rate: float
     """Of the common factor on dampings."""
     shift_rate: float
     """Of each frequency."""
-    decay_shift_rate: float
+    damping_shift_rate: float
     """Of each damping."""
     scale_rate: float
     """Of each gain factor."""
@@ -37,7 +37,7 @@ class Parameterisation:
     """Strength of what holds single modes back."""
     shift_deviation: float = 0.05
     """How far a frequency goes by itself, logarithm: .05 is almost a semitone."""
-    decay_shift_deviation: float = 0.3
+    damping_shift_deviation: float = 0.3
     """How far a damping goes by itself."""
     scale_deviation: float = 1.0
     """How far a gain factor goes, the common level aside."""
@@ -46,7 +46,7 @@ class Parameterisation:
 
 
 HIERARCHICAL = Parameterisation("hierarchical", 0.02, 0.02, 0.003, 0.01, 0.02, 0.05)
-"""The paper's: one pitch and one decay take the object to another material, single modes refine."""
+"""The paper's: one pitch and one damping factor take the object to another material, single modes refine."""
 INDEPENDENT = Parameterisation("independent", 0.0, 0.0, 0.02, 0.02, 0.02, 0.0, searches=False)
 """The paper's baseline, after Audio-SDS: every frequency, damping and gain by itself, nothing in common.
 
@@ -90,7 +90,7 @@ class EditVariables:
         parameters, scale = self.parameters, self.values["scale"]
         parts = (
             self.values["shift"] / parameters.shift_deviation,
-            self.values["decay_shift"] / parameters.decay_shift_deviation,
+            self.values["damping_shift"] / parameters.damping_shift_deviation,
             (scale - scale.mean()) / parameters.scale_deviation,
         )
         return 0.5 * parameters.stiffness * torch.stack([part.square().mean() for part in parts]).sum()

@@ -1,6 +1,7 @@
 """Guides towards sounds that exist: recordings of another object, or sounds as a material makes them."""
 
 import hashlib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,13 +13,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.audio import read_recording
-from avmsf.capture.prepare import prepare
+from avmsf.capture.blow import clipping, expect_sudden
+from avmsf.capture.onset import find_second_blow
+from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
-from avmsf.errors import CaptureError, EditError
+from avmsf.errors import AvmsfWarning, CaptureError, EditError
 from avmsf.tasks.clips import lasting, levelled, resampled
 from avmsf.tasks.modaledit import ModalEdit, Struck
 from avmsf.tasks.startsearch import heard_spectrum, search_start
 
+_HELD = 0.9
+"""Part of half a recording's rate up to which it still holds all of a sound."""
 _FADE = 0.01
 """Seconds over which a reference that ends early hands over to the sound itself."""
 
@@ -57,8 +62,9 @@ class Reference:
     def read(cls, paths: str | Path | Sequence[str | Path], *, sample_rate: float) -> "Reference":
         """Read recordings of blows and bring them to the field's `sample_rate`, Hz; a folder stands for its wav files.
 
-        Each begins at its onset; of several channels the strongest is heard. Raises `EditError` for what is missing, no
-        sound file, silent, or shorter than 20 ms after the onset.
+        Each begins at its onset and ends at a second blow; of several channels the strongest is heard. Raises
+        `EditError` for what is missing, no sound file, silent, shorter than 20 ms after the onset, or never sudden
+        enough to hold a blow. Warns of a second blow, of clipping, and of a rate below the field's.
         """
         found = wav_files(paths)
         clips = [read_clip(path, sample_rate=sample_rate) for path in found]
@@ -110,16 +116,33 @@ def wav_files(paths: str | Path | Sequence[str | Path]) -> list[Path]:
 
 
 def read_clip(path: Path, *, sample_rate: float) -> Float[Tensor, " samples"]:
-    """Return a recorded blow from its onset on, float32 at `sample_rate` Hz, of its strongest channel.
+    """Return a recorded blow from its onset to the next, float32 at `sample_rate` Hz, of its strongest channel.
 
-    Raises `EditError` as `Reference.read`.
+    Warns and raises `EditError` as `Reference.read`.
     """
     try:
         recording = read_recording(path)
         strongest = int(np.argmax(np.var(recording.channels, axis=1)))
         mono = replace(recording, channels=recording.channels[strongest : strongest + 1])
-        sound = prepare(mono, CaptureSettings()).sound
+        prepared = prepare(mono, CaptureSettings())
+        expect_sudden(mono.response(), sample_rate=mono.sample_rate, name=mono.name)
     except CaptureError as error:
         raise EditError(f"the reference cannot be used: {error}") from error
+    sound, rate = prepared.sound, mono.sample_rate
+    notes = [clipping(mono.response(), name=mono.name)]
+    second = find_second_blow(sound, 0, sample_rate=rate, seconds=len(sound) / rate)
+    if second is not None:
+        notes.append(
+            f"{mono.name} holds more than one blow, at {prepared.onset / rate:.3f} s and at "
+            f"{(prepared.onset + second) / rate:.3f} s: only the first is taken; give the others in files of their own"
+        )
+        sound = sound[: max(second, shortest_allowed(rate))]
+    if rate < sample_rate:
+        notes.append(
+            f"{mono.name} is at {rate:g} Hz and holds sound up to {_HELD * 0.5 * rate:.4g} Hz: what the object has "
+            f"above that is led towards silence; record at {sample_rate:g} Hz"
+        )
+    for note in filter(None, notes):
+        warnings.warn(note, AvmsfWarning, stacklevel=2)
     clip = torch.from_numpy(np.ascontiguousarray(sound - sound.mean()))[None]
-    return resampled(clip, sample_rate=recording.sample_rate, wanted=sample_rate)[0].float()
+    return resampled(clip, sample_rate=rate, wanted=sample_rate)[0].float()

@@ -39,8 +39,7 @@ def retune(
     unless modes of a brightened field move by factors of their own. What was done is the last entry of
     `origin.report["edits"]`, with the modes that have moved to half the sample rate or above: they are silent, and come
     back with an edit that lowers them. Raises `EditError` for factors that are not positive, levels that are no
-    numbers, and another number of values than there are modes, and for
-    what makes a mode no number.
+    numbers, another number of values than there are modes, and what makes a mode no number.
     """
     factors = {name: _values(field, value, name) for name, value in (("pitch", pitch), ("decay", decay))}
     for name, values in factors.items():
@@ -73,9 +72,7 @@ def brightness_centre(field: SoundField, bank: ModalBank | None = None) -> float
     points = gains.points[:: max(1, math.ceil(len(gains.points) / _POINTS))]
     with torch.no_grad():
         known = gains.at(points)
-    power = known.mean.double().square().mean(0)
-    if known.quadrature is not None:
-        power = power + known.quadrature.double().square().mean(0)
+    power = known.power.mean(0)
     share = power / power.sum() if bool(power.any()) else torch.full_like(power, 1.0 / len(power))
     frequency = (field.bank if bank is None else bank).frequency
     return math.exp(float((share * frequency.log()).sum()))

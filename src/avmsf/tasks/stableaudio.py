@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from avmsf.errors import EditError
 from avmsf.tasks.clips import lasting
+from avmsf.tasks.distillation import expect_prompt
 from avmsf.tasks.stableaudiofiles import STABLE_AUDIO, digest, load_pipeline
 
 
@@ -46,14 +47,8 @@ class StableAudio:
             part.eval().requires_grad_(False)
         pipeline.set_progress_bar_config(disable=True)
         self._hop = int(pipeline.vae.hop_length)
-        longest = int(pipeline.transformer.config.sample_size)
-        asked = longest if seconds is None else math.ceil(seconds * self.sample_rate / self._hop)
-        if not 1 <= asked <= longest:
-            raise EditError(
-                f"seconds = {seconds:g}: expected more than 0 and at most "
-                f"{longest * self._hop / self.sample_rate:.4g}, which {name} was made for"
-            )
-        self._frames = asked
+        self._longest = int(pipeline.transformer.config.sample_size)
+        self._frames = self._longest if seconds is None else self._frames_of(seconds)
         self._reach = _reach(pipeline.vae.config.downsampling_ratios)
         self._silence: Float[Tensor, "1 dim 1"] | None = None
 
@@ -204,15 +199,31 @@ class StableAudio:
         steps: int = 100,
         guidance: float = 7.0,
     ) -> Float[Tensor, " samples"]:
-        """Return a sound made from words alone, mono at the model's rate, by the pipeline's own sampler."""
-        if not prompt.strip():
-            raise EditError('expected a prompt, found an empty one: describe the sound, such as "a wooden bowl is hit"')
+        """Return a sound made from words alone, mono at the model's rate, by the pipeline's own sampler.
+
+        Raises `EditError` for an empty prompt, more seconds than the model has, and where memory runs out.
+        """
+        words = expect_prompt(prompt)
+        self._frames_of(seconds)
+        try:
+            latents = self._sampled(words, seconds, seed, negative=negative, steps=steps, guidance=guidance)
+            return self.decode(latents, samples=round(seconds * self.sample_rate))[0].mean(dim=0).cpu()
+        except torch.OutOfMemoryError as error:
+            raise EditError(
+                f"{self.name} runs out of memory on {self.device} while it makes a sound: free memory there, or choose "
+                "the device cpu"
+            ) from error
+
+    def _sampled(
+        self, words: str, seconds: float, seed: int, *, negative: str | None, steps: int, guidance: float
+    ) -> Float[Tensor, "1 dim frames"]:
+        """Return the latents that the pipeline makes of words."""
         with warnings.catch_warnings():
             # Its schedule ends at 500 in float32, a last digit beyond what the sampler's noise was made for.
             warnings.filterwarnings("ignore", message="Should have t[ab]")
             # Latents, for the pipeline would give the autoencoder the denoiser's precision.
             latents: Tensor = self.pipeline(
-                prompt,
+                words,
                 audio_end_in_s=seconds,
                 negative_prompt=negative,
                 num_inference_steps=steps,
@@ -220,7 +231,16 @@ class StableAudio:
                 generator=torch.Generator().manual_seed(seed),
                 output_type="latent",
             ).audios
-        return self.decode(latents, samples=round(seconds * self.sample_rate))[0].mean(dim=0).cpu()
+        return latents
+
+    def _frames_of(self, seconds: float) -> int:
+        """Return how many frames hold a length of time. Raises `EditError` for more than the model has."""
+        longest = self._longest * self._hop / self.sample_rate
+        if not 0 < seconds <= longest:
+            raise EditError(
+                f"seconds = {seconds:g}: expected more than 0 and at most {longest:.4g}, which {self.name} was made for"
+            )
+        return math.ceil(seconds * self.sample_rate / self._hop)
 
     def _encoded(self, waveforms: Float[Tensor, "contacts channels samples"]) -> Float[Tensor, "contacts dim frames"]:
         with torch.no_grad():

@@ -1,9 +1,9 @@
-"""Where a descent towards a reference begins: the common pitch and decay, searched all over their range.
+"""Where a descent towards a reference begins: the common pitch and damping, searched all over their range.
 
 Modes are sparse: between one that is there and one that is wanted a third of an octave higher, a spectrum's L1 distance
 has no slope. So the pitch comes from optimal transport, which in one dimension is a match of quantiles: a common factor
 on all frequencies moves the quantiles of the spectrum along a logarithmic axis by one step, and the best of them is the
-mean or median difference of two spectra's. A grid over the smoothed spectra's overlap proposes one more. The decay is
+mean or median difference of two spectra's. A grid over the smoothed spectra's overlap proposes one more. The damping is
 searched on a grid for each proposal, and the loss that will be descended chooses. Only what a target says counts:
 beyond its end there is the rendered sound itself, and the longer that rang, the smaller a relative error would be.
 """
@@ -30,7 +30,7 @@ _WIDTH = 3.0
 """Standard deviation of the smoothing, in bands: an eighth of an octave."""
 _MOST = math.log(8.0)
 """How far the pitch may be moved."""
-_MOST_DECAY = math.log(64.0)
+_MOST_DAMPING = math.log(64.0)
 _STRUCK = 6
 """Contacts that the search listens to."""
 _FFT_SIZES = (2048, 1024, 512, 256)
@@ -56,21 +56,21 @@ def heard_spectrum(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, "
 
 
 def search_start(struck: Struck, wanted: Wanted) -> ModalEdit:
-    """Return the edit by a common pitch and decay alone, up to 8 and 64 times either way, of least spectral error."""
+    """Return the edit by a common pitch and damping alone, up to 8 and 64 times either way, of least spectral error."""
     struck = struck.first(_STRUCK)
     best = (math.inf, 0.0, 0.0)
     for pitch in _pitches(struck, wanted):
-        step, decay = _MOST_DECAY / 4, 0.0
+        step, damping = _MOST_DAMPING / 4, 0.0
         tried: dict[float, float] = {}
         # Nine places over the whole range, then three refinements about the best.
         around = [step * place for place in range(-4, 5)]
         for _ in range(4):
             for each in around:
                 tried.setdefault(round(each, 9), _error(struck, wanted, pitch, each))
-            decay, step = min(tried, key=lambda each: tried[each]), step / 2
-            around = [max(-_MOST_DECAY, decay - step), min(_MOST_DECAY, decay + step)]
-        best = min(best, (tried[decay], pitch, decay))
-    return ModalEdit.none(struck.bank, pitch=best[1], decay=best[2])
+            damping, step = min(tried, key=lambda each: tried[each]), step / 2
+            around = [max(-_MOST_DAMPING, damping - step), min(_MOST_DAMPING, damping + step)]
+        best = min(best, (tried[damping], pitch, damping))
+    return ModalEdit.none(struck.bank, pitch=best[1], damping=best[2])
 
 
 def _pitches(struck: Struck, wanted: Wanted) -> list[float]:
@@ -96,8 +96,8 @@ def _quantiles(spectrum: Float[Tensor, " bands"]) -> Float[Tensor, " quantiles"]
     return band.to(spectrum) * (math.log(2.0) / _PER_OCTAVE)
 
 
-def _error(struck: Struck, wanted: Wanted, pitch: float, decay: float) -> float:
-    sounds = struck.sounds(ModalEdit.none(struck.bank, pitch=pitch, decay=decay))
+def _error(struck: Struck, wanted: Wanted, pitch: float, damping: float) -> float:
+    sounds = struck.sounds(ModalEdit.none(struck.bank, pitch=pitch, damping=damping))
     if float(sounds.abs().max()) == 0.0:
         return math.inf
     sizes = [scaled_fft_size(size, sample_rate=struck.sample_rate) for size in _FFT_SIZES]

@@ -37,6 +37,11 @@ _LARGEST_SEED = 1 << 40
 class Guide(Protocol):
     """Knows what a field shall sound like."""
 
+    @property
+    def sample_rate(self) -> float:
+        """Of the sounds that it takes and returns, Hz."""
+        ...
+
     def describe(self) -> dict[str, Any]:
         """Return what tells it from other guides, as plain values: the edit's report and checkpoint keep it."""
         ...
@@ -105,7 +110,7 @@ class SteerProgress:
     pitch: float
     """Factor on all frequencies so far."""
     decay: float
-    """Factor on all dampings so far."""
+    """Factor on the times in which modes die away so far."""
     preview: Float[Tensor, " samples"] | None
     """The edited field's sound at one place, at the field's rate, every so many steps and at the end."""
 
@@ -127,7 +132,7 @@ def steer(
     edit: the sounds compared, and the field returned, have the level of the given one. Rendering and loss run on
     `device`. With `checkpoint`, the state is kept there while the edit runs, on interruption and at the end, and an
     edit of the same arguments goes on from it to the same result. Raises `EditError` for a field that is silent, for a
-    checkpoint of another edit, and where the guide's targets or the loss are no numbers.
+    guide at another rate, for a checkpoint of another edit, and where the guide's targets or the loss are no numbers.
     """
     config = SteerConfig() if config is None else config
     run = _Steering(field, guide, config, parameters, None if checkpoint is None else Path(checkpoint), device)
@@ -146,6 +151,11 @@ class _Steering:
         checkpoint: Path | None,
         device: torch.device | str,
     ) -> None:
+        if guide.sample_rate != field.sample_rate:
+            raise EditError(
+                f"a guide of sounds at {guide.sample_rate:g} Hz and a field at {field.sample_rate:g} Hz: make the "
+                f"guide with sample_rate = {field.sample_rate:g}, of sounds at that rate"
+            )
         self.field, self.guide, self.config, self.parameters = field, guide, config, parameters
         self.checkpoint, self.device, self.saved_at = checkpoint, torch.device(device), time.monotonic()
         points = field.gain_field.points
