@@ -10,9 +10,9 @@ from pathlib import Path
 from statistics import mean
 
 from avmsf.bench.editing import EditScore, judge, write_scores
-from avmsf.bench.editingobjects import SHAPES, STRANGERS, SolvedShape, drawn_size, simulated_objects
+from avmsf.bench.editingobjects import SHAPES, STRANGERS, KnownObject, SolvedShape, drawn_size, simulated_objects
 from avmsf.bench.editmethods import towards_reference
-from avmsf.bench.edittasks import SIMULATED_TRANSITIONS, EditTask
+from avmsf.bench.edittasks import SIMULATED_TRANSITIONS, EditTask, Transition
 from avmsf.bench.modefeatures import Pitches, PitchesAndRings
 from avmsf.bench.modespace import MaterialSpace, UmapSettings
 from avmsf.simulate.material import MATERIALS
@@ -76,21 +76,12 @@ def measure_editing(
     """Make the objects and their space, edit, and judge."""
     begun, resident = time.perf_counter(), _forget_peak()
     tell("editing: solving shapes")
-    labelled = simulated_objects(tuple(SolvedShape.of(kind, seed=11) for kind in kinds))
-    strangers = tuple(SolvedShape.of(kind, seed=12) for kind in STRANGERS)
-    spaces = {
-        name: MaterialSpace.of(
-            [each.bank for each in labelled],
-            [each.material for each in labelled],
-            names=[each.name for each in labelled],
-            features=features,
-            settings=UmapSettings(),
-        )
-        for name, features in (("pitches", Pitches()), ("rings", PitchesAndRings()))
-    }
+    labelled = labelled_objects(kinds)
+    strangers = strange_shapes()
+    spaces = spaces_of(labelled)
     tell(f"editing: {len(labelled)} labelled objects after {time.perf_counter() - begun:.0f} s")
     tasks = [
-        _task(strangers[seed % 2], strangers[1 - seed % 2], transition.source, transition.target, seed)
+        referred_task(strangers[seed % 2], strangers[1 - seed % 2], transition, seed=seed)
         for transition in SIMULATED_TRANSITIONS
         for seed in range(seeds)
     ]
@@ -101,12 +92,42 @@ def measure_editing(
     return _report(scores, spaces, time.perf_counter() - begun, peak_gigabytes() * 1e3 - resident)
 
 
-def _task(own: SolvedShape, other: SolvedShape, source: str, target: str, seed: int) -> EditTask:
+def labelled_objects(kinds: Sequence[str] = SHAPES) -> tuple[KnownObject, ...]:
+    """Return the objects that the clusters are made of, each shape in all materials."""
+    return simulated_objects(tuple(SolvedShape.of(kind, seed=11) for kind in kinds))
+
+
+def strange_shapes() -> tuple[SolvedShape, ...]:
+    """Return the two shapes that are edited and referred to."""
+    return tuple(SolvedShape.of(kind, seed=12) for kind in STRANGERS)
+
+
+def spaces_of(labelled: Sequence[KnownObject], *, seed: int = 0) -> dict[str, MaterialSpace]:
+    """Return where materials lie, by frequencies as in the paper and by frequencies and dampings."""
+    return {
+        name: MaterialSpace.of(
+            [each.bank for each in labelled],
+            [each.material for each in labelled],
+            names=[each.name for each in labelled],
+            features=features,
+            settings=UmapSettings(seed=seed),
+        )
+        for name, features in (("pitches", Pitches()), ("rings", PitchesAndRings()))
+    }
+
+
+def stranger(shape: SolvedShape, material: str, *, seed: int) -> KnownObject:
+    """Return a shape in a material and in a size of its own."""
+    return shape.struck(MATERIALS[material], size=drawn_size(shape.kind, material, seed=100 + seed))
+
+
+def referred_task(own: SolvedShape, other: SolvedShape, transition: Transition, *, seed: int) -> EditTask:
     """Return one object to edit, with recordings of another shape in the new material."""
-    edited = own.struck(MATERIALS[source], size=drawn_size(own.kind, source, seed=100 + seed))
-    heard = other.struck(MATERIALS[target], size=drawn_size(other.kind, target, seed=100 + seed)).impacts
-    reference = Reference.of(heard.sounds, sample_rate=heard.sample_rate, name=f"{other.kind} of {target}")
-    return EditTask(edited, target, reference=reference, seed=seed)
+    edited = stranger(own, transition.source, seed=seed)
+    heard = stranger(other, transition.target, seed=seed).impacts
+    name = f"{other.kind} of {transition.target}"
+    reference = Reference.of(heard.sounds, sample_rate=heard.sample_rate, name=name)
+    return EditTask(edited, transition.target, reference=reference, seed=seed)
 
 
 def _forget_peak() -> float:

@@ -26,6 +26,7 @@ from avmsf.bench.editmethods import Generation, Recast, Untouched, towards_refer
 from avmsf.bench.edittasks import (
     PROMPTS,
     RECORDED_TRANSITIONS,
+    SEVEN_TRANSITIONS,
     SIMULATED_TRANSITIONS,
     EditTask,
     Transition,
@@ -37,21 +38,25 @@ from avmsf.capture.datasets.dataset import DatasetReport, ObjectFacts
 from avmsf.capture.datasets.numbering import REALIMPACT_NAMES, material_in, number_of
 from avmsf.capture.datasets.realimpact import SELF_INTERSECTING
 from avmsf.capture.folder import Capture
-from avmsf.errors import EvaluationError
+from avmsf.errors import AvmsfWarning, EvaluationError
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.synthesis import synthesise
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
 from avmsf.simulate.material import GLASS, MATERIALS, STEEL, WOOD
+from avmsf.tasks.distillation import DistillationConfig
 from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT
 from avmsf.tasks.reference import Reference
+from avmsf.tasks.stableaudio import StableAudio
+from made_audio import save_audio
+from made_clap import save_clap
 from made_modes import sliding_plate
 from plate_field import plate_impacts
 
 # The benchmarks are no part of the package, and `python -m benchmarks` finds them from the repository's root alone.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import editing as benchmark
-from benchmarks import realimpact_editing
+from benchmarks import editingprotocol as protocol
 
 RATE = 16000.0
 QUICK = {"steps": 3, "contacts": 2, "fft_sizes": (512, 128)}
@@ -197,21 +202,26 @@ def test_recorded_objects_are_those_there_are():
         recorded_objects(Recorded("59_stand"))
 
 
+def leave_out_umap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Judge by plain distances: UMAP takes its time to compile."""
+    laid_out = MaterialSpace.of
+
+    def flat(*told, **more) -> MaterialSpace:
+        space = laid_out(*told, **more)
+        return replace(space, stored=np.zeros((len(space.vectors), 2), dtype=np.float32))
+
+    monkeypatch.setattr(MaterialSpace, "of", flat)
+    monkeypatch.setattr(MaterialSpace, "distance", MaterialSpace.plain_distance)
+
+
 def test_the_protocol_of_recorded_objects_runs_without_words(tmp_path, monkeypatch):
     names = [*_named("ceramic")[:1], *_named("wood")[:7]]
     made = tuple(replace(struck(REALIMPACT_26[name]), name=name) for name in names)
-    monkeypatch.setattr(realimpact_editing, "open_dataset", lambda folder: Recorded(*names))
-    monkeypatch.setattr(realimpact_editing, "recorded_objects", lambda dataset: made)
-    monkeypatch.setattr(realimpact_editing, "RECORDED_TRANSITIONS", RECORDED_TRANSITIONS[:1])
-    laid_out = MaterialSpace.of
-    # Without UMAP, which takes its time to compile.
-    monkeypatch.setattr(
-        MaterialSpace,
-        "of",
-        lambda *told, **more: replace(laid_out(*told, **more), stored=np.zeros((8, 2), dtype=np.float32)),
-    )
-    monkeypatch.setattr(MaterialSpace, "distance", MaterialSpace.plain_distance)
-    report = realimpact_editing.measure_recorded(tmp_path, steps=1, record=tmp_path / "scores.json")
+    monkeypatch.setattr(protocol, "open_dataset", lambda folder: Recorded(*names))
+    monkeypatch.setattr(protocol, "recorded_objects", lambda dataset: made)
+    monkeypatch.setattr(protocol, "RECORDED_TRANSITIONS", RECORDED_TRANSITIONS[:1])
+    leave_out_umap(monkeypatch)
+    report = protocol.measure(protocol.recorded_cast(tmp_path, words=False), steps=1, record=tmp_path / "scores.json")
     record = json.loads((tmp_path / "scores.json").read_text())
     assert {(each["object"], each["source"], each["target"]) for each in record["scores"]} == {
         (names[0], "ceramic", "wood")
@@ -219,9 +229,100 @@ def test_the_protocol_of_recorded_objects_runs_without_words(tmp_path, monkeypat
     assert {each["method"] for each in record["scores"]} == {"before", "unconstrained", "searched", "hierarchical"}
     assert report.figures["realimpact.spectral_before"] > report.figures["realimpact.spectral_hierarchical"] > 0
     assert "94_GlassGoblet" in report.conventions[1]
-    monkeypatch.setattr(realimpact_editing, "open_dataset", lambda folder: Recorded(*names[:3]))
+    monkeypatch.setattr(protocol, "open_dataset", lambda folder: Recorded(*names[:3]))
     with pytest.raises(EvaluationError, match="holds 3 of the 26 objects whose materials are known, expected at least"):
-        realimpact_editing.measure_recorded(tmp_path)
+        protocol.recorded_cast(tmp_path, words=False)
+
+
+@pytest.fixture
+def plates_alone(monkeypatch) -> None:
+    """Let the simulated protocol's shapes all be plates, and its sounds short."""
+    monkeypatch.setattr(SolvedShape, "of", classmethod(lambda cls, kind, *, seed: replace(plate(), kind=kind)))
+    struck = SolvedShape.struck
+    monkeypatch.setattr(
+        SolvedShape,
+        "struck",
+        lambda self, material, *, size: struck(self, material, size=size, sample_rate=RATE, seconds=0.1),
+    )
+    leave_out_umap(monkeypatch)
+
+
+def scored(record: Path) -> set[tuple[str, str, str]]:
+    """Return the method, the first material and the second of every score in a file."""
+    scores = json.loads(record.read_text(encoding="utf-8"))["scores"]
+    return {(each["method"], each["source"], each["target"]) for each in scores}
+
+
+def test_every_simulated_material_is_left_and_reached_once():
+    for end in ("source", "target"):
+        assert sorted(getattr(each, end) for each in SEVEN_TRANSITIONS) == sorted(MATERIALS)
+    assert set(SIMULATED_TRANSITIONS) <= {*SEVEN_TRANSITIONS}
+
+
+@pytest.mark.filterwarnings("ignore:`torch.nn.utils.weight_norm` is deprecated:FutureWarning")
+def test_the_protocol_of_words_runs_on_simulated_objects(plates_alone, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("diffusers", reason="needs pip install 'avmsf[text]'")
+    pytest.importorskip("transformers")
+    monkeypatch.setattr(protocol, "SEVEN_TRANSITIONS", SEVEN_TRANSITIONS[3:4])
+    generate = StableAudio.generate
+
+    def ringing(self, prompt, *, seconds, seed):
+        """Let what a random network says die away, for in its noise there are no modes."""
+        made = generate(self, prompt, seconds=seconds, seed=seed, steps=5)
+        return made * torch.exp(-40.0 * torch.arange(len(made)) / self.sample_rate)
+
+    monkeypatch.setattr(StableAudio, "generate", ringing)
+    save_clap(tmp_path / "clap")
+    model, record = save_audio(tmp_path / "tiny-audio"), tmp_path / "scores.json"
+    words = ["--simulated", "--model", str(model), "--clap", str(tmp_path / "clap"), "--generated", "0.5"]
+    assert protocol.main([*words, "--steps", "1", "--record", str(record)]) == 0
+    methods = ("before", "generation", "audio-sds", "hierarchical")
+    assert scored(record) == {(name, "steel", "plastic") for name in methods}
+    scores = json.loads(record.read_text(encoding="utf-8"))["scores"]
+    # Two strangers, two prompts.
+    assert [sum(each["method"] == name for each in scores) for name in methods] == [4] * 4
+    assert {each["prompt"] for each in scores} == {*PROMPTS["plastic"]}
+    figures = json.loads(capsys.readouterr().out.splitlines()[-1])
+    for name in methods:
+        assert figures[f"simulated.clap_{name}"] == pytest.approx(
+            np.mean([each["clap"] for each in scores if each["method"] == name])
+        )
+        assert math.isfinite(figures[f"simulated.umap_{name}"])
+    # Strangers make no cluster.
+    assert len(json.loads(record.read_text(encoding="utf-8"))["spaces"]["pitches"]["names"]) == 4 * 7
+
+
+def test_the_simulated_protocol_without_a_model_goes_by_recordings(plates_alone, tmp_path, monkeypatch):
+    monkeypatch.setattr(protocol, "SEVEN_TRANSITIONS", SEVEN_TRANSITIONS[5:6])
+    record = tmp_path / "scores.json"
+    assert protocol.main(["--simulated", "--steps", "1", "--record", str(record)]) == 0
+    methods = ("before", "unconstrained", "searched", "hierarchical", "physics")
+    assert scored(record) == {(name, "iron", "polycarbonate") for name in methods}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "expected the folder of a dataset or --simulated, one of the two"),
+        (["realimpact", "--simulated"], "expected the folder of a dataset or --simulated"),
+        (["--simulated", "--clap", "here"], "--clap, --model-seconds and --generated go with --model"),
+    ],
+)
+def test_options_of_the_protocol_that_make_no_sense(words, message, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        protocol.main(words)
+    assert message in capsys.readouterr().err
+
+
+def test_what_is_generated_without_modes_has_no_score(space):
+    class Silence(Generator):
+        def generate(self, prompt, *, seconds, seed):
+            return torch.zeros(8000)
+
+    task = EditTask(struck("ceramic"), "glass", prompt="glass")
+    with pytest.warns(AvmsfWarning, match="plate-ceramic towards glass, generation: .* is silent.* this has no score"):
+        scores = judge([task], (Untouched(), Generation(Silence())), {"flat": space})
+    assert [each.method for each in scores] == ["before"]
 
 
 def _named(material: str) -> list[str]:
@@ -229,7 +330,7 @@ def _named(material: str) -> list[str]:
 
 
 def test_every_transition_has_two_prompts_for_every_object():
-    for transition in (*RECORDED_TRANSITIONS, *SIMULATED_TRANSITIONS):
+    for transition in (*RECORDED_TRANSITIONS, *SIMULATED_TRANSITIONS, *SEVEN_TRANSITIONS):
         assert len(set(transition.prompts)) == 2
     tasks = prompted_tasks([struck("ceramic"), struck("glass")], SIMULATED_TRANSITIONS)
     assert [(task.object.name, task.target, task.prompt) for task in tasks] == [
@@ -321,7 +422,7 @@ def test_generated_sounds_are_judged_by_their_modes():
 
 def test_words_have_the_papers_methods(space, monkeypatch):
     assert [each.name for each in towards_words(Speaker())] == ["before", "audio-sds", "hierarchical"]
-    methods = towards_words(Generator(), {**QUICK, "steps": 1}, steps=1)
+    methods = towards_words(Generator(), {**QUICK, "steps": 1}, distillation=DistillationConfig(denoising=1))
     assert [each.name for each in methods] == ["before", "generation", "audio-sds", "hierarchical"]
     assert [each.parameters for each in methods[2:]] == [INDEPENDENT, HIERARCHICAL]
     heard = []

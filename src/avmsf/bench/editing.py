@@ -7,6 +7,7 @@ the reference's, and, towards words, by the CLAP score. All scores of the object
 
 import json
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from avmsf.bench.editmethods import Edited, EditMethod
 from avmsf.bench.edittasks import EditTask
 from avmsf.bench.metrics import default_fft_sizes
 from avmsf.bench.modespace import MaterialSpace
-from avmsf.errors import EvaluationError
+from avmsf.errors import AvmsfWarning, CaptureError, EvaluationError, ExtractionError
 from avmsf.files import write_whole
 from avmsf.modal.spectra import magnitude_stft
 from avmsf.tasks.clips import lasting, level
@@ -55,13 +56,24 @@ def judge(
     clap: Clap | None = None,
     progress: Callable[[EditScore], None] | None = None,
 ) -> tuple[EditScore, ...]:
-    """Return every method's scores in every task. An object's field is made beforehand and not counted as time."""
+    """Return every method's scores in every task. An object's field is made beforehand and not counted as time.
+
+    What a method makes that holds no blow or no modes has no score, and a warning says so: a model may make anything.
+    """
     scores = []
     for task in tasks:
         _ = task.object.sound_field
         for method in methods:
             begun = time.perf_counter()
-            made = method.edit(task)
+            try:
+                made = method.edit(task)
+            except (CaptureError, ExtractionError) as error:
+                warnings.warn(
+                    f"{task.object.name} towards {task.target}, {method.name}: {error}; this has no score",
+                    AvmsfWarning,
+                    stacklevel=2,
+                )
+                continue
             seconds = time.perf_counter() - begun
             said = None
             if clap is not None and task.prompt is not None:

@@ -17,6 +17,12 @@ PROMPTS: Mapping[str, tuple[str, str]] = {
     "glass": ("a single tap on a wine glass, clear and bright", "a glass bottle is struck once and rings"),
     "metal": ("a single strike on a metal object, ringing for long", "a hammer hits a metal pan once"),
     "steel": ("a single strike on a steel object, ringing for long", "a hammer hits a steel pipe once"),
+    "iron": ("a single strike on a cast iron object, heavy and ringing", "a hammer hits an iron skillet once"),
+    "plastic": ("a single knock on a plastic object, light and dull", "tapping a hollow plastic bowl with a stick"),
+    "polycarbonate": (
+        "a single knock on a hard polycarbonate object, short and dry",
+        "tapping a polycarbonate box with a stick",
+    ),
     "ceramic": ("a single tap on a ceramic cup, a short bright clink", "a porcelain bowl is struck once with a stick"),
 }
 """Two prompts for each target material. The paper has two a transition and prints none: these are ours."""
@@ -45,6 +51,10 @@ RECORDED_TRANSITIONS = (
 )
 """Contrasting pairs for the 26 objects. The paper shows the first two and calls the others contrastive: ours."""
 SIMULATED_TRANSITIONS = (Transition("ceramic", "wood"), Transition("glass", "steel"), Transition("wood", "glass"))
+"""Those that are measured towards recordings with several seeds."""
+_RING = ("ceramic", "wood", "glass", "steel", "plastic", "iron", "polycarbonate")
+SEVEN_TRANSITIONS = tuple(Transition(*pair) for pair in zip(_RING, (*_RING[1:], _RING[0]), strict=True))
+"""Every one of the seven simulated materials is left once and reached once, by a neighbour that it contrasts with."""
 
 
 @dataclass(frozen=True, eq=False)
