@@ -331,15 +331,16 @@ PARTS: dict[str, Callable[[LocatingOptions], Report]] = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure what the command line asks for, and print it."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.locating", description=__doc__)
-    parser.add_argument("parts", nargs="*", choices=list(PARTS), help="by itself sim20")
+    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=["sim20"], help="by itself sim20")
     parser.add_argument("--sim20", type=Path, help="the set as `avmsf simulate sim-20` makes it; made anew without it")
     parser.add_argument("--every", action="store_true", help="all twenty objects of the set in place of five")
     parser.add_argument("--network", action="store_true", help="the paper's network beside physics")
     parser.add_argument("--output", type=Path, help="folder for every strike's rows as JSON")
     parser.add_argument("--cache", type=Path, help="folder that keeps elastic modes")
     chosen = parser.parse_args(arguments)
-    parts = tuple(chosen.parts) or ("sim20",)
-    figures(LocatingOptions(parts, chosen.sim20, chosen.every, chosen.network, chosen.output, chosen.cache))
+    figures(
+        LocatingOptions(tuple(chosen.parts), chosen.sim20, chosen.every, chosen.network, chosen.output, chosen.cache)
+    )
 
 
 if __name__ == "__main__":
