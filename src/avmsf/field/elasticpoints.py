@@ -45,8 +45,8 @@ class ElasticPoints:
 
     @classmethod
     def _looked_up(cls, elastic: ElasticModes, points: Float[Tensor, "points 3"]) -> "ElasticPoints":
-        inward = -elastic.normals(points)
-        shapes = elastic.at(points)
+        shapes, normals = elastic.at_with_normals(points)
+        inward = -normals
         size = torch.einsum("pkd,pd->pk", shapes, inward).square().mean(0).sqrt()
         scaled = shapes / size.clamp_min(torch.finfo(torch.float64).tiny)[:, None]
         return cls(points.float(), inward.float(), scaled.float())

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import SimulationError
-from avmsf.simulate.closest import ClosestPoints
+from avmsf.simulate.closest import Closest, ClosestPoints
 from avmsf.simulate.eigen import lowest_vibrations, rigid_motions
 from avmsf.simulate.elements import SecondOrder, mass, stiffness
 from avmsf.simulate.material import Material
@@ -46,19 +46,18 @@ class ElasticModes:
 
     def at(self, places: Float[Tensor, "contacts 3"]) -> Float64[Tensor, "contacts modes 3"]:
         """Return the shapes where the surface is nearest to each place, interpolated as the elements do."""
-        rows, weights = self._interpolation(places)
-        # A node at a time: the shapes of all six at once would be six times the result.
-        total = torch.zeros(len(places), *self.shapes.shape[1:], dtype=torch.float64)
-        for node in range(6):
-            total += weights[:, node, None, None] * self.shapes[rows[:, node]]
-        return total
+        return self._shapes_in(self._nearest(places))
 
     def normals(self, places: Float[Tensor, "contacts 3"]) -> Float64[Tensor, "contacts 3"]:
         """Return the unit normals, out of the body, of the triangles nearest to each place."""
-        found = self._closest(places.double().numpy())
-        corners = self.nodes[self.triangles[torch.from_numpy(found.rows), :3]]
-        normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return normals / normals.norm(dim=1, keepdim=True)
+        return self._normals_of(self._nearest(places))
+
+    def at_with_normals(
+        self, places: Float[Tensor, "contacts 3"]
+    ) -> tuple[Float64[Tensor, "contacts modes 3"], Float64[Tensor, "contacts 3"]]:
+        """Return what `at` and `normals` do, for one search of the surface."""
+        found = self._nearest(places)
+        return self._shapes_in(found), self._normals_of(found)
 
     def gains(
         self, places: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"]
@@ -68,22 +67,36 @@ class ElasticModes:
         A blow of one newton-second along a unit vector gives a mode the velocity gain times shape. The response at
         one place to a blow at another is the product of the two gains, whichever of them is struck.
         """
-        rows, weights = self._interpolation(places)
+        rows, weights = self._interpolation(self._nearest(places))
         total = torch.zeros(len(places), len(self), dtype=torch.float64)
         for node in range(6):
             along = torch.einsum("cmd,cd->cm", self.shapes[rows[:, node]], directions.double())
             total += weights[:, node, None] * along
         return total
 
-    def _interpolation(
-        self, places: Float[Tensor, "contacts 3"]
-    ) -> tuple[Int[Tensor, "contacts 6"], Float64[Tensor, "contacts 6"]]:
-        """Return the nodes of the nearest triangle, and the second-order shape functions in the nearest point of it."""
+    def _nearest(self, places: Float[Tensor, "contacts 3"]) -> Closest:
+        """Return the nearest triangles, and the nearest points of them."""
         unfit = torch.nonzero(~torch.isfinite(places).all(dim=1)).flatten()
         if len(unfit):
             row = int(unfit[0])
             raise SimulationError(f"place {row} is {places[row].tolist()}: expected finite coordinates, in metres")
-        found = self._closest(places.double().numpy())
+        return self._closest(places.double().numpy())
+
+    def _shapes_in(self, found: Closest) -> Float64[Tensor, "contacts modes 3"]:
+        rows, weights = self._interpolation(found)
+        # A node at a time: the shapes of all six at once would be six times the result.
+        total = torch.zeros(len(rows), *self.shapes.shape[1:], dtype=torch.float64)
+        for node in range(6):
+            total += weights[:, node, None, None] * self.shapes[rows[:, node]]
+        return total
+
+    def _normals_of(self, found: Closest) -> Float64[Tensor, "contacts 3"]:
+        corners = self.nodes[self.triangles[torch.from_numpy(found.rows), :3]]
+        normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return normals / normals.norm(dim=1, keepdim=True)
+
+    def _interpolation(self, found: Closest) -> tuple[Int[Tensor, "contacts 6"], Float64[Tensor, "contacts 6"]]:
+        """Return the nodes of the nearest triangle, and the second-order shape functions in the nearest point of it."""
         corner = torch.from_numpy(found.weights)
         weights = torch.cat([corner * (2.0 * corner - 1.0), 4.0 * corner * corner.roll(-1, dims=1)], dim=1)
         return self.triangles[torch.from_numpy(found.rows)], weights
