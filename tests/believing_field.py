@@ -75,7 +75,7 @@ def physics_field(contacts: Tensor, values: Tensor, *, only: tuple[int, int, int
         weights = torch.zeros_like(regression.weights)
         weights[(width * 3 + remainder) * 6 + noise] = 1.0
         regression = Regression(sites, prior, values, floor, doubt, weights, 0.0)
-    return ModalBasis(surface, contacts, directions, ELASTIC, regression)
+    return ModalBasis(surface, contacts, directions, regression)
 
 
 def spline_field(contacts: Tensor, values: Tensor) -> ThinPlateGains:

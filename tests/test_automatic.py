@@ -243,3 +243,12 @@ def test_a_fit_chooses_unless_it_is_told_and_says_how():
     assert report["choice"]["errors"].keys() == {"spline"}
     assert report["choice"]["missing"].keys() == {"attention"}
     assert isinstance(field.gain_field, ThinPlateGains)
+
+
+def test_a_network_without_a_warm_up_is_not_judged_and_the_report_says_why():
+    things = made("stuffs")
+    case = replace(things.case(), config=replace(CONFIG, warmup_steps=0))
+    choice = Automatic((Attention(), ThinPlate())).choose(case)
+    assert choice.recipe.name == "spline"
+    assert choice.report["choice"]["errors"].keys() == {"spline"}
+    assert "not judged: warmup_steps is 0" in choice.report["choice"]["missing"]["attention"]

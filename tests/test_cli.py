@@ -252,6 +252,30 @@ def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys
     assert [each.name for each in path.parent.iterdir()] == ["plate.safetensors"]
 
 
+SHEET = ("--body.wall", "0.004", "--body.shapes", "8", "--body.freedoms", "1000")
+
+
+def test_fit_says_why_physics_took_no_part(capture: Path, tmp_path: Path, capsys: Streams) -> None:
+    fields = tmp_path / "fields"
+    assert main(["fit", str(capture), "--output", str(fields / "two"), "--train-count", "2", *SHEET, *TINY]) == 0
+    told = capsys.readouterr().out
+    assert "not by physics: physics needs 3 strikes or more" in told
+    assert "gains by spline" in told
+    folder = fill_plate(tmp_path / "plate")
+    header, *rows = [line.split(",") for line in (folder / "impacts.csv").read_text().splitlines()]
+    assert header[:4] == ["file", "x", "y", "z"]
+    rows = [[row[0], *rows[0][1:4], *row[4:]] for row in rows]
+    (folder / "impacts.csv").write_text("\n".join(",".join(row) for row in [header, *rows]))
+    assert main(["fit", str(folder), "--output", str(fields / "one"), "--json", *SHEET, *TINY]) == 0
+    out, err = capsys.readouterr()
+    missing = json.loads(out)["report"]["choice"]["missing"]
+    assert f"not by physics: {missing['physics']}" in err
+    assert "strikes lie within 0 m on an object of" in missing["physics"]
+    # Told to spread them by splines, it tried nothing else.
+    assert main(["fit", str(capture), "--output", str(fields / "told"), "--gains", "spline", *TINY]) == 0
+    assert "not by" not in capsys.readouterr().out
+
+
 def test_a_recipes_settings_hold_where_the_options_say_nothing() -> None:
     from avmsf.cli.fit import parse
 

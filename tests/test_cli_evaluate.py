@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from avmsf.bench.plan import Evaluation
 from avmsf.cli.evaluate import parse, run
 from avmsf.errors import AvmsfError
+from avmsf.pipeline.objectbodies import ObjectBodies
 from plate_set import fill_plates
 
 Streams = pytest.CaptureFixture[str]
@@ -93,3 +95,20 @@ def test_ctrl_c_keeps_what_is_there(
     kept = json.loads((tmp_path / "results" / "objects" / "a.json").read_text())
     assert [each["method"] for each in kept["outcomes"]] == ["knn3"]
     assert run(parse(words)) == 0
+
+
+def test_a_known_wall_is_handed_on(plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Evaluation] = []
+
+    def stop(evaluation: Evaluation, *objects: object, **settings: object) -> None:
+        asked.append(evaluation)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("avmsf.cli.evaluate.run_objects", stop)
+    words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results"), "--body.wall", "0"]
+    assert run(parse([*words, "--geometry", "noisy"])) == 130
+    bodies = asked[0].bodies
+    assert isinstance(bodies, ObjectBodies)
+    assert (bodies.config.wall, bodies.geometry) == (0.0, "noisy")
+    # Figures of another wall are not these.
+    assert asked[0].settings["body"]["wall"] == 0.0

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from avmsf.cli import suggest as command
 from avmsf.cli.suggest import parse, run
 from avmsf.errors import AvmsfError
 from avmsf.field.store import save
@@ -36,6 +37,11 @@ def test_the_list_to_walk_by_is_what_is_printed(field: Path, tmp_path: Path, cap
     errors = [printed["before"], *(each["error_after"] for each in printed["suggestions"])]
     assert errors == sorted(errors, reverse=True)
     assert (tmp_path / "next" / "suggested.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("value", "words"), [(-1e-9, "0.0000"), (-0.0, "0.0000"), (-0.00006, "-0.0001"), (3, "3")])
+def test_nothing_that_is_printed_is_minus_nought(value: float, words: str) -> None:
+    assert command._cell(value) == words
 
 
 def test_splines_say_no_direction(tmp_path: Path, capsys: Streams) -> None:

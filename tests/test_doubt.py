@@ -179,7 +179,7 @@ def test_strikes_that_are_doubted_do_not_widen_the_others_intervals() -> None:
     sites = sites_of(surface, contacts, DOWN.expand(12, 3))
     known = physics_field(contacts, values).regression
     regression = Regression.of(sites, known.prior, wrong, floor=known.floor, doubt=doubt)
-    gains = ModalBasis(surface, contacts, DOWN.expand(12, 3), torch.arange(6).double(), regression)
+    gains = ModalBasis(surface, contacts, DOWN.expand(12, 3), regression)
     assert left_out(sound_field(gains)).shape == (11, 4, 2)
     assert widening(sound_field(gains)) < 4.0
 
@@ -327,7 +327,7 @@ class Certain(ModalBasis):
     """The same means, without doubt."""
 
     def __init__(self, known: ModalBasis) -> None:
-        super().__init__(known.surface, known.contacts, known.directions, known.elastic, known.regression)
+        super().__init__(known.surface, known.contacts, known.directions, known.regression)
 
     def deviation(self, contacts: Tensor, directions: Tensor | None = None) -> Tensor:
         return torch.zeros(len(contacts), 4, 2)

@@ -9,10 +9,12 @@ import torch
 
 from avmsf.bench.cases import Choosing
 from avmsf.bench.efficiency import Growing, curves, draw_efficiency
+from avmsf.bench.plan import Evaluation
 from avmsf.bench.results import CaseRecord, ObjectRecord, Outcome
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.efficiency import parse, run
 from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.pipeline.objectbodies import ObjectBodies
 from plate_capture import fill_plate
 
 Streams = pytest.CaptureFixture[str]
@@ -121,3 +123,31 @@ def test_one_of_several_objects_has_to_be_named(tmp_path: Path) -> None:
     fill_plate(tmp_path / "set" / "b")
     with pytest.raises(AvmsfError, match="holds 2 objects; name one with --object"):
         run(parse([str(tmp_path / "set"), "--output", str(tmp_path / "results")]))
+
+
+def test_a_metric_that_is_not_drawn_is_refused_before_any_work(tmp_path: Path, capsys: Streams) -> None:
+    with pytest.raises(SystemExit) as ended:
+        parse([str(tmp_path), "--metric", "l2"])
+    assert ended.value.code == 2
+    assert "l1_log" in capsys.readouterr().err
+
+
+def test_the_papers_network_takes_part_and_a_known_wall_is_handed_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "field-positions" in parse(["plate"]).methods
+    asked: list[Evaluation] = []
+
+    def stop(evaluation: Evaluation, *objects: object, **settings: object) -> None:
+        asked.append(evaluation)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("avmsf.cli.efficiency.run_objects", stop)
+    capture = fill_plate(tmp_path / "plate")
+    words = [str(capture), "--counts", "2", "--output", str(tmp_path / "results"), "--body.wall", "0.004"]
+    assert run(parse(words)) == 130
+    bodies = asked[0].bodies
+    assert isinstance(bodies, ObjectBodies)
+    assert bodies.config.wall == 0.004
+    # Figures of another wall are not these.
+    assert asked[0].settings["body"]["wall"] == 0.004

@@ -246,3 +246,38 @@ def test_walls_whose_names_are_alike_are_refused_each():
     assert "0.2001" not in str(caught.value)
     found = nominal_bodies(sheet(), walls=[0.2, 0.2001, 0.004], count=4, freedoms=2000)
     assert list(found.refused) == [0.2, 0.2001]
+
+
+def test_modes_that_do_not_fit_into_the_memory_after_all_are_refused(monkeypatch: pytest.MonkeyPatch):
+    def fail(*solid: object, **settings: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(nominal, "elastic_modes", fail)
+    with pytest.raises(SimulationError, match=r"the modes of \d+ degrees of freedom do not fit .* as freedoms=1500"):
+        nominal_bodies(sheet(), walls=[0.004], freedoms=3000)
+
+
+def test_the_memory_is_asked_for_what_is_computed_and_for_nothing_that_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    walls, settings = [0.004, 0.006], {"count": 4, "freedoms": 80_000, "cache": tmp_path}
+    monkeypatch.setattr(nominal, "TRIAL", 2000)
+    # Enough for the few degrees of freedom that two bodies are compared with.
+    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 377e6)
+    found = nominal_bodies(sheet(), walls=walls, **settings)
+    assert [body.wall for body in found.bodies] == walls
+    monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 0.0)
+    again = nominal_bodies(sheet(), walls=walls, **settings)
+    assert torch.equal(again.bodies[1].elastic.shapes, found.bodies[1].elastic.shapes)
+    with pytest.raises(SimulationError, match=r"degrees of freedom take about .* 0 GB of memory are free"):
+        nominal_bodies(sheet(), walls=[0.005, 0.007], **settings)
+
+
+@pytest.mark.parametrize(
+    ("walls", "words"), [(None, "state its wall in metres if it has one$"), ([0.2], "state another wall, or none$")]
+)
+def test_what_helps_depends_on_who_stated_the_wall(walls: list[float] | None, words: str):
+    one = sheet()
+    apart = Surface(torch.cat([one.vertices, one.vertices + 1]), torch.cat([one.faces, one.faces + len(one.vertices)]))
+    with pytest.raises(SimulationError, match=f"no body can be made .*: mend the mesh, or {words}"):
+        nominal_bodies(apart if walls is None else sheet(), walls=walls, freedoms=1000)

@@ -47,6 +47,18 @@ def test_an_inverted_part_is_turned_and_the_wall_of_a_void_is_not():
     )
 
 
+@pytest.mark.parametrize(("below", "vessel"), [(0.05, True), (0.9, True), (-0.995, False)])
+def test_an_open_vessel_that_faces_inwards_is_told_and_stays(below: float, vessel: bool):
+    skin = cup(below)
+    outwards = Surface(torch.from_numpy(skin.points).float(), torch.from_numpy(skin.faces))
+    for surface, expected in ((outwards, False), (Surface(outwards.vertices, outwards.faces.flip(1)), vessel)):
+        told: list[str] = []
+        found = checked(surface, tell=told.append).skin
+        # A dish a twentieth as deep as its radius has no inside worth the name.
+        assert any("faces the inside of what it encloses" in words for words in told) == expected
+        assert (found.volume > 0) == (Skin.of(surface).volume > 0)
+
+
 def test_lids_are_measured_as_they_would_close_the_holes():
     half = CheckedSurface(cup(0.05))
     # The disc on a dome of height h on a ball of radius 1 is (2 - h) / (4 - h) of all.

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from avmsf.errors import FitError
 from avmsf.field.belief import beliefs
+from avmsf.field.doubt import gain_doubt, widening
 from avmsf.field.fit import gain_case
 from avmsf.field.hypotheses import NOISES, REMAINDERS, WIDTHS
 from avmsf.field.recipes import SHARED, Attention
@@ -211,3 +212,12 @@ def test_one_place_says_nothing_of_doubt() -> None:
     values = drawn_gains(bar_contacts(1), seed=6).expand(3, 4, 2)
     with pytest.raises(FitError, match="strike a second place"):
         suggest(sound_field(spline_field(contacts, values)))
+
+
+def test_errors_are_calibrated_as_the_map_of_doubt_is() -> None:
+    field = of_one_hypothesis()
+    found = suggest(field, 1)
+    # The map is relative to the energy of the mean gains, to which errors add what is not known.
+    doubt = float(gain_doubt(field, found.points.float()).square().mean())
+    assert abs(widening(field) / 1.645 - 1) > 0.05
+    assert found.before**2 == pytest.approx(doubt / (1 + doubt), rel=1e-3)

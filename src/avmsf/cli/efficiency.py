@@ -1,8 +1,9 @@
 """`avmsf efficiency`: how many strikes each method needs, as a picture and as figures."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -22,6 +23,7 @@ from avmsf.errors import EvaluationError
 from avmsf.modal.extract import HighResolution
 from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
+from avmsf.pipeline.physics import BodyConfig
 from avmsf.pipeline.scene import SceneConfig
 
 PICTURE, FIGURES = "efficiency.png", "efficiency.json"
@@ -47,8 +49,9 @@ class Options:
     """Numbers of strikes to learn from; 3, 4, 6, 8, 12, 16, ... as far as a quarter is left to judge by."""
     starts: int = 3
     """First contacts, spread evenly over the table."""
-    metric: str = "relative_stft"
-    """What is drawn: relative_stft, l1, l1_log or envelope."""
+    metric: Literal["relative_stft", "l1", "l1_log", "envelope"] = "relative_stft"
+    """What is drawn."""
+    body: BodyConfig = field(default_factory=BodyConfig)
     output: Path | None = None
     """Folder of results; evaluation/DATA/efficiency in the current folder where it is not given."""
     seed: int = 0
@@ -83,11 +86,11 @@ def run(options: Options) -> int:
         protocol,
         methods,
         ObjectLooks(dataset, folder / "features", scene),
-        ObjectBodies(dataset, folder / "features", scene=scene),
+        ObjectBodies(dataset, folder / "features", config=options.body, scene=scene),
         options.seed,
         Judging(cdpam=False),
         HighResolution(modes=options.modes),
-        {"scene": asdict(scene)},
+        {"scene": asdict(scene), "body": asdict(options.body)},
     )
     results = ResultsFolder(folder)
     say(f"{protocol.name} of {len(methods)} methods on {chosen}, results in {folder}")

@@ -1,7 +1,7 @@
 """`avmsf evaluate`: how good methods are on a dataset, as tables and as a page."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -26,6 +26,7 @@ from avmsf.errors import EvaluationError
 from avmsf.modal.extract import HighResolution
 from avmsf.pipeline.objectbodies import Geometry, ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
+from avmsf.pipeline.physics import BodyConfig
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig
 
@@ -66,6 +67,7 @@ class Options:
     geometry: Geometry = "mesh"
     """What physics knows of an object's shape: its mesh; the surface of Gaussians fitted to its views; noisy, its mesh
     with vertices displaced by 2 % of its size."""
+    body: BodyConfig = field(default_factory=BodyConfig)
     level: Literal["full-scale", "raw"] = "full-scale"
     """full-scale: an object's sounds by one factor that brings its loudest recording to a peak of one, so that figures
     of different objects can be averaged; raw: in the recordings' unit."""
@@ -107,11 +109,11 @@ def run(options: Options) -> int:
         protocol,
         methods,
         ObjectLooks(dataset, kept, scene),
-        ObjectBodies(dataset, kept, options.geometry, scene=scene),
+        ObjectBodies(dataset, kept, options.geometry, options.body, scene),
         options.seed,
         Judging(level=options.level, cdpam=options.cdpam, cdpam_contacts=options.cdpam_contacts),
         HighResolution(modes=options.modes),
-        {"scene": asdict(scene), "geometry": options.geometry},
+        {"scene": asdict(scene), "geometry": options.geometry, "body": asdict(options.body)},
     )
     results, groups = ResultsFolder(folder), members(dataset)
     say(f"{protocol.name} on {title}: {len(objects)} objects, {len(methods)} methods, results in {folder}")

@@ -1,9 +1,9 @@
 """`avmsf fit`: a capture folder in, a field file out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
@@ -12,7 +12,7 @@ from avmsf.bench.evaluation import split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.modes import Method, finder
-from avmsf.cli.printing import console, print_json, say
+from avmsf.cli.printing import console, figure, print_json, say
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scores import compare, score_table, score_values
 from avmsf.cli.writing import expect_writable
@@ -138,6 +138,10 @@ def run(options: Options) -> int:
         title = f"{len(test)} contacts not trained on, {len(train)} trained on; lower is better"
         say(f"not trained on: {', '.join(test.names)}")
         screen.print(score_table(title, scores))
+    report = fitted.origin.report
+    if "choice" in report:
+        for words in choice_words(report["gains"], report["choice"]):
+            screen.print(words, soft_wrap=True)
     for words in suspect_words(fitted):
         screen.print(words, soft_wrap=True)
     screen.print(summary(fitted, len(train)), soft_wrap=True)
@@ -153,7 +157,7 @@ def run(options: Options) -> int:
                 "sample_rate": fitted.sample_rate,
                 "trained_on": list(train.names),
                 "tested_on": [] if test is None else list(test.names),
-                "report": fitted.origin.report,
+                "report": report,
                 "scores": score_values(scores),
             }
         )
@@ -198,6 +202,14 @@ def part_contacts(
     if count is not None:
         return split(impacts, count=count, start=start)
     return impacts, None
+
+
+def choice_words(name: str, choice: Mapping[str, Any]) -> list[str]:
+    """Say how gains are spread, and why."""
+    errors, missing = choice.get("errors", {}), choice.get("missing", {})
+    told = ", ".join(f"{each} {figure(error)}" for each, error in errors.items())
+    words = [f"gains by {name}" + (f"; errors at training contacts left out in turn: {told}" if told else "")]
+    return words + [f"not by {each}: {reason}" for each, reason in missing.items()]
 
 
 def suspect_words(fitted: SoundField) -> list[str]:

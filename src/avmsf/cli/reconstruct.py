@@ -1,15 +1,15 @@
 """`avmsf reconstruct`: a capture folder with all that it shows and sounds like in, a field out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from avmsf.capture import read_capture
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.fit import part_contacts, recipe_of, summary, suspect_words
+from avmsf.cli.fit import choice_words, part_contacts, recipe_of, summary, suspect_words
 from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
@@ -149,14 +149,6 @@ def run(options: Options) -> int:
             }
         )
     return 0
-
-
-def choice_words(name: str, choice: Mapping[str, Any]) -> list[str]:
-    """Say how gains are spread, and why."""
-    errors, missing = choice.get("errors", {}), choice.get("missing", {})
-    told = ", ".join(f"{each} {figure(error)}" for each, error in errors.items())
-    words = [f"gains by {name}" + (f"; errors at training contacts left out in turn: {told}" if told else "")]
-    return words + [f"not by {each}: {reason}" for each, reason in missing.items()]
 
 
 def show_fit(progress: Progress, scene_bar: SceneBar, fit_bar: FitBar) -> None:

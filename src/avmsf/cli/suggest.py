@@ -74,7 +74,11 @@ def run(options: Options) -> int:
     screen.print(
         table(title, columns, [[_cell(value) for value in row.values()] for row in rows], words=1 + bool(names))
     )
-    screen.print("error: relative to the energy of the gains, 0 = certain, 1 = as wrong as silence")
+    screen.print(
+        "error: relative to the energy of the gains, 0 = certain, 1 = as wrong as silence; as large as strikes "
+        "left out in turn show it to be",
+        soft_wrap=True,
+    )
     if found.directions is not None:
         screen.print("nx, ny, nz: the way the hammer moves, straight into the surface")
     if paths:
@@ -111,7 +115,8 @@ def _rows(found: Suggestions, names: Sequence[str] | None) -> list[dict[str, Any
 
 
 def _cell(value: Any) -> str:
-    return f"{value:.4f}" if isinstance(value, float) else str(value)
+    # What rounds to zero from below would have a sign.
+    return f"{round(value, 4) + 0.0:.4f}" if isinstance(value, float) else str(value)
 
 
 def _list(rows: Sequence[dict[str, Any]]) -> str:

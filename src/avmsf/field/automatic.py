@@ -75,9 +75,11 @@ class Automatic:
     def _error(self, recipe: GainRecipe, case: GainCase, *, least: float) -> float:
         """Return a recipe's mean error at contacts left out in turn; no error is relative to a silent recording.
 
-        Raises FitError for an error that is not finite, and as soon as what is left out could be foretold without any
-        error and the mean would still be larger than `least`.
+        Raises FitError for a network without a warm-up, for an error that is not finite, and as soon as what is left
+        out could be foretold without any error and the mean would still be larger than `least`.
         """
+        if recipe.warms_up and not case.config.warmup_steps:
+            raise FitError("not judged: warmup_steps is 0, so its gains would be judged before they are learnt")
         heard = case.train.sounds.abs().amax(1) > 0
         order = farthest_points(case.train.contacts, len(case.train)).tolist()
         parts = [order[first::FOLDS] for first in range(min(FOLDS, len(order)))]
@@ -102,7 +104,7 @@ def _errors(recipe: GainRecipe, case: GainCase, learnt: list[int], held: list[in
     """Return the relative STFT errors at the contacts held out."""
     part, config = case.take(learnt), case.config
     gains = recipe.start(part, SHARED)
-    if recipe.warms_up and config.warmup_steps:
+    if recipe.warms_up:
         run = TrainingRun(
             gains,
             part.modes,

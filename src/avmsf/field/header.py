@@ -1,6 +1,6 @@
 """All of a sound field that is no tensor, as the JSON in its file's header.
 
-{"format": 4, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
+{"format": 6, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
  "sizes": {"modes": 43, "bins": 1025},
  "gain_field": {"kind": "attention", what the gain field says of itself},
  "config": {FitConfig}, "origin": {"capture": "bowl", "trained_on": [...], "per_newton": true, "report": {...}}}
@@ -18,7 +18,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.records import count_of, like, record_of
 from avmsf.field.soundfield import Origin, SoundField
 
-FORMAT = 5
+FORMAT = 6
 """Number of this format; it grows with every change that older versions could not read."""
 
 

@@ -12,14 +12,13 @@ from avmsf.field.doubtedgains import Belief
 from avmsf.field.elasticpoints import ElasticPoints
 from avmsf.field.evidence import Regression
 from avmsf.field.gainfield import Gains
-from avmsf.field.hypotheses import NOISES, REMAINDERS, WIDTHS, Sites, nearness
+from avmsf.field.hypotheses import COUNT, WIDTHS, Sites, nearness
 from avmsf.field.records import count_of, like
 
 REACH = 0.15
 """Length of the remainder's kernel over the object's size, the diagonal of the box around it."""
 _UNHEARD = 1e8
 """Factor on the noise's variance of contacts that shall say nothing."""
-_HYPOTHESES = len(WIDTHS) * len(REMAINDERS) * len(NOISES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +31,6 @@ class ModalBasis:
     """Where the gains are known, metres."""
     directions: Float64[Tensor, "contacts 3"]
     """Unit vectors along which the contacts were struck."""
-    elastic: Float64[Tensor, " shapes"]
-    """Frequencies of the elastic shapes, scaled to the measured ones, Hz."""
     regression: Regression
     """What the gains at the contacts say of each mode."""
     report: dict[str, Any] = field(default_factory=dict)
@@ -154,7 +151,7 @@ class ModalBasis:
             "shapes": self.surface.shapes.shape[1],
             "contacts": contacts,
             "modes": modes,
-            "hypotheses": _HYPOTHESES,
+            "hypotheses": COUNT,
         }
 
     def tensors(self) -> dict[str, Tensor]:
@@ -166,7 +163,6 @@ class ModalBasis:
             "shapes": self.surface.shapes,
             "contacts": self.contacts,
             "directions": self.directions,
-            "elastic": self.elastic,
             "prior": known.prior,
             "values": known.values,
             "measured": known.values if self.measured is None else self.measured,
@@ -181,18 +177,17 @@ class ModalBasis:
         points, shapes, contacts, modes = (
             count_of(record[name], name) for name in ("points", "shapes", "contacts", "modes")
         )
-        if like(record["hypotheses"], 1, "hypotheses") != _HYPOTHESES:
-            raise ValueError(f"hypotheses is {record['hypotheses']}, not {_HYPOTHESES}")
+        if like(record["hypotheses"], 1, "hypotheses") != COUNT:
+            raise ValueError(f"hypotheses is {record['hypotheses']}, not {COUNT}")
         sizes: dict[str, tuple[int, ...]] = {
             "contacts": (contacts, 3),
             "directions": (contacts, 3),
-            "elastic": (shapes,),
             "prior": (modes, len(WIDTHS), shapes),
             "values": (contacts, modes, 2),
             "measured": (contacts, modes, 2),
             "floor": (contacts, modes),
             "doubt": (contacts,),
-            "weights": (_HYPOTHESES, modes, 2),
+            "weights": (COUNT, modes, 2),
         }
         named = {name: torch.empty(size, dtype=torch.float64, device="meta") for name, size in sizes.items()}
         named |= {name: torch.empty(points, 3, device="meta") for name in ("points", "inward")}
@@ -213,7 +208,7 @@ class ModalBasis:
             tensors["weights"],
             evidence=0.0,
         )
-        return cls(surface, contacts, directions, tensors["elastic"], regression, measured=tensors["measured"])
+        return cls(surface, contacts, directions, regression, measured=tensors["measured"])
 
     def _remainder(
         self, contacts: Float64[Tensor, "contacts 3"], directions: Float64[Tensor, "contacts 3"]
@@ -241,7 +236,7 @@ def fit_modal_basis(
     sites = sites_of(surface, contacts.double(), used)
     trust = torch.ones(len(contacts), dtype=torch.float64) if doubt is None else doubt
     regression = Regression.of(sites, nearness(frequency, elastic), values, floor=floor, doubt=trust)
-    return ModalBasis(surface, contacts.double(), used, elastic, regression)
+    return ModalBasis(surface, contacts.double(), used, regression)
 
 
 def sites_of(

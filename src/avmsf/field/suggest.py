@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from avmsf.errors import FitError
 from avmsf.field.belief import beliefs, energy_of, expect_doubt, parts_of
+from avmsf.field.doubt import LEVEL, widening
 from avmsf.field.doubtedgains import Belief, DoubtedGains
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.points import farthest_points
@@ -29,7 +31,8 @@ class Suggestions:
     """Where to strike next, in this order, and what that is expected to bring.
 
     Errors are relative: the square root of the expected squared error of the gains, as energy, over the energy that is
-    expected on the mean over the surface. 0 is certainty, 1 as wrong as silence.
+    expected on the mean over the surface. 0 is certainty, 1 as wrong as silence. They are calibrated as `widening`, by
+    how well the contacts that have been struck foretell one another.
     """
 
     contacts: Float64[Tensor, "contacts 3"]
@@ -87,7 +90,9 @@ def suggest(
     places = points if candidates is None else torch.cat([points, chosen_from])
     ways = _ways(gains, points, along, candidates is None)
     ledger = _Ledger(beliefs(field, places, ways), len(points), len(chosen_from))
-    energy = float(energy_of(field, parts_of(field, points.float())).mean()) + float(ledger.open.mean())
+    # Contacts that foretell one another perfectly leave nothing open.
+    calibration = max((widening(field) / NormalDist().inv_cdf(0.5 + LEVEL / 2.0)) ** 2, torch.finfo(torch.float64).tiny)
+    energy = float(energy_of(field, parts_of(field, points.float())).mean()) / calibration + float(ledger.open.mean())
     before, rows, after = ledger.open, [], []
     for _ in range(count):
         row = int(torch.where(allowed, ledger.worth(), -math.inf).argmax())

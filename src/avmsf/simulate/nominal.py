@@ -27,7 +27,7 @@ WALLS = tuple(float(part) for part in np.geomspace(0.003, 0.05, 6))
 """Thickness of walls that are tried, over the diagonal of the box around the surface."""
 TRIAL = 12_000
 """Degrees of freedom at most of each of several bodies."""
-_FORMAT = 1
+_FORMAT = 2
 """Number of the way in which bodies are made; kept files of another are not read."""
 
 
@@ -72,9 +72,10 @@ def nominal_bodies(
     `walls` states what to try: thicknesses in metres, None for what the surface encloses. By itself it tries that,
     and walls of `WALLS` times the surface's size where the surface is a sheet or holds much more than the wall would.
     Where one body is left, it has about `freedoms` degrees of freedom, at most a fifth more; of several each has at
-    most `TRIAL`, enough to choose by, and `refined` makes the chosen one fine. Noisy and inverted surfaces are mended,
-    and `tell` hears of it. Modes are kept by content in the folder `cache`, for filling by tetrahedra comes out a
-    little different each time; a damaged file is made again.
+    most `TRIAL`, enough to choose by, and `refined` makes the chosen one fine. Dense, noisy and inverted surfaces are
+    mended, and `tell` hears of it; the wall of an open one lies behind its triangles, whichever way they face. Modes
+    are kept by content in the folder `cache`, for filling by tetrahedra comes out a little different each time; a
+    damaged file is made again.
 
     Raises SimulationError for a surface of points, for what does not fit into memory, and where no body can be had,
     with the reason for each.
@@ -82,7 +83,6 @@ def nominal_bodies(
     told = tell or (lambda words: None)
     maker = _Maker(surface, count, cache, told)
     _expect_settings(count, freedoms, walls)
-    expect_memory(freedoms)
     guessed = walls is None
     wanted: list[float | None] = list(_guesses(maker.checked)) if walls is None else list(dict.fromkeys(walls))
     refused: dict[float | None, str] = {}
@@ -104,10 +104,8 @@ def nominal_bodies(
     for reason in reasons:
         told(f"not {reason}")
     if not bodies:
-        raise SimulationError(
-            f"no body can be made of this surface ({'; '.join(reasons)}): mend the mesh, or state its wall in metres "
-            "if it has one"
-        )
+        other = "state its wall in metres if it has one" if guessed else "state another wall, or none"
+        raise SimulationError(f"no body can be made of this surface ({'; '.join(reasons)}): mend the mesh, or {other}")
     if len(bodies) == 1 and not bodies[0].fine:
         bodies = [refined(surface, bodies[0], freedoms=freedoms, cache=cache, tell=tell)]
     return NominalBodies(tuple(bodies), MappingProxyType(refused))
@@ -131,7 +129,6 @@ def refined(
     told = tell or (lambda words: None)
     _expect_settings(len(body.elastic), freedoms, [body.wall])
     try:
-        expect_memory(freedoms)
         return _Maker(surface, len(body.elastic), cache, told).body(body.wall, freedoms, fine=True)
     except SimulationError as error:
         told(f"{body.name} stays coarse: {error}")
@@ -168,6 +165,7 @@ class _Maker:
                 return load_modes(kept)
             except SimulationError as error:
                 self._tell(f"computing again what cannot be read ({error})")
+        expect_memory(freedoms)
         self._tell(f"tetrahedra of the body, {body_name(wall)}")
         solid = self._solid(wall, freedoms)
         size = freedoms_of(solid)

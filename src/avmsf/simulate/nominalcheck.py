@@ -11,12 +11,16 @@ from jaxtyping import Float64, Int
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.simulate.nominalsmooth import denoised, roughness
+from avmsf.simulate.nominalthin import thinned
 from avmsf.simulate.skin import Skin
 
 _LIDS = 0.25
 """Part of the closed surface that lids over holes may make up, as `fill` has it."""
 _LOOSE = 0.1
 """Part of the area that may lie in loose bits, which a wall leaves out."""
+_VESSEL = 0.03
+"""Volume that an open surface holds, lids closing it, over its area to the power of 1.5, from which on it has an
+inside: that of a dish a tenth as deep as its radius; a hemisphere has .13."""
 _HOLLOW = 1.0 / 6.0
 """Thickness of a wall over the mean thickness of what a closed surface holds, beyond which no wall is guessed."""
 
@@ -51,9 +55,7 @@ class CheckedSurface:
         """Twice the volume over the area, metres: of a thin wall, its thickness; None for a sheet, which holds none."""
         if self.lids > _LIDS:
             return None
-        lids = _lids(self.skin)
-        volume = self.skin.volume + float((np.cross(lids[:, 0], lids[:, 1]) * lids[:, 2]).sum() / 6.0)
-        return 2.0 * abs(volume) / float(self.skin.areas.sum())
+        return 2.0 * abs(_held(self.skin)) / float(self.skin.areas.sum())
 
     def expect_filling(self) -> None:
         """Raise SimulationError where the surface is too open to be filled."""
@@ -84,15 +86,16 @@ class CheckedSurface:
                 f"the mesh has {len(areas)} parts that share no vertex ({told}{', ...' if len(areas) > 4 else ''} "
                 "cm2), and a wall follows one: join them, or give one of them"
             )
-        return part_of(self.skin, self.parts == 0).oriented()
+        return Skin.compact(self.skin.points, self.skin.faces[self.parts == 0]).oriented()
 
 
 def checked(surface: Surface, *, tell: Callable[[str], None]) -> CheckedSurface:
     """Return a surface with inverted parts turned and noise taken out, and tell what was done and what is missing.
 
-    Raises SimulationError for points without triangles, damaged triangles and a mesh without area.
+    A mesh of very many triangles is thinned first. Raises SimulationError for points without triangles, damaged
+    triangles and a mesh without area.
     """
-    skin, turned = _turned(Skin.of(surface))
+    skin, turned = _turned(thinned(Skin.of(surface), tell=tell))
     if turned:
         tell(f"the mesh faced inwards: {turned} of its {len(skin.faces)} triangles were turned")
     before = roughness(skin)
@@ -104,15 +107,15 @@ def checked(surface: Surface, *, tell: Callable[[str], None]) -> CheckedSurface:
         )
     result = CheckedSurface(skin)
     if skin.open_edges:
+        # No mistake that could be undone: what was seen from inside alone faces inwards, and its wall lies outside.
+        if _held(skin) < -_VESSEL * float(skin.areas.sum()) ** 1.5:
+            tell(
+                "the mesh is open and faces the inside of what it encloses: a wall lies outside of it; turn its "
+                "triangles if the wall lies inside"
+            )
         helps = "closing them by lids is tried" if result.lids <= _LIDS else "a wall turns it into a body"
         tell(f"{skin.open_edges} of the mesh's edges are open: {helps}")
     return result
-
-
-def part_of(skin: Skin, chosen: np.ndarray) -> Skin:
-    """Return a skin with the chosen triangles alone."""
-    used, rows = np.unique(skin.faces[chosen], return_inverse=True)
-    return Skin(skin.points[used], rows.reshape(-1, 3))
 
 
 def _turned(skin: Skin) -> tuple[Skin, int]:
@@ -121,7 +124,7 @@ def _turned(skin: Skin) -> tuple[Skin, int]:
     A part inside the box around another may be a void, which faces inwards; it goes with the part around it.
     """
     number = _parts(skin)
-    parts = [part_of(skin, number == part) for part in range(int(number.max()) + 1)]
+    parts = [Skin.compact(skin.points, skin.faces[number == part]) for part in range(int(number.max()) + 1)]
     lowest, highest = (np.array([edge(part.points, axis=0) for part in parts]) for edge in (np.min, np.max))
     turns = np.zeros(len(parts), dtype=bool)
     for part, each in enumerate(parts):
@@ -146,11 +149,15 @@ def _parts(skin: Skin) -> Int[np.ndarray, " faces"]:
     return rank[label]
 
 
+def _held(skin: Skin) -> float:
+    """Return the volume inside a skin whose holes have straight lids, cubic metres; less than 0 where it faces in."""
+    lids = _lids(skin)
+    return skin.volume + float((np.cross(lids[:, 0], lids[:, 1]) * lids[:, 2]).sum() / 6.0)
+
+
 def _lids(skin: Skin) -> Float64[np.ndarray, "lids 3 3"]:
     """Return triangles from the open edges to the middle of the rim that they are of, facing as the skin does."""
-    sides = skin.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    _, which, count = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
-    rim = sides[count[which.ravel()] == 1]
+    rim = skin.rim
     if not len(rim):
         return np.zeros((0, 3, 3))
     used, ends = np.unique(rim, return_inverse=True)

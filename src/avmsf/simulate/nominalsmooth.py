@@ -32,8 +32,9 @@ def roughness(skin: Skin) -> float:
     corners = skin.points[skin.faces]
     normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     ends = np.sort(skin.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    _, which, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(which.ravel(), kind="stable")
+    names = ends[:, 0] * len(skin.points) + ends[:, 1]
+    _, which, count = np.unique(names, return_inverse=True, return_counts=True)
+    order = np.argsort(which, kind="stable")
     starts = np.concatenate([[0], np.cumsum(count)])[:-1][count == 2]
     if not len(starts):
         return 0.0
@@ -75,14 +76,36 @@ def denoised(skin: Skin) -> tuple[Skin, float]:
     return smoothed, float(np.sqrt(((smoothed.points - skin.points) ** 2).sum(axis=1).mean()))
 
 
+def averaged(skin: Skin, rounds: int) -> Skin:
+    """Return a skin whose points were moved, so many times, to the mean of themselves and their neighbours.
+
+    The volume of a closed one stays.
+    """
+    step = _averaging(_joined(skin) + scipy.sparse.eye_array(len(skin.points)))
+    points = skin.points
+    for _ in range(rounds):
+        points = step @ points
+    return _as_large(Skin(points, skin.faces), skin)
+
+
 def _bending(skin: Skin) -> scipy.sparse.csc_array:
     """Return the squared difference of each point from the mean of its neighbours, as a matrix."""
+    difference = scipy.sparse.eye_array(len(skin.points)) - _averaging(_joined(skin))
+    return (difference.T @ difference).tocsc()
+
+
+def _averaging(joined: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
+    """Return what takes the mean over the points that each is joined to."""
+    return scipy.sparse.diags_array(1.0 / joined.sum(axis=1)) @ joined
+
+
+def _joined(skin: Skin) -> scipy.sparse.csr_array:
+    """Return 1 for points that share an edge."""
     count = len(skin.points)
     ends = skin.faces[:, [[0, 1], [1, 2], [2, 0], [1, 0], [2, 1], [0, 2]]].reshape(-1, 2)
     joined = scipy.sparse.csr_array((np.ones(len(ends)), ends.T), shape=(count, count))
     joined.data[:] = 1.0
-    difference = scipy.sparse.eye_array(count) - scipy.sparse.diags_array(1.0 / joined.sum(axis=1)) @ joined
-    return (difference.T @ difference).tocsc()
+    return joined
 
 
 def _as_large(smoothed: Skin, skin: Skin) -> Skin:

@@ -61,11 +61,10 @@ def filled_solid(checked: CheckedSurface, freedoms: int) -> Solid:
     Raises SimulationError as `fill` does, for sheets, and where no detail comes near enough.
     """
     checked.expect_filling()
-    skin = checked.skin
+    prepared = Coarsening(checked.skin)
 
     def filled(detail: float) -> Solid:
-        prepared = skin.coarsened(_PREPARED * detail * skin.size, turn=_TURN)
-        return fill(_surface(prepared), detail=detail)
+        return fill(_surface(prepared(_PREPARED * detail * checked.skin.size)), detail=detail)
 
     return _near(filled, freedoms, first=_filling_detail(checked, freedoms))
 
@@ -94,6 +93,19 @@ def wall_solids(checked: CheckedSurface, freedoms: int) -> Callable[[float], Sol
         return _near(made, freedoms, first=length / skin.size)
 
     return walled
+
+
+class Coarsening:
+    """A skin made coarser, from the last coarser one where that is finer than wanted: most of the work is done then."""
+
+    def __init__(self, skin: Skin) -> None:
+        self._skin, self._last, self._shortest = skin, skin, 0.0
+
+    def __call__(self, shortest: float) -> Skin:
+        """Return the skin with few edges shorter than `shortest` metres."""
+        start = self._last if self._shortest <= shortest else self._skin
+        self._last, self._shortest = start.coarsened(shortest, turn=_TURN), shortest
+        return self._last
 
 
 def _near(make: Callable[[float], Solid], freedoms: int, *, first: float) -> Solid:

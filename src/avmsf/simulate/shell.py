@@ -89,9 +89,7 @@ def _folded_part(skin: Skin, thickness: float) -> float:
 
 def _both_sides(skin: Skin, thickness: float) -> Surface:
     """Return the closed surface of a wall: the skin, its like inside turned round, and strips along the rims."""
-    sides = skin.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    _, which, count = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
-    start, end = sides[count[which.ravel()] == 1].T
+    start, end = skin.rim.T
     inner = len(skin.points)
     strips = [np.stack([end, start, start + inner], axis=1), np.stack([end, start + inner, end + inner], axis=1)]
     faces = np.concatenate([skin.faces, skin.faces[:, ::-1] + inner, *strips])

@@ -39,10 +39,30 @@ class Skin:
         return float((np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2]).sum() / 6.0)
 
     @property
+    def rim(self) -> Int[np.ndarray, "edges 2"]:
+        """Edges with a triangle on one side only: rows of `points`, in the order in which that triangle has them."""
+        sides, triangles = self._sides
+        return sides[triangles == 1]
+
+    @property
     def open_edges(self) -> int:
         """Edges that have a triangle on one side only."""
-        ends = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        return int((np.unique(ends, axis=0, return_counts=True)[1] == 1).sum())
+        return len(self.rim)
+
+    @property
+    def crowded_edges(self) -> int:
+        """Edges that more than two triangles share."""
+        sides, triangles = self._sides
+        return len(np.unique(np.sort(sides[triangles > 2], axis=1), axis=0))
+
+    @property
+    def _sides(self) -> tuple[Int[np.ndarray, "sides 2"], Int[np.ndarray, " sides"]]:
+        """The three sides of each triangle, and how many triangles share each."""
+        sides = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        # Sorting numbers is ten times as quick as sorting pairs.
+        names = sides.min(axis=1) * len(self.points) + sides.max(axis=1)
+        _, which, count = np.unique(names, return_inverse=True, return_counts=True)
+        return sides, count[which]
 
     @property
     def normals(self) -> Float64[np.ndarray, "points 3"]:
@@ -82,7 +102,7 @@ class Skin:
             raise SimulationError(
                 f"none of the {len(faces)} triangles has an area: the mesh is a line or a point; scan the object again"
             )
-        return cls._compact(places, welded[wide])
+        return cls.compact(places, welded[wide])
 
     def oriented(self) -> "Skin":
         """Return the skin without triangles that share an edge with two others or face against their neighbours.
@@ -104,7 +124,7 @@ class Skin:
                 f"{lost:.0%} of the surface faces against its neighbours or meets more than one of them at an edge: "
                 "expected triangles counter-clockwise from outside; make the normals of the mesh consistent"
             )
-        return self._compact(self.points, self.faces[kept])
+        return self.compact(self.points, self.faces[kept])
 
     def remeshed(self, length: float) -> "Skin":
         """Return the skin with edges of about `length` metres, shorter ones only where the skin bends sharply."""
@@ -128,10 +148,11 @@ class Skin:
     def coarsened(self, shortest: float, *, turn: float) -> "Skin":
         """Return the skin with few edges shorter than `shortest` metres, as `coarsen` takes them out."""
         faces = coarsen(self.points, self.faces, self.normals, shortest=shortest, turn=turn)
-        return self._compact(self.points, faces)
+        return self.compact(self.points, faces)
 
     @staticmethod
-    def _compact(points: np.ndarray, faces: np.ndarray) -> "Skin":
+    def compact(points: Float64[np.ndarray, "points 3"], faces: Int[np.ndarray, "faces 3"]) -> "Skin":
+        """Return a skin of triangles on the points that they name, which are all that stay."""
         used, rows = np.unique(faces, return_inverse=True)
         return Skin(points[used], rows.reshape(-1, 3))
 

@@ -78,14 +78,14 @@ def _tetrahedralise(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarr
             ended = subprocess.run(command, capture_output=True, timeout=timeout, env=single, cwd=name, check=False)
         except subprocess.TimeoutExpired as error:
             raise SimulationError(
-                f"filling {len(skin.faces)} triangles took more than {timeout:g} s: allow more time, use a larger "
-                "detail or simplify the mesh"
+                f"filling {len(skin.faces)} triangles took more than {timeout:g} s: simplify the mesh, or ask for "
+                "coarser tetrahedra, by a larger detail or fewer freedoms"
             ) from error
         if ended.returncode != 0 or not result.is_file():
             last = ended.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["it said nothing"]
             raise SimulationError(
-                f"pytetwild broke off (exit status {ended.returncode}; {last[0][:200]}): simplify the mesh, or use "
-                "another detail"
+                f"pytetwild broke off (exit status {ended.returncode}; {last[0][:200]}): simplify the mesh, or ask "
+                "for coarser or finer tetrahedra, by detail or freedoms"
             )
         with np.load(result) as arrays:
             return arrays["points"], arrays["cells"]
@@ -113,7 +113,8 @@ def _expect_likeness(solid: Solid, skin: Skin, *, tolerance: float, advice: str)
     if lost > _LOST:
         raise SimulationError(
             f"{lost:.0%} of the mesh encloses nothing ({skin.open_edges} of its edges are open), or walls too thin for "
-            f"the detail, which may be off by {tolerance:.2g} m: use a smaller detail, close the mesh, or {advice}"
+            f"the detail, which may be off by {tolerance:.2g} m: ask for finer tetrahedra, by a "
+            f"smaller detail or more freedoms, close the mesh, or {advice}"
         )
     lids = float((ClosestPoints(skin.points[skin.faces])(_spread(outside)).distances > tolerance).mean())
     if lids > _LID:
@@ -149,4 +150,4 @@ def _flatness(skin: Skin) -> float:
 
 
 def _advice(skin: Skin) -> str:
-    return f"give it a wall with shell(surface, thickness={0.015 * skin.size:.1g})"
+    return f"give it a wall, of {0.015 * skin.size:.1g} m perhaps"

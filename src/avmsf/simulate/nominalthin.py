@@ -1,0 +1,52 @@
+"""A dense mesh thinned before anything slow looks at it: by quadrics, noise first averaged out.
+
+What follows takes a minute or so for each hundred thousand triangles, and bodies have some thousand on their skin.
+"""
+
+import math
+from collections.abc import Callable
+from importlib import import_module
+
+import numpy as np
+
+from avmsf.simulate.nominalsmooth import ROUGH, averaged, roughness
+from avmsf.simulate.skin import Skin
+
+MOST = 60_000
+"""Triangles beyond which a mesh is thinned."""
+_ROUNDS = 4
+"""Averages taken of a noisy mesh over the thinning, so that they reach little farther than an edge that stays."""
+
+
+def thinned(skin: Skin, *, tell: Callable[[str], None]) -> Skin:
+    """Return a skin of at most `MOST` triangles, and tell what was done to a larger one.
+
+    More are left where fewer would open a seam or share an edge among three; all of them where fast-simplification is
+    missing, and `tell` hears that this takes long.
+    """
+    count = len(skin.faces)
+    if count <= MOST:
+        return skin
+    try:
+        simplify = import_module("fast_simplification").simplify
+    except ImportError:
+        tell(
+            f"checking a mesh of {count} triangles, which may take many minutes: simplify it, or pip install "
+            "'avmsf[fem]', which thins it first"
+        )
+        return skin
+    tell(f"checking a mesh of {count} triangles")
+    rough = roughness(skin)
+    # Quadrics follow each noisy corner, and tie the skin into knots.
+    even = averaged(skin, math.ceil(_ROUNDS * count / MOST)) if rough >= ROUGH else skin
+    opened, crowded = skin.open_edges, skin.crowded_edges
+    wanted = MOST
+    while wanted < count:
+        points, faces = simplify(even.points, even.faces, target_count=wanted)
+        found = Skin.compact(points.astype(np.float64), faces.astype(np.int64))
+        if found.open_edges <= opened and found.crowded_edges <= crowded:
+            noise = "" if even is skin else f", its noise of {rough:.0f} degrees from one to the next averaged out"
+            tell(f"the mesh was thinned to {len(found.faces)} triangles{noise}")
+            return found
+        wanted *= 2
+    return skin

@@ -1,0 +1,125 @@
+"""Dense meshes: thinned to the same body, without their noise, and with their rims where they were."""
+
+import importlib
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from avmsf.capture.surface import Surface
+from avmsf.simulate import nominalthin
+from avmsf.simulate.closest import ClosestPoints
+from avmsf.simulate.nominal import nominal_bodies
+from avmsf.simulate.nominalsolid import Coarsening
+from avmsf.simulate.nominalthin import thinned
+from avmsf.simulate.skin import Skin
+
+pytest.importorskip("fast_simplification", reason="thinning needs fast-simplification: pip install 'avmsf[fem]'")
+
+
+def ellipsoid(subdivisions: int) -> Skin:
+    """Return one with half axes of 60, 45 and 30 mm."""
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return Skin(np.array(mesh.vertices) * [0.060, 0.045, 0.030], np.array(mesh.faces))
+
+
+def vessel(sections: int) -> Skin:
+    """Return the part of a ball of 5 cm from its bottom to 115 degrees."""
+    angles = np.linspace(0.0, 2.0, sections // 2)
+    mesh = trimesh.creation.revolve(0.05 * np.stack([np.sin(angles), -np.cos(angles)], axis=1), sections=sections)
+    return Skin.of(surface_of(Skin(np.array(mesh.vertices), np.array(mesh.faces))))
+
+
+def surface_of(skin: Skin) -> Surface:
+    return Surface(torch.from_numpy(skin.points).float(), torch.from_numpy(skin.faces))
+
+
+@pytest.mark.parametrize(("dense", "coarse"), [(ellipsoid(5), ellipsoid(4)), (vessel(160), vessel(70))])
+def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
+    dense: Skin, coarse: Skin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Those that the wall is made of are far fewer.
+    monkeypatch.setattr(nominalthin, "MOST", 6000)
+    told: list[str] = []
+    found, known = (
+        nominal_bodies(surface_of(skin), walls=[0.002], count=4, freedoms=8000, tell=told.append).bodies[0].elastic
+        for skin in (dense, coarse)
+    )
+    assert told[:2] == [f"checking a mesh of {len(dense.faces)} triangles", "the mesh was thinned to 6000 triangles"]
+    assert sum("thinned" in words for words in told) == 1
+    # Without thinning, elements that differ change frequencies by 1.5 % at this size.
+    assert found.frequency.numpy() == pytest.approx(known.frequency.numpy(), rel=0.03)
+    assert found.mass == pytest.approx(known.mass, rel=0.01)
+
+
+def test_a_noisy_mesh_is_thinned_without_its_noise_and_stays_a_skin(monkeypatch: pytest.MonkeyPatch) -> None:
+    clean = ellipsoid(5)
+    noise = 0.01 * clean.size * np.random.default_rng(0).standard_normal(clean.points.shape) / 3**0.5
+    told: list[str] = []
+    monkeypatch.setattr(nominalthin, "MOST", 4000)
+    found = thinned(Skin(clean.points + noise, clean.faces), tell=told.append)
+    assert len(found.faces) == 4000
+    assert (found.open_edges, found.crowded_edges) == (0, 0)
+    surface = ClosestPoints(clean.points[clean.faces])
+    before = np.sqrt((surface(clean.points + noise).distances ** 2).mean())
+    assert np.sqrt((surface(found.points).distances ** 2).mean()) < 0.35 * before
+    assert found.volume == pytest.approx(clean.volume, rel=0.01)
+    assert told[-1].endswith("degrees from one to the next averaged out")
+
+
+def test_a_thinned_sheet_keeps_its_rim(monkeypatch: pytest.MonkeyPatch) -> None:
+    side = np.linspace(0.0, 1.0, 61)
+    rows = np.arange(61 * 61).reshape(61, 61)
+    a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
+    points = np.stack([*(each.ravel() for each in np.meshgrid(side, side, indexing="ij")), np.zeros(61 * 61)], axis=1)
+    sheet = Skin(points, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]))
+    monkeypatch.setattr(nominalthin, "MOST", 1000)
+    found = thinned(sheet, tell=lambda words: None)
+    assert len(found.faces) <= 1000
+    # Each corner may lose a triangle, with sides of about .045 now.
+    assert found.areas.sum() == pytest.approx(1.0, abs=4 * 0.045**2 / 2)
+    assert np.ptp(found.points, axis=0) == pytest.approx([1.0, 1.0, 0.0], abs=1e-6)
+    assert 0 < found.open_edges < sheet.open_edges
+
+
+def test_more_triangles_are_left_where_fewer_would_tear_the_skin(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = ellipsoid(4)
+
+    def tearing(points: np.ndarray, faces: np.ndarray, *, target_count: int) -> tuple[np.ndarray, np.ndarray]:
+        return points, faces if target_count >= 4000 else faces[:target_count]
+
+    monkeypatch.setattr(importlib.import_module("fast_simplification"), "simplify", tearing)
+    monkeypatch.setattr(nominalthin, "MOST", 1000)
+    found = thinned(ball, tell=lambda words: None)
+    assert np.array_equal(found.faces, ball.faces)
+    monkeypatch.setattr(nominalthin, "MOST", 3000)
+    assert thinned(ball, tell=lambda words: None) is ball
+
+
+def test_without_the_package_a_dense_mesh_stays_and_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise ImportError(name)
+
+    ball, told = ellipsoid(2), []
+    monkeypatch.setattr(nominalthin, "import_module", missing)
+    assert thinned(ball, tell=told.append) is ball
+    assert told == []
+    monkeypatch.setattr(nominalthin, "MOST", 100)
+    assert thinned(ball, tell=told.append) is ball
+    assert len(told) == 1
+    assert "checking a mesh of 320 triangles, which may take many minutes" in told[0]
+    assert "pip install 'avmsf[fem]'" in told[0]
+
+
+def test_a_coarser_skin_starts_from_the_last_one_that_is_finer() -> None:
+    coarsened = Coarsening(ellipsoid(4))
+    first, coarser, finer = (coarsened(length) for length in (0.006, 0.012, 0.004))
+
+    def places(skin: Skin) -> set[tuple[float, ...]]:
+        return {tuple(point) for point in skin.points.tolist()}
+
+    assert places(coarser) < places(first)
+    assert len(coarser.points) < 0.5 * len(first.points)
+    # What the first one had lost is there again.
+    assert len(finer.points) > 1.3 * len(first.points)
