@@ -78,6 +78,7 @@ def test_a_blow_is_found_drawn_and_told(place: Place, tmp_path: Path, capsys: St
     assert blow["place"] == pytest.approx(place.points[STRUCK].tolist(), abs=1e-6)
     assert blow["recording"] == hit
     assert blow["explained"] > 0.98
+    assert blow["misfit"] < 0.01
     assert blow["region"]["level"] == 0.9
     # The field's own contacts, left out, are badly foretold by the others: the region is as wide as that makes it.
     assert 0.0 < blow["region"]["share"] < 0.7
@@ -170,6 +171,14 @@ def test_a_captures_settings_say_how_recordings_are_read(place: Place, tmp_path:
     assert printed["blows"][0]["place"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
     given, _ = located([place.field, str(path), "--settings", str(tmp_path / "capture.toml")], capsys)
     assert given == printed
+
+
+def test_several_blows_are_read_as_one_is(place: Place, tmp_path: Path, capsys: Streams) -> None:
+    hit = place.wav("mono.wav", place.blow(STRUCK))
+    (tmp_path / "capture.toml").write_text("response_channel = 2\n")
+    for words in ([], ["--several"]):
+        printed, _ = located([place.field, hit, "--capture", str(tmp_path), *words], capsys)
+        assert printed["blows"][0]["place"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
 
 
 def test_what_cannot_be_done_is_said_in_one_line(place: Place, tmp_path: Path, capsys: Streams) -> None:

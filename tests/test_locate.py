@@ -1,4 +1,5 @@
 import math
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import ClassVar
@@ -16,7 +17,7 @@ from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise_phased
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 from avmsf.tasks.contactmap import ContactMap
-from avmsf.tasks.locate import STRANGE, locate
+from avmsf.tasks.locate import DOUBTFUL, STRANGE, UNLIKE, judge_fit, locate
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
 
@@ -209,6 +210,14 @@ def test_a_known_force_tells_places_apart_that_sound_alike():
     assert float(known[1][0]) > 0.99
 
 
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+def test_a_force_that_cannot_be_is_refused(value):
+    with pytest.raises(LocationError, match=f"a force with expected = {value:g}: expected a number above 0"):
+        Force(value)
+    with pytest.raises(LocationError, match=f"a force with spread_db = {value:g}: expected a number above 0"):
+        Force(1.0, spread_db=value)
+
+
 def test_the_region_grows_with_the_noise():
     locator = locator_of()
     sizes = [
@@ -259,11 +268,29 @@ def test_another_plate_is_refused_with_the_number(length):
     impacts = struck(4, seed=6, plate=replace(PLATE, length=length, width=length / 1.3))
     locator = locator_of()
     for sound in impacts.sounds:
-        assert locator.locate(sound).modal < STRANGE
-        with pytest.raises(LocationError, match=r"explain \d+ % of the sound, and 60 % or more of its own"):
+        assert locator.locate(sound).misfit > 1.5 * STRANGE
+        with pytest.raises(LocationError, match=r"explain \d+ % of the sound and, .*a misfit of \d\.\d\d; its own"):
             locate(true_field(), sound, locator=locator)
-    own = struck(4, seed=6, noise_db=0.0)
-    assert all(locator.locate(sound).modal > 2 * STRANGE for sound in own.sounds)
+
+
+@pytest.mark.parametrize("noise_db", [-40.0, 0.0])
+def test_its_own_sounds_are_not_taken_for_another_plates(noise_db):
+    # Noise, were it as loud as the sound, counts neither for the modes nor against them.
+    for sound in struck(8, seed=6, noise_db=noise_db).sounds:
+        found = locator_of().locate(sound)
+        assert found.misfit < DOUBTFUL
+        assert found.modal > 0.85
+
+
+def test_what_falls_between_is_doubted_in_words():
+    found = locator_of().locate(struck(1, seed=6).sounds[0])
+    assert judge_fit(found, "it") == []
+    (note,) = judge_fit(replace(found, modal=0.8, detuned=0.5), "it")
+    assert re.search(r"explain 80 % of the sound and, put out of tune, 50 %, a misfit of 0\.40: it may be", note)
+    (note,) = judge_fit(replace(found, explained=0.9 * UNLIKE), "it")
+    assert "a blow at the likeliest place 9 %" in note
+    # Where modes out of tune explain all as well, a rounding is no misfit.
+    assert judge_fit(replace(found, modal=1.0 - 1e-4, detuned=1.0 - 1e-5), "it") == []
 
 
 @pytest.mark.parametrize(
@@ -283,8 +310,17 @@ def test_what_holds_no_blow_is_refused(sound, message):
 def test_points_without_sense_are_refused():
     with pytest.raises(LocationError, match="expected points"):
         Locator.of(true_field(), points=torch.zeros(0, 3))
+    with pytest.raises(LocationError, match=r"expected points .* found the shape \(3, 2\) and 0 numbers"):
+        Locator.of(true_field(), points=torch.zeros(3, 2))
+    with pytest.raises(LocationError, match=r"expected points .* and 9 numbers that are not finite"):
+        Locator.of(true_field(), points=torch.full((3, 3), torch.nan))
     with pytest.raises(LocationError, match="2 directions do not go with 3 points"):
         Locator.of(true_field(), points=torch.zeros(3, 3), directions=torch.zeros(2, 3))
+    for row, said in ((torch.nan, r"nan\], of length nan"), (0.0, r"0\.0\], of length 0"), (2.0, r"of length 3\.46")):
+        directions = torch.eye(3)
+        directions[1] = row
+        with pytest.raises(LocationError, match=rf"direction 1 is \[.*{said}.*: expected unit"):
+            Locator.of(true_field(), points=torch.zeros(3, 3), directions=directions)
     with pytest.raises(LocationError, match="positive area for each of 3 points"):
         Locator.of(true_field(), points=torch.zeros(3, 3), areas=torch.zeros(3))
     with pytest.raises(LocationError, match="none of the object's 43 modes lies below 50 Hz"):

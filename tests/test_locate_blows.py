@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from avmsf.capture.audio import Recording
+from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.severalblows import find_blows, locate_blows, still_ringing
@@ -73,3 +75,18 @@ def test_blows_on_another_object_are_left_out_and_refused_where_there_are_no_oth
     assert [round(seconds, 2) for seconds, _ in locate_blows(true_field(), mixed, locator=locator)] == [0.1]
     with pytest.raises(LocationError, match=r"the blow at 0\.\d+ s: the modes of this object explain \d+ %"):
         locate_blows(true_field(), torch.cat([torch.zeros(3000), mixed[begin:]]).numpy(), locator=locator)
+
+
+def test_settings_count_as_for_one_blow(locator):
+    sound, contacts = overlapping([0.1, 0.3], [1.0, 0.8], seed=36)
+    settings = CaptureSettings(response_channel=2, force_channel=1, normalise="deconvolve")
+    # Mono, as a telephone records it: the capture's channels are not asked for, and there is no pulse to divide out.
+    mono = Recording("session.wav", sound.double().numpy()[None], RATE, "FLOAT")
+    found = locate_blows(true_field(), mono, settings=settings, locator=locator)
+    for (_, each), contact in zip(found, contacts, strict=True):
+        assert missed(each, each.most_probable, contact) < 0.05
+    both = Recording("session.wav", np.stack([0.1 * mono.channels[0][::-1], mono.channels[0]]), RATE, "FLOAT")
+    with pytest.raises(LocationError, match=r"session\.wav: normalise = .deconvolve. divides one push"):
+        locate_blows(true_field(), both, settings=settings, locator=locator)
+    plain = replace(settings, normalise="auto")
+    assert len(locate_blows(true_field(), both, settings=plain, locator=locator)) == 2

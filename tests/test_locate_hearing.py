@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import scipy.signal
@@ -84,6 +86,17 @@ def test_what_holds_no_blow_is_refused(samples, message):
         hear(samples, true_field())
 
 
+def test_samples_that_are_none_are_refused():
+    sound = recorded(struck(1, seed=25).sounds[0]).channels
+    with pytest.raises(LocationError, match=r"samples of one channel, found the shape \(1, 9000\): give one row"):
+        locate(true_field(), sound)
+    with pytest.raises(LocationError, match=r"samples of one channel, found the shape \(\)"):
+        hear(torch.tensor(1.0), true_field())
+    for rate in (math.nan, math.inf, 0.0, -8000.0):
+        with pytest.raises(LocationError, match=f"the recording is at {rate:g} Hz: expected a sample rate above 0"):
+            locate(true_field(), sound[0], sample_rate=rate)
+
+
 def test_channels_follow_the_capture_where_the_recording_has_them():
     one = recorded(struck(1, seed=25).sounds[0]).channels[0]
     two = Recording("hit.wav", np.stack([0.1 * one[::-1], one]), RATE, "FLOAT")
@@ -93,5 +106,8 @@ def test_channels_follow_the_capture_where_the_recording_has_them():
     assert abs(hear(two, true_field(), settings=settings).onset - 1800) <= 8
     alone = hear(Recording("hit.wav", one[None], RATE, "FLOAT"), true_field(), settings=settings)
     torch.testing.assert_close(alone.sound, hear(two, true_field(), settings=settings).sound)
+    hammered = CaptureSettings(force_channel=1, response_channel=2, highpass=30.0, normalise="deconvolve")
+    pushless = hear(Recording("hit.wav", one[None], RATE, "FLOAT"), true_field(), settings=hammered)
+    torch.testing.assert_close(pushless.sound, alone.sound)
     with pytest.raises(LocationError, match="sample_rate says 8000 Hz"):
         hear(two, true_field(), sample_rate=8000.0)

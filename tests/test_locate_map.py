@@ -31,7 +31,7 @@ def made(probability: list[float]) -> ContactMap:
     points = torch.zeros(len(probability), 3)
     points[:, 0] = 0.01 * torch.arange(len(probability))
     chances = torch.tensor(probability, dtype=torch.float64)
-    return ContactMap(points, 1 - chances, chances, 0.9, 0.9)
+    return ContactMap(points, 1 - chances, chances, 0.9, 0.9, 0.1)
 
 
 def test_region_is_the_smallest_set_of_that_probability():

@@ -219,6 +219,25 @@ def test_what_cannot_be_judged_is_refused() -> None:
         judge_locating(locator(), strikes(), strikes(), name="plate", truth=strikes().contacts[:1])
     with pytest.raises(EvaluationError, match="no strike was located by 'guess'"):
         scores().figures("guess")
+    one = replace(locator(), points=locator().points[:1].expand_as(locator().points))
+    with pytest.raises(EvaluationError, match="plate: points 0 m across and an object of 0 m"):
+        judge_locating(one, strikes(), strikes(), name="plate")
+    for size in (0.0, -1.0, math.nan):
+        with pytest.raises(EvaluationError, match="which must be positive"):
+            judge_locating(locator(), strikes(), strikes(), name="plate", scale=size)
+
+
+def test_errors_are_parts_of_the_boxs_diagonal() -> None:
+    # A box of .3 x .4 x 1.2, whose diagonal is 1.3; from one of its ends the strikes are at known distances.
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.3, 0.4, 1.2]])
+    far = replace(locator(), points=points[:1].expand(len(locator().points), 3).clone())
+    far.points[-1] = points[1]
+    truth = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.3], [0.03, 0.04, 0.0], [0.0, 0.65, 0.0]], dtype=torch.float64)
+    judged = judge_locating(far, strikes(), strikes(), name="box", truth=truth, methods=("cosine",), scale=0.5)
+    assert judged.diagonal == pytest.approx(1.3)
+    expected = dict(zip(strikes().names, [0.0, 1.0, 0.05 / 1.3, 0.5], strict=True))
+    assert {row.recording: row.rmed for row in judged.rows} == pytest.approx(expected, abs=1e-6)
+    assert judged.figures("cosine")["contact_error"] == pytest.approx((1.3 + 0.05 + 0.65) / 4 / 0.5)
 
 
 @cache

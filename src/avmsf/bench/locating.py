@@ -13,6 +13,7 @@ may sound the same at all of them. The methods:
 A recording that the locator refuses counts as a random point, and its row says why.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
@@ -117,8 +118,8 @@ def judge_locating(
     """Locate every strike of `test` by every method and compare.
 
     `images` are those of the object's symmetries; `truth` is where the blows fell, metres, where that is known better
-    than by the recordings' table. Raises EvaluationError for unknown methods and sounds at another rate than the
-    field's.
+    than by the recordings' table; `scale`, metres, is what contact errors are relative to, the diagonal unless told.
+    Raises EvaluationError for unknown methods, sounds at another rate than the field's, and objects without a size.
     """
     unknown = [method for method in methods if method not in METHODS]
     if unknown or not methods:
@@ -132,13 +133,18 @@ def judge_locating(
         raise EvaluationError(f"{name}: {len(truth)} true contacts for {len(test)} recordings: give one for each")
     right = test.contacts if truth is None else truth
     ground = _Ground(locator.points.double(), Images.none() if images is None else images, level)
+    size = ground.diagonal if scale is None else scale
+    if not (ground.diagonal > 0.0 and math.isfinite(size) and size > 0.0):
+        raise EvaluationError(
+            f"{name}: points {ground.diagonal:g} m across and an object of {size:g} m: errors are relative to both, "
+            "which must be positive"
+        )
     alike = NearestSpectrum(train)
     rows: list[StrikeRow] = []
     for row in sorted(range(len(test)), key=lambda each: test.names[each]):
         sound, place = test.sounds[row], right[row].double()
         rows += _located(locator, alike, ground, sound, place, name=test.names[row], methods=methods)
-    size = ground.diagonal
-    return LocatingScores(name, tuple(rows), size, size if scale is None else scale, level, dict(settings or {}))
+    return LocatingScores(name, tuple(rows), ground.diagonal, size, level, dict(settings or {}))
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ metric calls `validate` first, which raises EvaluationError with the row that is
 - `objectfolder_distance`: the ObjectFolder benchmark's spectrogram distance.
 
 CDPAM is in `avmsf.bench.cdpam`; modes are compared with true ones in `avmsf.bench.physical`, places with true ones in
-`avmsf.bench.localisation`. A `Convention` in `avmsf.bench.conventions` names the parameters that each is reported with.
+`avmsf.bench.locating`. A `Convention` in `avmsf.bench.conventions` names the parameters that each is reported with.
 """
 
 import math

@@ -26,7 +26,7 @@ _COHERENT = 0.5
 _BAND = 512
 """Samples of the frames that the noise's power is measured in, at most."""
 _QUIET = 0.25
-"""Part of the bands that count as quiet."""
+"""Part of the bands, and of their frames, that count as quiet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,12 @@ class Amplitudes:
     @property
     def explained(self) -> float:
         """Part of the sound's energy that the modes explain, free to sound as strongly as they like."""
-        both = torch.cat([self.values.real, self.values.imag])
-        return self.part(float(both @ self.products))
+        return self.part(self.fitted)
+
+    @property
+    def fitted(self) -> float:
+        """The energy that they explain, in the unit of `energy`."""
+        return float(torch.cat([self.values.real, self.values.imag]) @ self.products)
 
     def part(self, energy: float) -> float:
         """Return an energy as part of the sound's, 0 to 1."""
@@ -102,7 +106,7 @@ class Extractor:
     def _noise(
         self, sound: Float[Tensor, " samples"], values: Complex128[Tensor, " modes"], colour: Residual
     ) -> tuple[Float64[Tensor, " bands"], float]:
-        """Return the noise's power in bands up to half the sample rate, and its mean as the quiet bands have it."""
+        """Return the noise's power in bands up to half the sample rate, and on the mean what is there throughout."""
         modelled = synthesise(
             values.real[None],
             self.bank.frequency,
@@ -113,13 +117,14 @@ class Extractor:
         )[0]
         # Each amplitude takes its share of the noise away.
         free = self.samples / max(self.samples - 2 * len(self.bank), 0.5 * self.samples)
-        own = free * _band_power(sound.double() - modelled)
-        level = _at(colour.magnitude.double(), len(own)).square()
-        if not bool(level.any()):
-            level = torch.ones_like(own)
-        level = level.clamp_min(1e-6 * float(level.mean()))
-        level = level * torch.quantile(own / level, _QUIET)
-        return torch.maximum(own, level), float(level.mean())
+        cells = free * _cell_power(sound.double() - modelled)
+        own = cells.mean(0)
+        shape = _at(colour.magnitude.double(), len(own)).square()
+        if not bool(shape.any()):
+            shape = torch.ones_like(own)
+        shape = shape.clamp_min(1e-6 * float(shape.mean()))
+        level = shape * torch.quantile(own / shape, _QUIET)
+        return torch.maximum(own, level), float(shape.mean()) * _steady(cells / shape)
 
 
 def _separate(
@@ -158,12 +163,22 @@ def _groups(linked: Tensor) -> list[Int64[Tensor, " group"]]:
     return groups
 
 
-def _band_power(sound: Float64[Tensor, " samples"]) -> Float64[Tensor, " bands"]:
-    """Return the power in bands: white noise of variance v gives v."""
+def _cell_power(sound: Float64[Tensor, " samples"]) -> Float64[Tensor, "frames bands"]:
+    """Return the power in bands of overlapping frames: white noise of variance v gives v on the mean."""
     size = min(_BAND, 2 ** int(math.log2(max(len(sound) // 2, 2))))
     window = torch.hann_window(size, dtype=torch.float64)
     frames = sound.unfold(0, size, size // 2) * window
-    return torch.fft.rfft(frames).abs().square().mean(0) / window.square().sum()
+    return torch.fft.rfft(frames).abs().square() / window.square().sum()
+
+
+def _steady(cells: Float64[Tensor, "frames bands"]) -> float:
+    """Return the mean power of the noise that is there throughout, from the quiet ones among cells of even noise.
+
+    Noise's power in a cell is distributed exponentially, so that a quiet cell tells the mean. What dies away is no
+    noise, however broad: its later cells are quiet.
+    """
+    quiet = torch.kthvalue(cells.flatten(), max(1, round(_QUIET * cells.numel()))).values
+    return float(quiet) / -math.log1p(-_QUIET)
 
 
 def _at(values: Float64[Tensor, " bins"], count: int) -> Float64[Tensor, " bands"]:

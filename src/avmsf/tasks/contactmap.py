@@ -19,6 +19,8 @@ LEVEL = 0.9
 """Probability that a credible region holds, where nothing else is asked for."""
 COMPARABLE = 0.25
 """Part of the likeliest place's probability from which on another place is as good an answer."""
+_LEAST_LEFT = 0.01
+"""Part of a sound that detuned modes leave at least: less is not told from rounding and from what noise adds."""
 _NEIGHBOUR_SPACINGS = 2.5
 _NEIGHBOUR_PART = 0.04
 
@@ -52,6 +54,8 @@ class ContactMap:
     """Part of the sound's energy, without its noise, that a blow at the field's likeliest point explains, 0 to 1."""
     modal: float
     """Part of the same energy that the object's modes explain if each may be as strong as it likes, 0 to 1."""
+    detuned: float
+    """Part of it that they explain on the mean when they are put out of tune, 0 to 1."""
     force: float = 1.0
     """Strength of that blow, with its sign, relative to one that sounds as the field renders it."""
     notes: tuple[str, ...] = field(default=())
@@ -61,6 +65,11 @@ class ContactMap:
     def best(self) -> int:
         """Row of the point of least distance: the paper's answer."""
         return int(torch.argmin(self.distance))
+
+    @property
+    def misfit(self) -> float:
+        """What the object's modes leave of the sound over what they leave out of tune: own sounds 0, others about 1."""
+        return (1.0 - self.modal) / max(1.0 - self.detuned, _LEAST_LEFT)
 
     @property
     def most_probable(self) -> int:

@@ -1,5 +1,6 @@
 """A recorded blow as the recordings were that a field was fitted to: its channel, its onset, its rate."""
 
+import math
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -17,8 +18,8 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, LocationError
 from avmsf.field.soundfield import SoundField
 
-Sound = Recording | Float[Tensor, " samples"] | Float[np.ndarray, " samples"]
-"""A recording, or samples alone."""
+Sound = Recording | Float[Tensor, "..."] | Float[np.ndarray, "..."]
+"""A recording, or samples alone: [samples], of which `as_recording` says what else was found."""
 _HELD = 0.9
 """Part of half a sample rate up to which a recording of another rate still holds all of a sound."""
 _FINEST = 2000
@@ -54,7 +55,7 @@ def hear(
     never sudden enough to hold a blow.
     """
     whole = as_recording(recording, field, sample_rate=sample_rate)
-    chosen = _settings_for(whole, settings)
+    chosen = settings_for(whole, settings)
     notes = describe(whole, chosen)
     try:
         prepared = prepare(whole, chosen)
@@ -78,9 +79,17 @@ def hear(
 
 
 def as_recording(recording: Sound, field: SoundField, *, sample_rate: float | None = None) -> Recording:
-    """Return a recording that can be listened to. Raises LocationError for silence and for what is not finite."""
+    """Return a recording that can be listened to.
+
+    Raises LocationError for samples of more than one channel, rates that are none, silence and what is not finite.
+    """
     if not isinstance(recording, Recording):
         samples = torch.as_tensor(recording).detach().cpu().double().numpy()
+        if samples.ndim != 1:
+            raise LocationError(
+                f"expected the samples of one channel, found the shape {samples.shape}: give one row or column of it, "
+                "or a Recording"
+            )
         rate = field.sample_rate if sample_rate is None else sample_rate
         recording = Recording("the recording", samples[None], rate, "FLOAT")
     elif sample_rate is not None and sample_rate != recording.sample_rate:
@@ -88,6 +97,8 @@ def as_recording(recording: Sound, field: SoundField, *, sample_rate: float | No
             f"{recording.name} is at {recording.sample_rate:g} Hz and sample_rate says {sample_rate:g} Hz: leave "
             "sample_rate out, a recording knows its own"
         )
+    if not (math.isfinite(recording.sample_rate) and recording.sample_rate > 0.0):
+        raise LocationError(f"{recording.name} is at {recording.sample_rate:g} Hz: expected a sample rate above 0")
     channels = recording.channels
     least = shortest_allowed(recording.sample_rate)
     if recording.frames < least:
@@ -141,7 +152,7 @@ def at_field_rate(
     return torch.from_numpy(resampled.astype(np.float32)), highest, [note]
 
 
-def _settings_for(recording: Recording, settings: CaptureSettings | None) -> CaptureSettings:
+def settings_for(recording: Recording, settings: CaptureSettings | None) -> CaptureSettings:
     """Return settings that ask for nothing which a recording of a single blow may lack."""
     if settings is None:
         return CaptureSettings(normalise="none")
@@ -150,7 +161,8 @@ def _settings_for(recording: Recording, settings: CaptureSettings | None) -> Cap
     kept = replace(
         settings,
         normalise="none",
-        force_channel=force if force is not None and force <= count else None,
+        # A single channel is the sound, wherever the capture has its force.
+        force_channel=force if force is not None and count > 1 and force <= count else None,
         response_channel=response if response is not None and response <= count else None,
     )
     if settings.normalise == "deconvolve" and kept.force_channel is not None:

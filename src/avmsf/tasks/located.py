@@ -52,6 +52,7 @@ def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: flo
         },
         "explained": contact.explained,
         "modes_explain": contact.modal,
+        "misfit": contact.misfit,
         "force": contact.force,
         "cosine": {
             "place": contact.points[contact.best].tolist(),

@@ -15,11 +15,14 @@ from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.tasks.amplitudes import Amplitudes, Extractor
 from avmsf.tasks.contactmap import ContactMap as ContactMap
+from avmsf.tasks.detuning import OutOfTune
 from avmsf.tasks.foretelling import foretell, patches, unknown, widened
 from avmsf.tasks.heed import heed_of
 from avmsf.tasks.posterior import Force, Foretold, Judgement, judge
 from avmsf.tasks.slack import contacts_of, spread_by
 
+_UNIT = 1e-3
+"""How far a direction's length may be from one."""
 _KEPT_LENGTHS = 8
 """Lengths of sounds whose equations are kept."""
 
@@ -51,7 +54,7 @@ class Locator:
         cls,
         field: SoundField,
         *,
-        points: Float[Tensor, "points 3"] | None = None,
+        points: Float[Tensor, "..."] | None = None,
         directions: Float[Tensor, "..."] | None = None,
         areas: Float[Tensor, "..."] | None = None,
         use_residual: bool = True,
@@ -93,6 +96,9 @@ class Locator:
         self._expect_sound(heard)
         length = self._length(len(heard), float("inf") if highest is None else highest)
         amplitudes = length.extractor.extract(heard, colour=self.field.residual if self.heeds_residual else None)
+        detuned = length.detuned.fitted(heard)
+        # What is left beside loud noise is known badly, but it is no less than what modes explain, in tune or not.
+        amplitudes = replace(amplitudes, energy=max(amplitudes.energy, amplitudes.fitted, float(detuned.max())))
         values, noise = length.separate(amplitudes)
         _expect_more_than_noise(values, noise)
         found = judge(length.foretold, values, noise, force=length.scaled(force))
@@ -108,6 +114,7 @@ class Locator:
             probability,
             explained,
             amplitudes.explained,
+            amplitudes.part(float(detuned.mean())),
             float(found.force[row]) / length.unit,
         )
 
@@ -155,15 +162,17 @@ class _Length:
     parts: Float32[Tensor, "points two_modes"]
     """The modes' own gains over their length at each point, sine and cosine in turn."""
     unit: float
+    detuned: OutOfTune
 
     @classmethod
     def of(cls, locator: Locator, samples: int, highest: float) -> "_Length":
         """Return it for the modes up to `highest` Hz."""
         whole, rate = locator.field.bank, locator.field.sample_rate
-        heard = torch.nonzero(whole.frequency < min(highest, 0.5 * rate)).flatten()
+        highest = min(highest, 0.5 * rate)
+        heard = torch.nonzero(whole.frequency < highest).flatten()
         if not len(heard):
             raise LocationError(
-                f"none of the object's {len(whole)} modes lies below {min(highest, 0.5 * rate):g} Hz, the lowest is at "
+                f"none of the object's {len(whole)} modes lies below {highest:g} Hz, the lowest is at "
                 f"{float(whole.frequency.min()):g} Hz: record at a higher sample rate"
             )
         bank = ModalBank(whole.frequency[heard].double(), whole.damping[heard].double())
@@ -177,7 +186,8 @@ class _Length:
         gains = gains / unit
         parts = torch.nn.functional.normalize(torch.view_as_real(gains).flatten(1), dim=1)
         foretold = _mixed(gains, locator.variance[:, heard] / unit**2, extractor)
-        return cls(extractor, foretold, parts, unit)
+        detuned = OutOfTune.of(bank, sample_rate=rate, samples=samples, highest=highest)
+        return cls(extractor, foretold, parts, unit, detuned)
 
     def separate(self, amplitudes: Amplitudes) -> tuple[Complex128[Tensor, " modes"], Float64[Tensor, " modes"]]:
         """Return the amplitudes of mixtures, and the variances of their independent errors."""
@@ -253,14 +263,26 @@ def _expect_more_than_noise(values: Complex128[Tensor, " modes"], noise: Float64
 
 
 def _expect_points(
-    points: Float[Tensor, "points 3"],
+    points: Float[Tensor, "..."],
     directions: Float[Tensor, "..."] | None,
     areas: Float[Tensor, "..."] | None,
 ) -> None:
-    if not len(points) or not bool(torch.isfinite(points).all()):
-        raise LocationError(f"expected points [points, 3] that are finite, found {len(points)}: give others")
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not bool(torch.isfinite(points).all()):
+        raise LocationError(
+            f"expected points [points, 3] that are finite, found the shape {tuple(points.shape)} and "
+            f"{int((~torch.isfinite(points)).sum())} numbers that are not finite: give others"
+        )
     if directions is not None and directions.shape != points.shape:
         raise LocationError(f"{len(directions)} directions do not go with {len(points)} points: give one a point")
+    if directions is not None:
+        length = directions.double().norm(dim=1)
+        # Not "> _UNIT": NaN is no unit vector either.
+        bad = torch.nonzero(~((length - 1.0).abs() <= _UNIT)).flatten()
+        if len(bad):
+            raise LocationError(
+                f"direction {int(bad[0])} is {directions[int(bad[0])].tolist()}, of length {float(length[bad[0]]):g}: "
+                "expected unit vectors, divide each by its length"
+            )
     fit = areas is None or (areas.shape == points.shape[:1] and bool((areas > 0).all() & torch.isfinite(areas).all()))
     if not fit:
         raise LocationError(f"expected a positive area for each of {len(points)} points: mend or leave out `areas`")

@@ -11,7 +11,8 @@ integrated over; t is taken where it fits best; r is unknown as well: every valu
 say as loud as the sound supports it. So a field that foretells the sound to a hair's breadth gives a sharp answer, and
 a rough one a broad answer. What is wrong in one mode is wrong in others too, and modes whose errors hang together tell
 less than their number: where it is the field that errs, the log likelihood counts for a part of itself, and for the
-less the less of the sound the field explains at its best (`INDEPENDENT`).
+less the less of the sound the field explains at its best (`INDEPENDENT`). How fast modes die away is no evidence, even
+of a field whose dampings vary with the contact: these only correct the gains that its sounds seem to have.
 """
 
 import math
@@ -20,6 +21,8 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Complex64, Complex128, Float32, Float64, Int64
 from torch import Tensor
+
+from avmsf.errors import LocationError
 
 MISFITS = (0.8, 0.15, 0.03)
 """How wrong gains may be, relative: what every point is tried with."""
@@ -64,12 +67,20 @@ class Foretold:
 
 @dataclass(frozen=True, eq=False)
 class Force:
-    """What is known beforehand of a blow's strength."""
+    """What is known beforehand of a blow's strength. Raises LocationError for what no force can be."""
 
     expected: float
     """In the unit in which a blow of one is as loud as the field renders it."""
     spread_db: float = 3.0
     """Standard deviation, dB."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("expected", self.expected), ("spread_db", self.spread_db)):
+            if not (math.isfinite(value) and value > 0.0):
+                raise LocationError(
+                    f"a force with {name} = {value:g}: expected a number above 0; blows of either polarity are looked "
+                    "for, and without a known force leave it out"
+                )
 
 
 @dataclass(frozen=True, eq=False)

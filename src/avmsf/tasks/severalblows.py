@@ -20,7 +20,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.synthesis import synthesise
 from avmsf.tasks.amplitudes import Extractor
 from avmsf.tasks.contactmap import ContactMap
-from avmsf.tasks.hearing import Sound, as_recording, at_field_rate, describe
+from avmsf.tasks.hearing import Sound, as_recording, at_field_rate, describe, settings_for
 from avmsf.tasks.locate import judge_fit
 from avmsf.tasks.locator import Locator
 
@@ -46,10 +46,16 @@ def locate_blows(
     Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `hear`; `locator` saves making the
     field's anew. What rang before a blow is fitted by the object's modes, carried on as they decay, and subtracted.
     Blows that are none on this object are left out, and blows closer than 30 ms are not told apart. Raises
-    LocationError as `hear`, and where no blow can be located.
+    LocationError as `hear`, where the settings ask for the pulse that the recording holds to be divided out, and where
+    no blow can be located.
     """
-    chosen = CaptureSettings() if settings is None else settings
     whole = as_recording(recording, field, sample_rate=sample_rate)
+    chosen = settings_for(whole, settings)
+    if chosen.normalise == "deconvolve":
+        raise LocationError(
+            f'{whole.name}: normalise = "deconvolve" divides one push of the hammer out of a recording, not several: '
+            "cut it into a recording for each blow, and locate these"
+        )
     notes = describe(whole, chosen)
     try:
         sound = remove_rumble(
