@@ -22,6 +22,7 @@ from safetensors import safe_open
 from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 
+from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FieldFileError
 from avmsf.field.fit import fit
 from avmsf.field.recipes import Attention
@@ -32,13 +33,22 @@ from plate_field import PLATE, QUICK, plate_extraction, plate_features, plate_im
 
 CONTACTS = sample_contacts(PLATE, 10, generator=torch.Generator().manual_seed(5))
 CONFIG = replace(QUICK, warmup_steps=4, steps=2)
+SETTINGS = CaptureSettings(response_channel=2, highpass=30.0, align=False)
 
 
 @cache
 def field(damping: str = "shared") -> SoundField:
     impacts = plate_impacts(forces=True)
     config = replace(CONFIG, damping=damping, learning_rate=0.05)
-    return fit(impacts, plate_features(), plate_extraction(impacts), config, gains=Attention(), capture="a plate")
+    return fit(
+        impacts,
+        plate_features(),
+        plate_extraction(impacts),
+        config,
+        gains=Attention(),
+        capture="a plate",
+        settings=SETTINGS,
+    )
 
 
 def other_field() -> SoundField:
@@ -54,6 +64,7 @@ def test_a_field_comes_back_to_the_last_bit(tmp_path, damping):
     assert torch.equal(loaded.gains(CONTACTS), saved.gains(CONTACTS))
     assert torch.equal(loaded.dampings(CONTACTS), saved.dampings(CONTACTS))
     assert loaded.origin == saved.origin
+    assert loaded.origin.settings == SETTINGS
     assert loaded.origin.config.fft_sizes == (1024, 256)
     assert loaded.origin.trained_on == plate_impacts().names
     assert (loaded.sample_rate, loaded.samples) == (saved.sample_rate, saved.samples)
@@ -337,6 +348,7 @@ def test_a_record_that_is_not_of_these_tensors_is_refused(tmp_path, keys, value)
         (("config", "unheard_of"), 1, "unheard_of"),
         (("origin", "trained_on"), [1], "trained_on"),
         (("origin",), None, "NoneType"),
+        (("origin", "settings", "highpass"), -1.0, "highpass"),
     ],
 )
 def test_a_damaged_record_is_refused_with_what_is_wrong(tmp_path, keys, value, reason):

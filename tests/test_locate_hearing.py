@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -104,6 +105,9 @@ def test_channels_follow_the_capture_where_the_recording_has_them():
         hear(two, true_field())
     settings = CaptureSettings(response_channel=2, highpass=30.0)
     assert abs(hear(two, true_field(), settings=settings).onset - 1800) <= 8
+    # What the field was fitted to was read so, though from its first sample on: a blow is sought all the same.
+    like = replace(true_field(), origin=replace(true_field().origin, settings=replace(settings, align=False)))
+    torch.testing.assert_close(hear(two, like).sound, hear(two, true_field(), settings=settings).sound)
     alone = hear(Recording("hit.wav", one[None], RATE, "FLOAT"), true_field(), settings=settings)
     torch.testing.assert_close(alone.sound, hear(two, true_field(), settings=settings).sound)
     hammered = CaptureSettings(force_channel=1, response_channel=2, highpass=30.0, normalise="deconvolve")
@@ -111,3 +115,12 @@ def test_channels_follow_the_capture_where_the_recording_has_them():
     torch.testing.assert_close(pushless.sound, alone.sound)
     with pytest.raises(LocationError, match="sample_rate says 8000 Hz"):
         hear(two, true_field(), sample_rate=8000.0)
+
+
+def test_bare_samples_are_taken_as_they_are_and_files_as_the_capture_was():
+    sped = CaptureSettings(playback_speed=2.0)
+    like = replace(true_field(), origin=replace(true_field().origin, settings=sped))
+    whole = recorded(struck(1, seed=25).sounds[0])
+    torch.testing.assert_close(hear(whole.channels[0], like).sound, hear(whole.channels[0], true_field()).sound)
+    slow = replace(whole, sample_rate=whole.sample_rate / 2)
+    torch.testing.assert_close(hear(slow, like).sound, hear(whole, true_field()).sound)

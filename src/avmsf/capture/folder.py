@@ -5,7 +5,7 @@ import os
 import shutil
 import uuid
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -42,6 +42,8 @@ class Capture:
     name: str
     impacts: Impacts
     surface: Surface | None = None
+    settings: CaptureSettings = field(default_factory=CaptureSettings)
+    """By which its folder was read."""
 
 
 def read_capture(folder: str | Path, settings: CaptureSettings | None = None) -> Capture:
@@ -82,7 +84,7 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
         directions=None if None in directions else torch.tensor(directions, dtype=torch.float32),
         forces=None if None in forces else torch.tensor(forces, dtype=torch.float32),
     )
-    return Capture(settings.name or folder.resolve().name, impacts, surface)
+    return Capture(settings.name or folder.resolve().name, impacts, surface, settings)
 
 
 def settings_of(folder: Path) -> CaptureSettings:

@@ -2,11 +2,12 @@
 
 import math
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from pathlib import Path
 from types import NoneType
-from typing import get_args
+from typing import Any, get_args
 
 from avmsf.errors import CaptureError
 
@@ -101,15 +102,21 @@ class CaptureSettings:
             raise CaptureError(f"{path}: there is no such file of capture settings") from error
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             raise CaptureError(f"{path}: not a TOML file that can be read: {error}") from error
+        return cls.of(table, name=str(path))
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any], *, name: str) -> "CaptureSettings":
+        """Return settings of these keys' plain values; `CaptureError` gives `name`, the key and what was expected."""
         known = {field.name: get_args(field.type) or (field.type,) for field in fields(cls)}
-        for key, value in table.items():
+        typed: dict[str, Any] = {}
+        for key, value in values.items():
             if key not in known:
-                raise CaptureError(f"{path}: unknown key {key!r}{_nearest_key(key, list(known))}")
-            table[key] = _typed(value, known[key], f"{path}: {key}")
+                raise CaptureError(f"{name}: unknown key {key!r}{_nearest_key(key, list(known))}")
+            typed[key] = _typed(value, known[key], f"{name}: {key}")
         try:
-            return cls(**table)
+            return cls(**typed)
         except CaptureError as error:
-            raise CaptureError(f"{path}: {error}") from error
+            raise CaptureError(f"{name}: {error}") from error
 
 
 def _typed(value: object, kinds: tuple[object, ...], where: str) -> object:

@@ -122,6 +122,7 @@ def run(options: Options) -> int:
                 options.config,
                 gains=recipe,
                 capture=capture.name,
+                settings=capture.settings,
                 checkpoint=checkpoint,
                 progress=bar.show,
             )

@@ -43,9 +43,9 @@ class Options:
     recordings: tyro.conf.Positional[tuple[Path, ...]]
     """Recordings of blows on the same object: wav, flac or another format that libsndfile reads."""
     capture: Path | None = None
-    """Capture folder whose capture.toml says how recordings are read, where these were made like those of the fit."""
+    """Capture folder whose capture.toml says how recordings are read; by itself they are as those of the fit were."""
     settings: Path | None = None
-    """A capture.toml to use in place of that folder's own."""
+    """A capture.toml that says so."""
     several: bool = False
     """The recordings hold several blows each; every one of them is located."""
     level: float = 0.9

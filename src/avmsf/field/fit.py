@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
+from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.arguments import expect_fitting, fingerprint
 from avmsf.field.automatic import Automatic
@@ -62,6 +63,7 @@ def fit(
     *,
     gains: GainRecipe | Automatic | None = None,
     capture: str = "",
+    settings: CaptureSettings | None = None,
     checkpoint: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> SoundField:
@@ -69,7 +71,8 @@ def fit(
 
     `modes` as extracted from `train`, or `uninformed` where there is no warm-up. `gains` is how the gain field is made,
     or `Automatic`, which chooses among several ways and is the default: between the paper's network and splines, for of
-    the object's shape nothing is known here. What the config leaves open is chosen on a part of the training contacts
+    the object's shape nothing is known here. `settings` are the capture's, which the field keeps: recordings that it is
+    asked about later are read by them. What the config leaves open is chosen on a part of the training contacts
     held out for the purpose, then the field is fitted to all. With
     `checkpoint`, the state is kept there while the fit runs, on interruption and at the end, and a fit of the same
     arguments goes on from it to the same result; delete the file once the field is saved. Raises `FitError` for
@@ -104,7 +107,7 @@ def fit(
         Residual(run.residual.magnitude.detach().clone()),
         train.sample_rate,
         train.sounds.shape[1],
-        Origin(capture, train.names, train.forces is not None, config, report),
+        Origin(capture, train.names, train.forces is not None, config, report, settings or CaptureSettings()),
     )
 
 

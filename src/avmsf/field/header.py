@@ -3,7 +3,8 @@
 {"format": 6, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
  "sizes": {"modes": 43, "bins": 1025},
  "gain_field": {"kind": "attention", what the gain field says of itself},
- "config": {FitConfig}, "origin": {"capture": "bowl", "trained_on": [...], "per_newton": true, "report": {...}}}
+ "config": {FitConfig}, "origin": {"capture": "bowl", "trained_on": [...], "per_newton": true, "report": {...},
+                                   "settings": {CaptureSettings}}}
 """
 
 import json
@@ -13,7 +14,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from avmsf.errors import FieldFileError, FitError
+from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import CaptureError, FieldFileError, FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.records import count_of, like, record_of
 from avmsf.field.soundfield import Origin, SoundField
@@ -55,6 +57,7 @@ class Header:
     def to_json(self, path: Path) -> str:
         """Return the record as text for the file `path`, or raise `FieldFileError` where the report is none."""
         origin = {name: getattr(self.origin, name) for name in ("capture", "trained_on", "per_newton", "report")}
+        origin["settings"] = asdict(self.origin.settings)
         record = {
             "format": FORMAT,
             "version": version("avmsf"),
@@ -89,7 +92,7 @@ def read_header(words: str, path: Path) -> Header:
         )
     try:
         return _header(record)
-    except (ValueError, TypeError, KeyError, FitError) as error:
+    except (ValueError, TypeError, KeyError, FitError, CaptureError) as error:
         raise broken(path, error) from error
 
 
@@ -111,6 +114,7 @@ def _header(record: dict[str, Any]) -> Header:
             per_newton=like(origin["per_newton"], True, "origin.per_newton"),
             config=record_of(FitConfig(), record["config"], "config"),
             report=like(origin["report"], {}, "origin.report"),
+            settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
         ),
     )
 

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from avmsf.capture.settings import CaptureSettings
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField, Gains
 from avmsf.modal.bank import ModalBank
@@ -32,6 +33,8 @@ class Origin:
     """Settings of the fit."""
     report: dict[str, Any] = field(default_factory=dict)
     """What the fit chose and reached, as plain numbers and words."""
+    settings: CaptureSettings = field(default_factory=CaptureSettings)
+    """By which its recordings were read."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -145,6 +145,7 @@ def reconstruct(
             config.fit,
             gains=recipe_for(name, shape.candidates, physics),
             capture=capture.name,
+            settings=capture.settings,
             checkpoint=stages.checkpoint(FIELD),
             progress=fitting,
         )

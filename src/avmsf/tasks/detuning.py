@@ -22,9 +22,9 @@ DETUNINGS = (0.9, 0.95, 1.05, 1.1)
 class OutOfTune:
     """A bank's modes at each of `DETUNINGS`, for sounds of one length."""
 
-    poles: tuple[Complex128[Tensor, " modes"], ...]
+    poles: tuple[Complex128[Tensor, " _modes"], ...]
     """Of each detuning, apart: their products with a sound are faster one after the other than all at once."""
-    inverses: tuple[Float64[Tensor, "two_modes two_modes"], ...]
+    inverses: tuple[Float64[Tensor, "_two_modes _two_modes"], ...]
     """As `Extractor.inverse`."""
 
     @classmethod

@@ -47,15 +47,16 @@ def hear(
     sample_rate: float | None = None,
     settings: CaptureSettings | None = None,
 ) -> Heard:
-    """Prepare a recorded blow for a field: `settings` are those of the capture that the field was fitted to.
+    """Prepare a recorded blow for a field as the recordings were that it was fitted to.
 
-    Bare samples are at `sample_rate` Hz, or at the field's rate. Nothing is divided by a force, but a pulse that was
-    divided out of the capture's sounds is divided out here too where the recording holds it; channels that the
-    recording lacks are not asked for. Raises LocationError for recordings that are silent, too short, not finite, or
-    never sudden enough to hold a blow.
+    By the settings of that capture, which the field keeps, but that the blow is sought wherever it begins; `settings`
+    take their place. Bare samples are at `sample_rate` Hz, or at the field's rate, and taken as they are. Nothing is
+    divided by a force, but a pulse that was divided out of the capture's sounds is divided out here too where the
+    recording holds it; channels that the recording lacks are not asked for. Raises LocationError for recordings that
+    are silent, too short, not finite, or never sudden enough to hold a blow.
     """
     whole = as_recording(recording, field, sample_rate=sample_rate)
-    chosen = settings_for(whole, settings)
+    chosen = settings_for(whole, own_settings(recording, field) if settings is None else settings)
     notes = describe(whole, chosen)
     try:
         prepared = prepare(whole, chosen)
@@ -152,10 +153,13 @@ def at_field_rate(
     return torch.from_numpy(resampled.astype(np.float32)), highest, [note]
 
 
-def settings_for(recording: Recording, settings: CaptureSettings | None) -> CaptureSettings:
+def own_settings(recording: Sound, field: SoundField) -> CaptureSettings:
+    """Return the settings by which a field's own capture was read; bare samples are read already."""
+    return replace(field.origin.settings, align=True) if isinstance(recording, Recording) else CaptureSettings()
+
+
+def settings_for(recording: Recording, settings: CaptureSettings) -> CaptureSettings:
     """Return settings that ask for nothing which a recording of a single blow may lack."""
-    if settings is None:
-        return CaptureSettings(normalise="none")
     count = len(recording.channels)
     force, response = settings.force_channel, settings.response_channel
     kept = replace(

@@ -35,10 +35,10 @@ def locate(
 ) -> ContactMap:
     """Return where on the object a recorded blow fell (paper, section Contact Localization, and a posterior).
 
-    Bare samples are at `sample_rate` Hz, or at the field's rate. `settings` are those of the capture that the field was
-    fitted to (see `hear`), `points` and `directions` as for `Locator.of`, `force` as for `Locator.locate`; `locator`,
-    made before, saves making one for each recording. Raises LocationError as `hear` and `Locator.locate`, and for the
-    sound of another object: where its misfit is above `STRANGE`.
+    Bare samples are at `sample_rate` Hz, or at the field's rate. `settings` take the place of those of the capture
+    that the field was fitted to (see `hear`), `points` and `directions` as for `Locator.of`, `force` as for
+    `Locator.locate`; `locator`, made before, saves making one for each recording. Raises LocationError as `hear` and
+    `Locator.locate`, and for the sound of another object: where its misfit is above `STRANGE`.
     """
     heard = hear(recording, field, sample_rate=sample_rate, settings=settings)
     finder = Locator.of(field, points=points, directions=directions) if locator is None else locator

@@ -20,7 +20,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.synthesis import synthesise
 from avmsf.tasks.amplitudes import Extractor
 from avmsf.tasks.contactmap import ContactMap
-from avmsf.tasks.hearing import Sound, as_recording, at_field_rate, describe, settings_for
+from avmsf.tasks.hearing import Sound, as_recording, at_field_rate, describe, own_settings, settings_for
 from avmsf.tasks.locate import judge_fit
 from avmsf.tasks.locator import Locator
 
@@ -50,7 +50,7 @@ def locate_blows(
     no blow can be located.
     """
     whole = as_recording(recording, field, sample_rate=sample_rate)
-    chosen = settings_for(whole, settings)
+    chosen = settings_for(whole, own_settings(recording, field) if settings is None else settings)
     if chosen.normalise == "deconvolve":
         raise LocationError(
             f'{whole.name}: normalise = "deconvolve" divides one push of the hammer out of a recording, not several: '
