@@ -258,7 +258,10 @@ SHEET = ("--body.wall", "0.004", "--body.shapes", "8", "--body.freedoms", "1000"
 def test_fit_says_why_physics_took_no_part(capture: Path, tmp_path: Path, capsys: Streams) -> None:
     fields = tmp_path / "fields"
     assert main(["fit", str(capture), "--output", str(fields / "two"), "--train-count", "2", *SHEET, *TINY]) == 0
-    told = capsys.readouterr().out
+    told, beside = capsys.readouterr()
+    assert "2 recordings tell little of how loud modes are between contacts" in beside
+    # Counted before anything is computed.
+    assert "tetrahedra" not in beside
     assert "not by physics: physics needs 3 strikes or more" in told
     assert "gains by spline" in told
     folder = fill_plate(tmp_path / "plate")

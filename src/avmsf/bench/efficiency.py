@@ -129,8 +129,9 @@ def curves(record: ObjectRecord, *, metric: str) -> tuple[Curve, ...]:
         known = sorted({name for outcome in record.outcomes for name in outcome.values})
         reason = next((each.failure for each in record.outcomes if each.failure), record.failure)
         raise EvaluationError(
-            f"{record.identifier}: no method has the metric {metric!r}"
-            + (f"; there are {', '.join(known)}" if known else f": {reason or 'nothing was measured'}")
+            f"{record.identifier}: no method has the metric {metric!r}; there are {', '.join(known)}"
+            if known
+            else f"{record.identifier}: {reason or 'nothing was measured'}"
         )
     return tuple(_curve(method, by_count) for method, by_count in found.items())
 

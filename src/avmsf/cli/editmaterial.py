@@ -49,7 +49,12 @@ class MaterialChange:
         return self.material is not None or self.size != 1.0 or bool(self.constants)
 
     def made_of(self, field: SoundField) -> Material:
-        """Return what a field is of before the change, with words on how that is known where it is not given."""
+        """Return what a field is of before the change, with words on how that is known where it is not given.
+
+        Raises `EditError` first of all where what it comes to be of is unknown.
+        """
+        if self.material is not None:
+            material_named(self.material)
         return old_material(field) if self.old is None else material_named(self.old)
 
     def target(self, old: Material) -> Material:

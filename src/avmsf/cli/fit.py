@@ -31,6 +31,9 @@ from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features
 
+_FEW = 8
+"""Recordings below which little is told of the gains between contacts."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -108,9 +111,11 @@ def run(options: Options) -> int:
     )
     features = features_of(capture, options.config) if options.features is None else load_features(options.features)
     expect_on_object(capture.impacts, features.points)
+    if len(train) < _FEW:
+        say(f"{len(train)} recordings tell little of how loud modes are between contacts; {_FEW} or more tell much")
     say(f"finding the modes of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     modes = extract_once(train, finder(options.method, options.modes), _beside(options.output, "modes"))
-    recipe = _recipe(options, capture, features)
+    recipe = _recipe(options, capture, train, features)
     say(f"fitting a field of {len(modes.bank)} modes")
     checkpoint = _beside(options.output, "checkpoint")
     try:
@@ -165,14 +170,14 @@ def run(options: Options) -> int:
     return 0
 
 
-def _recipe(options: Options, capture: Capture, features: FeatureField) -> GainRecipe | Automatic:
+def _recipe(options: Options, capture: Capture, train: Impacts, features: FeatureField) -> GainRecipe | Automatic:
     """Return how gains are spread."""
 
     def physics() -> Physics:
         if capture.surface is None:
             raise FitError("physics needs the object's shape: lay its mesh into the capture folder as surface.obj")
         cache = _beside(options.output, "bodies")
-        return physics_of(capture.surface, options.body, impacts=capture.impacts, cache=cache, tell=say)
+        return physics_of(capture.surface, options.body, impacts=train, cache=cache, tell=say)
 
     if options.gains == "auto":
         return all_recipes({"attention": features}, physics, tell=say)

@@ -39,7 +39,8 @@ class Options:
     capture: tyro.conf.Positional[Path | None] = None
     """Capture to set beside the field: its recordings that the field was not fitted to, or all where there are none."""
     output: Path | None = None
-    """Folder for the pictures modes.png, gains.png and, with a capture, spectrograms.png; none without it."""
+    """Folder for the pictures modes.png, gains.png, doubt.png and spectrum.png where the gains know how sure they are,
+    and spectrograms.png with a capture; none without it."""
     settings: Path | None = None
     """A capture.toml to use in place of the capture's own."""
     json: bool = False

@@ -84,7 +84,7 @@ class Physics:
         or features that are not on the body's surface.
         """
         heard, points, bodies = measured_gains(case), case.features.points, self.bodies.bodies
-        _expect_enough(case)
+        expect_enough(len(case.train))
         _expect_one_frame(case, bodies[0])
         _expect_strikes(case)
         _expect_motion(bodies, heard)
@@ -158,11 +158,12 @@ def gain_variance(case: GainCase) -> Float64[Tensor, " modes"]:
     return 4.0 * bank.damping * noise / (case.train.sample_rate * lasting)
 
 
-def _expect_enough(case: GainCase) -> None:
-    if len(case.train) < FEWEST:
+def expect_enough(strikes: int) -> None:
+    """Raise FitError for fewer strikes than physics can learn from."""
+    if strikes < FEWEST:
         raise FitError(
-            f"physics needs {FEWEST} strikes or more to tell how much of each shape a mode has, found "
-            f"{len(case.train)}: strike more places, or let splines spread the gains"
+            f"physics needs {FEWEST} strikes or more to tell how much of each shape a mode has, found {strikes}: "
+            "strike more places, or let splines spread the gains"
         )
 
 

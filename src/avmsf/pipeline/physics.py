@@ -11,7 +11,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.placement import surface_points
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
-from avmsf.field.physics import Physics
+from avmsf.field.physics import Physics, expect_enough
 from avmsf.field.placed import expect_placed
 from avmsf.simulate.nominal import NominalBody, nominal_bodies, refined
 
@@ -70,11 +70,12 @@ def physics_of(
 ) -> Physics:
     """Return the recipe for an object with this surface; elastic modes are kept by content in `cache`.
 
-    Raises SimulationError where no body can be had, and FitError, before any is computed, where the contacts of the
-    `impacts` that it is meant for do not lie on the surface.
+    Raises SimulationError where no body can be had, and FitError, before any is computed, where the `impacts` that it
+    is meant for are too few, or their contacts do not lie on the surface.
     """
     config = BodyConfig() if config is None else config
     if impacts is not None:
+        expect_enough(len(impacts))
         expect_placed(impacts.contacts, surface_points(surface), names=impacts.names)
     walls = None if config.wall is None else [config.wall or None]
     bodies = nominal_bodies(surface, walls=walls, count=config.shapes, freedoms=config.freedoms, cache=cache, tell=tell)

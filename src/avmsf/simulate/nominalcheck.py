@@ -70,8 +70,8 @@ class CheckedSurface:
         held = self.mean_thickness
         if held is not None and wall > _HOLLOW * held:
             raise SimulationError(
-                f"the surface holds {1000 * held:.2g} mm on the mean, as if both sides of a wall were there already: "
-                f"not guessed above {1000 * _HOLLOW * held:.2g} mm; state the wall if it has one"
+                f"the mesh shows both sides of what is {1000 * held:.2g} mm thick on the mean, and is taken as filled: "
+                f"walls above {1000 * _HOLLOW * held:.2g} mm are not guessed"
             )
 
     def sheet(self) -> Skin:

@@ -48,7 +48,8 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
     if skin.open_edges == 0 and skin.areas.sum() * thickness > abs(skin.volume):
         middle = 0.5 * abs(skin.volume) / skin.areas.sum()
         raise SimulationError(
-            f"a wall of {thickness:g} m is more than the closed surface holds: fill it, or try thickness={middle:.1g}"
+            f"a wall of {1000 * thickness:.3g} mm is more than the closed surface holds, {4000 * middle:.2g} mm on "
+            f"the mean: take it as filled (a wall of 0 m), or its wall as {middle:.1g} m"
         )
     coarse = skin.remeshed(detail * skin.size)
     if _folded_part(coarse, thickness) > _SPARED:

@@ -116,7 +116,7 @@ def partial_denoising(
 
 @dataclass(frozen=True)
 class DistillationConfig:
-    """How targets are drawn from a model. Raises `EditError` for values that cannot be meant."""
+    """How targets are drawn from a model."""
 
     guidance: float = 15.0
     """How many times the step from the negative words, or from none, to the prompt is taken; Audio-SDS is said to have
@@ -131,6 +131,7 @@ class DistillationConfig:
     """Sounds that the model is given at once; halved where memory runs out."""
 
     def __post_init__(self) -> None:
+        """Raise `EditError` for values that cannot be meant."""
         if not 0 < self.lowest <= self.highest < 1:
             raise EditError(f"noise levels {self.lowest:g} to {self.highest:g}: expected 0 < lowest <= highest < 1")
         for name in ("denoising", "batch"):

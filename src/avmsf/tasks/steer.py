@@ -62,7 +62,7 @@ class Guide(Protocol):
 
 @dataclass(frozen=True)
 class SteerConfig:
-    """How an edit descends. Raises `EditError` for values that cannot be meant."""
+    """How an edit descends."""
 
     steps: int = 300
     """Steps; Audio-SDS is said to take about 1,000."""
@@ -80,6 +80,7 @@ class SteerConfig:
     """Steps between previews that can be listened to; 0 for none."""
 
     def __post_init__(self) -> None:
+        """Raise `EditError` for values that cannot be meant."""
         for name, least in (("steps", 1), ("contacts", 1), ("modes", 1), ("preview_every", 0), ("seed", 0)):
             if getattr(self, name) < least:
                 raise EditError(f"{name} = {getattr(self, name)}: expected {least} or more")
