@@ -13,14 +13,15 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 from avmsf.tasks.locator import Locator
+from unsaved_gains import Unsaved
 
 RATE, SECONDS, LENGTH = 44100.0, 0.4, 0.24
 HIGHEST = {"wood": 6000.0, "plastic": 3000.0}
 
 
 @dataclass(frozen=True, eq=False)
-class PlateGains:
-    """A plate's own gains, in closed form; they know no doubt and are never kept in a file."""
+class PlateGains(Unsaved):
+    """A plate's own gains, in closed form."""
 
     plate: Plate
     highest: float
@@ -32,23 +33,6 @@ class PlateGains:
 
     def at(self, contacts: Tensor, directions: Tensor | None = None) -> Gains:
         return Gains(plate_modes(self.plate, contacts, highest=self.highest).gains.float())
-
-    def deviation(self, contacts: Tensor, directions: Tensor | None = None) -> None:
-        return None
-
-    def record(self):
-        raise NotImplementedError
-
-    def tensors(self):
-        raise NotImplementedError
-
-    @classmethod
-    def skeleton(cls, record):
-        raise NotImplementedError
-
-    @classmethod
-    def restore(cls, record, tensors):
-        raise NotImplementedError
 
 
 def plate(material: str, length: float = LENGTH) -> Plate:

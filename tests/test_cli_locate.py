@@ -11,8 +11,10 @@ import torch
 import trimesh
 from torch import Tensor
 
+from avmsf.capture import CaptureSettings
 from avmsf.cli import main
-from avmsf.cli.locate import parse, run
+from avmsf.cli.locate import Options, parse, run
+from avmsf.cli.locate import _settings as settings_asked
 from avmsf.errors import AvmsfError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import save
@@ -199,3 +201,9 @@ def test_what_cannot_be_done_is_said_in_one_line(place: Place, tmp_path: Path, c
             code = int(left.code or 0)
         assert code == 2
         assert said in capsys.readouterr().err
+
+
+def test_another_capture_without_settings_of_its_own_is_read_as_captures_are(tmp_path: Path) -> None:
+    """Not as the field's own was: that is what is read by where no capture is named."""
+    assert settings_asked(Options(tmp_path / "field", (), capture=tmp_path)) == CaptureSettings()
+    assert settings_asked(Options(tmp_path / "field", ())) is None

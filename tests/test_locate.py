@@ -20,31 +20,11 @@ from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locate import DOUBTFUL, STRANGE, UNLIKE, judge_fit, locate
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
+from unsaved_gains import Unsaved
 
 PLATE = Plate()
 RATE, SECONDS, HIGHEST = 18000.0, 0.4, 8000.0
 DIAGONAL = math.hypot(PLATE.length, PLATE.width)
-
-
-class Unsaved:
-    """A gain field that knows no doubt and is never kept in a file."""
-
-    def deviation(self, contacts: torch.Tensor, directions: torch.Tensor | None = None) -> None:
-        return None
-
-    def record(self):
-        raise NotImplementedError
-
-    def tensors(self):
-        raise NotImplementedError
-
-    @classmethod
-    def skeleton(cls, record):
-        raise NotImplementedError
-
-    @classmethod
-    def restore(cls, record, tensors):
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)

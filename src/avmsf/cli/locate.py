@@ -14,7 +14,7 @@ from avmsf.bench.contactpictures import draw_contact, write_contact_cloud
 from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings
 from avmsf.capture.audio import Recording, read_recording
-from avmsf.capture.folder import SETTINGS
+from avmsf.capture.folder import settings_of
 from avmsf.cli.printing import console, figure, print_json, say
 from avmsf.cli.writing import OutputError, expect_writable
 from avmsf.errors import AvmsfError
@@ -126,8 +126,7 @@ def _settings(options: Options) -> CaptureSettings | None:
         return None
     if not options.capture.is_dir():
         raise OutputError(f"{options.capture}: expected a capture folder, found none: check the name, or leave it out")
-    path = options.capture / SETTINGS
-    return CaptureSettings.read(path) if path.is_file() else None
+    return settings_of(options.capture)
 
 
 def _describe(name: str, seconds: float | None, contact: ContactMap, known: _Known, level: float) -> dict[str, Any]:

@@ -132,9 +132,9 @@ def coverage(
 
     `parts` as `GainCase.parts`: amplitudes along each of the field's modes' phases and a quarter of a period ahead, of
     each mode up to a phase that all contacts share, of each contact up to their common sign where the field knows no
-    directions of blows. The interval is that of a
-    measured gain, so it holds the scatter of a blow as well as the field's doubt, and is as wide as `widening` says.
-    Raises FitError for gains that know no doubt and for gains of other modes.
+    directions of blows. The interval is that of a measured gain, so it holds the scatter of a blow as well as the
+    field's doubt, and is as wide as `widening` says. Raises FitError for gains that know no doubt and for gains of
+    other modes.
     """
     gains, scale = measured_gains(field), scale_of(field).square()[:, None]
     if parts.shape != (len(contacts), len(field.bank), 2):

@@ -19,6 +19,7 @@ from avmsf.field.arguments import expect_fitting, fingerprint
 from avmsf.field.automatic import Automatic
 from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
 from avmsf.field.config import FitConfig
+from avmsf.field.gainfield import GainField
 from avmsf.field.losses import spectral_loss
 from avmsf.field.recipes import GainCase, GainRecipe, along_phase
 from avmsf.field.refinement import RefinedGains
@@ -72,11 +73,11 @@ def fit(
     `modes` as extracted from `train`, or `uninformed` where there is no warm-up. `gains` is how the gain field is made,
     or `Automatic`, which chooses among several ways and is the default: between the paper's network and splines, for of
     the object's shape nothing is known here. `settings` are the capture's, which the field keeps: recordings that it is
-    asked about later are read by them. What the config leaves open is chosen on a part of the training contacts
-    held out for the purpose, then the field is fitted to all. With
-    `checkpoint`, the state is kept there while the fit runs, on interruption and at the end, and a fit of the same
-    arguments goes on from it to the same result; delete the file once the field is saved. Raises `FitError` for
-    arguments that do not fit together and for a fit that diverges, `FieldFileError` for a checkpoint of another fit.
+    asked about later are read by them. What the config leaves open is chosen on a part of the training contacts held
+    out for the purpose, then the field is fitted to all. With `checkpoint`, the state is kept there while the fit runs,
+    on interruption and at the end, and a fit of the same arguments goes on from it to the same result; delete the file
+    once the field is saved. Raises `FitError` for arguments that do not fit together and for a fit that diverges,
+    `FieldFileError` for a checkpoint of another fit.
     """
     config = FitConfig() if config is None else config
     expect_fitting(train, modes)
@@ -96,10 +97,12 @@ def fit(
     order = torch.argsort(run.bank.frequency.detach())
     report = {"gains": recipe.name, **told, **run.network.report, **report}
     bank = ModalBank(*(each.detach()[order] for each in (run.bank.frequency, run.bank.damping)))
-    finished = run.network.finished(order)
+    finished: GainField
     if isinstance(run.network, RefinedGains):
         parts = fit_gains(train.sounds, bank, sample_rate=train.sample_rate)
         finished = run.network.judged(order, along_phase(*parts, case.phase[order]))
+    else:
+        finished = run.network.finished(order)
     return SoundField(
         bank,
         finished,

@@ -153,6 +153,7 @@ def reconstruct(
         save(replace(fitted, origin=replace(fitted.origin, report=report)), path)
 
     recipe = {**basis, "modes": found.digest, "chosen": name, "name": capture.name, "body": asdict(config.body)}
+    recipe["settings"] = asdict(capture.settings)
     recipe["surface"] = shape.surface_digest
     kept = stages.keep(FIELD, recipe, make)
     made = {**shape.made, "modes": found} | ({} if chosen is None else {"choice": chosen}) | {"fit": kept}

@@ -14,7 +14,7 @@ from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.tasks.amplitudes import Amplitudes, Extractor
-from avmsf.tasks.contactmap import ContactMap as ContactMap
+from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.detuning import OutOfTune
 from avmsf.tasks.foretelling import foretell, patches, unknown, widened
 from avmsf.tasks.heed import heed_of
