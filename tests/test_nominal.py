@@ -117,7 +117,7 @@ def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
     assert found.bodies[0].elastic.mass == pytest.approx(mass, rel=0.06)
     reasons = [reason for wall, reason in found.refused.items() if wall is not None]
     assert len(reasons) == 6
-    assert all("both sides of a wall" in reason or "2 parts" in reason for reason in reasons)
+    assert all("both sides of what is 6 mm thick" in reason or "2 parts" in reason for reason in reasons)
 
 
 @needs_pytetwild
