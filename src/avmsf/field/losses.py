@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf.field.comparison import compare
+
 _CHUNK = 1 << 19
 """Samples of windowed frames held at once: they stay near the processor's cache."""
 _SILENT = 1e-12
@@ -25,6 +27,8 @@ class SpectralTarget:
 
     magnitudes: tuple[Float[Tensor, "contacts _frames _bins"], ...]
     """One a resolution, each with its own numbers of frames and bins."""
+    norms: tuple[Float[Tensor, " _frames"], ...]
+    """Their sums over contacts and bins."""
     hops: tuple[int, ...]
     """Samples between frames, one a resolution."""
     samples: int
@@ -52,10 +56,11 @@ def spectral_target(
         window = torch.hann_window(fft_size, dtype=cut.dtype, device=cut.device)
         frames = _padded(cut, fft_size).unfold(1, fft_size, hop)
         target = torch.empty(*frames.shape[:2], fft_size // 2 + 1, dtype=cut.dtype, device=cut.device)
-        for row, part in _chunks(frames.shape[0], frames.shape[1], fft_size):
-            target[row, part] = _magnitude(torch.fft.rfft(frames[row, part] * window), _floor(window))
+        for chunk in _chunks(frames.shape[0], frames.shape[1], fft_size):
+            target[chunk] = _magnitude(torch.fft.rfft(frames[chunk] * window), _floor(window))
         magnitudes.append(target)
-    return SpectralTarget(tuple(magnitudes), tuple(hops), cut.shape[1])
+    norms = tuple(magnitude.sum((0, 2)) for magnitude in magnitudes)
+    return SpectralTarget(tuple(magnitudes), norms, tuple(hops), cut.shape[1])
 
 
 def spectral_loss(
@@ -85,69 +90,46 @@ class _SpectralL1(torch.autograd.Function):
     def forward(
         ctx: Any, sounds: Float[Tensor, "contacts samples"], target: SpectralTarget, first: int, every: int
     ) -> Float[Tensor, ""]:
+        widest = max(_fft_size(magnitude) for magnitude in target.magnitudes)
+        padded = _padded(sounds, widest)
+        # A hop more than the sound, for the last column of hops that `_overlap_add` fills only in part.
+        slope = padded.new_zeros(len(padded), padded.shape[1] + every * max(target.hops))
         loss = sounds.new_zeros(())
-        gradient = torch.zeros_like(sounds)
-        for magnitude, hop in zip(target.magnitudes, target.hops, strict=True):
+        for magnitude, norms, hop in zip(target.magnitudes, target.norms, target.hops, strict=True):
+            fft_size = _fft_size(magnitude)
             # Short sounds may have fewer frames than are skipped.
             step = min(every, magnitude.shape[1])
             start = first % step
-            asked = magnitude[:, start::step]
-            norm = asked.sum().clamp_min(torch.finfo(sounds.dtype).tiny)
-            distance, slope = _distance(sounds, asked, start * hop, step * hop, with_slope=ctx.needs_input_grad[0])
-            loss += distance / norm
-            if slope is not None:
-                gradient += slope / norm
-        ctx.save_for_backward(gradient)
+            norm = norms[start::step].sum().clamp_min(torch.finfo(sounds.dtype).tiny)
+            window = torch.hann_window(fft_size, dtype=sounds.dtype, device=sounds.device)
+            floor, slope_window = _floor(window), 0.5 * window / norm
+            before = (widest - fft_size) // 2 + start * hop
+            frames = padded[:, before : padded.shape[1] - (widest - fft_size) // 2].unfold(1, fft_size, step * hop)
+            for rows, part in _chunks(*frames.shape):
+                spectra = torch.fft.rfft(frames[rows, part] * window)
+                place = start + step * part.start
+                loss += compare(spectra, magnitude[rows], floor, first=place, every=step) / norm
+                if ctx.needs_input_grad[0]:
+                    slopes = torch.fft.irfft(spectra, fft_size, norm="forward").mul_(slope_window)
+                    _overlap_add(slope[rows], slopes, before + part.start * step * hop, step * hop)
+        ctx.save_for_backward(slope[:, widest // 2 : widest // 2 + sounds.shape[1]])
         return loss
 
     @staticmethod
     def backward(ctx: Any, outer: Float[Tensor, ""]) -> tuple[Tensor, None, None, None]:
-        (gradient,) = ctx.saved_tensors
-        return outer * gradient, None, None, None
+        (slope,) = ctx.saved_tensors
+        return outer * slope, None, None, None
 
 
-def _distance(
-    sounds: Float[Tensor, "contacts samples"],
-    target: Float[Tensor, "contacts frames bins"],
-    start: int,
-    hop: int,
-    *,
-    with_slope: bool,
-) -> tuple[Float[Tensor, ""], Float[Tensor, "contacts samples"] | None]:
-    """Return the L1 distance to `target` and, on demand, its gradient; the first frame's centre is sample `start`."""
-    fft_size = 2 * (target.shape[2] - 1)
-    window = torch.hann_window(fft_size, dtype=sounds.dtype, device=sounds.device)
-    padded = _padded(sounds, fft_size)
-    frames = padded[:, start:].unfold(1, fft_size, hop)
-    # A hop more than the sound, for the last column of hops that `_overlap_add` fills only in part.
-    gradient = padded.new_zeros(padded.shape[0], padded.shape[1] + hop)
-    half_window = 0.5 * window
-    distance = sounds.new_zeros(())
-    for row, part in _chunks(frames.shape[0], frames.shape[1], fft_size):
-        spectrum = torch.fft.rfft(frames[row, part] * window)
-        magnitude = _magnitude(spectrum, _floor(window))
-        difference = magnitude - target[row, part]
-        distance += difference.abs().sum()
-        if with_slope:
-            spectrum *= difference.sign_().div_(magnitude)
-            # The one-sided inverse transform counts every bin but the two ends twice; the gradient counts each once.
-            spectrum[:, 0] *= 2.0
-            spectrum[:, -1] *= 2.0
-            slopes = torch.fft.irfft(spectrum, fft_size, norm="forward").mul_(half_window)
-            _overlap_add(gradient[row], slopes, start + part.start * hop, hop)
-    if not with_slope:
-        return distance, None
-    return distance, gradient[:, fft_size // 2 : fft_size // 2 + sounds.shape[1]]
-
-
-def _overlap_add(into: Float[Tensor, " samples"], frames: Float[Tensor, "frames size"], start: int, hop: int) -> None:
-    """Add frames that begin at start, start + hop, ... to a signal, in place, one column of hops at a time."""
-    count, size = frames.shape
+def _overlap_add(
+    into: Float[Tensor, "contacts samples"], frames: Float[Tensor, "contacts frames size"], start: int, hop: int
+) -> None:
+    """Add frames that begin at start, start + hop, ... to signals, in place, one column of hops at a time."""
+    count, size = frames.shape[1:]
     for offset in range(0, size, hop):
         width = min(hop, size - offset)
-        into[start + offset : start + offset + count * hop].view(count, hop)[:, :width] += frames[
-            :, offset : offset + width
-        ]
+        column = into[:, start + offset : start + offset + count * hop].view(-1, count, hop)
+        column[..., :width] += frames[..., offset : offset + width]
 
 
 def _padded(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Float[Tensor, "contacts padded"]:
@@ -155,10 +137,14 @@ def _padded(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Float[T
     return torch.nn.functional.pad(sounds, (fft_size // 2, fft_size // 2))
 
 
-def _chunks(contacts: int, frames: int, fft_size: int) -> list[tuple[int, slice]]:
-    step = max(1, _CHUNK // fft_size)
+def _chunks(contacts: int, frames: int, fft_size: int) -> list[tuple[slice, slice]]:
+    """Return contacts and frames that are transformed at once: several contacts, or a part of one's frames."""
+    most = max(1, _CHUNK // fft_size)
+    rows = max(1, most // frames)
     return [
-        (row, slice(first, min(frames, first + step))) for row in range(contacts) for first in range(0, frames, step)
+        (slice(row, min(contacts, row + rows)), slice(first, min(frames, first + most)))
+        for row in range(0, contacts, rows)
+        for first in range(0, frames, most)
     ]
 
 
@@ -166,6 +152,10 @@ def _magnitude(spectrum: Tensor, floor: float) -> Tensor:
     # Torch's abs() of a complex tensor guards against overflow at three times the cost.
     parts = torch.view_as_real(spectrum)
     return torch.addcmul(parts[..., 0].square(), parts[..., 1], parts[..., 1]).clamp_min_(floor).sqrt_()
+
+
+def _fft_size(magnitude: Float[Tensor, "contacts frames bins"]) -> int:
+    return 2 * (magnitude.shape[2] - 1)
 
 
 def _floor(window: Float[Tensor, " size"]) -> float:
