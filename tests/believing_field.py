@@ -51,7 +51,7 @@ def drawn_gains(contacts: Tensor, *, seed: int, noise: float = 0.03, remainder: 
     """Return gains of contacts, drawn from what the regression takes gains to be, [contacts, modes, 2]."""
     surface = bar_surface()
     directions = DOWN.expand(len(contacts), 3)
-    sites = sites_of(surface, contacts, directions)
+    sites, _ = sites_of(surface, contacts, directions)
     prior = nearness(BANK.frequency, ELASTIC)[:, 1]
     prior = prior / prior.sum(1, keepdim=True)
     elastic = torch.einsum("ck,mk,dk->mcd", sites.shapes, prior, sites.shapes)
@@ -67,14 +67,14 @@ def physics_field(contacts: Tensor, values: Tensor, *, only: tuple[int, int, int
     """Return the field of gains at contacts; of one hypothesis alone where `only` names it."""
     surface = bar_surface()
     directions = DOWN.expand(len(contacts), 3)
-    sites, prior = sites_of(surface, contacts, directions), nearness(BANK.frequency, ELASTIC)
+    sites, prior = sites_of(surface, contacts, directions)[0], nearness(BANK.frequency, ELASTIC)
     floor, doubt = torch.zeros(values.shape[:2], dtype=torch.float64), torch.ones(len(contacts), dtype=torch.float64)
     regression = Regression.of(sites, prior, values, floor=floor, doubt=doubt)
     if only is not None:
         width, remainder, noise = only
         weights = torch.zeros_like(regression.weights)
         weights[(width * 3 + remainder) * 6 + noise] = 1.0
-        regression = Regression(sites, prior, values, floor, doubt, weights, 0.0)
+        regression = Regression(sites, prior, values, floor, doubt, weights)
     return ModalBasis(surface, contacts, directions, regression)
 
 

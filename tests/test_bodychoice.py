@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from avmsf.field.bodychoice import likely_bodies
+from avmsf.field.evidence import Regression
 from avmsf.field.suspects import agreeing
 from avmsf.simulate.nominal import NominalBody
 from made_dome import STIFFER, WALLS, bodies, points, struck
@@ -40,8 +41,14 @@ def test_a_lag_is_the_evidence_of_the_field_that_the_body_gives():
     measured = struck(WALLS[1], 8)
     first, second = likely_bodies(bodies(), points(), measured)[:2]
     strong = measured.strongest()
-    one, other = (each.suits + each.fit(strong).regression.evidence for each in (first, second))
-    assert second.lag == pytest.approx(one - other, rel=1e-9)
+    evidence = []
+    for each in (first, second):
+        known = each.fit(strong).regression
+        found = Regression.evidence_of(
+            known.sites, known.prior[None], known.values, floor=known.floor, doubt=known.doubt
+        )
+        evidence.append(each.suits + float(found[0]))
+    assert second.lag == pytest.approx(evidence[0] - evidence[1], rel=1e-9)
 
 
 def test_where_frequencies_are_the_same_gains_decide():

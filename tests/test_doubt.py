@@ -12,6 +12,7 @@ from avmsf.errors import FitError
 from avmsf.field.belief import beliefs, deviation_of, knows_doubt, left_out, struck_at
 from avmsf.field.doubt import coverage, gain_doubt, spectrum_band, widening
 from avmsf.field.evidence import Regression
+from avmsf.field.hypotheses import row_of
 from avmsf.field.modalbasis import ModalBasis, sites_of
 from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.suggest import suggest
@@ -38,7 +39,7 @@ def test_leaving_contacts_out_at_once_agrees_with_leaving_each_out_by_itself() -
     values = drawn_gains(contacts, seed=1)
     gains = physics_field(contacts, values, only=FIRST)
     missed, spread = gains.regression.left_out
-    whole = gains.regression.covariance_of(*FIRST)
+    whole = gains.regression.hypotheses.covariance(torch.arange(4), torch.tensor([row_of(*FIRST)]))[0]
     for row in range(6):
         kept = [each for each in range(6) if each != row]
         for mode in range(4):
@@ -64,7 +65,7 @@ def test_hypotheses_are_weighed_without_the_gain_that_is_left_out() -> None:
         total = torch.zeros(4, 2, dtype=torch.float64)
         mass = torch.zeros(4, 2, dtype=torch.float64)
         for hypothesis in range(len(known.weights)):
-            whole = known.covariance_of(hypothesis // 18, hypothesis // 6 % 3, hypothesis % 6)
+            whole = known.hypotheses.covariance(torch.arange(4), torch.tensor([hypothesis]))[0]
             others = whole[:, kept][:, :, kept]
             inverse, rest = torch.linalg.inv(others), values[kept].transpose(0, 1)
             squares = (rest * (inverse @ rest)).sum(1)
@@ -176,7 +177,7 @@ def test_strikes_that_are_doubted_do_not_widen_the_others_intervals() -> None:
     doubt = torch.ones(12, dtype=torch.float64)
     doubt[3] = 1e6
     surface = physics_field(contacts, values).surface
-    sites = sites_of(surface, contacts, DOWN.expand(12, 3))
+    sites, _ = sites_of(surface, contacts, DOWN.expand(12, 3))
     known = physics_field(contacts, values).regression
     regression = Regression.of(sites, known.prior, wrong, floor=known.floor, doubt=doubt)
     gains = ModalBasis(surface, contacts, DOWN.expand(12, 3), regression)

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from avmsf.field.elasticpoints import ElasticPoints
-from avmsf.field.hypotheses import NOISES, REMAINDERS, WIDTHS
-from avmsf.field.modalbasis import REACH, ModalBasis, fit_modal_basis, remainder_kernel
+from avmsf.field.hypotheses import NOISES, REMAINDERS, WIDTHS, row_of
+from avmsf.field.modalbasis import REACH, ModalBasis, fit_modal_basis, remainder_kernel, sites_of
 from avmsf.field.thinplategains import thin_plate_gains
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts
 
@@ -137,8 +137,10 @@ def test_what_the_field_says_at_its_contacts_is_what_its_smoother_does():
 
 def test_the_covariance_with_the_contacts_is_that_of_the_contacts_without_noise():
     one = (WIDTHS.index(0.2), REMAINDERS.index(0.1), NOISES.index(0.1))
-    whole = field().regression.covariance_of(*one)
-    cross = field().covariance_with(field().contacts, field().directions, *one)
+    known, surface = field().regression.hypotheses, field().surface
+    whole = known.covariance(torch.arange(known.prior.shape[0]), torch.tensor([row_of(*one)]))[0]
+    found, _ = sites_of(surface, field().contacts, field().directions)
+    cross = known.kernel(found.shapes, found.remainder, *one[:2])
     assert torch.allclose(whole - cross, 0.1 * torch.eye(10, dtype=torch.float64).expand_as(whole), atol=1e-12)
 
 

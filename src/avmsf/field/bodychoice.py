@@ -167,10 +167,10 @@ def _gains_suit(
 
     A factor changes the prior alone: what is known of the contacts is looked up once for all.
     """
-    _, used = surface.along(measured.contacts, measured.directions)
+    sites, _ = sites_of(surface, measured.contacts, measured.directions)
     priors = nearness(measured.frequency, (factors[:, None] * elastic).flatten())
     return Regression.evidence_of(
-        sites_of(surface, measured.contacts.double(), used),
+        sites,
         priors.reshape(*priors.shape[:2], len(factors), len(elastic)).movedim(2, 0),
         measured.values,
         floor=measured.floor,

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float64, Int
 from torch import Tensor
 
 from avmsf.field import foretelling, leftout
-from avmsf.field.hypotheses import COUNT, NOISES, REMAINDERS, Hypotheses, Sites
+from avmsf.field.hypotheses import COUNT, Hypotheses, Sites
 
 _ROUNDS = 5
 """Of learning how likely hypotheses are beforehand."""
@@ -40,8 +40,6 @@ class Regression:
     """As in `Hypotheses`."""
     weights: Float64[Tensor, "hypotheses modes 2"]
     """How likely each hypothesis is after all; they sum to one."""
-    evidence: float
-    """Log of the likelihood of all gains, up to a constant of their number."""
 
     @classmethod
     def of(
@@ -58,8 +56,7 @@ class Regression:
         joint = _with_beliefs(torch.cat([known.likelihood(modes) for modes in known.batches()], dim=1))
         weights = torch.softmax(joint, dim=0)
         weights = torch.where(weights < _NEGLIGIBLE, 0.0, weights)
-        evidence = float(torch.logsumexp(joint, dim=0).sum())
-        return cls(sites, prior, values, floor, doubt, weights / weights.sum(0), evidence)
+        return cls(sites, prior, values, floor, doubt, weights / weights.sum(0))
 
     @classmethod
     def evidence_of(
@@ -71,7 +68,10 @@ class Regression:
         floor: Float64[Tensor, "contacts modes"],
         doubt: Float64[Tensor, " contacts"],
     ) -> Float64[Tensor, " trials"]:
-        """Return the evidence that `of` finds with each of several priors, all at once: many are soon tried."""
+        """Return the evidence of each of several priors, all at once: many are soon tried.
+
+        It is the log of the likelihood of all gains, up to a constant of their number.
+        """
         trials, modes = priors.shape[:2]
         known = Hypotheses(sites, priors.flatten(0, 1), values.repeat(1, trials, 1), floor.repeat(1, trials), doubt)
         single = torch.cat([known.likelihood(rows) for rows in known.batches()], dim=1)
@@ -141,21 +141,6 @@ class Regression:
         """Return what `foretelling.posterior` does by the mode's likeliest hypothesis."""
         likeliest = (self.weights[:, mode] * self.values[:, mode].square().sum(0)).sum(1).argmax()
         return foretelling.posterior(self.hypotheses, likeliest[None], mode, shapes, across, among)
-
-    def covariance_of(self, width: int, remainder: int, noise: int) -> Float64[Tensor, "modes contacts contacts"]:
-        """Return the gains' covariance over s^2 by one hypothesis, by the rows in the tables; its noise included."""
-        hypothesis = torch.tensor([(width * len(REMAINDERS) + remainder) * len(NOISES) + noise])
-        return self.hypotheses.covariance(torch.arange(self.prior.shape[0]), hypothesis)[0]
-
-    def kernel(
-        self,
-        shapes: Float64[Tensor, "places shapes"],
-        across: Float64[Tensor, "places contacts"],
-        width: int,
-        remainder: int,
-    ) -> Float64[Tensor, "modes places contacts"]:
-        """Return the covariance over s^2 of the gains at places with those at the contacts, by one hypothesis."""
-        return self.hypotheses.kernel(shapes, across, width, remainder)
 
 
 def _with_beliefs(

@@ -31,7 +31,7 @@ def standard_error(
     """Return the standard error of the gains at the contacts."""
     found = []
     for modes in known.batches():
-        scale = known.squares(modes, known.solve(modes, known.factor(modes))) / len(known.values)
+        scale = known.squares(modes, known.solve(modes, known.factor(modes))) / known.count
         weighed = (weights[:, modes] * scale).unsqueeze(2) * known.noise(modes)[..., None]
         found.append(weighed.sum(0).transpose(0, 1))
     return torch.cat(found, dim=1).sqrt()
@@ -67,7 +67,7 @@ def deviation(
         kept = torch.nonzero(weights[:, mode].sum(1) > 0).flatten()
         factor = known.factor(modes, kept)
         solved = known.solve(modes, factor)
-        scale = known.squares(modes, solved)[:, 0] / len(known.values)
+        scale = known.squares(modes, solved)[:, 0] / known.count
         width, remainder, _ = rows_of(kept)
         prior = known.scaled_prior(modes)[0][width]
         part = torch.tensor(REMAINDERS, dtype=torch.float64)[remainder]
@@ -105,5 +105,5 @@ def posterior(
     alone = (1.0 - part) * (shapes * prior) @ shapes.T + part * among
     factor = known.factor(modes, hypothesis)
     half = torch.linalg.solve_triangular(factor[0, 0], cross.T, upper=False)
-    scale = float(known.squares(modes, known.solve(modes, factor)).sum()) / len(known.values)
+    scale = float(known.squares(modes, known.solve(modes, factor)).sum()) / known.count
     return scale * (alone - half.T @ half), scale * (NOISES[noise] + float(known.floor[:, mode].mean()))

@@ -5,9 +5,9 @@ Gains y at the contacts are one draw of a Gaussian field with the covariance
     s^2 [(1 - p) sum_k g_k phi_k(x) phi_k(x') + p r(x, x')] + s^2 q I,
 
 where phi_k is the component of elastic shape k along the blow, r a smooth kernel, and g_k = exp(-(log f/f_k)^2 / 2 w^2)
-says that a mode draws on shapes near to it in frequency. How near (w), how smooth a remainder (p) and how much noise
-(q) is not known: every combination of a grid is a hypothesis, whose evidence is the likelihood of y with s integrated
-out (prior 1/s).
++ `FARTHEST` says that a mode draws on shapes near to it in frequency. How near (w), how smooth a remainder (p) and how
+much noise (q) is not known: every combination of a grid is a hypothesis, whose evidence is the likelihood of y with s
+integrated out (prior 1/s).
 """
 
 from dataclasses import dataclass
@@ -27,6 +27,8 @@ COUNT = len(WIDTHS) * len(REMAINDERS) * len(NOISES)
 """Hypotheses: each noise in turn, for each remainder, for each width."""
 FARTHEST = 1e-3
 """Prior variance of the shapes that are not near at all, over that of the nearest."""
+UNHEARD = 1e6
+"""Factor on the noise's variance of a contact that says nothing, and that is not counted."""
 MEMORY = 4_000_000
 """Numbers of a batch of matrices."""
 _EVERY = torch.arange(COUNT)
@@ -53,6 +55,11 @@ def nearness(
     return torch.exp(-0.5 * (apart[:, None, :] / widths[:, None]).square()) + FARTHEST
 
 
+def row_of(width: int, remainder: int, noise: int) -> int:
+    """Return the hypothesis of a width, a remainder and a noise, by their rows in their tables."""
+    return (width * len(REMAINDERS) + remainder) * len(NOISES) + noise
+
+
 def rows_of(hypotheses: Int[Tensor, " hypotheses"]) -> tuple[Tensor, Tensor, Tensor]:
     """Return the rows of each hypothesis's width, remainder and noise in their tables."""
     rest = hypotheses // len(NOISES)
@@ -74,7 +81,17 @@ class Hypotheses:
     floor: Float64[Tensor, "contacts modes"]
     """Variance of the gains by the extraction's own error, over the gains' mean square: added to every noise."""
     doubt: Float64[Tensor, " contacts"]
-    """Factor on the noise's variance, one for a contact that is trusted."""
+    """Factor on the noise's variance: one for a contact that is trusted, `UNHEARD` for one that says nothing."""
+
+    @cached_property
+    def heard(self) -> Bool[Tensor, " contacts"]:
+        """Whether each contact says something."""
+        return self.doubt < UNHEARD
+
+    @cached_property
+    def count(self) -> int:
+        """How many contacts do, at least one."""
+        return max(int(self.heard.sum()), 1)
 
     def batches(self) -> tuple[Int[Tensor, " modes"], ...]:
         """Return the modes in parts whose covariances by all hypotheses fit into `MEMORY`."""
@@ -90,7 +107,7 @@ class Hypotheses:
     def scaled_prior(self, modes: Int[Tensor, " modes"]) -> Float64[Tensor, "modes widths shapes"]:
         """Return the prior variances, such that gains at the contacts are of mean square one."""
         prior = self.prior[modes]
-        size = torch.einsum("ck,mwk->mw", self.sites.shapes.square(), prior) / len(self.values)
+        size = torch.einsum("ck,mwk->mw", self.sites.shapes[self.heard].square(), prior) / self.count
         return prior / size.clamp_min(torch.finfo(torch.float64).tiny)[..., None]
 
     def noise(
@@ -143,7 +160,7 @@ class Hypotheses:
     def squares(
         self, modes: Int[Tensor, " modes"], solved: Float64[Tensor, "hypotheses modes contacts 2"]
     ) -> Float64[Tensor, "hypotheses modes 2"]:
-        """Return the gains times what `solve` gives: over their number it is s^2 as each hypothesis has it."""
+        """Return the gains times what `solve` gives: over `count` it is s^2 as each hypothesis has it."""
         values = self.values[:, modes].transpose(0, 1)
         return (values * solved).sum(2).clamp_min(torch.finfo(torch.float64).tiny)
 
@@ -152,5 +169,8 @@ class Hypotheses:
         factor = self.factor(modes)
         squares = self.squares(modes, self.solve(modes, factor))
         spread = 2.0 * torch.log(torch.diagonal(factor, dim1=-2, dim2=-1)).sum(-1)
-        likely = -0.5 * (len(self.values) * torch.log(squares) + spread[..., None])
+        # What is not heard has next to no part in the squares, and its own noise alone as factor of the determinant:
+        # left there, it would speak for as little noise as there is.
+        spread = spread - torch.log(self.noise(modes)[..., ~self.heard]).sum(-1)
+        likely = -0.5 * (self.count * torch.log(squares) + spread[..., None])
         return torch.where(self.silent[modes], 0.0, likely)

@@ -25,7 +25,7 @@ def _left_out(
     inverse = torch.cholesky_inverse(known.factor(modes))
     alone = torch.diagonal(inverse, dim1=-2, dim2=-1)[..., None]
     solved = inverse @ known.values[:, modes].transpose(0, 1)
-    count, tiny = len(known.values), torch.finfo(torch.float64).tiny
+    count, tiny = known.count, torch.finfo(torch.float64).tiny
     whole = known.squares(modes, solved)[:, :, None]
     rest = (whole - solved.square() / alone).clamp_min(tiny)
     # A determinant without one row has the inverse's entry there as a factor.

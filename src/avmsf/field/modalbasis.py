@@ -12,13 +12,11 @@ from avmsf.field.doubtedgains import Belief
 from avmsf.field.elasticpoints import ElasticPoints
 from avmsf.field.evidence import Regression
 from avmsf.field.gainfield import Gains
-from avmsf.field.hypotheses import COUNT, WIDTHS, Sites, nearness
+from avmsf.field.hypotheses import COUNT, UNHEARD, WIDTHS, Sites, nearness
 from avmsf.field.records import count_of, like
 
 REACH = 0.15
 """Length of the remainder's kernel over the object's size, the diagonal of the box around it."""
-_UNHEARD = 1e8
-"""Factor on the noise's variance of contacts that shall say nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,22 +69,10 @@ class ModalBasis:
         across = self._remainder(contacts.double(), used)
         return self.regression.deviation(shapes, across, torch.ones(len(contacts), dtype=torch.float64)).float()
 
-    def covariance_with(
-        self,
-        contacts: Float64[Tensor, "contacts 3"],
-        directions: Float64[Tensor, "contacts 3"],
-        width: int,
-        remainder: int,
-        noise: int,
-    ) -> Float64[Tensor, "modes contacts sites"]:
-        """Return the covariance over s^2 of gains with those at the field's own contacts, by one hypothesis."""
-        shapes, used = self.surface.along(contacts, directions)
-        return self.regression.kernel(shapes, self._remainder(contacts, used), width, remainder)
-
     @property
     def places(self) -> int:
         """Contacts that say something and are not in the same place as another."""
-        return len(torch.unique(self.contacts[self.regression.doubt < _UNHEARD], dim=0))
+        return len(torch.unique(self.contacts[self.regression.hypotheses.heard], dim=0))
 
     def ways(
         self, places: Float[Tensor, "places 3"], directions: Float[Tensor, "places 3"] | None
@@ -124,7 +110,7 @@ class ModalBasis:
 
     def without(self, contacts: Bool[Tensor, " contacts"]) -> "ModalBasis":
         """Return the field to which these contacts say nothing: so doubtful are they made."""
-        doubt = torch.where(contacts, _UNHEARD, self.regression.doubt)
+        doubt = torch.where(contacts, UNHEARD, self.regression.doubt)
         return replace(self, regression=replace(self.regression, doubt=doubt))
 
     def left_out(self) -> Float64[Tensor, "trusted modes 2"]:
@@ -198,7 +184,7 @@ class ModalBasis:
         """Return the field."""
         surface = ElasticPoints(tensors["points"], tensors["inward"], tensors["shapes"])
         contacts, directions = tensors["contacts"], tensors["directions"]
-        sites = sites_of(surface, contacts, directions)
+        sites, _ = sites_of(surface, contacts, directions)
         regression = Regression(
             sites,
             tensors["prior"],
@@ -206,7 +192,6 @@ class ModalBasis:
             tensors["floor"],
             tensors["doubt"],
             tensors["weights"],
-            evidence=0.0,
         )
         return cls(surface, contacts, directions, regression, measured=tensors["measured"])
 
@@ -232,20 +217,19 @@ def fit_modal_basis(
     `values` are the measured modes' gains at contacts in metres, `floor` their variance by the extraction's own error
     over each mode's mean square gain, `doubt` a factor on the noise's variance at each contact.
     """
-    _, used = surface.along(contacts, directions)
-    sites = sites_of(surface, contacts.double(), used)
+    sites, used = sites_of(surface, contacts, directions)
     trust = torch.ones(len(contacts), dtype=torch.float64) if doubt is None else doubt
     regression = Regression.of(sites, nearness(frequency, elastic), values, floor=floor, doubt=trust)
     return ModalBasis(surface, contacts.double(), used, regression)
 
 
 def sites_of(
-    surface: ElasticPoints, contacts: Float64[Tensor, "contacts 3"], directions: Float64[Tensor, "contacts 3"]
-) -> Sites:
-    """Return what is known beforehand of the gains of blows."""
-    shapes, _ = surface.along(contacts, directions)
-    reach = REACH * surface.size
-    return Sites(shapes, remainder_kernel(contacts, directions, contacts, directions, reach=reach))
+    surface: ElasticPoints, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None
+) -> tuple[Sites, Float64[Tensor, "contacts 3"]]:
+    """Return what is known beforehand of the gains of blows, and their directions as unit vectors."""
+    shapes, used = surface.along(contacts, directions)
+    places = contacts.double()
+    return Sites(shapes, remainder_kernel(places, used, places, used, reach=REACH * surface.size)), used
 
 
 def remainder_kernel(

@@ -10,11 +10,10 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.field.bodychoice import ChosenBody, MeasuredGains
-from avmsf.field.hypotheses import NOISES, REMAINDERS, WIDTHS
+from avmsf.field.hypotheses import NOISES, REMAINDERS, UNHEARD, WIDTHS, Hypotheses, nearness, row_of
+from avmsf.field.modalbasis import REACH, remainder_kernel, sites_of
 
-_DOUBT = 1e6
-"""Factor on the noise of a strike that counts for nothing."""
-_HYPOTHESIS = (WIDTHS.index(0.2), REMAINDERS.index(0.1), NOISES.index(0.1))
+_WIDTH, _REMAINDER, _NOISE = WIDTHS.index(0.2), REMAINDERS.index(0.1), NOISES.index(0.1)
 """What strikes are compared by: not what the gains make likeliest, for wrong ones make noise likeliest."""
 _COST = 0.8
 """Squared misfit over that of silence, summed over all strikes, that taking one out has to save.
@@ -128,7 +127,7 @@ def find_suspects(bodies: Sequence[ChosenBody], measured: MeasuredGains) -> tupl
     for row in sorted(silent):
         found = [witness.located(row, silent) for witness in witnesses]
         if 2 * sum(each.is_wrong for each in found) > len(found):
-            wrong.append(next((each for each in found if each.is_wrong), found[0]))
+            wrong.append(next(each for each in found if each.is_wrong))
     wrong += _elsewhere(witnesses, wrong)
     return tuple(sorted(wrong, key=lambda each: -each.misfit))
 
@@ -161,7 +160,7 @@ def _silenced(judges: Sequence["_Judge"]) -> tuple[list["_Judge"], frozenset[int
 def doubted(measured: MeasuredGains, suspects: Sequence[Suspect]) -> MeasuredGains:
     """Return the gains with suspects counting for nothing."""
     doubt = measured.doubt.clone()
-    doubt[[each.row for each in suspects]] = _DOUBT
+    doubt[[each.row for each in suspects]] = UNHEARD
     return replace(measured, doubt=doubt)
 
 
@@ -186,8 +185,11 @@ class _Judge:
 
     def __init__(self, body: ChosenBody, measured: MeasuredGains) -> None:
         self.body, self.measured = body, measured
-        self.field = body.fit(measured)
-        self.covariance = self.field.regression.covariance_of(*_HYPOTHESIS)
+        sites, self.directions = sites_of(body.surface, measured.contacts, measured.directions)
+        prior = nearness(measured.frequency, body.elastic)
+        self.known = Hypotheses(sites, prior, measured.values, measured.floor, measured.doubt)
+        hypothesis = torch.tensor([row_of(_WIDTH, _REMAINDER, _NOISE)])
+        self.covariance = self.known.covariance(torch.arange(len(prior)), hypothesis)[0]
         self.values = measured.values.transpose(0, 1)
         self.power = measured.values.square().sum(2)
 
@@ -214,7 +216,7 @@ class _Judge:
         scatter = self._scatter(errors, speaking)
         surface = self.body.surface
         places = torch.cat([self.measured.contacts[row : row + 1].double(), surface.points[surface.spread].double()])
-        directions = torch.cat([self.field.directions[row : row + 1], surface.inward[surface.spread].double()])
+        directions = torch.cat([self.directions[row : row + 1], surface.inward[surface.spread].double()])
         cross = torch.cat([self.covariance[:, row : row + 1], self.elsewhere], dim=1)
         there = (cross[:, :, speaking] @ solved).transpose(0, 1)
         both = torch.stack([there, -there])
@@ -235,7 +237,10 @@ class _Judge:
         """Covariance of gains at places all over the surface, struck straight in, with those at the contacts."""
         surface = self.body.surface
         points, inward = surface.points[surface.spread].double(), surface.inward[surface.spread].double()
-        return self.field.covariance_with(points, inward, *_HYPOTHESIS)
+        shapes, used = surface.along(points, inward)
+        contacts, reach = self.measured.contacts.double(), REACH * surface.size
+        across = remainder_kernel(points, used, contacts, self.directions, reach=reach)
+        return self.known.kernel(shapes, across, _WIDTH, _REMAINDER)
 
     def _scatter(self, errors: Float64[Tensor, "speaking modes"], speaking: list[int]) -> Float64[Tensor, " modes"]:
         least = _FLOOR * self.power.mean(0)
