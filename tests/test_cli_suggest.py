@@ -3,8 +3,10 @@
 import csv
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
 from avmsf.cli import suggest as command
 from avmsf.cli.suggest import parse, run
@@ -44,6 +46,21 @@ def test_nothing_that_is_printed_is_minus_nought(value: float, words: str) -> No
     assert command._cell(value) == words
 
 
+def test_directions_that_candidates_bring_are_not_said_to_go_straight_in(
+    field: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    contacts = bar_contacts(12)[6:].float()
+    slanted = torch.tensor([[0.6, 0.0, -0.8]])
+    for directions, straight in ((None, True), (slanted.expand(6, 3), False)):
+        impacts = SimpleNamespace(contacts=contacts, directions=directions, names=tuple("abcdef"))
+        monkeypatch.setattr(command, "read_capture", lambda *_, made=impacts: SimpleNamespace(impacts=made))
+        assert run(parse([str(field), "--count", "2", "--candidates", str(tmp_path)])) == 0
+        out, _ = capsys.readouterr()
+        assert "the way the hammer moves" in out
+        assert ("straight into the surface" in out) == straight
+        assert ("0.6000" in out) != straight
+
+
 def test_splines_say_no_direction(tmp_path: Path, capsys: Streams) -> None:
     contacts = bar_contacts(6)
     path = tmp_path / "bar.safetensors"
@@ -58,6 +75,10 @@ def test_splines_say_no_direction(tmp_path: Path, capsys: Streams) -> None:
 def test_what_cannot_be_done_is_said_before_any_work(field: Path, tmp_path: Path) -> None:
     with pytest.raises(AvmsfError, match="count = 0: expected 1 contact or more"):
         run(parse([str(field), "--count", "0"]))
+    settings = tmp_path / "capture.toml"
+    settings.write_text("")
+    with pytest.raises(AvmsfError, match="--settings are those of a capture of candidates"):
+        run(parse([str(field), "--settings", str(settings)]))
     blocked = tmp_path / "file"
     blocked.write_text("")
     with pytest.raises(AvmsfError, match="is a file"):

@@ -164,6 +164,12 @@ WRONG = {
         "candidates": torch.tensor([[0.4, 0.1, 0.0]]),
         "directions": torch.zeros(1, 3),
     },
+    "expected a direction for each of the 2 candidates, found 1": {
+        "count": 1,
+        "candidates": torch.tensor([[0.4, 0.1, 0.0], [0.2, 0.1, 0.0]]),
+        "directions": DOWN.expand(1, 3),
+    },
+    "directions are given and no candidates": {"count": 1, "directions": DOWN.expand(1, 3)},
     "2 contacts are asked for and 1 of the 2 candidates have not": {
         "count": 2,
         "candidates": torch.cat([bar_contacts(1), torch.tensor([[0.4, 0.1, 0.0]])]),
@@ -179,6 +185,15 @@ WRONG = {
 def test_what_cannot_be_suggested_is_said(message: str) -> None:
     with pytest.raises(FitError, match=message):
         suggest(of_one_hypothesis(), **WRONG[message])  # type: ignore[arg-type]
+
+
+def test_the_place_of_a_wrong_label_may_be_struck_again() -> None:
+    contacts = bar_contacts(6)
+    field = sound_field(physics_field(contacts, drawn_gains(contacts, seed=3)))
+    with pytest.raises(FitError, match="1 contacts are asked for and 0 of the 6 candidates have not been struck"):
+        suggest(field, 1, candidates=contacts)
+    doubted = replace(field, gain_field=field.gain_field.without(torch.arange(6) == 4))
+    assert suggest(doubted, 1, candidates=contacts).rows.tolist() == [4]
 
 
 @pytest.mark.parametrize("made", [physics_field, spline_field])

@@ -113,6 +113,15 @@ def test_suspects_count_for_nothing():
     assert silent.doubt.sum() - silent.doubt[4] == 11
 
 
+def test_a_strike_without_any_sound_is_named_as_silent():
+    measured = struck(WALLS[1], 12)
+    values = measured.values.clone()
+    values[5] = 0.0
+    measured = replace(measured, values=values)
+    found = find_suspects(plausible(measured), measured)
+    assert [each.describe(NAMES) for each in found] == ["strike 5 is silent"]
+
+
 @pytest.mark.parametrize(
     ("suspect", "words"),
     [

@@ -14,6 +14,7 @@ from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.writing import expect_writable, write_text
+from avmsf.errors import FitError
 from avmsf.field.belief import expect_doubt
 from avmsf.field.doubt import gain_doubt
 from avmsf.field.store import load
@@ -53,18 +54,22 @@ def parse(words: Sequence[str]) -> Options:
 
 def run(options: Options) -> int:
     """Suggest, print and draw."""
+    if options.settings is not None and options.candidates is None:
+        raise FitError("--settings are those of a capture of candidates: give --candidates, or leave them out")
     paths = {} if options.output is None else {name: options.output / name for name in (TABLE, PICTURE)}
     for path in paths.values():
         expect_writable(path)
     field = load(options.field)
     gains = expect_doubt(field)
     names: tuple[str, ...] | None = None
+    given = False
     if options.candidates is None:
         found = suggest(field, options.count)
     else:
         settings = None if options.settings is None else CaptureSettings.read(options.settings)
         impacts = read_capture(options.candidates, settings).impacts
         found = suggest(field, options.count, candidates=impacts.contacts, directions=impacts.directions)
+        given = impacts.directions is not None
         names = tuple(impacts.names[row] for row in found.rows.tolist())
     rows = _rows(found, names)
     screen = console(errors=options.json)
@@ -80,7 +85,7 @@ def run(options: Options) -> int:
         soft_wrap=True,
     )
     if found.directions is not None:
-        screen.print("nx, ny, nz: the way the hammer moves, straight into the surface")
+        screen.print("nx, ny, nz: the way the hammer moves" + ("" if given else ", straight into the surface"))
     if paths:
         write_text(paths[TABLE], _list(rows))
         step = max(1, len(gains.points) // _DRAWN_POINTS)

@@ -6,11 +6,12 @@ does it; elsewhere torch, with the same result.
 
 from typing import no_type_check
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
+
+from avmsf.compiled import compiled
 
 
 def compare(
@@ -51,7 +52,7 @@ def _by_torch(
 
 
 # Not all of fastmath: a fit that diverges is known by what is not a number.
-@numba.njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+@compiled(fastmath={"reassoc", "contract"}, error_model="numpy")
 @no_type_check
 def _in_one_pass(spectra, target, floor, first, every):
     """Do what `_by_torch` does, for arrays."""

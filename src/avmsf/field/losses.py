@@ -92,8 +92,9 @@ class _SpectralL1(torch.autograd.Function):
     ) -> Float[Tensor, ""]:
         widest = max(_fft_size(magnitude) for magnitude in target.magnitudes)
         padded = _padded(sounds, widest)
+        sought = ctx.needs_input_grad[0]
         # A hop more than the sound, for the last column of hops that `_overlap_add` fills only in part.
-        slope = padded.new_zeros(len(padded), padded.shape[1] + every * max(target.hops))
+        slope = padded.new_zeros(len(padded), padded.shape[1] + every * max(target.hops) if sought else 0)
         loss = sounds.new_zeros(())
         for magnitude, norms, hop in zip(target.magnitudes, target.norms, target.hops, strict=True):
             fft_size = _fft_size(magnitude)
@@ -109,7 +110,8 @@ class _SpectralL1(torch.autograd.Function):
                 spectra = torch.fft.rfft(frames[rows, part] * window)
                 place = start + step * part.start
                 loss += compare(spectra, magnitude[rows], floor, first=place, every=step) / norm
-                if ctx.needs_input_grad[0]:
+                if sought:
+                    # From here on the spectra are the slope's.
                     slopes = torch.fft.irfft(spectra, fft_size, norm="forward").mul_(slope_window)
                     _overlap_add(slope[rows], slopes, before + part.start * step * hop, step * hop)
         ctx.save_for_backward(slope[:, widest // 2 : widest // 2 + sounds.shape[1]])

@@ -148,7 +148,7 @@ def gain_variance(case: GainCase) -> Float64[Tensor, " modes"]:
     """Return the variance that the background noise gives each gain by least squares.
 
     White noise of variance v on samples at a rate r leaves a damped sine's amplitude with 2 v / r over the energy
-    (1 - exp(-2 d T)) / (4 d), twice that of the sine squared alone, for each of its two parts; around the mode's
+    (1 - exp(-2 d T)) / (2 d), twice that of the sine squared alone, for each of its two parts; around the mode's
     frequency the residual is as good as white.
     """
     bank, magnitude = case.modes.bank, case.modes.residual.magnitude.double()

@@ -38,7 +38,8 @@ class Suggestions:
     contacts: Float64[Tensor, "contacts 3"]
     """Object frame, metres."""
     directions: Float64[Tensor, "contacts 3"] | None
-    """Unit vectors straight into the body; None where the field knows nothing of directions."""
+    """Unit vectors along which to strike: as given, or straight into the body; None where the field knows nothing of
+    directions."""
     rows: Int[Tensor, " contacts"]
     """Which of the candidates they are."""
     before: float
@@ -58,27 +59,28 @@ def suggest(
     count: int = 5,
     *,
     candidates: Float[Tensor, "candidates 3"] | None = None,
-    directions: Float[Tensor, "candidates 3"] | None = None,
+    directions: Float[Tensor, "_given 3"] | None = None,
 ) -> Suggestions:
     """Return the `count` contacts that lower the expected error of the whole field most, each given those before it.
 
     Gains at two places hang together as far as the field believes they do, so a blow tells of other places too; its
     expected gain is known before it is struck, for in a Gaussian field it does not depend on what will be heard.
-    `candidates` are the places to choose from (metres, on the surface; places that have been struck are passed over),
-    by itself points spread over the surface; `directions` the unit vectors along which they can be struck, straight
-    into the surface where not given. Of more than `MOST` candidates as many are weighed, spread as far apart as they
-    go.
+    `candidates` are the places to choose from (metres, on the surface; places that have been struck are passed over,
+    but for those of strikes whose labels the field holds for wrong), by itself points spread over the surface;
+    `directions` the unit vectors along which they can be struck, straight into the surface where not given. Of more
+    than `MOST` candidates as many are weighed, spread as far apart as they go.
 
     Raises FitError for gains that know no doubt, a count below 1, candidates that are not finite or not on the object,
-    and fewer candidates than contacts asked for.
+    directions that are not one a candidate, and fewer candidates than contacts asked for.
     """
     gains = expect_doubt(field)
     spread = farthest_points(gains.points, min(PLACES, len(gains.points)))
     points = gains.points[spread].double()
     chosen_from = points if candidates is None else candidates.double()
-    _expect(gains.points, count, chosen_from, directions)
+    _expect_directions(directions, candidates)
+    _expect(gains.points, count, chosen_from)
     size = float((points.amax(0) - points.amin(0)).norm())
-    allowed = _apart(chosen_from, gains.contacts, size=size)
+    allowed = _apart(chosen_from, gains.contacts[gains.trusted], size=size)
     if int(allowed.sum()) < count:
         raise FitError(
             f"{count} contacts are asked for and {int(allowed.sum())} of the {len(chosen_from)} candidates have not "
@@ -177,12 +179,21 @@ def _apart(
     return distance.amin(1) > _SAME * size
 
 
-def _expect(
-    surface: Float[Tensor, "points 3"],
-    count: int,
-    candidates: Float64[Tensor, "candidates 3"],
-    directions: Float[Tensor, "candidates 3"] | None,
-) -> None:
+def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates: Tensor | None) -> None:
+    if directions is None:
+        return
+    if candidates is None:
+        raise FitError("directions are given and no candidates: give the places that can be struck along them")
+    if len(directions) != len(candidates):
+        raise FitError(
+            f"expected a direction for each of the {len(candidates)} candidates, found {len(directions)} directions"
+        )
+    still = torch.nonzero(~(directions.norm(dim=1) > 0)).flatten().tolist()
+    if still:
+        raise FitError(f"candidate {still[0]}: its direction is a vector of length zero: give the way the hammer moves")
+
+
+def _expect(surface: Float[Tensor, "points 3"], count: int, candidates: Float64[Tensor, "candidates 3"]) -> None:
     if count < 1:
         raise FitError(f"count = {count}: expected 1 contact or more")
     if len(candidates) == 0:
@@ -190,9 +201,6 @@ def _expect(
     if not bool(torch.isfinite(candidates).all()):
         row = int(torch.nonzero(~torch.isfinite(candidates).all(1))[0])
         raise FitError(f"candidate {row} is {candidates[row].tolist()}: expected finite coordinates in metres")
-    if directions is not None and not bool((directions.norm(dim=1) > 0).all()):
-        row = int(torch.nonzero(~(directions.norm(dim=1) > 0))[0])
-        raise FitError(f"candidate {row}: its direction is a vector of length zero: give the way the hammer moves")
     points = surface.double()
     size = float((points.amax(0) - points.amin(0)).norm())
     distance = torch.cat(

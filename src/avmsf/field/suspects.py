@@ -50,6 +50,8 @@ strikes tell little of one, and shapes that are a little off look like a place t
 _BETTER_HEARD = 0.2
 """The same of a far place, for a strike that fits its label well enough to speak: on the other side of a symmetric
 object half of the modes are as strong, and it is wrong all the same."""
+_SILENT = 1e12
+"""Misfit that only a strike without any sound can have."""
 _SURELY = 2.0
 """Misfit from which on a strike is wrong even if no place explains it; else it may be one that nobody else tells of."""
 
@@ -88,6 +90,8 @@ class Suspect:
 
     def describe(self, names: Sequence[str]) -> str:
         """Say what is wrong with it."""
+        if self.misfit > _SILENT:
+            return f"{names[self.row]} is silent"
         turned = " with its direction reversed" if self.reversed else ""
         if self.best > _NOWHERE:
             found = "fits nowhere on the object"

@@ -11,10 +11,10 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import no_type_check
 
-import numba
 import numpy as np
 from jaxtyping import Complex128, Float32, Float64
 
+from avmsf.compiled import compiled
 from avmsf.errors import PlayerError
 
 FLOOR = 1e-7
@@ -220,7 +220,7 @@ def _faded(noise: Float64[np.ndarray, " samples"], length: int) -> Float64[np.nd
     return noise * ramp
 
 
-@numba.njit(cache=True, fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 @no_type_check
 def _turn(real, imaginary, turn_real, turn_imaginary, sine, cosine, force, out):
     """Let modes ring for a block: turn, add what the blows push, and sum up what is heard."""
@@ -242,7 +242,7 @@ def _turn(real, imaginary, turn_real, turn_imaginary, sine, cosine, force, out):
         out[n] = total
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _limit(out, gain, release):
     """Scale samples so that none is above the ceiling: down at once, and slowly back; return the last gain."""

@@ -16,6 +16,7 @@ from jaxtyping import Float32, Int64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from avmsf.compiled import compiled
 from avmsf.scene.ellipses import FAINTEST
 from avmsf.scene.pixels import PIXELS, SIDE, blend, blend_back
 from avmsf.scene.tiles import KERNELS, list_tiles, rank
@@ -94,7 +95,7 @@ def _bounds(starts: Int64[np.ndarray, " edges"], lanes: int) -> Int64[np.ndarray
     return bounds
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 @no_type_check
 def _pack(chosen, faintest, screen, remainders, ellipses, opacities, colors, depths):
     """Return the chosen Gaussians' places in float64, packed rows and squared reach.
@@ -117,7 +118,7 @@ def _pack(chosen, faintest, screen, remainders, ellipses, opacities, colors, dep
     return places, packed, reaches
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@compiled(parallel=True, error_model="numpy")
 @no_type_check
 def _gather(parts, ends, chosen, packed, lanes, by_screen, by_ellipses, by_opacities, by_colors, by_depths):
     """Sum each Gaussian's rows and turn the sums into derivatives."""

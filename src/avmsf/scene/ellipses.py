@@ -15,6 +15,8 @@ from typing import no_type_check
 import numba
 import numpy as np
 
+from avmsf.compiled import compiled
+
 NEAR = 0.01
 """Gaussians with centers nearer than this to the camera's plane are not seen, metres (gsplat's default)."""
 _WIDEST = 1e30
@@ -25,7 +27,7 @@ BLUR = 0.3
 """What is added to the variances in the image, square pixels (3DGS)."""
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _rotate(rotation, turn):
     """Write the matrix of a quaternion w, x, y, z into `turn`; return the quaternion's length."""
@@ -39,7 +41,7 @@ def _rotate(rotation, turn):
     return length
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _unrotate(rotation, length, slope, result):
     """Write the derivatives by a quaternion of length `length` into `result`, given those by its matrix."""
@@ -57,7 +59,7 @@ def _unrotate(rotation, length, slope, result):
     result[2], result[3] = (by_y - along * y) / length, (by_z - along * z) / length
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _inside(center, pose):
     """Return a point of the object frame in the camera's frame."""
@@ -69,7 +71,7 @@ def _inside(center, pose):
     )
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _axes(turn, scales, pose, x, y, z, lens, slope, axes):
     """Write J W into `slope` [2, 3] and J W R S into `axes` [2, 3]; return the tangents at which J is taken."""
@@ -84,7 +86,7 @@ def _axes(turn, scales, pose, x, y, z, lens, slope, axes):
     return across, down
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _variances(axes):
     """Return the blurred covariance xx, xy, yy and its determinant, which is summed from squares so that it stays."""
@@ -97,7 +99,7 @@ def _variances(axes):
     return xx + BLUR, xy, yy + BLUR, crossed + BLUR * (xx + yy) + BLUR * BLUR
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _usable(center, rotation, log_scale, logit, weights):
     """Return whether all of a Gaussian's numbers are finite and its quaternion has a length."""
@@ -114,7 +116,7 @@ def _usable(center, rotation, log_scale, logit, weights):
     return math.isfinite(total) and 0.0 < length < math.inf
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@compiled(parallel=True, error_model="numpy")
 @no_type_check
 def project_points(
     centers,
@@ -170,7 +172,7 @@ def project_points(
             opacities[i, 0], depths[i, 0] = opacity, z
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@compiled(parallel=True, error_model="numpy")
 @no_type_check
 def project_points_back(
     centers,

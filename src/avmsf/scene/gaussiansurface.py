@@ -18,6 +18,7 @@ from avmsf.capture.cameras import Camera
 from avmsf.capture.levelset import enclose
 from avmsf.capture.meshviews import orbit_cameras
 from avmsf.capture.surface import Surface
+from avmsf.compiled import compiled
 from avmsf.errors import CaptureError, SceneError
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
@@ -149,7 +150,7 @@ def _carve(
     return free, seen
 
 
-@numba.njit(cache=True, parallel=True)
+@compiled(parallel=True)
 @no_type_check
 def _look(projection, reached, first, spacing, step, free, seen):
     """Count, for each cell whose middle is in the image, that it was seen and how far it lies before the surface."""

@@ -11,6 +11,8 @@ import numba
 import numpy as np
 from jaxtyping import Float64
 
+from avmsf.compiled import compiled
+
 _C0 = 0.28209479177387814
 """sqrt(1 / 4 pi); the further constants normalise their polynomials to one over the sphere likewise."""
 _C1 = 0.4886025119029199
@@ -19,7 +21,7 @@ _C3, _C3_PRODUCT, _C3_FLAT = 0.5900435899266435, 2.890611442640554, 0.4570457994
 _C3_ZONAL, _C3_TESSERAL = 0.3731763325901154, 1.445305721320277
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _harmonics(x: float, y: float, z: float, count: int, basis: Float64[np.ndarray, "16"]) -> None:
     """Write the first `count` harmonics, 1, 4, 9 or 16, of a unit direction into `basis`."""
@@ -41,7 +43,7 @@ def _harmonics(x: float, y: float, z: float, count: int, basis: Float64[np.ndarr
         basis[15] = -_C3 * x * (x * x - 3.0 * y * y)
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _slope(x: float, y: float, z: float, count: int, weights: Float64[np.ndarray, "16"]) -> tuple[float, float, float]:
     """Return the derivatives by x, y and z of the weighted sum of the first `count` harmonics' polynomials."""
@@ -70,7 +72,7 @@ def _slope(x: float, y: float, z: float, count: int, weights: Float64[np.ndarray
     return by_x, by_y, by_z
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _direction(center, position):
     """Return the unit direction from the camera to a point, and their distance."""
@@ -79,7 +81,7 @@ def _direction(center, position):
     return x / distance, y / distance, z / distance, distance
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@compiled(parallel=True, error_model="numpy")
 @no_type_check
 def shade(centers, weights, radii, position, lanes, colors):
     """Write the colours [points, 3] in which a camera at `position` sees Gaussians, zero where their radius is."""
@@ -98,7 +100,7 @@ def shade(centers, weights, radii, position, lanes, colors):
                     colors[i, j] = max(color, 0.0)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@compiled(parallel=True, error_model="numpy")
 @no_type_check
 def shade_back(centers, weights, radii, position, by_colors, lanes, by_centers, by_weights):
     """Add to `by_centers` [points, 3] what the colours' derivatives bring, and write those by the weights."""

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from avmsf.capture.cameras import View
 from avmsf.capture.warning import CaptureWarning
+from avmsf.compiled import compiled
 from avmsf.errors import SceneError
 from avmsf.scene.tiles import KERNELS
 
@@ -148,7 +149,7 @@ def _carve(
     return agreed & (seen >= max(1.0, enough))
 
 
-@numba.njit(cache=True, parallel=True)
+@compiled(parallel=True)
 @no_type_check
 def _vote(projection, mask, first, spacing, seen, against):
     """Count, for each voxel whose middle is in the image, that it was seen and whether the mask speaks against it."""

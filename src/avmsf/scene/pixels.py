@@ -12,6 +12,8 @@ import numpy as np
 from numba.core import types
 from numba.extending import intrinsic
 
+from avmsf.compiled import compiled
+
 SIDE = 8
 """Width and height of a tile, pixels: its 64 pixels fill the registers, and few of them lie outside an ellipse."""
 PIXELS = SIDE * SIDE
@@ -41,7 +43,7 @@ def _power(typing: Any, exponent: Any) -> Any:
     return types.float32(types.int32), generate
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 @no_type_check
 def _exponential(x):
     """Return 2 to a float32 number from -8 to 0, within 3e-7 of its value: a polynomial (Remez) about whole numbers."""
@@ -56,7 +58,7 @@ def _exponential(x):
     return value * _power(whole)
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _scratch():
     """Return a tile's working numbers, nine for each of its pixels, with the pixels' places in the first two."""
@@ -67,7 +69,7 @@ def _scratch():
     return scratch
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _stretch(down, high):
     """Return the first and the last but one of the tile's four double rows that an ellipse's height reaches."""
@@ -76,7 +78,7 @@ def _stretch(down, high):
     return int(first) // 2, (int(last) + 2) // 2
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_FAST)
+@compiled(error_model="numpy", fastmath=_FAST)
 @no_type_check
 def _cover(scratch, packed, row, middle, center, first, last, number, faint):
     """Draw one Gaussian on a tile's pixels in the double rows from `first` to before `last`.
@@ -106,7 +108,7 @@ def _cover(scratch, packed, row, middle, center, first, last, number, faint):
         scratch[_NUMBER + p] = number if drawn else previous
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy", fastmath=_FAST)
+@compiled(parallel=True, error_model="numpy", fastmath=_FAST)
 @no_type_check
 def blend(places, packed, starts, rows, bounds, paint, faint, color, alpha, depth, kept):
     """Blend the tiles' lists into `color`, `alpha` and `depth`, and keep what the way back needs of every tile.
@@ -151,7 +153,7 @@ def blend(places, packed, starts, rows, bounds, paint, faint, color, alpha, dept
                     alpha[i, j], depth[i, j] = _ONE - rest, mean
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_FAST)
+@compiled(error_model="numpy", fastmath=_FAST)
 @no_type_check
 def _uncover(scratch, packed, row, middle, center, first, last, number, faint, parts, slot):
     """Take one Gaussian off a tile's pixels again and write its sums of derivatives into `part` [10].
@@ -197,7 +199,7 @@ def _uncover(scratch, packed, row, middle, center, first, last, number, faint, p
     parts[slot, 8], parts[slot, 9] = sum_blue, sum_away
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy", fastmath=_FAST)
+@compiled(parallel=True, error_model="numpy", fastmath=_FAST)
 @no_type_check
 def blend_back(places, packed, starts, rows, slots, bounds, paint, faint, by_color, by_alpha, by_depth, kept, parts):
     """Write for each pair of tile and Gaussian the sums that `_uncover` makes into its row of `parts`."""

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from avmsf.compiled import compiled
 from avmsf.scene.tiles import KERNELS
 
 _REACH = 5
@@ -86,7 +87,7 @@ class _Similarity(torch.autograd.Function):
         return gradients[0] * slope, None
 
 
-@numba.njit(cache=True, fastmath=True, parallel=True)
+@compiled(fastmath=True, parallel=True)
 @no_type_check
 def _filter_products(first, second, window, across):
     """Filter both images, their squares and their product along the rows."""
@@ -105,7 +106,7 @@ def _filter_products(first, second, window, across):
             _filter_row(padded[which], window, across[which, row])
 
 
-@numba.njit(cache=True, fastmath=True, parallel=True)
+@compiled(fastmath=True, parallel=True)
 @no_type_check
 def _compare(across, window, similar, slopes):
     """Filter along the columns; sum each row's SSIM and note its slopes by mean, square and product."""
@@ -136,7 +137,7 @@ def _compare(across, window, similar, slopes):
         similar[row] = total
 
 
-@numba.njit(cache=True, fastmath=True, parallel=True)
+@compiled(fastmath=True, parallel=True)
 @no_type_check
 def _filter_slopes(first, second, slopes, window, across, gradient):
     """Take the slopes back through the filter, which is its own transpose, to the first image."""
@@ -158,7 +159,7 @@ def _filter_slopes(first, second, slopes, window, across, gradient):
             )
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 @no_type_check
 def _filter_row(padded, window, out):
     w0, w1, w2, w3, w4, w5 = window[0], window[1], window[2], window[3], window[4], window[5]
@@ -173,7 +174,7 @@ def _filter_row(padded, window, out):
         )
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 @no_type_check
 def _filter_column(across, window, row, out):
     """Add up the rows under the window around `row`, as far as there are any, in `out`."""

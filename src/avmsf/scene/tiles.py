@@ -12,11 +12,13 @@ from typing import no_type_check
 import numba
 import numpy as np
 
+from avmsf.compiled import compiled
+
 KERNELS = threading.Lock()
 """Held while kernels run: where numba has no OpenMP, two threads in its own pool at once end the process."""
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def rank(keys):
     """Return the order that sorts unsigned 32-bit keys upwards, equal ones as they come: least digit first."""
@@ -38,7 +40,7 @@ def rank(keys):
     return order
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _columns(place, packed, reach, top, bottom, width):
     """Return the first and last pixel column of an ellipse between two rows of pixels; none where last < first."""
@@ -58,7 +60,7 @@ def _columns(place, packed, reach, top, bottom, width):
     return int(first), int(last)
 
 
-@numba.njit(cache=True)
+@compiled()
 @no_type_check
 def _rows(place, packed, reach, height, side):
     """Return the first and last row of tiles that an ellipse may touch."""
@@ -68,7 +70,7 @@ def _rows(place, packed, reach, height, side):
     return int(first) // side, (int(last) // side if last >= 0 else -1)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@compiled(parallel=True, error_model="numpy")
 @no_type_check
 def list_tiles(places, packed, reaches, width, height, side, lanes):
     """Return the tiles' lists for Gaussians in order of depth.
