@@ -4,6 +4,7 @@
 """
 
 import argparse
+import itertools
 import json
 import math
 import tempfile
@@ -54,8 +55,9 @@ CONVENTIONS = (
     "fields: physics without end-to-end steps, fitted to a fifth of the strikes (aircraft: 15 of 74, three starts), "
     "spread as far apart as they go. network: the paper's, quick recipe. no_residual: fitted and located as if there "
     "were no noise.",
-    "coverage90: part of the strikes whose true contact lies in the 90 % region of the posterior, modulo symmetry; "
-    "region: that region's part of the surface.",
+    "coverage90: part of the strikes that were located whose true contact lies in the 90 % region of the posterior, "
+    "modulo symmetry; region: that region's part of the surface; refused: part of the strikes that were not located, "
+    "which count as placed at random.",
     "ms a recording, load: processor time. latency: seconds from a blow to its answer, as it was; unloaded: with "
     "processor time in place of the time that passed, which is longer beside other work.",
 )
@@ -209,10 +211,10 @@ def _table(key: str, groups: dict[str, list[LocatingCase]], options: LocatingOpt
                     found[f"locate.{group}{'.' + kind if kind else ''}.coverage90"] = means["covered_modulo"]
                     found[f"locate.{group}{'.' + kind if kind else ''}.region90"] = means["region"]
                 covered = [means.get(metric, float("nan")) for metric in ("covered_modulo", "region")]
-                rows.append([name, means["rmed"], means["rmed_modulo"], *covered])
+                rows.append([name, means["rmed"], means["rmed_modulo"], *covered, means["refused"]])
     names = ", ".join(judged)
     title = f"locate.{key}: {names}; {1000 * found[f'locate.{key}.seconds']:.0f} ms a recording"
-    columns = ("method", "rmed", "rmed modulo", "coverage90", "region90")
+    columns = ("method", "rmed", "rmed modulo", "coverage90", "region90", "refused")
     return Report(tables=(Table(title, columns, rows),), figures=found)
 
 
@@ -257,7 +259,8 @@ def _judged(case: LocatingCase, options: LocatingOptions, seconds: list[float]) 
 def _means(scores: Iterable[LocatingScores], method: str) -> dict[str, float]:
     """Return the means over objects, each counting the same."""
     each = [one.figures(method) for one in scores]
-    return {name: sum(one[name] for one in each) / len(each) for name in each[0]}
+    known = {name: [one[name] for one in each if name in one] for name in dict.fromkeys(itertools.chain(*each))}
+    return {name: sum(values) / len(values) for name, values in known.items()}
 
 
 def _stream(options: LocatingOptions) -> Report:

@@ -123,6 +123,26 @@ def test_several_blows_are_told_apart(place: Place, tmp_path: Path, capsys: Stre
     assert "holds more than one blow" in err
 
 
+def test_no_blows_files_are_anothers(place: Place, tmp_path: Path, capsys: Streams) -> None:
+    first, second = place.blow(STRUCK, before=0.1), place.blow(SECOND, before=0.4)
+    both = torch.cat([first, torch.zeros(len(second) - len(first), dtype=torch.float64)]) + second
+    words = [place.field, place.wav("twin.wav", both), place.wav("twin-2.wav", first), "--several"]
+    printed, _ = located([*words, "--output", str(tmp_path)], capsys)
+    assert [Path(blow["picture"]).stem for blow in printed["blows"]] == ["twin", "twin-2", "twin-2-2"]
+
+
+def test_a_known_force_counts(place: Place, capsys: Streams) -> None:
+    hit = place.wav("forced.wav", place.blow(STRUCK))
+    shares = []
+    for words in ([], ["--force", "1"], ["--force", "1", "--several"], ["--force", "1000"]):
+        printed, _ = located([place.field, hit, *words], capsys)
+        shares.append(printed["blows"][0]["region"]["share"])
+    assert shares[1] == pytest.approx(shares[2], abs=0.05)
+    assert len({round(share, 3) for share in shares}) > 1
+    with pytest.raises(AvmsfError, match="a force with expected = 0: expected a number above 0"):
+        run(parse([place.field, hit, "--force", "0"]))
+
+
 def test_another_rate_and_clipping_are_said(place: Place, capsys: Streams) -> None:
     fast = place.wav("fast.wav", place.blow(STRUCK, rate=16000), rate=16000)
     printed, err = located([place.field, fast], capsys)

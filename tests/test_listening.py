@@ -1,6 +1,6 @@
 """Blows in a stream: found where and when they fell, whatever rings, and whatever blocks the stream comes in."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cache
 
 import pytest
@@ -13,6 +13,7 @@ from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise
 from avmsf.tasks.listening import WINDOW, Blow, Listener
 from avmsf.tasks.locator import Locator
+from avmsf.tasks.retune import retune
 from avmsf.tasks.ringing import Ringing
 from made_fields import BANK, spline
 
@@ -165,11 +166,35 @@ def test_ringing_is_followed_and_fitted_exactly() -> None:
     assert not modes.fit(1e-3 * sound[:480], 1.0).abs().any()
 
 
+def test_modes_that_an_edit_made_silent_are_not_followed() -> None:
+    high = retune(locator().field, pitch=2.5)
+    audible = int(high.audible.sum())
+    assert 0 < audible < len(BANK)
+    listener = Listener(Locator.of(high))
+    assert len(listener.ears.ringing) == audible
+    sound = torch.cat([torch.zeros(800), high.render(locator().points[:1])[0]]).double()
+    noise = 1e-4 * torch.randn(len(sound), generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    (blow,) = heard(listener, sound + noise)
+    assert round(blow.seconds * RATE) == pytest.approx(800, abs=4)
+
+
+def test_nothing_is_heard_for_longer_than_the_fields_own_sounds() -> None:
+    short = replace(locator().field, samples=800)
+    listener = Listener(Locator.of(short), window=0.05, later=3.0)
+    assert (listener.window, listener.later) == (400, 800)
+    assert Listener(Locator.of(short), window=0.2, later=0.3).later is None
+    assert {blow.heard for blow in heard(listener, stream())} <= {0.05, *(each / RATE for each in range(400, 801))}
+
+
 def test_streams_that_cannot_be_listened_to_are_refused() -> None:
     with pytest.raises(LocationError, match="comes at 44100 Hz and the field is of 8000 Hz"):
         Listener(locator(), sample_rate=44100.0)
     with pytest.raises(LocationError, match="window = 0 s"):
         Listener(locator(), window=0.0)
+    with pytest.raises(LocationError, match=r"window = 0\.01 s is 80 samples: expected 160 or more"):
+        Listener(locator(), window=0.01)
+    with pytest.raises(LocationError, match=r"none of the object's .* modes lies below half of 8000 Hz"):
+        Listener(replace(locator(), field=retune(locator().field, pitch=1000.0)))
     with pytest.raises(LocationError, match=r"later = 0\.05"):
         Listener(locator(), window=0.06, later=0.05)
     with pytest.raises(LocationError, match="rumble = 4000 Hz"):

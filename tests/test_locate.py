@@ -20,6 +20,9 @@ from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locate import DOUBTFUL, STRANGE, UNLIKE, judge_fit, locate
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
+from avmsf.tasks.retune import retune
+from avmsf.tasks.slack import contacts_of
+from believing_field import bar_contacts, drawn_gains, physics_field, sound_field
 from unsaved_gains import Unsaved
 
 PLATE = Plate()
@@ -287,6 +290,46 @@ def test_what_holds_no_blow_is_refused(sound, message):
         locator_of().locate(sound)
 
 
+def test_fields_that_were_edited_and_know_no_contacts_are_located_on_too():
+    impacts = struck(2, seed=44)
+    for field in (true_field(), retune(true_field(), pitch=1.1)):
+        assert contacts_of(field) is None
+        assert Locator.of(field).slack is None
+    higher = retune(replace(true_field(), origin=Origin(trained_on=("a", "b"))), pitch=1.1)
+    assert contacts_of(higher) == 2
+    sound = higher.render(impacts.contacts[:1])[0]
+    found = Locator.of(higher).locate(sound)
+    assert missed(found, found.most_probable, impacts.contacts[0]) < 0.05
+
+
+def test_contacts_that_say_nothing_are_not_counted():
+    contacts = bar_contacts(8)
+    gains = physics_field(contacts, drawn_gains(contacts, seed=1))
+    assert contacts_of(sound_field(gains)) == 8
+    assert contacts_of(sound_field(gains.without(torch.arange(8) < 3))) == 5
+    assert contacts_of(retune(sound_field(gains.without(torch.arange(8) < 3)), pitch=1.1)) == 5
+
+
+def test_lengths_that_are_used_are_kept():
+    fresh = Locator.of(true_field(100))
+    sound = struck(1, seed=45).sounds[0]
+    fresh.prepare(720)
+    kept = fresh.lengths[720, math.inf]
+    for samples in range(800, 1000, 10):
+        fresh.locate(sound[:samples])
+        fresh.locate(sound[:720])
+    assert fresh.lengths[720, math.inf] is kept
+    assert len(fresh.lengths) == 8
+
+
+def test_a_locator_is_of_its_own_field_and_points():
+    sound = struck(1, seed=46).sounds[0]
+    with pytest.raises(LocationError, match="given with points or directions"):
+        locate(true_field(), sound, points=torch.zeros(5, 3), locator=locator_of())
+    with pytest.raises(LocationError, match="given with another field"):
+        locate(true_field(100), sound, locator=locator_of())
+
+
 def test_points_without_sense_are_refused():
     with pytest.raises(LocationError, match="expected points"):
         Locator.of(true_field(), points=torch.zeros(0, 3))
@@ -294,7 +337,7 @@ def test_points_without_sense_are_refused():
         Locator.of(true_field(), points=torch.zeros(3, 2))
     with pytest.raises(LocationError, match=r"expected points .* and 9 numbers that are not finite"):
         Locator.of(true_field(), points=torch.full((3, 3), torch.nan))
-    with pytest.raises(LocationError, match="2 directions do not go with 3 points"):
+    with pytest.raises(LocationError, match=r"directions of the shape \(2, 3\) do not go with points of \(3, 3\)"):
         Locator.of(true_field(), points=torch.zeros(3, 3), directions=torch.zeros(2, 3))
     for row, said in ((torch.nan, r"nan\], of length nan"), (0.0, r"0\.0\], of length 0"), (2.0, r"of length 3\.46")):
         directions = torch.eye(3)

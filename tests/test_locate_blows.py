@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -72,9 +73,18 @@ def test_blows_on_another_object_are_left_out_and_refused_where_there_are_no_oth
     mixed = sound.clone()
     mixed[begin:] = 0.0
     mixed[begin : begin + len(other)] = (other / other.abs().max())[: len(mixed) - begin]
-    assert [round(seconds, 2) for seconds, _ in locate_blows(true_field(), mixed, locator=locator)] == [0.1]
+    ((seconds, found),) = locate_blows(true_field(), mixed, locator=locator)
+    assert round(seconds, 2) == 0.1
+    assert re.match(r"the recording holds 1 more, at 0\.5\d\d s, left out: .* a misfit of", found.notes[-1])
     with pytest.raises(LocationError, match=r"the blow at 0\.\d+ s: the modes of this object explain \d+ %"):
         locate_blows(true_field(), torch.cat([torch.zeros(3000), mixed[begin:]]).numpy(), locator=locator)
+
+
+def test_a_channel_that_is_silent_is_refused_as_such(locator):
+    sound, _ = overlapping([0.1], [1.0], seed=33)
+    two = Recording("two.wav", np.stack([np.zeros(len(sound)), sound.double().numpy()]), RATE, "FLOAT")
+    with pytest.raises(LocationError, match=r"two\.wav: the sound is silent"):
+        locate_blows(true_field(), two, settings=CaptureSettings(response_channel=1), locator=locator)
 
 
 def test_settings_count_as_for_one_blow(locator):

@@ -9,7 +9,7 @@ import torch
 from avmsf.capture.audio import Recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
-from avmsf.tasks.hearing import hear
+from avmsf.tasks.hearing import at_field_rate, hear
 from avmsf.tasks.locate import locate
 from avmsf.tasks.locator import Locator
 from test_locate import RATE, locator_of, missed, struck, true_field
@@ -49,6 +49,30 @@ def test_another_rate_is_resampled_and_said(rate, locator):
     found = locate(true_field(), torch.from_numpy(samples), sample_rate=rate, locator=locator)
     assert missed(found, found.most_probable, impacts.contacts[0]) < 0.03
     assert found.modal > 0.9
+
+
+@pytest.mark.parametrize("noise_db", [0.0, 3.0])
+def test_bands_that_resampling_emptied_are_not_taken_for_quiet(noise_db, locator):
+    """Half the rate holds half of the noise, which is as loud as the blow is and no other object's sound."""
+    for seed in (51, 52):
+        sound = struck(1, seed=seed, noise_db=noise_db).sounds[0].double().numpy()
+        halved = scipy.signal.resample_poly(sound, 1, 2)
+        heard = at_field_rate(halved, Recording("half.wav", halved[None], RATE / 2, "FLOAT"), true_field())
+        found = locator.locate(heard[0], highest=heard[1])
+        assert found.misfit < 0.25
+
+
+def test_how_hard_a_blow_was_is_heard_where_its_push_was_recorded():
+    one = recorded(struck(1, seed=25).sounds[0]).channels[0]
+    push = np.zeros_like(one)
+    push[1800:1809] = np.sin(np.pi * np.arange(1, 10) / 10)
+    blow = scipy.signal.fftconvolve(one, push[1800:1809])[: len(one)]
+    settings = CaptureSettings(force_channel=1, response_channel=2, normalise="deconvolve")
+    soft, hard = (
+        hear(Recording("hit.wav", force * np.stack([push, blow]), RATE, "FLOAT"), true_field(), settings=settings)
+        for force in (0.02, 0.4)
+    )
+    assert float(hard.sound.norm() / soft.sound.norm()) == pytest.approx(20.0, rel=1e-3)
 
 
 def test_a_rate_that_holds_no_mode_is_refused():

@@ -141,6 +141,21 @@ def test_the_most_alike_spectrum_is_a_sounds_own_however_loud() -> None:
         alike.row(torch.zeros(SAMPLES))
 
 
+def test_silent_strikes_are_nobodys_nearest_and_are_placed_by_chance() -> None:
+    quiet = strikes().sounds.clone()
+    quiet[1] = 0.0
+    alike = NearestSpectrum(replace(strikes(), sounds=quiet))
+    assert [alike.row(sound) for sound in strikes().sounds[[0, 2, 3]]] == [0, 2, 3]
+    assert alike.row(strikes().sounds[1]) != 1
+    judged = judge_locating(locator(), strikes(), replace(strikes(), sounds=quiet), name="plate")
+    for method in ("nearest", "cosine", "posterior"):
+        assert judged.figures(method)["refused"] == 0.25
+    assert judged.figures("random")["refused"] == 0.0
+    (row,) = (each for each in judged.rows if each.method == "nearest" and each.refusal)
+    assert row.place is None
+    assert row.rmed == next(each.rmed for each in judged.rows if each.method == "random" and each.truth == row.truth)
+
+
 @cache
 def scores() -> LocatingScores:
     test, train = strikes(), strikes().take([2, 3])

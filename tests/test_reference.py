@@ -199,6 +199,18 @@ def test_statistics_find_the_law_the_slope_and_the_band():
     assert float(found.frequency[31:33].mean()) == pytest.approx(400 / (1 + 1 / 16), rel=0.05)
 
 
+def test_modes_that_are_muted_say_nothing_of_brightness():
+    whole = made_statistics()
+    frequency = torch.exp(torch.linspace(math.log(200.0), math.log(3200.0), 50, dtype=torch.float64))
+    bank = ModalBank(frequency, law(frequency, 12.0, 4e-7))
+    gains = ((frequency / 200.0) ** -1.0).float()
+    for row in (0, 49):
+        muted = gains.clone()
+        muted[row] = 0.0
+        found = MaterialStatistics.of_modes([bank], [muted], name="muted")
+        assert found.brightness == pytest.approx(whole.brightness, rel=0.02)
+
+
 def test_made_up_blows_have_the_statistics():
     found, generator = made_statistics(), torch.Generator().manual_seed(1)
     sounds = found.sounds(6, samples=4000, sample_rate=RATE, generator=generator)

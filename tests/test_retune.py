@@ -114,6 +114,8 @@ def test_values_that_cannot_be_are_refused():
         for value in (0.0, -1.0, math.inf, math.nan, [1.0, 1.0, 0.0, 1.0, 1.0]):
             with pytest.raises(EditError, match=rf"{name} = .*: expected factors above 0"):
                 retune(field(), **{name: value})
+    with pytest.raises(EditError, match="pitch = inf: expected"):
+        retune(field(), pitch=[1.0, 1.1, 1.2, 1.3, math.inf])
     with pytest.raises(EditError, match="pitch has 3 values: expected one, or one for each of the 5 modes"):
         retune(field(), pitch=[1.0, 1.0, 1.0])
     for value in (math.inf, math.nan):

@@ -19,7 +19,7 @@ from avmsf.bench.editmethods import Edited, EditMethod
 from avmsf.bench.edittasks import EditTask
 from avmsf.bench.metrics import default_fft_sizes
 from avmsf.bench.modespace import MaterialSpace
-from avmsf.errors import AvmsfWarning, CaptureError, EvaluationError, ExtractionError
+from avmsf.errors import AvmsfWarning, CaptureError, EditError, EvaluationError, ExtractionError
 from avmsf.files import write_whole
 from avmsf.modal.spectra import magnitude_stft
 from avmsf.tasks.clips import lasting, level
@@ -58,7 +58,8 @@ def judge(
 ) -> tuple[EditScore, ...]:
     """Return every method's scores in every task. An object's field is made beforehand and not counted as time.
 
-    What a method makes that holds no blow or no modes has no score, and a warning says so: a model may make anything.
+    What a method makes that holds no blow or no modes, or cannot make, has no score, and a warning says so: a model may
+    make anything.
     """
     scores = []
     for task in tasks:
@@ -67,7 +68,7 @@ def judge(
             begun = time.perf_counter()
             try:
                 made = method.edit(task)
-            except (CaptureError, ExtractionError) as error:
+            except (CaptureError, ExtractionError, EditError, EvaluationError) as error:
                 warnings.warn(
                     f"{task.object.name} towards {task.target}, {method.name}: {error}; this has no score",
                     AvmsfWarning,

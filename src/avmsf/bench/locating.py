@@ -77,14 +77,16 @@ class LocatingScores:
     """Seed and settings that decided the figures, as plain values."""
 
     def figures(self, method: str) -> dict[str, float]:
-        """Return a method's means: `rmed`, `rmed_modulo`, `contact_error` and, of regions, `covered`,
-        `covered_modulo` and `region`. Raises EvaluationError for a method that was not judged."""
+        """Return a method's means: `rmed`, `rmed_modulo`, `contact_error`, `refused`, the part of the strikes that were
+        not located and count as placed at random, and, of the regions of the others, `covered`, `covered_modulo` and
+        `region`. Raises EvaluationError for a method that was not judged."""
         rows = [row for row in self.rows if row.method == method]
         if not rows:
             judged = ", ".join(dict.fromkeys(row.method for row in self.rows))
             raise EvaluationError(f"{self.name}: no strike was located by {method!r}; judged were {judged}")
         means = {name: _mean([getattr(row, name) for row in rows]) for name in ("rmed", "rmed_modulo")}
         means["contact_error"] = means["rmed"] * self.diagonal / self.scale
+        means["refused"] = _mean([float(row.refusal is not None) for row in rows])
         sure = [row for row in rows if row.region is not None]
         if sure:
             for name in ("covered", "covered_modulo", "region"):
@@ -198,7 +200,10 @@ def _located(
         place: Float64[Tensor, " 3"] | None = None
         more: dict[str, Any] = {}
         if method == "nearest":
-            place = alike.place(sound)
+            if bool(sound.any()):
+                place = alike.place(sound)
+            else:
+                more = {"refusal": "the recording is silent"}
         elif method != "random" and isinstance(found, ContactMap):
             place = ground.points[int(found.distance.argmin())] if method == "cosine" else found.place.double()
             more = {"explained": found.explained}

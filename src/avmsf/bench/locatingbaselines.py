@@ -26,9 +26,12 @@ class NearestSpectrum:
     def row(self, sound: Float[Tensor, " samples"]) -> int:
         """Return the training recording's row.
 
-        Raises EvaluationError for a sound that is silent.
+        Training recordings that are silent are never the nearest. Raises EvaluationError for a sound that is silent.
         """
-        return int((self._signatures @ self._signature(sound)).argmax())
+        if not bool(sound.any()):
+            raise EvaluationError("a silent recording has no spectrum to compare; leave it out")
+        alike = self._signatures @ self._signature(sound)
+        return int(torch.where(self.train.sounds.any(dim=1), alike, -torch.inf).argmax())
 
     def place(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " 3"]:
         """Return where that recording was struck, metres."""
@@ -39,7 +42,10 @@ class NearestSpectrum:
         return torch.stack([self._signature(sound) for sound in self.train.sounds])
 
     def _signature(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " bins"]:
-        """Return the log of the mean power spectrum, of mean zero and norm one: products are correlations."""
+        """Return the log of the mean power spectrum, of mean zero and norm one: products are correlations.
+
+        Zero for silence.
+        """
         size = scaled_fft_size(_FFT_SIZE, sample_rate=self.train.sample_rate)
         padded = torch.nn.functional.pad(sound.double(), (0, max(0, size - len(sound))))
         window = torch.hann_window(size, dtype=torch.float64)
@@ -47,7 +53,7 @@ class NearestSpectrum:
         frames = torch.nn.functional.pad(padded, (size // 2, size // 2)).unfold(0, size, size // 4)
         power = torch.fft.rfft(frames * window).abs().square().mean(dim=0)
         if not float(power.max()) > 0.0:
-            raise EvaluationError("a silent recording has no spectrum to compare; leave it out")
+            return torch.zeros_like(power)
         level = torch.log(power.clamp_min(_FLOOR * float(power.max())))
         centred = level - level.mean()
         return centred / centred.norm().clamp_min(torch.finfo(torch.float64).tiny)

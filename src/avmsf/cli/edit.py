@@ -1,6 +1,7 @@
 """`avmsf edit`: a field in, the field of another material, size, pitch or sound out."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -239,6 +240,12 @@ def _rows(before: HeardModes, after: HeardModes) -> list[dict[str, Any]]:
     ]
 
 
+def _change(row: dict[str, Any]) -> str:
+    if row["silent"]:
+        return "silent"
+    return decimals(row["level_change_db"], 1) if math.isfinite(row["level_change_db"]) else "back"
+
+
 def _table(before: HeardModes, after: HeardModes) -> Table:
     loudest = torch.argsort(torch.maximum(before.size, after.size), descending=True)[:_LISTED].sort().values.tolist()
     rows = _rows(before, after)
@@ -248,7 +255,7 @@ def _table(before: HeardModes, after: HeardModes) -> Table:
             figure(row["frequency_after"], 5),
             figure(row["t60_before"]),
             figure(row["t60_after"]),
-            "silent" if row["silent"] else decimals(row["level_change_db"], 1),
+            _change(row),
         ]
         for row in (rows[place] for place in loudest)
     ]

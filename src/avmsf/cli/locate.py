@@ -1,6 +1,6 @@
 """`avmsf locate`: where recorded blows fell, in words, as heat maps and as point clouds."""
 
-from collections import Counter
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,6 +25,7 @@ from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locate import locate
 from avmsf.tasks.located import describe_blow, symmetries_of
 from avmsf.tasks.locator import Locator
+from avmsf.tasks.posterior import Force
 from avmsf.tasks.severalblows import locate_blows
 
 UNLOCATED = 2
@@ -48,6 +49,9 @@ class Options:
     """A capture.toml that says so."""
     several: bool = False
     """The recordings hold several blows each; every one of them is located."""
+    force: float | None = None
+    """How hard every blow was, newtons at its peak: it tells places apart that differ in loudness alone. For a field of
+    recordings that were not divided by their forces, over the mean blow among them."""
     level: float = 0.9
     """Probability of the region that is said to hold the contact."""
     output: Path | None = None
@@ -70,12 +74,13 @@ def run(options: Options) -> int:
     if options.output is not None:
         expect_writable(options.output / "blow.png")
     settings = _settings(options)
+    force = None if options.force is None else Force(options.force)
     known = _Known(load(options.field))
     screen = console(errors=options.json)
-    names, found, failures = Counter[str](), list[dict[str, Any]](), list[dict[str, str]]()
+    taken, found, failures = set[str](), list[dict[str, Any]](), list[dict[str, str]]()
     for path in options.recordings:
         try:
-            blows = _blows(known, read_recording(path), settings, several=options.several)
+            blows = _blows(known, read_recording(path), settings, force, several=options.several)
         except AvmsfError as error:
             if len(options.recordings) == 1:
                 raise
@@ -86,7 +91,7 @@ def run(options: Options) -> int:
             values = _describe(str(path), seconds, contact, known, options.level)
             screen.print(_words(values), soft_wrap=True)
             if options.output is not None:
-                values |= _draw(contact, options.output, _name(path, names), values)
+                values |= _draw(contact, options.output, _name(path, taken), values)
             found.append(values)
     if options.json:
         print_json({"field": str(options.field), "blows": found, "failures": failures})
@@ -110,12 +115,12 @@ class _Known:
 
 
 def _blows(
-    known: _Known, recording: Recording, settings: CaptureSettings | None, *, several: bool
+    known: _Known, recording: Recording, settings: CaptureSettings | None, force: Force | None, *, several: bool
 ) -> list[tuple[float | None, ContactMap]]:
     """Return when the blows of a recording began, seconds, where that tells them apart, and where they fell."""
     if several:
-        return [*locate_blows(known.field, recording, settings=settings, locator=known.locator)]
-    return [(None, locate(known.field, recording, settings=settings, locator=known.locator))]
+        return [*locate_blows(known.field, recording, settings=settings, force=force, locator=known.locator)]
+    return [(None, locate(known.field, recording, settings=settings, force=force, locator=known.locator))]
 
 
 def _settings(options: Options) -> CaptureSettings | None:
@@ -151,10 +156,12 @@ def _words(values: dict[str, Any]) -> str:
     return "\n".join([*lines, *(f"  note: {note}" for note in values["notes"])])
 
 
-def _name(path: Path, names: Counter[str]) -> str:
-    """Return what a blow's files are called: the recording's name, numbered from its second blow on."""
-    names[path.stem] += 1
-    return path.stem if names[path.stem] == 1 else f"{path.stem}-{names[path.stem]}"
+def _name(path: Path, taken: set[str]) -> str:
+    """Return what a blow's files are called: the recording's name, numbered where that is taken."""
+    numbered = (f"{path.stem}-{number}" for number in itertools.count(2))
+    name = next(each for each in itertools.chain([path.stem], numbered) if each not in taken)
+    taken.add(name)
+    return name
 
 
 def _draw(contact: ContactMap, folder: Path, name: str, values: dict[str, Any]) -> dict[str, str]:

@@ -65,6 +65,8 @@ class Extractor:
     sample_rate: float
     """Hz."""
     samples: int
+    highest: float
+    """Frequency in Hz up to which sounds hold anything: half the sample rate, or less where they were resampled."""
     gram: Float64[Tensor, "two_modes two_modes"]
     """Inner products of all sines and cosines."""
     inverse: Float64[Tensor, "two_modes two_modes"]
@@ -75,15 +77,16 @@ class Extractor:
     """Variance of each mixture's error where the noise has variance one."""
 
     @classmethod
-    def of(cls, bank: ModalBank, *, sample_rate: float, samples: int) -> "Extractor":
-        """Return the extractor of a bank's modes, all below half the sample rate (Hz)."""
+    def of(cls, bank: ModalBank, *, sample_rate: float, samples: int, highest: float | None = None) -> "Extractor":
+        """Return the extractor of a bank's modes, all below half the sample rate (Hz), and below `highest` if given."""
         inner = gram(poles_of(bank, sample_rate), samples, power=0)
         scale = torch.sqrt(torch.diagonal(inner))
         ridge = _RIDGE * torch.eye(len(scale), dtype=inner.dtype)
         inverse = torch.cholesky_inverse(torch.linalg.cholesky(inner / (scale[:, None] * scale) + ridge))
         inverse = inverse / (scale[:, None] * scale)
         mixing, spread = _separate(inverse)
-        return cls(bank, sample_rate, samples, inner, inverse, mixing, spread)
+        up_to = 0.5 * sample_rate if highest is None else min(highest, 0.5 * sample_rate)
+        return cls(bank, sample_rate, samples, up_to, inner, inverse, mixing, spread)
 
     def extract(self, sound: Float[Tensor, " samples"], *, colour: Residual | None) -> Amplitudes:
         """Return the amplitudes in a sound; `colour` is the noise to expect, of which the shape alone counts.
@@ -123,8 +126,11 @@ class Extractor:
         if not bool(shape.any()):
             shape = torch.ones_like(own)
         shape = shape.clamp_min(1e-6 * float(shape.mean()))
-        level = shape * torch.quantile(own / shape, _QUIET)
-        return torch.maximum(own, level), float(shape.mean()) * _steady(cells / shape)
+        # Bands that resampling has emptied are the quietest of all, and tell nothing of the noise in the others.
+        held = max(2, int(self.highest / (0.5 * self.sample_rate) * len(own)))
+        level = shape * torch.quantile((own / shape)[:held], _QUIET)
+        quiet = float(shape[:held].sum()) / len(shape) * _steady((cells / shape)[:, :held])
+        return torch.maximum(own, level), quiet
 
 
 def _separate(

@@ -65,7 +65,8 @@ def hear(
         expect_sudden(heard, sample_rate=whole.sample_rate, name=whole.name)
     except CaptureError as error:
         raise LocationError(str(error)) from error
-    sound = prepared.sound
+    # A pulse that was divided out took the force with it, which says how hard the blow was.
+    sound = prepared.sound if prepared.newtons is None else prepared.sound * prepared.newtons
     begin = prepared.onset if chosen.align else 0
     second = _second(whole, sound, begin, prepared.pulse, chosen)
     if second is not None:

@@ -16,7 +16,9 @@ from scipy.signal import butter, sosfilt
 from torch import Tensor
 
 from avmsf.capture.onset import find_onset
+from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
+from avmsf.modal.bank import ModalBank
 from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locate import judge_fit
 from avmsf.tasks.locator import Locator
@@ -26,8 +28,6 @@ WINDOW = 0.04
 """Seconds of a blow that its first answer rests on."""
 _HOP, _FEWEST = 0.0025, 16
 """Seconds, and samples at least, that are taken at once."""
-_SHORTEST = 64
-"""Samples in which modes can be told apart at all."""
 _MEMORY, _SKIPPED, _LEAD = 24, 2, 4
 """Hops that a blow has to stand above, hops between these and the blow, in which it may have begun, and fewest of the
 former."""
@@ -106,9 +106,10 @@ class Listener:
     comes when so much of the blow was heard, or as much as there was before the next blow. Blows closer to each other
     than `window` are heard as one, and so is one fainter than -17 dB beside what rings; the first 15 ms of a stream
     count as its noise. Whatever lies below `rumble` Hz is removed, a constant among it; by itself that is a twentieth
-    of the lowest mode's frequency, at most 20 Hz.
+    of the lowest mode's frequency, at most 20 Hz. Nothing is heard for longer than the field's own sounds last.
 
-    Raises LocationError for a sample rate that is not the field's, and times that are not positive.
+    Raises LocationError for a sample rate that is not the field's, times that are not positive, a window of less than
+    20 ms, and a field of which no mode is audible.
     """
 
     def __init__(
@@ -135,13 +136,23 @@ class Listener:
         cut = lowest if rumble is None else rumble
         if not 0.0 <= cut < rate / 2:
             raise LocationError(f"rumble = {cut:g} Hz: expected 0 for none, or less than half of {rate:g} Hz")
+        if round(window * rate) < shortest_allowed(rate):
+            raise LocationError(
+                f"window = {window:g} s is {round(window * rate)} samples: expected {shortest_allowed(rate)} or more, "
+                "in fewer modes cannot be told apart"
+            )
+        audible = torch.nonzero(field.audible).flatten()
+        if not len(audible):
+            raise LocationError(f"none of the object's {len(field.bank)} modes lies below half of {rate:g} Hz")
         self.locator, self.rate = locator, rate
         self.hop = max(_FEWEST, round(_HOP * rate))
-        self.window = max(_SHORTEST, round(window * rate))
-        self.later = None if later is None else max(self.window + 1, round(later * rate))
+        self.window = min(round(window * rate), field.samples)
+        last = 0 if later is None else min(round(later * rate), field.samples)
+        self.later = last if last > self.window else None
         self.filter = butter(2, cut, "highpass", fs=rate, output="sos") if cut > 0.0 else None
-        strength = locator.gains.abs().square().mean(0).sqrt()
-        self._modes = Ringing.of(field.bank, strength, sample_rate=rate, hop=self.hop, window=self.window)
+        strength = locator.gains[:, audible].abs().square().mean(0).sqrt()
+        bank = ModalBank(field.bank.frequency[audible], field.bank.damping[audible])
+        self._modes = Ringing.of(bank, strength, sample_rate=rate, hop=self.hop, window=self.window)
         self._kept = (self.later or self.window) + self.hop * (_MEMORY + 2 * _SKIPPED) + round(_BEFORE * rate)
         self.ears = self._silence()
         locator.prepare(*(each for each in (self.window, self.later) if each is not None))

@@ -37,9 +37,13 @@ def locate(
 
     Bare samples are at `sample_rate` Hz, or at the field's rate. `settings` take the place of those of the capture
     that the field was fitted to (see `hear`), `points` and `directions` as for `Locator.of`, `force` as for
-    `Locator.locate`; `locator`, made before, saves making one for each recording. Raises LocationError as `hear` and
-    `Locator.locate`, and for the sound of another object: where its misfit is above `STRANGE`.
+    `Locator.locate`; `locator`, made of the field before, saves making one for each recording, and has points of its
+    own. Raises LocationError as `hear` and `Locator.locate`, for a locator of another field or given with points, and
+    for the sound of another object: where its misfit is above `STRANGE`.
     """
+    if locator is not None and (locator.field is not field or points is not None or directions is not None):
+        what = "points or directions" if locator.field is field else "another field"
+        raise LocationError(f"a locator is of one field and its points, and was given with {what}: leave it out")
     heard = hear(recording, field, sample_rate=sample_rate, settings=settings)
     finder = Locator.of(field, points=points, directions=directions) if locator is None else locator
     found = finder.locate(heard.sound, highest=heard.highest, force=force)

@@ -67,6 +67,7 @@ class Locator:
         or areas that are none.
         """
         places = (field.gain_field.points if points is None else points).detach().cpu()
+        directions = None if directions is None else directions.detach().cpu()
         _expect_points(places, directions, areas)
         gains, dampings = foretell(field, places, directions)
         variance = unknown(field, places, directions, factor=widened(field))
@@ -145,11 +146,14 @@ class Locator:
 
     def _length(self, samples: int, highest: float) -> "_Length":
         key = (samples, highest)
-        if key not in self.lengths:
+        # What is used moves to the end, so that what a stream needs again and again is never the oldest.
+        found = self.lengths.pop(key, None)
+        if found is None:
             while len(self.lengths) >= _KEPT_LENGTHS:
                 del self.lengths[next(iter(self.lengths))]
-            self.lengths[key] = _Length.of(self, samples, highest)
-        return self.lengths[key]
+            found = _Length.of(self, samples, highest)
+        self.lengths[key] = found
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +180,7 @@ class _Length:
                 f"{float(whole.frequency.min()):g} Hz: record at a higher sample rate"
             )
         bank = ModalBank(whole.frequency[heard].double(), whole.damping[heard].double())
-        extractor = Extractor.of(bank, sample_rate=rate, samples=samples)
+        extractor = Extractor.of(bank, sample_rate=rate, samples=samples, highest=highest)
         gains = locator.gains[:, heard]
         if locator.dampings is not None:
             gains = gains * _seen_through(bank.damping, locator.dampings[:, heard], samples / rate)
@@ -273,7 +277,10 @@ def _expect_points(
             f"{int((~torch.isfinite(points)).sum())} numbers that are not finite: give others"
         )
     if directions is not None and directions.shape != points.shape:
-        raise LocationError(f"{len(directions)} directions do not go with {len(points)} points: give one a point")
+        raise LocationError(
+            f"directions of the shape {tuple(directions.shape)} do not go with points of {tuple(points.shape)}: give "
+            "one a point"
+        )
     if directions is not None:
         length = directions.double().norm(dim=1)
         # Not "> _UNIT": NaN is no unit vector either.

@@ -24,6 +24,8 @@ _POINTS = 64
 """Places at which a field's brightness is taken."""
 _MODES = 40
 """Modes of a sound that is made up."""
+_HEARD = 1e-3
+"""Gain over the object's largest below which a mode says nothing of its brightness."""
 _SCATTER = 0.5
 """Standard deviation of a mode's gain about the slope, logarithm: places and shapes differ."""
 
@@ -49,8 +51,9 @@ class MaterialStatistics:
         """Sum up objects' modes, each object with the same weight, each mode of an object with its gain's.
 
         `gains` holds the size of each mode's. The law of decay is fitted by least squares of the relative error with
-        both constants not negative, the brightness by least squares over the logarithms. Raises `EditError` where there
-        are no modes, and for an object whose modes are silent or have another number of gains.
+        both constants not negative, the brightness by least squares over the logarithms of gains within 60 dB of the
+        largest. Raises `EditError` where there are no modes, and for an object whose modes are silent or have another
+        number of gains.
         """
         if not banks or any(len(bank) == 0 for bank in banks):
             raise EditError(f"{name}: expected modes of every object, found none: there is nothing to sum up")
@@ -79,8 +82,10 @@ class MaterialStatistics:
         # Scaled alike, for the second constant is a billionth of the first.
         columns = np.abs(terms).max(axis=0)
         law, _ = nnls(root * terms / columns, root[:, 0])
-        octaves = [torch.log2(bank.frequency) for bank in banks]
-        levels = [20 * torch.log10(each.clamp_min(1e-12)) for each in sizes]
+        # What is hardly heard would decide a slope of logarithms.
+        heard = [each > _HEARD * each.max() for each in sizes]
+        octaves = [torch.log2(bank.frequency[kept]) for bank, kept in zip(banks, heard, strict=True)]
+        levels = [20 * torch.log10(each[kept]) for each, kept in zip(sizes, heard, strict=True)]
         # Each object has its own level: the slope is that within objects.
         apart = torch.cat([each - each.mean() for each in octaves])
         loud = torch.cat([each - each.mean() for each in levels])

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from avmsf.errors import EditError
@@ -43,9 +43,9 @@ def retune(
     """
     factors = {name: _values(field, value, name) for name, value in (("pitch", pitch), ("decay", decay))}
     for name, values in factors.items():
-        _expect(bool((torch.isfinite(values) & (values > 0)).all()), name, values, "factors above 0, as 1.5")
+        _expect(torch.isfinite(values) & (values > 0), name, values, "factors above 0, as 1.5")
     levels = _values(field, gains_db, "gains_db")
-    _expect(bool((levels < math.inf).all()), "gains_db", levels, "decibels, or -inf for silence")
+    _expect(levels < math.inf, "gains_db", levels, "decibels, or -inf for silence")
     if not math.isfinite(brightness_db):
         raise EditError(f"brightness_db = {brightness_db:g}: expected decibels an octave, as 3")
     bank = ModalBank(field.bank.frequency * factors["pitch"], field.bank.damping / factors["decay"])
@@ -87,9 +87,9 @@ def _values(field: SoundField, value: Slider, name: str) -> Float64[Tensor, " mo
     return values.expand(modes)
 
 
-def _expect(fine: bool, name: str, values: Tensor, wanted: str) -> None:
-    if not fine:
-        found = ", ".join(f"{each:g}" for each in sorted(set(values.tolist()))[:4])
+def _expect(fine: Bool[Tensor, " modes"], name: str, values: Float64[Tensor, " modes"], wanted: str) -> None:
+    if not bool(fine.all()):
+        found = ", ".join(f"{each:g}" for each in dict.fromkeys(values[~fine].tolist()[:4]))
         raise EditError(f"{name} = {found}: expected {wanted}")
 
 

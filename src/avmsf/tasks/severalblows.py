@@ -11,6 +11,7 @@ from jaxtyping import Float64
 from scipy.fft import irfft, next_fast_len, rfft
 from torch import Tensor
 
+from avmsf.capture.audio import refuse_silence
 from avmsf.capture.onset import find_onset
 from avmsf.capture.prepare import remove_rumble, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
@@ -23,6 +24,7 @@ from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.hearing import Sound, as_recording, at_field_rate, describe, own_settings, settings_for
 from avmsf.tasks.locate import judge_fit
 from avmsf.tasks.locator import Locator
+from avmsf.tasks.posterior import Force
 
 _BEFORE = 0.005
 """Seconds before a blow that are left out of what rang before it: it may begin a little earlier than it is found."""
@@ -39,15 +41,17 @@ def locate_blows(
     *,
     sample_rate: float | None = None,
     settings: CaptureSettings | None = None,
+    force: Force | None = None,
     locator: Locator | None = None,
 ) -> list[tuple[float, ContactMap]]:
     """Return when each blow of a recording begins, seconds, and where it fell, in order.
 
-    Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `hear`; `locator` saves making the
-    field's anew. What rang before a blow is fitted by the object's modes, carried on as they decay, and subtracted.
-    Blows that are none on this object are left out, and blows closer than 30 ms are not told apart. Raises
-    LocationError as `hear`, where the settings ask for the pulse that the recording holds to be divided out, and where
-    no blow can be located.
+    Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `hear`; `force`, of every blow, as
+    for `Locator.locate`; `locator` saves making the field's anew. What rang before a blow is fitted by the object's
+    modes, carried on as they decay, and subtracted.
+    Blows that are none on this object are left out, which a note says, and blows closer than 30 ms are not told apart.
+    Raises LocationError as `hear`, where the settings ask for the pulse that the recording holds to be divided out, and
+    where no blow can be located.
     """
     whole = as_recording(recording, field, sample_rate=sample_rate)
     chosen = settings_for(whole, own_settings(recording, field) if settings is None else settings)
@@ -58,9 +62,9 @@ def locate_blows(
         )
     notes = describe(whole, chosen)
     try:
-        sound = remove_rumble(
-            whole.response(chosen.response_channel, force_channel=chosen.force_channel), chosen.highpass, whole
-        )
+        response = whole.response(chosen.response_channel, force_channel=chosen.force_channel)
+        refuse_silence(response, whole.name)
+        sound = remove_rumble(response, chosen.highpass, whole)
     except CaptureError as error:
         raise LocationError(str(error)) from error
     onsets = find_blows(sound, sample_rate=whole.sample_rate)
@@ -69,7 +73,7 @@ def locate_blows(
     ratio = len(resampled) / len(sound)
     starts = [round(onset * ratio) for onset in onsets]
     found = []
-    refused: list[LocationError] = []
+    refused: list[tuple[float, LocationError]] = []
     for number, (onset, start) in enumerate(zip(onsets, starts, strict=True)):
         end = starts[number + 1] if number + 1 < len(starts) else len(resampled)
         own = resampled[start : min(end, start + field.samples)].double()
@@ -77,15 +81,19 @@ def locate_blows(
             own = own - still_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
         seconds = onset / whole.sample_rate
         try:
-            located = finder.locate(own.float(), highest=highest)
+            located = finder.locate(own.float(), highest=highest, force=force)
             doubts = judge_fit(located, f"{whole.name}, the blow at {seconds:.3f} s")
         except LocationError as error:
-            refused.append(error)
+            refused.append((seconds, error))
             continue
         found.append((seconds, replace(located, notes=(*notes, *remark, *located.notes, *doubts))))
     if not found:
-        raise refused[0]
-    return found
+        raise refused[0][1]
+    if not refused:
+        return found
+    times = ", ".join(f"{seconds:.3f}" for seconds, _ in refused)
+    left_out = f"{whole.name} holds {len(refused)} more, at {times} s, left out: {refused[0][1]}"
+    return [(seconds, replace(each, notes=(*each.notes, left_out))) for seconds, each in found]
 
 
 def find_blows(sound: Float64[np.ndarray, " frames"], *, sample_rate: float) -> list[int]:

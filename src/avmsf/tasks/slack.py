@@ -13,6 +13,8 @@ from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from avmsf.field.doubtedgains import DoubtedGains
+from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import SoundField
 
 SLACK = 0.06
@@ -25,10 +27,10 @@ _NEIGHBOURS = 6
 
 
 def contacts_of(field: SoundField) -> int | None:
-    """Return how many contacts a field was fitted to; None where that is not known."""
-    contacts = getattr(field.gain_field, "contacts", None)
-    if contacts is not None:
-        return len(torch.unique(contacts, dim=0))
+    """Return how many contacts in different places a field learnt from; None where that is not known."""
+    gains = field.gain_field.field if isinstance(field.gain_field, ScaledGains) else field.gain_field
+    if isinstance(gains, DoubtedGains):
+        return gains.places
     return len(field.origin.trained_on) or None
 
 

@@ -66,7 +66,8 @@ def search_start(struck: Struck, wanted: Wanted) -> ModalEdit:
         around = [step * place for place in range(-4, 5)]
         for _ in range(4):
             for each in around:
-                tried.setdefault(round(each, 9), _error(struck, wanted, pitch, each))
+                if round(each, 9) not in tried:
+                    tried[round(each, 9)] = _error(struck, wanted, pitch, each)
             damping, step = min(tried, key=lambda each: tried[each]), step / 2
             around = [max(-_MOST_DAMPING, damping - step), min(_MOST_DAMPING, damping + step)]
         best = min(best, (tried[damping], pitch, damping))
