@@ -45,6 +45,14 @@ def test_levels_and_edits_change_nothing() -> None:
     assert heed_of(edited) == heed_of(field)
 
 
+def test_modes_that_an_edit_muted_have_no_say() -> None:
+    whole = plate_splines(40, copies=10)
+    scale = torch.zeros(len(whole.bank), dtype=torch.float64)
+    scale[: len(scale) // 10] = 3.0
+    muted = replace(whole, gain_field=ScaledGains(whole.gain_field, scale))
+    assert heed_of(muted) == pytest.approx(heed_of(plate_splines(40)), rel=0.2)
+
+
 def test_fields_with_too_few_strikes_are_heeded_as_fields_are_on_the_whole() -> None:
     few = plate_splines(20)
     gains = few.gain_field

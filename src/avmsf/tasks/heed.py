@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.field.belief import measured_gains
+from avmsf.field.belief import measured_gains, scale_of
 from avmsf.field.doubtedgains import DoubtedGains
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.points import farthest_points
@@ -55,20 +55,22 @@ def heed_of(field: SoundField) -> float:
     about = patches(gains.points, foretell(fitted, gains.points, None)[0])[rows]
     prior = areas_of(places).clamp_min(1e-300).log() if len(places) > 2 else torch.zeros(len(places)).double()
     slack = spread_by(places, contacts=contacts_of(fitted))
-    turned = torch.polar(torch.ones_like(field.phase), field.phase)
+    # A locator does not hear the others either.
+    kept = torch.nonzero(field.audible & (scale_of(field) != 0.0)).flatten()
+    turned = torch.polar(torch.ones_like(field.phase), field.phase)[kept]
     score = -0.5 * (_TRIED.log() / _BEFOREHAND).square()
     for strike, truth in zip(strikes.tolist(), truths.tolist(), strict=True):
         left = gains.without(_same_place(gains, strike))
         if left.places < 2:
             continue
-        heard = torch.view_as_complex(gains.values[strike].double().contiguous()) * turned
-        loudest = float(heard.abs().max())
-        if loudest == 0.0:
+        heard = torch.view_as_complex(gains.values[strike][kept].double().contiguous()) * turned
+        if not bool(heard.any()):
             continue
-        known = _foretold(replace(field, gain_field=left), places, about, factor=factor)
+        loudest = float(heard.abs().max())
+        known = _foretold(replace(field, gain_field=left), places, about, kept, factor=factor)
         found = judge(known, heard, torch.full(heard.shape, _NOISE * loudest**2, dtype=torch.float64))
         row = int(found.log_likelihood.argmax())
-        explained = _explained(known.gains[row].to(heard), heard, 1.0 / (4.0 * field.bank.damping.double()))
+        explained = _explained(known.gains[row].to(heard), heard, 1.0 / (4.0 * field.bank.damping[kept].double()))
         trusts = torch.tensor([found.trust(explained, heed=heed) for heed in _TRIED.tolist()], dtype=torch.float64)
         score += _log_score(trusts[:, None] * found.log_likelihood + prior, truth, slack)
     return float(_TRIED[int(score.argmax())])
@@ -92,16 +94,17 @@ def _foretold(
     field: SoundField,
     places: Float[Tensor, "points 3"],
     about: Float32[Tensor, "points modes"],
+    kept: Int64[Tensor, " kept"],
     *,
     factor: float,
 ) -> Foretold:
-    """Return what a field foretells of places whose gains vary by `about` around them."""
-    gains, _ = foretell(field, places, None)
+    """Return what a field foretells of some modes at places whose gains vary by `about` around them."""
+    gains = foretell(field, places, None)[0][:, kept]
     power = gains.abs().square()
     usual = power.mean(0)
     usual = usual.clamp_min(max(1e-8 * float(usual.max()), torch.finfo(torch.float32).tiny))
-    variance = unknown(field, places, None, factor=factor) + about
-    return Foretold(gains, power, variance, usual, field.bank.frequency.double())
+    variance = (unknown(field, places, None, factor=factor) + about)[:, kept]
+    return Foretold(gains, power, variance, usual, field.bank.frequency[kept].double())
 
 
 def _explained(foretold: Tensor, heard: Tensor, weights: Float64[Tensor, " modes"]) -> float:
