@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from avmsf.bench.doubtpictures import draw_band, draw_doubt
@@ -296,7 +297,7 @@ def test_pictures_are_drawn_of_solids_and_of_sheets() -> None:
     assert len(sheet.axes) == 2  # the sheet and its colours
     bent = points + torch.tensor([0.0, 0.0, 1.0]) * points[:, :1].square()
     solid = draw_doubt(bent, doubt, title="bent", suggested=contacts[:3])
-    assert len(solid.axes) == 5
+    assert len(solid.axes) == 7
     band = draw_band(spectrum_band(field, contacts[0]), title="one blow")
     assert band.axes[0].get_xlim() == (0.0, pytest.approx(1000.0, abs=5.0))
 
@@ -306,8 +307,21 @@ def test_marks_behind_the_object_are_not_drawn() -> None:
     ball = torch.nn.functional.normalize(torch.randn(3000, 3, generator=generator), dim=1)
     marks = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     picture = draw_doubt(ball, torch.ones(3000), title="ball", suggested=marks)
-    seen = [sorted(each.get_text() for each in axes.texts) for axes in picture.axes[:4]]
-    assert seen == [["1"], ["1"], ["1"], ["2"]]
+    assert _numbers(picture) == [["1"], ["1"], ["1"], ["1"], ["2"], ["2"]]
+
+
+def test_marks_on_the_other_side_of_a_wall_are_not_drawn() -> None:
+    """Two blows on one place of a thin dish: into it from above, and from below."""
+    x, y = torch.meshgrid(torch.linspace(-1, 1, 60), torch.linspace(-1, 1, 60), indexing="ij")
+    dish = torch.stack([x, y, 0.2 * (x.square() + y.square())], dim=2).reshape(-1, 3)
+    marks, ways = torch.zeros(2, 3), torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    picture = draw_doubt(dish, torch.ones(3600), title="dish", suggested=marks, directions=ways)
+    assert _numbers(picture)[3:] == [["1"], ["2"], ["2"]]
+
+
+def _numbers(picture: Figure) -> list[list[str]]:
+    """Return the numbers that each view shows."""
+    return [sorted(each.get_text() for each in axes.texts if each.get_text().isdigit()) for axes in picture.axes[:-1]]
 
 
 def test_what_cannot_be_said_is_refused() -> None:

@@ -51,6 +51,7 @@ def test_of_three_labels_that_changed_places_those_that_went_far_are_named_and_n
     # Where it was really struck is found between places some 2 cm apart.
     for each in found:
         assert each.distance == pytest.approx(float(away[each.row]), abs=0.015)
+        assert each.place == pytest.approx(clean.contacts[each.row].tolist(), abs=0.015)
     assert agreeing(likely(measured), doubted(measured, found)).name == bodies()[1].name
 
 
@@ -104,7 +105,7 @@ def test_too_few_strikes_accuse_none():
 
 def test_suspects_count_for_nothing():
     measured = struck(WALLS[1], 12)
-    silent = doubted(measured, [Suspect(4, 2.0, 0.1, False, 0.1, 0.3)])
+    silent = doubted(measured, [Suspect(4, 2.0, 0.1, False, 0.1, 0.3, (0.0, 0.0, 0.0))])
     wild = replace(silent, values=torch.where((torch.arange(12) == 4)[:, None, None], -silent.values, silent.values))
     body = likely(measured)[0]
     one, other = (body.fit(each).at(points()[:50]).mean for each in (silent, wild))
@@ -119,22 +120,35 @@ def test_a_strike_without_any_sound_is_named_as_silent():
     values[5] = 0.0
     measured = replace(measured, values=values)
     found = find_suspects(plausible(measured), measured)
-    assert [each.describe(NAMES) for each in found] == ["strike 5 is silent"]
+    assert [each.describe(NAMES, measured.contacts) for each in found] == ["strike 5 is silent"]
+
+
+AT = torch.tensor([[0.0, 0, 0.1 * row] for row in range(15)])
+BY_ONE = (0.0, 0.001, 0.5)
 
 
 @pytest.mark.parametrize(
     ("suspect", "words"),
     [
         (
-            Suspect(3, 2.1, 0.2, False, 0.1, 1.0),
-            "strike 3 fits best 0.2 m away (misfit 2.1 where it is said to be, 0.1",
+            Suspect(3, 2.1, 0.2, False, 0.1, 1.0, BY_ONE),
+            "strike 3 fits best 0.2 m away, at (0, 0.001, 0.5) m, near to where strike 5 is said to be (misfit 2.1 "
+            "where it is said to be, 0.1 there; 0 is",
         ),
-        (Suspect(3, 4.0, 0.0, True, 0.1, 1.0), "strike 3 fits best with its direction reversed (misfit 4"),
-        (Suspect(3, 4.0, 0.05, True, 0.1, 1.0), "strike 3 fits best 0.05 m away with its direction reversed (misfit 4"),
-        (Suspect(3, 1.2, 0.3, False, 0.9, 1.0), "strike 3 fits nowhere on the object (misfit 1.2"),
-        (Suspect(3, 0.5, 0.0, False, 0.5, 1.0), "strike 3 fits its place badly"),
+        (Suspect(3, 2.1, 0.2, False, 0.1, 0.01, BY_ONE), "strike 3 fits best 0.2 m away, at (0, 0.001, 0.5) m (misfit"),
+        (Suspect(5, 2.1, 0.2, False, 0.1, 1.0, BY_ONE), "strike 5 fits best 0.2 m away, at (0, 0.001, 0.5) m (misfit"),
+        (Suspect(3, 4.0, 0.0, True, 0.1, 1.0, BY_ONE), "strike 3 fits best with its direction reversed (misfit 4"),
+        (
+            Suspect(3, 4.0, 0.05, True, 0.1, 0.01, (1.0, 0.0, 0.0)),
+            "strike 3 fits best 0.05 m away, at (1, 0, 0) m with its direction reversed (misfit 4",
+        ),
+        (
+            Suspect(3, 1.2, 0.3, False, 0.9, 1.0, BY_ONE),
+            "strike 3 fits nowhere on the object (misfit 1.2 where it is said to be, 0.9 at best;",
+        ),
+        (Suspect(3, 0.5, 0.0, False, 0.5, 1.0, BY_ONE), "strike 3 fits its place badly"),
     ],
 )
 def test_suspects_say_what_is_wrong_with_them(suspect: Suspect, words: str):
-    assert suspect.describe(NAMES).startswith(words)
+    assert suspect.describe(NAMES, AT).startswith(words)
     assert math.isfinite(suspect.misfit)

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from avmsf.field.doubt import SpectrumBand
 
-_SIDES = ((25.0, -60.0), (25.0, 60.0), (25.0, 180.0), (-40.0, -60.0))
-"""Elevation and azimuth of the eye, degrees: three sides from above, one from below."""
+_SIDES = ((25.0, -60.0), (25.0, 60.0), (25.0, 180.0), (75.0, -60.0), (-25.0, -60.0), (-75.0, -60.0))
+"""Elevation and azimuth of the eye, degrees: three sides, into what is open above, and two from below."""
 _INK, _NEXT = "#1f3b5c", "#19e0c8"
 _RANGE_DB = 100.0
 """What a spectrum shows below its highest level."""
@@ -31,25 +31,31 @@ def draw_doubt(
     title: str,
     struck: Float[Tensor, "struck 3"] | None = None,
     suggested: Float[Tensor, "suggested 3"] | None = None,
+    directions: Float[Tensor, "suggested 3"] | None = None,
 ) -> Figure:
-    """Draw doubt (of `gain_doubt`, 0 is certainty) on an object's points (object frame, metres), from four sides.
+    """Draw doubt (of `gain_doubt`, 0 is certainty) on an object's points (object frame, metres), from six sides.
 
-    `struck` contacts are marked by crosses, `suggested` ones by their numbers, each where it can be seen. What is flat
-    along an axis is drawn once, in its plane.
+    `struck` contacts are marked by crosses, `suggested` ones by their numbers, each where it can be seen: no point is
+    in front of it, and the blow, whose `directions` may be given, goes away from the eye, so that the two sides of a
+    wall are not mistaken for each other. What is flat along an axis is drawn once, in its plane.
     """
     places, values = points.double().numpy(), doubt.double().numpy()
     crosses, numbers = (None if each is None else each.double().numpy() for each in (struck, suggested))
     extent = np.ptp(places, axis=0)
     flat = np.flatnonzero(extent <= _FLAT * extent.max())
     frames = [_side(*side) for side in _SIDES] if len(flat) == 0 else [_plane(int(flat[0]))]
-    figure = Figure(figsize=(11, 9.5) if len(frames) > 1 else (8, 5), layout="constrained")
-    grid = figure.subplots(2, 2).flatten() if len(frames) > 1 else np.array([figure.subplots()])
+    figure = Figure(figsize=(14, 9.5) if len(frames) > 1 else (8, 5), layout="constrained")
+    grid = figure.subplots(2, 3).flatten() if len(frames) > 1 else np.array([figure.subplots()])
+    away = None if directions is None else directions.double().numpy()
     for axes, frame in zip(grid, frames, strict=True):
         drawn = _scatter(axes, places @ frame, values)
+        _name_axes(axes, frame)
         if crosses is not None:
             _mark(axes, places @ frame, crosses @ frame, None)
         if numbers is not None:
-            _mark(axes, places @ frame, numbers @ frame, [str(number + 1) for number in range(len(numbers))])
+            faced = np.ones(len(numbers), dtype=bool) if away is None or len(frames) == 1 else (away @ frame)[:, 2] < 0
+            names = [str(number + 1) for number in range(len(numbers))]
+            _mark(axes, places @ frame, numbers @ frame, names, faced=faced)
     figure.colorbar(drawn, ax=list(grid), shrink=0.7, label="doubt over the mean size of gains (0 = certain)")
     known = [words for words, each in (("× struck", struck), ("numbers: next", suggested)) if each is not None]
     figure.suptitle("\n".join([title, ", ".join(known)] if known else [title]))
@@ -104,12 +110,29 @@ def _scatter(axes: Axes, seen: np.ndarray, values: np.ndarray) -> PathCollection
     return drawn
 
 
-def _mark(axes: Axes, seen: np.ndarray, marks: np.ndarray, names: list[str] | None) -> None:
-    """Draw marks that no point hides: crosses, or names in discs."""
+def _name_axes(axes: Axes, frame: np.ndarray) -> None:
+    """Draw the directions of x, y and z, in the lower left corner."""
+    for axis, name in enumerate("xyz"):
+        across, along = 0.06 * frame[axis, :2]
+        # What points at the eye or away from it has no direction here.
+        if np.hypot(across, along) < 0.02:
+            continue
+        start, end = (0.07, 0.07), (0.07 + across, 0.07 + along)
+        axes.annotate("", end, start, "axes fraction", "axes fraction", arrowprops={"arrowstyle": "->", "color": _INK})
+        beyond = (0.07 + 1.4 * across, 0.07 + 1.4 * along)
+        axes.annotate(name, beyond, xycoords="axes fraction", color=_INK, fontsize=8, ha="center", va="center")
+
+
+def _mark(
+    axes: Axes, seen: np.ndarray, marks: np.ndarray, names: list[str] | None, *, faced: np.ndarray | None = None
+) -> None:
+    """Draw marks that no point hides, of those on the `faced` side: crosses, or names in discs."""
     size = float(np.linalg.norm(np.ptp(seen, axis=0)))
     apart = np.linalg.norm(seen[None, :, :2] - marks[:, None, :2], axis=2)
     nearer = seen[None, :, 2] - marks[:, None, 2] > _BEHIND * size
     visible = ~np.any((apart < size / math.sqrt(len(seen))) & nearer, axis=1)
+    if faced is not None:
+        visible &= faced
     across, along = marks[visible, 0], marks[visible, 1]
     if names is None:
         axes.scatter(across, along, c="white", marker="x", s=45, linewidths=3.5)

@@ -108,7 +108,8 @@ def run(options: Options) -> int:
     assert record is not None
     found = curves(record, metric=options.metric)
     picture, figures = (folder / chosen / name for name in (PICTURE, FIGURES))
-    contacts = f"{record.contacts} contacts, {options.starts} first ones"
+    starts = "one choice" if options.starts == 1 else f"{options.starts} choices"
+    contacts = f"{record.contacts} contacts, {starts} of those learnt from"
     save_picture(draw_efficiency(found, metric=options.metric, title=f"{chosen}: {contacts}"), picture)
     failures = {f"{each.method}, {each.case}": each.failure for each in record.outcomes if each.failure is not None}
     values = {

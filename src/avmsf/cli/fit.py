@@ -221,7 +221,8 @@ def choice_words(name: str, choice: Mapping[str, Any]) -> list[str]:
 def suspect_words(fitted: SoundField) -> list[str]:
     """Say which strikes disagree with all others, one a line."""
     suspects = fitted.origin.report.get("suspects", {})
-    return [f"left out of the gains, look at its row in impacts.csv: {words}" for words in suspects.values()]
+    told = [f"left out of the gains, look at its row in impacts.csv: {words}" for words in suspects.values()]
+    return [*told, "a strike whose label was exchanged with one of these may be among the others"] if told else []
 
 
 def summary(fitted: SoundField, contacts: int) -> str:

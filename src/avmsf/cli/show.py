@@ -188,6 +188,7 @@ def _words(values: dict[str, Any]) -> str:
         f"  gains      {_gains_words(values['gain_field'])}",
         f"  fitted to  {len(values['trained_on'])} recordings",
     ]
+    lines += [f"  left out   {words}" for words in report.get("suspects", {}).values()]
     for edit in report.get("edits", []):
         lines.append(f"  edited     {_edit_words(edit)}")
     if report.get("validated"):

@@ -96,6 +96,7 @@ def run(options: Options) -> int:
             title=f"{field.origin.capture or 'field'}: doubt, and where to strike next",
             struck=gains.contacts,
             suggested=found.contacts,
+            directions=found.directions,
         )
         save_picture(picture, paths[PICTURE])
         for path in paths.values():

@@ -88,6 +88,7 @@ class Physics:
         _expect_one_frame(case, bodies[0])
         _expect_strikes(case)
         _expect_motion(bodies, heard)
+        names = case.train.names
         suspects = find_suspects(plausible_bodies(bodies, points, heard), heard)
         measured = doubted(heard, suspects)
         likely = likely_bodies(bodies, points, measured)
@@ -107,7 +108,7 @@ class Physics:
                 {"body": body_name(wall), "wall": wall, "reason": reason}
                 for wall, reason in self.bodies.refused.items()
             ],
-            "suspects": {case.train.names[each.row]: each.describe(case.train.names) for each in suspects},
+            "suspects": {names[each.row]: each.describe(names, case.train.contacts) for each in suspects},
         }
         return RefinedGains(replace(body.fit(measured), report=report), case.modes.bank)
 

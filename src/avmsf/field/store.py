@@ -101,6 +101,8 @@ def _guess(path: Path) -> str:
             start = file.read(9)
     except OSError as error:
         return f"a file that cannot be read ({error.strerror}): check its permissions"
+    if not start:
+        return "an empty file: copy it again, or fit and save it again"
     # Eight bytes of length, then the header's opening brace.
     if start[8:] == b"{":
         return "one that is cut short or damaged: copy it again, or fit and save it again"

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.field.bodychoice import ChosenBody, MeasuredGains
@@ -72,6 +72,8 @@ class Suspect:
     """Squared misfit there, over that of silence."""
     size: float
     """Of the object, metres."""
+    place: tuple[float, float, float]
+    """The place that they fit best, metres."""
 
     @property
     def is_wrong(self) -> bool:
@@ -88,18 +90,30 @@ class Suspect:
     def _far(self) -> bool:
         return self.distance > _FAR * self.size
 
-    def describe(self, names: Sequence[str]) -> str:
-        """Say what is wrong with it."""
+    def describe(self, names: Sequence[str], contacts: Float[Tensor, "contacts 3"]) -> str:
+        """Say what is wrong with it, by the names and places (metres) of all training contacts."""
         if self.misfit > _SILENT:
             return f"{names[self.row]} is silent"
         turned = " with its direction reversed" if self.reversed else ""
+        where = "there"
         if self.best > _NOWHERE:
-            found = "fits nowhere on the object"
+            found, where = "fits nowhere on the object", "at best"
         elif self.distance < 1e-9:
             found = f"fits best{turned}" if turned else "fits its place badly"
         else:
-            found = f"fits best {self.distance:.2g} m away{turned}"
-        return f"{names[self.row]} {found} (misfit {self.misfit:.2g} where it is said to be, {self.best:.2g} there)"
+            place = ", ".join(f"{each + 0.0:.4g}" for each in self.place)
+            found = f"fits best {self.distance:.2g} m away, at ({place}) m{self._beside(names, contacts)}{turned}"
+        return (
+            f"{names[self.row]} {found} (misfit {self.misfit:.2g} where it is said to be, {self.best:.2g} {where}; "
+            "0 is a strike explained, 1 as badly as by silence)"
+        )
+
+    def _beside(self, names: Sequence[str], contacts: Float[Tensor, "contacts 3"]) -> str:
+        """Say which other contact is said to be where this one fits best: their labels may have changed places."""
+        apart = (contacts.double() - torch.tensor(self.place, dtype=torch.float64)).norm(dim=1)
+        apart[self.row] = math.inf
+        other = int(apart.argmin())
+        return f", near to where {names[other]} is said to be" if float(apart[other]) <= _NEAR * self.size else ""
 
 
 def agreeing(bodies: Sequence[ChosenBody], measured: MeasuredGains) -> ChosenBody:
@@ -234,7 +248,9 @@ class _Judge:
         # Elsewhere, or where no direction was given, a turned blow says nothing of the label's direction.
         near = distance <= _NEAR * surface.size
         against = against and near and self.measured.directions is not None
-        return Suspect(row, float(misfits[0, 0]), distance, against, float(misfits[turned, place]), surface.size)
+        x, y, z = places[place].tolist()
+        best = float(misfits[turned, place])
+        return Suspect(row, float(misfits[0, 0]), distance, against, best, surface.size, (x, y, z))
 
     @cached_property
     def elsewhere(self) -> Float64[Tensor, "modes places contacts"]:
