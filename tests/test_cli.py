@@ -1,5 +1,6 @@
 """The command line: every verb end to end, what goes to which stream, exit codes, one line an error."""
 
+import io
 import json
 import subprocess
 import sys
@@ -115,6 +116,20 @@ def test_output_that_nobody_reads_any_more_ends_quietly(field: Path) -> None:
     assert b"Traceback" not in told
     assert b"BrokenPipe" not in told
     assert run.returncode == 141
+
+
+def test_a_terminal_is_told_that_something_goes_on_until_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    for stream, begins in (
+        (Terminal(), "loading ...\r           \ravmsf suggest: "),
+        (io.StringIO(), "avmsf suggest: "),
+    ):
+        monkeypatch.setattr(sys, "stderr", stream)
+        assert main(["suggest", "nothing.safetensors"]) == 2
+        assert stream.getvalue().startswith(begins)
 
 
 def test_the_version_is_the_packages(capsys: Streams) -> None:

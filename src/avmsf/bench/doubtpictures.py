@@ -20,6 +20,8 @@ _FLAT = 1e-3
 """Extent over the longest below which an object is flat."""
 _BEHIND = 0.04
 """Depth over the object's size by which a point in front hides a mark."""
+_ARROW = 28.0
+"""Length of the arrows along the axes, points."""
 _INCHES = 4.0
 """Width of an object in its picture."""
 
@@ -113,14 +115,20 @@ def _scatter(axes: Axes, seen: np.ndarray, values: np.ndarray) -> PathCollection
 def _name_axes(axes: Axes, frame: np.ndarray) -> None:
     """Draw the directions of x, y and z, in the lower left corner."""
     for axis, name in enumerate("xyz"):
-        across, along = 0.06 * frame[axis, :2]
+        across, along = _ARROW * frame[axis, :2]
         # What points at the eye or away from it has no direction here.
-        if np.hypot(across, along) < 0.02:
-            continue
-        start, end = (0.07, 0.07), (0.07 + across, 0.07 + along)
-        axes.annotate("", end, start, "axes fraction", "axes fraction", arrowprops={"arrowstyle": "->", "color": _INK})
-        beyond = (0.07 + 1.4 * across, 0.07 + 1.4 * along)
-        axes.annotate(name, beyond, xycoords="axes fraction", color=_INK, fontsize=8, ha="center", va="center")
+        if np.hypot(across, along) > 0.4 * _ARROW:
+            axes.annotate(
+                name,
+                (0.06, 0.06),
+                (across, along),
+                xycoords="axes fraction",
+                textcoords="offset points",
+                arrowprops={"arrowstyle": "<-", "color": _INK},
+                color=_INK,
+                ha="center",
+                va="center",
+            )
 
 
 def _mark(

@@ -3,7 +3,8 @@
 import os
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from typing import TextIO
 
@@ -56,7 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings():
         try:
             # Only the verb that is asked for is imported: torch takes seconds, and help on the whole needs none of it.
-            verb = import_module(f"avmsf.cli.{words[0].replace('-', '_')}")
+            with _loading():
+                verb = import_module(f"avmsf.cli.{words[0].replace('-', '_')}")
             _show_plainly()
             return verb.run(verb.parse(words[1:]))
         except AvmsfError as error:
@@ -69,6 +71,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             print(f"avmsf {words[0]}: interrupted", file=sys.stderr)
             return INTERRUPTED
+
+
+@contextmanager
+def _loading() -> Iterator[None]:
+    """Tell a terminal that something goes on, for as long as it does."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    print("loading ...", end="", file=sys.stderr, flush=True)
+    try:
+        yield
+    finally:
+        print("\r           \r", end="", file=sys.stderr, flush=True)
 
 
 def _explain(words: list[str]) -> None:
