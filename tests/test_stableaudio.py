@@ -174,7 +174,8 @@ def test_what_the_decoder_says_is_the_target(model, monkeypatch):
     by_sound = steer(field, reference, config=config, parameters=still)
     # A random autoencoder's decoded sound is far from any ring: eight steps take a twentieth off.
     assert seen[-1].loss < 0.97 * seen[0].loss
-    torch.testing.assert_close(by_words.bank.frequency, by_sound.bank.frequency, rtol=1e-5, atol=0)
+    # Where a magnitude all but meets its target, rounding decides which way the loss would have it.
+    torch.testing.assert_close(by_words.bank.frequency, by_sound.bank.frequency, rtol=5e-5, atol=0)
     torch.testing.assert_close(by_words.bank.damping, by_sound.bank.damping, rtol=1e-4, atol=0)
     torch.testing.assert_close(by_words.gain_field.scale, by_sound.gain_field.scale, rtol=1e-4, atol=0)
     assert float((by_words.bank.damping / field.bank.damping).log().abs().min()) > 0.02
