@@ -38,7 +38,7 @@ from avmsf.capture.datasets.dataset import DatasetReport, ObjectFacts
 from avmsf.capture.datasets.numbering import REALIMPACT_NAMES, material_in, number_of
 from avmsf.capture.datasets.realimpact import SELF_INTERSECTING
 from avmsf.capture.folder import Capture
-from avmsf.errors import AvmsfWarning, EvaluationError
+from avmsf.errors import AvmsfWarning, EditError, EvaluationError
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.synthesis import synthesise
 from avmsf.simulate.block import block
@@ -322,6 +322,20 @@ def test_what_is_generated_without_modes_has_no_score(space):
     task = EditTask(struck("ceramic"), "glass", prompt="glass")
     with pytest.warns(AvmsfWarning, match="plate-ceramic towards glass, generation: .* is silent.* this has no score"):
         scores = judge([task], (Untouched(), Generation(Silence())), {"flat": space})
+    assert [each.method for each in scores] == ["before"]
+
+
+@pytest.mark.parametrize("error", [EditError("it diverged"), EvaluationError("none of 9 modes is heard")])
+def test_an_edit_that_fails_costs_its_own_score_alone(space, error):
+    class Failing:
+        name = "failing"
+
+        def edit(self, task):
+            raise error
+
+    task = EditTask(struck("ceramic"), "glass", prompt="glass")
+    with pytest.warns(AvmsfWarning, match=f"plate-ceramic towards glass, failing: {error}; this has no score"):
+        scores = judge([task], (Failing(), Untouched()), {"flat": space})
     assert [each.method for each in scores] == ["before"]
 
 
