@@ -55,7 +55,7 @@ def draw_doubt(
         if crosses is not None:
             _mark(axes, places @ frame, crosses @ frame, None)
         if numbers is not None:
-            faced = np.ones(len(numbers), dtype=bool) if away is None or len(frames) == 1 else (away @ frame)[:, 2] < 0
+            faced = None if away is None or len(frames) == 1 else (away @ frame)[:, 2] < 0
             names = [str(number + 1) for number in range(len(numbers))]
             _mark(axes, places @ frame, numbers @ frame, names, faced=faced)
     figure.colorbar(drawn, ax=list(grid), shrink=0.7, label="doubt over the mean size of gains (0 = certain)")

@@ -9,7 +9,7 @@ from torch import Tensor
 from avmsf.errors import FitError
 from avmsf.field.doubtedgains import Belief, DoubtedGains
 from avmsf.field.kinds import FITTED
-from avmsf.field.scaledgains import ScaledGains
+from avmsf.field.scaledgains import ScaledGains, fitted_gains
 from avmsf.field.soundfield import SoundField
 
 
@@ -34,7 +34,7 @@ def measured_gains(field: SoundField) -> DoubtedGains:
 
     Raises FitError where they know no doubt, with the kinds that do.
     """
-    gains = field.gain_field.field if isinstance(field.gain_field, ScaledGains) else field.gain_field
+    gains = fitted_gains(field.gain_field)
     if not isinstance(gains, DoubtedGains):
         known = " and ".join(kind for kind, fitted in FITTED.items() if hasattr(fitted, "beliefs"))
         raise FitError(f"gains of the kind {gains.kind!r} do not know how sure they are; {known} do: fit with these")

@@ -14,6 +14,13 @@ from torch import Tensor
 from avmsf.compiled import compiled
 
 
+def magnitude(spectra: Complex[Tensor, "contacts frames bins"], floor: float) -> Float[Tensor, "contacts frames bins"]:
+    """Return magnitudes of spectra; a power below `floor` counts as `floor`."""
+    # Torch's abs() of a complex tensor guards against overflow at three times the cost.
+    parts = torch.view_as_real(spectra)
+    return torch.addcmul(parts[..., 0].square(), parts[..., 1], parts[..., 1]).clamp_min_(floor).sqrt_()
+
+
 def compare(
     spectra: Complex[Tensor, "contacts frames bins"],
     target: Float[Tensor, "contacts _frames bins"],
@@ -40,12 +47,10 @@ def _by_torch(
     first: int,
     every: int,
 ) -> Float[Tensor, ""]:
-    parts = torch.view_as_real(spectra)
-    # Torch's abs() of a complex tensor guards against overflow at three times the cost.
-    magnitude = parts.square().sum(-1).clamp_min_(floor).sqrt_()
-    difference = magnitude - target[:, first : first + every * spectra.shape[1] : every]
+    found = magnitude(spectra, floor)
+    difference = found - target[:, first : first + every * spectra.shape[1] : every]
     distance = difference.abs().sum()
-    parts *= difference.sign_().div_(magnitude)[..., None]
+    spectra *= difference.sign_().div_(found)
     spectra[..., 0] *= 2.0
     spectra[..., -1] *= 2.0
     return distance

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.field.comparison import compare
+from avmsf.field.comparison import compare, magnitude
 
 _CHUNK = 1 << 19
 """Samples of windowed frames held at once: they stay near the processor's cache."""
@@ -57,9 +57,9 @@ def spectral_target(
         frames = _padded(cut, fft_size).unfold(1, fft_size, hop)
         target = torch.empty(*frames.shape[:2], fft_size // 2 + 1, dtype=cut.dtype, device=cut.device)
         for chunk in _chunks(frames.shape[0], frames.shape[1], fft_size):
-            target[chunk] = _magnitude(torch.fft.rfft(frames[chunk] * window), _floor(window))
+            target[chunk] = magnitude(torch.fft.rfft(frames[chunk] * window), _floor(window))
         magnitudes.append(target)
-    norms = tuple(magnitude.sum((0, 2)) for magnitude in magnitudes)
+    norms = tuple(each.sum((0, 2)) for each in magnitudes)
     return SpectralTarget(tuple(magnitudes), norms, tuple(hops), cut.shape[1])
 
 
@@ -90,16 +90,16 @@ class _SpectralL1(torch.autograd.Function):
     def forward(
         ctx: Any, sounds: Float[Tensor, "contacts samples"], target: SpectralTarget, first: int, every: int
     ) -> Float[Tensor, ""]:
-        widest = max(_fft_size(magnitude) for magnitude in target.magnitudes)
+        widest = max(_fft_size(known) for known in target.magnitudes)
         padded = _padded(sounds, widest)
         sought = ctx.needs_input_grad[0]
         # A hop more than the sound, for the last column of hops that `_overlap_add` fills only in part.
         slope = padded.new_zeros(len(padded), padded.shape[1] + every * max(target.hops) if sought else 0)
         loss = sounds.new_zeros(())
-        for magnitude, norms, hop in zip(target.magnitudes, target.norms, target.hops, strict=True):
-            fft_size = _fft_size(magnitude)
+        for known, norms, hop in zip(target.magnitudes, target.norms, target.hops, strict=True):
+            fft_size = _fft_size(known)
             # Short sounds may have fewer frames than are skipped.
-            step = min(every, magnitude.shape[1])
+            step = min(every, known.shape[1])
             start = first % step
             norm = norms[start::step].sum().clamp_min(torch.finfo(sounds.dtype).tiny)
             window = torch.hann_window(fft_size, dtype=sounds.dtype, device=sounds.device)
@@ -109,7 +109,7 @@ class _SpectralL1(torch.autograd.Function):
             for rows, part in _chunks(*frames.shape):
                 spectra = torch.fft.rfft(frames[rows, part] * window)
                 place = start + step * part.start
-                loss += compare(spectra, magnitude[rows], floor, first=place, every=step) / norm
+                loss += compare(spectra, known[rows], floor, first=place, every=step) / norm
                 if sought:
                     # From here on the spectra are the slope's.
                     slopes = torch.fft.irfft(spectra, fft_size, norm="forward").mul_(slope_window)
@@ -150,14 +150,8 @@ def _chunks(contacts: int, frames: int, fft_size: int) -> list[tuple[slice, slic
     ]
 
 
-def _magnitude(spectrum: Tensor, floor: float) -> Tensor:
-    # Torch's abs() of a complex tensor guards against overflow at three times the cost.
-    parts = torch.view_as_real(spectrum)
-    return torch.addcmul(parts[..., 0].square(), parts[..., 1], parts[..., 1]).clamp_min_(floor).sqrt_()
-
-
-def _fft_size(magnitude: Float[Tensor, "contacts frames bins"]) -> int:
-    return 2 * (magnitude.shape[2] - 1)
+def _fft_size(magnitudes: Float[Tensor, "contacts frames bins"]) -> int:
+    return 2 * (magnitudes.shape[2] - 1)
 
 
 def _floor(window: Float[Tensor, " size"]) -> float:

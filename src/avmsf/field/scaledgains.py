@@ -92,6 +92,11 @@ class ScaledGains:
         return (gains.double() * self.scale).float()
 
 
+def fitted_gains(gains: GainField) -> GainField:
+    """Return gains as they were fitted, beneath all edits."""
+    return gains.field if isinstance(gains, ScaledGains) else gains
+
+
 def _inner(record: Mapping[str, Any]) -> str:
     kind: str = like(record["inner"], "", "inner")
     if kind not in FITTED:

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.export.sampledfield import SampledField
-from avmsf.field.gainfield import GainField
-from avmsf.field.scaledgains import ScaledGains
+from avmsf.field.belief import scale_of
+from avmsf.field.scaledgains import ScaledGains, fitted_gains
 from avmsf.field.soundfield import SoundField
 
 
@@ -29,9 +29,11 @@ def resample(sampled: SampledField, before: SoundField, after: SoundField) -> Sa
 
     None where that cannot be: another fitted field, another phase, or a mode that could not be heard or was mute.
     """
-    if _fitted(before) is not _fitted(after) or not torch.equal(before.phase, after.phase):
+    if fitted_gains(before.gain_field) is not fitted_gains(after.gain_field) or not torch.equal(
+        before.phase, after.phase
+    ):
         return None
-    old, new = _scale(before), _scale(after)
+    old, new = scale_of(before), scale_of(after)
     if bool((after.audible & (~before.audible | ((old == 0) & (new != 0)))).any()):
         return None
     heard = torch.nonzero(after.audible).flatten()
@@ -45,13 +47,3 @@ def resample(sampled: SampledField, before: SoundField, after: SoundField) -> Sa
         sine=(sampled.sine[:, columns] * factor).float(),
         cosine=(sampled.cosine[:, columns] * factor).float(),
     )
-
-
-def _fitted(field: SoundField) -> GainField:
-    gains = field.gain_field
-    return gains.field if isinstance(gains, ScaledGains) else gains
-
-
-def _scale(field: SoundField) -> Float[Tensor, " modes"]:
-    gains = field.gain_field
-    return gains.scale if isinstance(gains, ScaledGains) else torch.ones_like(field.bank.frequency)

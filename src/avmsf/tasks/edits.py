@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from avmsf.errors import EditError
+from avmsf.field.belief import scale_of
 from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
@@ -48,8 +49,7 @@ def edited(
 
 def muted(field: SoundField) -> Bool[Tensor, " modes"]:
     """Return which modes edits have taken all gains of: nothing brings these back."""
-    gains = field.gain_field
-    return gains.scale == 0 if isinstance(gains, ScaledGains) else torch.zeros_like(field.audible)
+    return scale_of(field) == 0
 
 
 def silenced(field: SoundField) -> Bool[Tensor, " modes"]:

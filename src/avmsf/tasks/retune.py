@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from avmsf.errors import EditError
-from avmsf.field.scaledgains import ScaledGains
+from avmsf.field.scaledgains import fitted_gains
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.tasks.edits import edited
@@ -68,7 +68,7 @@ def brightness_centre(field: SoundField, bank: ModalBank | None = None) -> float
     The geometric mean of the frequencies, those of `bank` where one is given, each counted by the mean square of its
     gains over the object as these were before any edit; so that edits do not move it, but as pitch does.
     """
-    gains = field.gain_field.field if isinstance(field.gain_field, ScaledGains) else field.gain_field
+    gains = fitted_gains(field.gain_field)
     points = gains.points[:: max(1, math.ceil(len(gains.points) / _POINTS))]
     with torch.no_grad():
         known = gains.at(points)

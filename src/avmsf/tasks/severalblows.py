@@ -48,10 +48,9 @@ def locate_blows(
 
     Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `hear`; `force`, of every blow, as
     for `Locator.locate`; `locator` saves making the field's anew. What rang before a blow is fitted by the object's
-    modes, carried on as they decay, and subtracted.
-    Blows that are none on this object are left out, which a note says, and blows closer than 30 ms are not told apart.
-    Raises LocationError as `hear`, where the settings ask for the pulse that the recording holds to be divided out, and
-    where no blow can be located.
+    modes, carried on as they decay, and subtracted. Blows that are none on this object are left out, which a note says,
+    and blows closer than 30 ms are not told apart. Raises LocationError as `hear`, where the settings ask for the pulse
+    that the recording holds to be divided out, and where no blow can be located.
     """
     whole = as_recording(recording, field, sample_rate=sample_rate)
     chosen = settings_for(whole, own_settings(recording, field) if settings is None else settings)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.field.doubtedgains import DoubtedGains
-from avmsf.field.scaledgains import ScaledGains
+from avmsf.field.scaledgains import fitted_gains
 from avmsf.field.soundfield import SoundField
 
 SLACK = 0.06
@@ -28,7 +28,7 @@ _NEIGHBOURS = 6
 
 def contacts_of(field: SoundField) -> int | None:
     """Return how many contacts in different places a field learnt from; None where that is not known."""
-    gains = field.gain_field.field if isinstance(field.gain_field, ScaledGains) else field.gain_field
+    gains = fitted_gains(field.gain_field)
     if isinstance(gains, DoubtedGains):
         return gains.places
     return len(field.origin.trained_on) or None
