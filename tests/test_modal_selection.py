@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.leastsquares import NormalEquations, poles_of
+from avmsf.modal.forward import choose
+from avmsf.modal.innerproducts import gram, poles_of
+from avmsf.modal.leastsquares import NormalEquations
 from avmsf.modal.pencil import candidates
 from avmsf.modal.selection import Candidates, chance_ratio, merge, prune, select
 from avmsf.modal.synthesis import synthesise
@@ -235,3 +237,31 @@ def test_pruning_nothing_but_noise_leaves_nothing():
     assert len(prune(sounds, TRUTH, flat(1.0, TRUTH), count=9, **SIFTING)) == 0
     assert len(prune(sounds, bank_of([], []), flat(1.0, bank_of([], [])), count=9, **SIFTING)) == 0
     assert math.isfinite(chance_ratio(1, trials=1))
+
+
+def explained(sounds: Tensor, bank: ModalBank) -> float:
+    return NormalEquations.of(sounds, poles_of(bank, RATE)).explained() if len(bank) else 0.0
+
+
+@pytest.mark.parametrize("known", [[], [1, 3]])
+def test_what_the_chosen_explain_one_after_another_is_what_they_explain_together(known: list[int]):
+    sounds = record(TRUTH, noise=1e-3)
+    bank = bank_of([299.0, 300.0, 700.0, 703.0, 704.0, 1500.0, 2900.0], [4.0, 5.0, 6.0, 7.0, 9.0, 30.0, 80.0])
+    both = Candidates.of(sounds, bank, flat(1e-3, bank), sample_rate=RATE)
+    given = torch.zeros(len(bank), dtype=torch.bool)
+    given[known] = True
+    inner = gram(poles_of(bank, RATE), SAMPLES, power=0)
+    energy = choose(inner, both.products, both.noise, given, significance=6.0, reach=1e-6)
+    assert (energy[given] == 0).all()
+    alone = ModalBank(bank.frequency[given], bank.damping[given])
+    taken = (energy > 0) | given
+    together = ModalBank(bank.frequency[taken], bank.damping[taken])
+    assert float(energy.sum()) == pytest.approx(explained(sounds, together) - explained(sounds, alone), rel=1e-7)
+    # The first to go explains most beside those given, of all.
+    gained = [
+        explained(sounds, ModalBank(torch.cat([alone.frequency, f]), torch.cat([alone.damping, d])))
+        - explained(sounds, alone)
+        for f, d in zip(bank.frequency[~given].split(1), bank.damping[~given].split(1), strict=True)
+    ]
+    assert float(energy.max()) == pytest.approx(max(gained), rel=1e-7)
+    assert int(energy[~given].argmax()) == gained.index(max(gained))

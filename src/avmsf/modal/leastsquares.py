@@ -1,9 +1,4 @@
-"""Gains, and better modes, by linear and nonlinear least squares.
-
-All sums over time that least squares needs are inner products of damped sines, and those are geometric series: with
-z = exp((-d + 2 pi i f) / rate), sum_n n^p (z_i z_j)^n has a closed form. So the normal equations of any number of
-modes cost nothing that grows with the length of the sounds; only the products of the sounds with the modes do.
-"""
+"""Gains, and better modes, by linear and nonlinear least squares."""
 
 import math
 from dataclasses import dataclass
@@ -13,12 +8,10 @@ from jaxtyping import Complex128, Float, Float64, Int64
 from torch import Tensor
 
 from avmsf.modal.bank import ModalBank
+from avmsf.modal.innerproducts import gram, poles_of, project
 
-_BLOCK = 512
 _RIDGE = 1e-13
 """Relative to the Gram matrix's diagonal: keeps two modes of one frequency solvable."""
-_DEAD = 1e-12
-"""Part of its beginning below which a mode is no longer followed."""
 
 
 def fit_gains(
@@ -91,11 +84,6 @@ def refine(
             break
     order = torch.argsort(frequency)
     return ModalBank(frequency[order], damping[order])
-
-
-def poles_of(bank: ModalBank, sample_rate: float) -> Complex128[Tensor, " modes"]:
-    """Return z = exp((-d + 2 pi i f) / rate), the factor by which each mode turns and shrinks from sample to sample."""
-    return torch.exp(torch.complex(-bank.damping, 2 * math.pi * bank.frequency) / sample_rate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +161,8 @@ class NormalEquations:
         projected = self.weighted_gram - self.mixed_gram @ _solve(self.gram, self.mixed_gram).T
         blocks = projected.reshape(2, modes, 2, modes)
         by_part = slopes.reshape(2, -1, 2, modes)
-        hessian = torch.einsum("acpi,piqj,bcqj->aibj", by_part, blocks, by_part).reshape(2 * modes, 2 * modes)
+        weights = torch.einsum("acpi,bcqj->apibqj", by_part, by_part)
+        hessian = torch.einsum("apibqj,piqj->aibj", weights, blocks).reshape(2 * modes, 2 * modes)
         slope = torch.einsum("acpi,cpi->ai", by_part, residual.reshape(-1, 2, modes)).reshape(-1)
         scale = torch.diagonal(hessian).clamp_min(torch.finfo(torch.float64).tiny)
         damped = hessian + torch.diag(trust * scale)
@@ -194,111 +183,3 @@ def _normalise(
 ) -> Float64[Tensor, "basis basis"]:
     ridge = _RIDGE * torch.eye(len(scale), dtype=gram.dtype, device=gram.device)
     return gram / (scale[:, None] * scale[None, :]) + ridge
-
-
-def gram(poles: Complex128[Tensor, " modes"], samples: int, *, power: int) -> Float64[Tensor, "two_modes two_modes"]:
-    """Return inner products over time, weighted by n^power (0, 1 or 2), of all sines and cosines with each other."""
-    last = poles**samples
-    straight = _power_sum(poles[:, None] * poles[None, :], last[:, None] * last[None, :], samples, power)
-    mirror, last_mirror = poles.conj(), last.conj()
-    crossed = _power_sum(poles[:, None] * mirror[None, :], last[:, None] * last_mirror[None, :], samples, power)
-    sine_sine, sine_cosine = (crossed - straight).real, (straight + crossed).imag
-    cosine_sine, cosine_cosine = (straight - crossed).imag, (straight + crossed).real
-    return 0.5 * torch.cat([torch.cat([sine_sine, sine_cosine], dim=1), torch.cat([cosine_sine, cosine_cosine], dim=1)])
-
-
-def own_gram(poles: Complex128[Tensor, " modes"], samples: int) -> Float64[Tensor, "modes 2 2"]:
-    """Return the inner products over time of each mode's own sine and cosine: the two by two blocks of `gram`."""
-    straight = _power_sum(poles.square(), (poles**samples).square(), samples, 0)
-    crossed = _power_sum(poles * poles.conj(), (poles * poles.conj()) ** samples, samples, 0)
-    mixed = straight.imag
-    rows = torch.stack([crossed.real - straight.real, mixed, mixed, crossed.real + straight.real], dim=-1)
-    return 0.5 * rows.reshape(-1, 2, 2)
-
-
-def _power_sum(
-    ratio: Complex128[Tensor, "*shape"], last: Complex128[Tensor, "*shape"], samples: int, power: int
-) -> Complex128[Tensor, "*shape"]:
-    """Return the sum over n < samples of n^power ratio^n, in closed form; `last` is ratio^samples."""
-    rest = 1 - ratio
-    plain = (1 - last) / rest
-    first = (ratio * plain - samples * last) / rest
-    sums = (plain, first, (ratio * (2 * first + plain) - samples * samples * last) / rest)[power]
-    # The fractions lose their digits where hardly anything decays or turns over the whole sound.
-    steady = rest.abs() * samples < 1
-    return sums.masked_scatter(steady, _steady_sum(ratio[steady], samples, power))
-
-
-def _steady_sum(ratio: Complex128[Tensor, " sums"], samples: int, power: int) -> Complex128[Tensor, " sums"]:
-    """Return the sum over n < samples of n^power ratio^n for ratios near one, doubling its length again and again."""
-    plain, first, second = torch.zeros_like(ratio), torch.zeros_like(ratio), torch.zeros_like(ratio)
-    length = 0
-    for bit in f"{samples:b}":
-        turned = ratio**length
-        second = second + turned * (second + 2 * length * first + length * length * plain)
-        first = first + turned * (first + length * plain)
-        plain = plain + turned * plain
-        length *= 2
-        if bit == "1":
-            turned = ratio**length
-            plain, first, second = plain + turned, first + length * turned, second + length * length * turned
-            length += 1
-    return (plain, first, second)[power]
-
-
-def project(
-    sounds: Float[Tensor, "contacts samples"], poles: Complex128[Tensor, " modes"], *, weighted: bool = False
-) -> tuple[Float64[Tensor, "contacts two_modes"], Float64[Tensor, "contacts two_modes"] | None]:
-    """Return the sounds' inner products with all sines and cosines, and with n times them if `weighted`.
-
-    All in float64: what two modes of nearly one frequency share cancels in the solution, and float32 products would
-    leave only rounding of the rest. A mode is followed until it has fallen below 1e-12 of its beginning: most die
-    long before the sound ends.
-    """
-    samples = sounds.shape[1]
-    wide = sounds.to(torch.float64)
-    needed = math.log(_DEAD) / torch.log(poles.abs()).clamp_max(-1e-300)
-    inner = torch.zeros(len(sounds), len(poles), dtype=torch.complex128)
-    outer = torch.zeros_like(inner)
-    upper, length = math.inf, samples
-    while upper > 0:
-        lower = length // 2 if length > 2 * _BLOCK else 0
-        group = torch.nonzero((needed > lower) & (needed <= upper)).flatten()
-        if len(group):
-            inner[:, group], outer[:, group] = _project(wide[:, :length], poles[group], weighted)
-        upper, length = lower, lower
-    products = torch.cat([inner.imag, inner.real], dim=1)
-    return products, torch.cat([outer.imag, outer.real], dim=1) if weighted else None
-
-
-def _project(
-    sounds: Float64[Tensor, "contacts samples"], poles: Complex128[Tensor, " modes"], weighted: bool
-) -> tuple[Complex128[Tensor, "contacts modes"], Complex128[Tensor, "contacts modes"]]:
-    """Return the sums over n of sound z^n and, if `weighted`, of n sound z^n (zero if not).
-
-    By blocks, as in `synthesise`: z^(mK + k) = z^(mK) z^k.
-    """
-    blocks = math.ceil(sounds.shape[1] / _BLOCK)
-    padded = torch.nn.functional.pad(sounds, (0, blocks * _BLOCK - sounds.shape[1])).reshape(-1, blocks, _BLOCK)
-    within = _powers(poles, _BLOCK)
-    tables = [within.real, within.imag]
-    if weighted:
-        steps = torch.arange(_BLOCK, dtype=torch.float64)[:, None]
-        tables += [steps * within.real, steps * within.imag]
-    summed = padded @ torch.cat(tables, dim=1)
-    parts = summed.reshape(*summed.shape[:2], len(tables), len(poles)).unbind(-2)
-    starts = _powers(poles**_BLOCK, blocks)
-    inner = torch.complex(parts[0], parts[1])
-    plain = (starts * inner).sum(1)
-    if not weighted:
-        return plain, torch.zeros_like(plain)
-    offsets = torch.arange(blocks, dtype=torch.float64)[:, None] * _BLOCK
-    return plain, (starts * (torch.complex(parts[2], parts[3]) + offsets * inner)).sum(1)
-
-
-def _powers(poles: Complex128[Tensor, " modes"], count: int) -> Complex128[Tensor, "count modes"]:
-    """Return z^0 to z^(count - 1), by doubling: a product costs a twentieth of a power, and rounds no worse."""
-    table = torch.ones(1, len(poles), dtype=poles.dtype)
-    while len(table) < count:
-        table = torch.cat([table, table * poles ** len(table)])
-    return table[:count]

@@ -8,10 +8,14 @@ in narrow bands, and ever shorter beginnings, for modes that die early, in ever 
 """
 
 import math
+from typing import no_type_check
 
+import numpy as np
 import torch
 from jaxtyping import Complex, Complex128, Float, Float64
 from torch import Tensor
+
+from avmsf.compiled import compiled
 
 _DEPTH = 512
 """Decimated samples in a band: enough to tell modes apart, few enough for small eigenproblems."""
@@ -119,18 +123,36 @@ def _poles(band: Complex[Tensor, "contacts times"]) -> Complex128[Tensor, " pole
 
 
 def _correlation(band: Complex128[Tensor, "contacts times"], span: int) -> Complex128[Tensor, "span span"]:
-    """Return the sum of x x^H over all runs x of `span` samples: H^T H* of the signals' Hankel matrices H.
+    """Return the sum of x x^H over all runs x of `span` samples: H^T H* of the signals' Hankel matrices H."""
+    whole = torch.empty(span, span, dtype=band.dtype)
+    _correlate(band.numpy(), whole.numpy())
+    return whole
+
+
+@compiled(error_model="numpy", fastmath={"reassoc", "contract"})
+@no_type_check
+def _correlate(band, whole):
+    """Write what `_correlation` returns.
 
     From one entry to the next along a diagonal one product leaves the sum and one enters it, so that only the first
     row is summed in full.
     """
-    runs = band.shape[1] - span + 1
-    ahead = band.unfold(1, runs, 1)
-    first = torch.einsum("ct,cjt->j", ahead[:, 0], ahead.conj())
-    enters, leaves = band[:, runs : runs + span - 1], band[:, : span - 1]
-    changes = enters.T @ enters.conj() - leaves.T @ leaves.conj()
-    whole = torch.empty(span, span, dtype=band.dtype)
-    whole[0], whole[:, 0] = first, first.conj()
-    for row in range(span - 1):
-        whole[row + 1, 1:] = whole[row, :-1] + changes[row]
-    return whole
+    contacts, times = band.shape
+    span = len(whole)
+    runs = times - span + 1
+    conjugate = np.conj(band)
+    whole[:] = 0.0
+    for contact in range(contacts):
+        for column in range(span):
+            whole[0, column] += (band[contact, :runs] * conjugate[contact, column : column + runs]).sum()
+        for row in range(span - 1):
+            enters, leaves = band[contact, runs + row], band[contact, row]
+            for column in range(row, span - 1):
+                one, other = conjugate[contact, runs + column], conjugate[contact, column]
+                whole[row + 1, column + 1] += enters * one - leaves * other
+    for row in range(1, span):
+        for column in range(row, span):
+            whole[row, column] += whole[row - 1, column - 1]
+            whole[column, row] = whole[row, column].conjugate()
+    for column in range(1, span):
+        whole[column, 0] = whole[0, column].conjugate()

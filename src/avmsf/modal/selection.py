@@ -4,17 +4,17 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Float, Float64, Int64
 from scipy.special import gammainccinv
 from torch import Tensor
 
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.leastsquares import NormalEquations, gram, own_gram, poles_of, project
+from avmsf.modal.forward import choose
+from avmsf.modal.innerproducts import gram, own_gram, poles_of, project
+from avmsf.modal.leastsquares import NormalEquations
 
 _CHUNK, _SHARED = 120, 30
 """Candidates judged together, in order of frequency, and how many of them the next chunk judges again."""
-_DISTINCT = 1e-6
-"""Part of a candidate's (sine, cosine) area that the chosen ones must leave for it to count as another mode."""
 _APART = 0.01
 """Least part of a mode that the others must not span: with less, gains of large and opposite modes would cancel."""
 _SAME = 0.03
@@ -127,7 +127,11 @@ def select(
     first = 0
     while True:
         rows = torch.arange(first, min(len(both.bank), first + _CHUNK))
-        gained = _forward(both.take(rows), given[rows], samples, sample_rate, significance, range_db)
+        judged = both.take(rows)
+        inner = gram(poles_of(judged.bank, sample_rate), samples, power=0)
+        gained = choose(
+            inner, judged.products, judged.noise, given[rows], significance=significance, reach=10 ** (-range_db / 10)
+        )
         energy[rows] = torch.maximum(energy[rows], gained)
         if first + _CHUNK >= len(both.bank):
             break
@@ -173,49 +177,6 @@ def prune(
     return ModalBank(bank.frequency[strongest], bank.damping[strongest])
 
 
-def _forward(
-    candidates: Candidates,
-    given: Bool[Tensor, " candidates"],
-    samples: int,
-    sample_rate: float,
-    significance: float,
-    range_db: float,
-) -> Float64[Tensor, " candidates"]:
-    """Return the energy that each candidate explained when it was chosen, zero if never: orthogonal least squares.
-
-    The `given` ones have been chosen before.
-    """
-    modes = len(given)
-    products = candidates.products.permute(2, 1, 0).contiguous()
-    inner = gram(poles_of(candidates.bank, sample_rate), samples, power=0)
-    inner = inner.reshape(2, modes, 2, modes).permute(1, 0, 3, 2).contiguous()
-    whole = _determinants(_own(inner))
-    for mode in torch.nonzero(given).flatten().tolist():
-        if _determinants(_own(inner)[mode : mode + 1]) > _DISTINCT * whole[mode]:
-            _eliminate(mode, products, inner)
-    chosen = torch.zeros(modes, dtype=torch.float64)
-    free = ~given
-    noise = candidates.noise.T
-    for _ in range(modes):
-        own = _own(inner)
-        # What the chosen ones span already cannot be judged: only rounding is left of it.
-        distinct = free & (_determinants(own) > _DISTINCT * whole)
-        explained = _explained(torch.where(distinct[:, None, None], own, torch.eye(2, dtype=torch.float64)), products)
-        ratio = (explained / noise).mean(1) / 2
-        score = torch.where(distinct & (ratio > significance), explained.sum(1), 0.0)
-        best = int(score.argmax())
-        if score[best] <= chosen.max() * 10 ** (-range_db / 10):
-            break
-        chosen[best] = score[best]
-        free[best] = False
-        _eliminate(best, products, inner)
-    return chosen
-
-
-def _own(inner: Float64[Tensor, "modes 2 modes 2"]) -> Float64[Tensor, "modes 2 2"]:
-    return torch.diagonal(inner, dim1=0, dim2=2).permute(2, 0, 1)
-
-
 def _determinants(own: Float64[Tensor, "modes 2 2"]) -> Float64[Tensor, " modes"]:
     return own[:, 0, 0] * own[:, 1, 1] - own[:, 0, 1] * own[:, 1, 0]
 
@@ -228,13 +189,3 @@ def _explained(
     crossed = (own[:, 0, 1] + own[:, 1, 0])[:, None] * sine * cosine
     energy = own[:, 1, 1, None] * sine.square() - crossed + own[:, 0, 0, None] * cosine.square()
     return energy / _determinants(own)[:, None]
-
-
-def _eliminate(
-    mode: int, products: Float64[Tensor, "modes 2 contacts"], inner: Float64[Tensor, "modes 2 modes 2"]
-) -> None:
-    """Make all modes orthogonal to one of them, in place."""
-    column = inner[:, :, mode, :].flatten(0, 1)
-    weights = torch.linalg.solve(inner[mode, :, mode, :], column.T)
-    products -= (weights.T @ products[mode]).reshape(products.shape)
-    inner -= (column @ weights).reshape(inner.shape)

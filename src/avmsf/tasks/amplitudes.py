@@ -15,7 +15,7 @@ from jaxtyping import Complex128, Float, Float64, Int64
 from torch import Tensor
 
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.leastsquares import gram, poles_of, project
+from avmsf.modal.innerproducts import gram, poles_of, project
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise
 

@@ -11,7 +11,7 @@ from jaxtyping import Complex128, Float, Float64
 from torch import Tensor
 
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.leastsquares import poles_of, project
+from avmsf.modal.innerproducts import poles_of, project
 from avmsf.tasks.amplitudes import Extractor
 
 DETUNINGS = (0.9, 0.95, 1.05, 1.1)
