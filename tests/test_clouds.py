@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 
 from avmsf.bench.clouds import component_colours, draw_cloud, draw_features, label_colours, save_turntable
+from avmsf.bench.sides import ALL_SIDES, view_from
 from avmsf.errors import EvaluationError
 from avmsf.scene.features import FeatureField
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
@@ -24,21 +25,28 @@ FOUND = Symmetries(
 )
 
 
-def test_a_sheet_has_a_row_for_each_set_of_colours_and_a_column_for_each_azimuth():
+def test_a_sheet_has_a_row_for_each_set_of_colours_and_a_column_for_each_side():
     field = FeatureField(POINTS, torch.randn(300, 8, generator=GENERATOR), "test")
     figure = draw_features(
-        field, title="a box", colours=torch.rand(300, 3), clusters=5, symmetries=FOUND, azimuths=(0.0, 90.0)
+        field,
+        title="a box",
+        colours=torch.rand(300, 3),
+        clusters=5,
+        symmetries=FOUND,
+        sides=((0.0, 25.0), (90.0, 25.0)),
     )
     titles = [axes.get_title() for axes in figure.axes]
     assert titles == [
-        f"{name}, {azimuth}°" for name in ("colour", "features", "5 clusters", "symmetries") for azimuth in (0, 90)
+        f"{name}, {azimuth}° round, 25° up"
+        for name in ("colour", "features", "5 clusters", "symmetries")
+        for azimuth in (0, 90)
     ]
     assert all(len(axes.collections[0].get_offsets()) == 300 for axes in figure.axes)
     assert [len(axes.lines) for axes in figure.axes] == [0] * 6 + [2, 2]
 
 
 def test_an_axis_and_a_plane_are_drawn_where_they_are():
-    figure = draw_cloud(POINTS, {}, title="a box", symmetries=FOUND, azimuths=(90.0,))
+    figure = draw_cloud(POINTS, {}, title="a box", symmetries=FOUND, sides=((90.0, 25.0),))
     plane, axis = figure.axes[0].lines
     # Seen from y, with z up, the upright axis is upright; and the plane, whose normal is x, is seen edge-on. The
     # cloud's middle is a few thousandths from that of the box.
@@ -47,13 +55,30 @@ def test_an_axis_and_a_plane_are_drawn_where_they_are():
     assert np.ptp(axis.get_ydata()) == pytest.approx(2.1 * np.cos(np.radians(25)) * 0.187, rel=0.05)
     assert abs(np.mean(axis.get_ydata())) < 0.005
     assert np.abs(plane.get_xdata()).max() < 0.005
-    assert [text.get_text() for text in figure.axes[0].texts] == ["4"]
+    # Seen from y, x lies to the left and z up, y at the eye.
+    order, *named = figure.axes[0].texts
+    assert order.get_text() == "4"
+    across = {text.get_text(): text.xyann for text in named}
+    assert across.keys() == {"x", "y", "z"}
+    assert across["x"][0] < -20
+    assert across["z"][1] > 20
+
+
+def test_no_direction_is_out_of_sight_from_all_sides():
+    eyes = np.array([view_from(side)[2] for side in ALL_SIDES])
+    faces = torch.nn.functional.normalize(torch.randn(5000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    # Seen at no less than a few degrees.
+    assert (faces.numpy() @ eyes.T).max(1).min() > 0.05
+    for side in ALL_SIDES:
+        view = view_from(side)
+        assert np.allclose(view @ view.T, np.eye(3))
+        assert np.linalg.det(view) == pytest.approx(1.0)
 
 
 def test_what_points_up_is_up_and_nearer_points_come_last():
     points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.5, 0.0, 0.0]])
     colours = torch.eye(3)
-    axes = draw_cloud(points, {"colour": colours}, title="", azimuths=(90.0,), up=(0.0, 1.0, 0.0)).axes[0]
+    axes = draw_cloud(points, {"colour": colours}, title="", sides=((90.0, 25.0),), up=(0.0, 1.0, 0.0)).axes[0]
     drawn = axes.collections[0]
     place = {
         int(np.argmax(face[:3])): spot for face, spot in zip(drawn.get_facecolors(), drawn.get_offsets(), strict=True)

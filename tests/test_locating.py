@@ -284,9 +284,10 @@ def test_a_cloud_holds_what_was_found(tmp_path: Path) -> None:
 def test_a_picture_shows_both_maps_and_the_marks(tmp_path: Path) -> None:
     figure = draw_contact(contact(), title="hit.wav", others=contact().points[:2], truth=contact().points[5])
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
-    assert len(titles) == 8
+    assert len(titles) == 12
+    assert any("down" in title for title in titles)
     assert "turquoise" in figure.get_suptitle()
     assert "blue" in figure.get_suptitle()
-    assert "blue" not in draw_contact(contact(), title="hit.wav", azimuths=(0.0,)).get_suptitle()
+    assert "blue" not in draw_contact(contact(), title="hit.wav", sides=((0.0, 25.0),)).get_suptitle()
     save_picture(figure, tmp_path / "hit.png")
     assert (tmp_path / "hit.png").read_bytes().startswith(b"\x89PNG")

@@ -15,16 +15,21 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor
 
+from avmsf.bench.sides import AROUND, UP, Side, name_axes, side_words, view_from
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import cluster
 from avmsf.scene.symmetry import Symmetries
 
-UP = (0.0, 0.0, 1.0)
 _GREY = 0.62
+_INCHES, _TURNTABLE_INCHES = 3.0, 4.0
+_MARGIN = 1.12
+_WIDTH = 1.9
+"""Width of a dot over the picture's, times the root of how many there are."""
+_FEW = 400
+"""Points below which dots grow no wider."""
 _AXIS, _PLANE = "#c8502d", "#1f3b5c"
-_ELEVATION = 25.0
 
 
 def draw_cloud(
@@ -33,32 +38,32 @@ def draw_cloud(
     *,
     title: str,
     symmetries: Symmetries | None = None,
-    azimuths: Sequence[float] = (30.0, 120.0, 210.0, 300.0),
+    sides: Sequence[Side] = AROUND,
     up: Sequence[float] = UP,
 ) -> Figure:
-    """Draw a cloud from each azimuth (degrees) in a column, once for every named set of colours (0 to 1) in a row.
+    """Draw a cloud from each side in a column, once for every named set of colours (0 to 1) in a row.
 
-    Symmetries get a row of their own: axes as lines with their order, mirror planes as outlines. The camera is far
-    away, 25 degrees above the horizon; `up` is the direction that points to the sky. Raises EvaluationError where there
-    is nothing to draw.
+    Symmetries get a row of their own: axes as lines with their order, mirror planes as outlines. `up` is the direction
+    that points to the sky. Raises EvaluationError where there is nothing to draw.
     """
     rows = dict(colours)
     if symmetries is not None:
         rows["symmetries"] = torch.full((len(points), 3), _GREY)
-    if not rows or not azimuths or not len(points):
+    if not rows or not sides or not len(points):
         raise EvaluationError(
-            f"expected points, colours or symmetries, and azimuths to draw, found {len(points)} points, {len(rows)} "
-            f"sets of colours and {len(azimuths)} azimuths"
+            f"expected points, colours or symmetries, and sides to draw, found {len(points)} points, {len(rows)} "
+            f"sets of colours and {len(sides)} sides"
         )
-    figure = Figure(figsize=(3.0 * len(azimuths), 3.0 * len(rows) + 0.5), layout="constrained")
-    grid = figure.subplots(len(rows), len(azimuths), squeeze=False)
+    figure = Figure(figsize=(_INCHES * len(sides), _INCHES * len(rows) + 0.5), layout="constrained")
+    grid = figure.subplots(len(rows), len(sides), squeeze=False)
     for (name, shown), line in zip(rows.items(), grid, strict=True):
-        for azimuth, axes in zip(azimuths, line, strict=True):
-            view = _view(azimuth, up)
-            _scatter(axes, points, shown, view, size=3.0)
+        for side, axes in zip(sides, line, strict=True):
+            view = view_from(side, up)
+            _scatter(axes, points, shown, view, inches=_INCHES)
             if symmetries is not None and name == "symmetries":
                 _draw_symmetries(axes, points, symmetries, view)
-            axes.set_title(f"{name}, {azimuth:g}°", fontsize=9)
+            name_axes(axes, view)
+            axes.set_title(f"{name}, {side_words(side)}", fontsize=9)
     figure.suptitle(title)
     return figure
 
@@ -70,7 +75,7 @@ def draw_features(
     colours: Float[Tensor, "points 3"] | None = None,
     clusters: int | None = None,
     symmetries: Symmetries | None = None,
-    azimuths: Sequence[float] = (30.0, 120.0, 210.0, 300.0),
+    sides: Sequence[Side] = AROUND,
     up: Sequence[float] = UP,
 ) -> Figure:
     """Draw what is known of an object's points, as `draw_cloud` does.
@@ -82,7 +87,7 @@ def draw_features(
     rows["features"] = component_colours(features.features)
     if clusters is not None:
         rows[f"{clusters} clusters"] = label_colours(cluster(features.points, clusters).labels)
-    return draw_cloud(features.points, rows, title=title, symmetries=symmetries, azimuths=azimuths, up=up)
+    return draw_cloud(features.points, rows, title=title, symmetries=symmetries, sides=sides, up=up)
 
 
 def component_colours(features: Float[Tensor, "points dim"]) -> Float[Tensor, "points 3"]:
@@ -125,10 +130,10 @@ def save_turntable(
         raise EvaluationError(f"{path}: expected a turntable of 2 or more frames named .gif, found {frames} frames")
     pictures = []
     for frame in range(frames):
-        figure = Figure(figsize=(4.0, 4.0), dpi=100)
+        figure = Figure(figsize=(_TURNTABLE_INCHES, _TURNTABLE_INCHES), dpi=100)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        view = _view(360.0 * frame / frames, up)
-        _scatter(axes, points, colours, view, size=4.0)
+        view = view_from((360.0 * frame / frames, AROUND[0][1]), up)
+        _scatter(axes, points, colours, view, inches=_TURNTABLE_INCHES)
         if symmetries is not None:
             _draw_symmetries(axes, points, symmetries, view)
         still = io.BytesIO()
@@ -138,23 +143,6 @@ def save_turntable(
     first, *others = pictures
     first.save(memory, format="GIF", save_all=True, append_images=others, duration=round(3000 / frames), loop=0)
     write_whole(path, lambda place: place.write_bytes(memory.getvalue()))
-
-
-def _view(azimuth: float, up: Sequence[float]) -> Float[np.ndarray, "3 3"]:
-    """Return rows right, up and towards the eye, for a camera at an azimuth in degrees about the `up` direction."""
-    sky = np.asarray(up, dtype=float)
-    if sky.shape != (3,) or not np.isfinite(sky).all() or np.linalg.norm(sky) == 0.0:
-        raise EvaluationError(f"expected a direction of three numbers that points up, found {list(up)}")
-    sky = sky / np.linalg.norm(sky)
-    # Azimuth 0 looks from the next coordinate axis: from x where z is up, from z where y is.
-    first = np.roll(np.eye(3)[np.argmax(np.abs(sky))], 1)
-    first = first - (first @ sky) * sky
-    first /= np.linalg.norm(first)
-    angle, height = math.radians(azimuth), math.radians(_ELEVATION)
-    level = math.cos(angle) * first + math.sin(angle) * np.cross(sky, first)
-    eye = math.cos(height) * level + math.sin(height) * sky
-    right = np.cross(sky, level)
-    return np.stack([right, np.cross(eye, right), eye])
 
 
 def _middle(points: Float[Tensor, "points 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
@@ -169,7 +157,7 @@ def _scatter(
     colours: Float[Tensor, "points 3"],
     view: Float[np.ndarray, "3 3"],
     *,
-    size: float,
+    inches: float,
 ) -> None:
     middle, radius = _middle(points)
     seen = (points.double().numpy() - middle) @ view.T
@@ -177,9 +165,10 @@ def _scatter(
     # What is farther is darker: flat dots alone show no depth.
     shade = 0.72 + 0.28 * (seen[:, 2:] / max(radius, 1e-30) + 1) / 2
     shown = np.clip(colours.numpy() * shade, 0.0, 1.0)
-    dots = size * max(0.4, math.sqrt(6000 / len(seen)))
-    axes.scatter(seen[order, 0], seen[order, 1], c=shown[order], s=dots, linewidths=0, rasterized=True)
-    reach = 1.12 * radius if radius > 0.0 else 1.0
+    # Dots so wide that near ones hide far ones: about twice as wide as they lie apart.
+    dot = 72 * inches * _WIDTH / math.sqrt(max(len(seen), _FEW))
+    axes.scatter(seen[order, 0], seen[order, 1], c=shown[order], s=dot**2, linewidths=0, rasterized=True)
+    reach = _MARGIN * radius if radius > 0.0 else 1.0
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach, reach)
     axes.set_aspect("equal")

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from avmsf.bench.clouds import draw_cloud
+from avmsf.bench.sides import ALL_SIDES, Side
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
 from avmsf.tasks.contactmap import ContactMap
@@ -23,7 +24,6 @@ _HEAT = "inferno"
 _FOUND, _OTHER, _TRUTH = (0.10, 0.88, 0.78), (0.95, 0.95, 0.95), (0.20, 0.45, 1.00)
 _MARK = 0.018
 """Radius of a mark over the object's diagonal."""
-_AZIMUTHS = (30.0, 120.0, 210.0, 300.0)
 _DRAWN = 6000
 """Points in a picture, about."""
 
@@ -34,7 +34,7 @@ def draw_contact(
     title: str,
     others: Float[Tensor, "others 3"] | None = None,
     truth: Float[Tensor, " 3"] | None = None,
-    azimuths: Sequence[float] = _AZIMUTHS,
+    sides: Sequence[Side] = ALL_SIDES,
 ) -> Figure:
     """Draw the probability of a contact over the object, and beneath it the paper's cosine distance, from all sides.
 
@@ -52,7 +52,7 @@ def draw_contact(
         _marked(points, colours, marks)[rows] for colours in (contact_colours(contact), _distance_colours(contact))
     )
     figure = draw_cloud(
-        points[rows], {"probability": likely, "cosine distance": alike}, title=_title(title, marks), azimuths=azimuths
+        points[rows], {"probability": likely, "cosine distance": alike}, title=_title(title, marks), sides=sides
     )
     low, high = _span(contact)
     for line, (first, last, words, heat) in enumerate(
@@ -61,7 +61,7 @@ def draw_contact(
             (low, high, "cosine distance of the gains", f"{_HEAT}_r"),
         )
     ):
-        panels = figure.axes[line * len(azimuths) : (line + 1) * len(azimuths)]
+        panels = figure.axes[line * len(sides) : (line + 1) * len(sides)]
         figure.colorbar(ScalarMappable(Normalize(first, last), heat), ax=list(panels), shrink=0.75, label=words)
     return figure
 

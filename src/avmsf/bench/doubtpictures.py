@@ -9,10 +9,9 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from avmsf.bench.sides import ALL_SIDES, name_axes, view_from
 from avmsf.field.doubt import SpectrumBand
 
-_SIDES = ((25.0, -60.0), (25.0, 60.0), (25.0, 180.0), (75.0, -60.0), (-25.0, -60.0), (-75.0, -60.0))
-"""Elevation and azimuth of the eye, degrees: three sides, into what is open above, and two from below."""
 _INK, _NEXT = "#1f3b5c", "#19e0c8"
 _RANGE_DB = 100.0
 """What a spectrum shows below its highest level."""
@@ -20,8 +19,6 @@ _FLAT = 1e-3
 """Extent over the longest below which an object is flat."""
 _BEHIND = 0.04
 """Depth over the object's size by which a point in front hides a mark."""
-_ARROW = 28.0
-"""Length of the arrows along the axes, points."""
 _INCHES = 4.0
 """Width of an object in its picture."""
 
@@ -45,13 +42,13 @@ def draw_doubt(
     crosses, numbers = (None if each is None else each.double().numpy() for each in (struck, suggested))
     extent = np.ptp(places, axis=0)
     flat = np.flatnonzero(extent <= _FLAT * extent.max())
-    frames = [_side(*side) for side in _SIDES] if len(flat) == 0 else [_plane(int(flat[0]))]
+    frames = [view_from(side).T for side in ALL_SIDES] if len(flat) == 0 else [_plane(int(flat[0]))]
     figure = Figure(figsize=(14, 9.5) if len(frames) > 1 else (8, 5), layout="constrained")
     grid = figure.subplots(2, 3).flatten() if len(frames) > 1 else np.array([figure.subplots()])
     away = None if directions is None else directions.double().numpy()
     for axes, frame in zip(grid, frames, strict=True):
         drawn = _scatter(axes, places @ frame, values)
-        _name_axes(axes, frame)
+        name_axes(axes, frame.T)
         if crosses is not None:
             _mark(axes, places @ frame, crosses @ frame, None)
         if numbers is not None:
@@ -83,15 +80,6 @@ def draw_band(band: SpectrumBand, *, title: str) -> Figure:
     return figure
 
 
-def _side(elevation: float, azimuth: float) -> np.ndarray:
-    """Return what takes places to right, up and towards the eye, one a column."""
-    up, round_ = math.radians(elevation), math.radians(azimuth)
-    right = [-math.sin(round_), math.cos(round_), 0.0]
-    above = [-math.sin(up) * math.cos(round_), -math.sin(up) * math.sin(round_), math.cos(up)]
-    towards = [math.cos(up) * math.cos(round_), math.cos(up) * math.sin(round_), math.sin(up)]
-    return np.array([right, above, towards]).T
-
-
 def _plane(thin: int) -> np.ndarray:
     wide = [axis for axis in range(3) if axis != thin]
     return np.eye(3)[:, [*wide, thin]]
@@ -110,25 +98,6 @@ def _scatter(axes: Axes, seen: np.ndarray, values: np.ndarray) -> PathCollection
     axes.set_aspect("equal")
     axes.set_axis_off()
     return drawn
-
-
-def _name_axes(axes: Axes, frame: np.ndarray) -> None:
-    """Draw the directions of x, y and z, in the lower left corner."""
-    for axis, name in enumerate("xyz"):
-        across, along = _ARROW * frame[axis, :2]
-        # What points at the eye or away from it has no direction here.
-        if np.hypot(across, along) > 0.4 * _ARROW:
-            axes.annotate(
-                name,
-                (0.06, 0.06),
-                (across, along),
-                xycoords="axes fraction",
-                textcoords="offset points",
-                arrowprops={"arrowstyle": "<-", "color": _INK},
-                color=_INK,
-                ha="center",
-                va="center",
-            )
 
 
 def _mark(
