@@ -123,6 +123,10 @@ def test_gains_have_the_dtype_of_the_sounds_and_render_them():
     assert float((rendered - sounds).abs().max()) < 3e-6 * float(sounds.abs().max())
 
 
+def test_no_sounds_have_no_gains():
+    assert fit_gains(torch.zeros(0, 1000), BANK, sample_rate=RATE)[0].shape == (0, len(BANK))
+
+
 def test_an_empty_bank_has_no_gains():
     empty = bank_of([], [])
     gains, quadrature = fit_gains(torch.ones(3, 600), empty, sample_rate=RATE)

@@ -265,3 +265,22 @@ def test_what_the_chosen_explain_one_after_another_is_what_they_explain_together
     ]
     assert float(energy.max()) == pytest.approx(max(gained), rel=1e-7)
     assert int(energy[~given].argmax()) == gained.index(max(gained))
+
+
+def energies(sounds: Tensor, bank: ModalBank, given: list[int]) -> Tensor:
+    both = Candidates.of(sounds, bank, flat(1e-3, bank), sample_rate=RATE)
+    known = torch.zeros(len(bank), dtype=torch.bool)
+    known[given] = True
+    inner = gram(poles_of(bank, RATE), SAMPLES, power=0)
+    return choose(inner, both.products, both.noise, known, significance=6.0, reach=1e-12)
+
+
+def test_what_is_chosen_twice_explains_nothing_the_second_time():
+    sounds = record(TRUTH, noise=1e-3)
+    twice = bank_of([300.0, 300.0, 700.0], [5.0, 5.0, 6.0])
+    assert sorted((energies(sounds, twice, []) > 0).tolist()) == [False, True, True]
+    close = bank_of([300.0 + 1e-7 * step for step in range(20)], [5.0] * 20)
+    assert int((energies(sounds, close, []) > 0).sum()) == 1
+    # What is left of a twin is rounding, which must not be divided by: the others explain what they do beside one.
+    beside_one = energies(sounds, bank_of([300.0, 700.0], [5.0, 6.0]), [0])
+    torch.testing.assert_close(energies(sounds, twice, [0, 1])[[0, 2]], beside_one, rtol=1e-9, atol=0)

@@ -44,7 +44,7 @@ def measured_gains(field: SoundField) -> DoubtedGains:
 
 
 def scale_of(field: SoundField) -> Float64[Tensor, " modes"]:
-    """Return the field's gains over those that its doubt rests on: 1, or what an edit has made of each mode."""
+    """Return the field's gains over the fitted ones: 1, or what an edit has made of each mode."""
     gains = field.gain_field
     return gains.scale if isinstance(gains, ScaledGains) else torch.ones(len(field.bank), dtype=torch.float64)
 

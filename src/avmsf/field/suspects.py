@@ -218,19 +218,13 @@ class _Judge:
 
     def cost(self, silent: frozenset[int]) -> float:
         """Return the sum of the misfits of those that speak, and of the price for those that do not."""
-        speaking = [row for row in range(len(self.power)) if row not in silent]
-        inverse = torch.linalg.inv(self.covariance[:, speaking][:, :, speaking])
-        solved = inverse @ self.values[:, speaking]
-        errors = (solved / torch.diagonal(inverse, dim1=1, dim2=2)[..., None]).square().sum(2).T
+        speaking, _, errors = self._left_out(silent)
         misfits = self._relative(errors, self.power[speaking], self._scatter(errors, speaking))
         return float(misfits.clamp_max(_ENOUGH).sum()) + _COST * len(silent)
 
     def located(self, row: int, silent: frozenset[int]) -> Suspect:
         """Return where on the surface, and which way round, a strike fits best, foretold by those that speak."""
-        speaking = [each for each in range(len(self.power)) if each not in silent]
-        inverse = torch.linalg.inv(self.covariance[:, speaking][:, :, speaking])
-        solved = inverse @ self.values[:, speaking]
-        errors = (solved / torch.diagonal(inverse, dim1=1, dim2=2)[..., None]).square().sum(2).T
+        speaking, solved, errors = self._left_out(silent)
         scatter = self._scatter(errors, speaking)
         surface = self.body.surface
         places = torch.cat([self.measured.contacts[row : row + 1].double(), surface.points[surface.spread].double()])
@@ -261,6 +255,16 @@ class _Judge:
         contacts, reach = self.measured.contacts.double(), REACH * surface.size
         across = remainder_kernel(points, used, contacts, self.directions, reach=reach)
         return self.known.kernel(shapes, across, _WIDTH, _REMAINDER)
+
+    def _left_out(
+        self, silent: frozenset[int]
+    ) -> tuple[list[int], Float64[Tensor, "modes speaking 2"], Float64[Tensor, "speaking modes"]]:
+        """Return who speaks, their gains over their covariance, and the squared error of each foretold by the rest."""
+        speaking = [row for row in range(len(self.power)) if row not in silent]
+        inverse = torch.linalg.inv(self.covariance[:, speaking][:, :, speaking])
+        solved = inverse @ self.values[:, speaking]
+        errors = (solved / torch.diagonal(inverse, dim1=1, dim2=2)[..., None]).square().sum(2).T
+        return speaking, solved, errors
 
     def _scatter(self, errors: Float64[Tensor, "speaking modes"], speaking: list[int]) -> Float64[Tensor, " modes"]:
         least = _FLOOR * self.power.mean(0)

@@ -36,7 +36,7 @@ def choose(
     return gram.new_tensor(chosen)
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=True)
 @no_type_check
 def _choose(inner, products, noise, given, significance, reach):
     """Do what `choose` says, and leave of `inner` and `products` what the chosen ones do not span."""
@@ -75,7 +75,7 @@ def _choose(inner, products, noise, given, significance, reach):
     return chosen
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=True)
 @no_type_check
 def _area(inner, mode):
     """Return the squared area that a mode's sine and cosine span."""
@@ -83,7 +83,7 @@ def _area(inner, mode):
     return inner[sine, sine] * inner[cosine, cosine] - inner[sine, cosine] * inner[cosine, sine]
 
 
-@compiled(error_model="numpy", fastmath={"contract"})
+@compiled(error_model="numpy", nogil=True, fastmath={"contract"})
 @no_type_check
 def _eliminate(mode, inner, products, done):
     """Make all modes that are not done orthogonal to one."""

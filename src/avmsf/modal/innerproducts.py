@@ -2,7 +2,7 @@
 
 With z = exp((-d + 2 pi i f) / rate) the former are geometric series, sum_n n^p (z_i z_j)^n, and have a closed form: the
 normal equations of any number of modes cost nothing that grows with the length of the sounds. Only the products of the
-sounds with the modes do.
+sounds with the modes do. All on the processor and without gradients.
 """
 
 import math
@@ -39,7 +39,7 @@ def own_gram(poles: Complex128[Tensor, " modes"], samples: int) -> Float64[Tenso
     return blocks
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=True)
 @no_type_check
 def _power_sum(ratio, last, samples, power):
     """Return the sum over n < samples of n^power ratio^n, in closed form; `last` is ratio^samples."""
@@ -56,7 +56,7 @@ def _power_sum(ratio, last, samples, power):
     return (ratio * (2.0 * first + plain) - float(samples) * samples * last) / rest
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=True)
 @no_type_check
 def _steady_sum(ratio, samples, power):
     """Return the sum over n < samples of n^power ratio^n for a ratio near one, doubling its length again and again."""
@@ -80,7 +80,7 @@ def _steady_sum(ratio, samples, power):
     return first if power == 1 else second
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=True)
 @no_type_check
 def _gram(poles, last, samples, power, products):
     """Write what `gram` returns; symmetric, so that half of the sums are enough."""
@@ -98,7 +98,7 @@ def _gram(poles, last, samples, power, products):
             products[modes + row, modes + column] = products[modes + column, modes + row] = cosines
 
 
-@compiled(error_model="numpy")
+@compiled(error_model="numpy", nogil=True)
 @no_type_check
 def _own_gram(poles, last, samples, blocks):
     """Write what `own_gram` returns."""
@@ -124,7 +124,7 @@ def project(
     """
     samples = sounds.shape[1]
     padded = torch.nn.functional.pad(sounds.to(torch.float64), (0, -samples % _BLOCK))
-    padded = padded.reshape(len(sounds), -1, _BLOCK)
+    padded = padded.reshape(len(sounds), padded.shape[1] // _BLOCK, _BLOCK)
     needed = math.log(_DEAD) / torch.log(poles.abs()).clamp_max(-1e-300)
     inner = torch.zeros(len(sounds), len(poles), dtype=torch.complex128)
     outer = torch.zeros_like(inner)
@@ -161,7 +161,7 @@ def _project(
     return torch.complex(*plain), torch.complex(*outer)
 
 
-@compiled(fastmath={"contract"}, error_model="numpy")
+@compiled(fastmath={"contract"}, error_model="numpy", nogil=True)
 @no_type_check
 def _over_blocks(summed, real, imaginary, plain, outer):
     """Add up the blocks' sums, each turned and shrunk to where its block starts; real and imaginary parts apart."""

@@ -129,7 +129,7 @@ def _correlation(band: Complex128[Tensor, "contacts times"], span: int) -> Compl
     return whole
 
 
-@compiled(error_model="numpy", fastmath={"reassoc", "contract"})
+@compiled(error_model="numpy", nogil=True, fastmath={"reassoc", "contract"})
 @no_type_check
 def _correlate(band, whole):
     """Write what `_correlation` returns.
