@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import soundfile
 import torch
+import trimesh
 
 import avmsf
 from avmsf.capture import read_capture
@@ -292,6 +293,16 @@ def test_fit_says_why_physics_took_no_part(capture: Path, tmp_path: Path, capsys
     # Told to spread them by splines, it tried nothing else.
     assert main(["fit", str(capture), "--output", str(fields / "told"), "--gains", "spline", *TINY]) == 0
     assert "not by" not in capsys.readouterr().out
+
+
+def test_a_surface_in_another_unit_is_noted_once(tmp_path: Path, capsys: Streams) -> None:
+    folder = fill_plate(tmp_path / "plate")
+    (surface,) = folder.glob("surface.*")
+    trimesh.load(surface, process=False).apply_scale(1000.0).export(surface)
+    assert main(["fit", str(folder), "--output", str(tmp_path / "field"), "--gains", "spline", *TINY]) == 0
+    notes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: ")]
+    assert len(notes) == 1
+    assert "is the surface's unit mm?" in notes[0]
 
 
 def test_a_recipes_settings_hold_where_the_options_say_nothing() -> None:

@@ -109,8 +109,11 @@ def run(options: Options) -> int:
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
     )
-    features = features_of(capture, options.config) if options.features is None else load_features(options.features)
-    expect_on_object(capture.impacts, features.points)
+    if options.features is None:
+        features = features_of(capture, options.config)
+    else:
+        features = load_features(options.features)
+        expect_on_object(capture.impacts, features.points)
     if len(train) < _FEW:
         say(f"{len(train)} recordings tell little of how loud modes are between contacts; {_FEW} or more tell much")
     say(f"finding the modes of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")

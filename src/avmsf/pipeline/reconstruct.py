@@ -102,7 +102,6 @@ def reconstruct(
     """
     stages = StageFolder(cache)
     shape = _shape(folder, capture, config, stages, settings=settings, listener=listener)
-    expect_on_object(capture.impacts, shape.points, strict=shape.found_frame)
     heard = {"impacts": train.digest(), "method": repr(method)}
     listener.tell(f"modes: of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path))
@@ -163,15 +162,12 @@ def reconstruct(
 
 @dataclass(frozen=True, eq=False)
 class _Shape:
-    """The points of an object, and what a field may read of them."""
+    """What a field may read of an object's points, and its surface."""
 
-    points: Float[Tensor, "points 3"]
     candidates: Mapping[str, FeatureField]
     made: Mapping[str, Kept]
     """The stages that made it."""
     report: Mapping[str, Any]
-    found_frame: bool
-    """Whether the cameras' frame was found by structure from motion, which knows nothing of the contacts'."""
     surface: Callable[[], Surface]
     """Makes the object's surface: its mesh, or what encloses its Gaussians. Raises SceneError without either."""
     surface_digest: str
@@ -208,15 +204,17 @@ def _shape(
         else:
             features = FeatureField.from_points(capture.surface.vertices)
         surface, digest = _mesh(capture, None)
-        return _Shape(features.points, {"positions": features}, {}, {}, False, surface, digest)
+        return _Shape({"positions": features}, {}, {}, surface, digest)
     features = load_features(scene.features.path)
     candidates = {}
     candidates["positions"] = FeatureField.from_points(features.points)
     candidates["visual"] = features
+    # Structure from motion knows nothing of the frame that the contacts are in.
     found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
+    expect_on_object(capture.impacts, features.points, strict=found_frame)
     report = read_report(scene.features.path)
     surface, digest = _mesh(capture, scene)
-    return _Shape(features.points, candidates, scene.made(), report, found_frame, surface, digest)
+    return _Shape(candidates, scene.made(), report, surface, digest)
 
 
 def _mesh(capture: Capture, scene: SceneStages | None) -> tuple[Callable[[], Surface], str]:
