@@ -1,13 +1,13 @@
 """Where a surface of triangles is closest to a place, exactly."""
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float64, Int
 from scipy.spatial import cKDTree
 
-_PAIRS = 2_000_000
-"""Pairs of places and triangles that are compared at a time."""
+from avmsf.compiled import compiled
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,62 +37,80 @@ class ClosestPoints:
     def __call__(self, places: Float64[np.ndarray, "places 3"]) -> Closest:
         """Return the closest points."""
         bound = np.min([tree.query(places)[0] for tree in self._trees], axis=0)
-        lists = []
+        closest = Closest(
+            np.zeros(len(places), dtype=np.int64), np.zeros((len(places), 3)), np.full(len(places), np.inf)
+        )
         for group, tree in zip(self._groups, self._trees, strict=True):
-            found = tree.query_ball_point(places, bound * (1 + 1e-9) + self._reach[group].max(), return_sorted=True)
-            lists.append([group[each] for each in found])
-        candidates = [np.sort(np.concatenate(each)) for each in zip(*lists, strict=True)]
-        rows = np.empty(len(places), dtype=np.int64)
-        weights, distances = np.empty((len(places), 3)), np.empty(len(places))
-        lengths = np.array([len(each) for each in candidates], dtype=np.int64)
-        for chunk in _chunks(lengths):
-            owners = np.repeat(np.arange(chunk.start, chunk.stop), lengths[chunk])
-            among = np.concatenate(candidates[chunk])
-            inside, apart = _on_triangles(self._triangles[among], places[owners])
-            order = np.lexsort((among, apart, owners))
-            best = order[np.concatenate([[True], owners[order][1:] != owners[order][:-1]])]
-            rows[chunk], weights[chunk], distances[chunk] = among[best], inside[best], apart[best]
-        return Closest(rows, weights, distances)
+            found = tree.query_ball_point(places, bound * (1 + 1e-9) + self._reach[group].max())
+            ends = np.cumsum([len(each) for each in found], dtype=np.int64)
+            among = group[np.concatenate(found).astype(np.int64)]
+            _take_closer(self._triangles, places, among, ends, closest.rows, closest.weights, closest.distances)
+        return closest
 
 
-def _chunks(lengths: Int[np.ndarray, " places"]) -> list[slice]:
-    """Return slices of the places with at most `_PAIRS` candidates each, or one place."""
-    ends = np.cumsum(lengths)
-    slices, start = [], 0
-    while start < len(lengths):
-        before = ends[start - 1] if start else 0
-        stop = max(start + 1, int(np.searchsorted(ends, before + _PAIRS, side="right")))
-        slices.append(slice(start, stop))
-        start = stop
-    return slices
+@compiled(error_model="numpy", nogil=True)
+@no_type_check
+def _take_closer(triangles, places, among, ends, rows, weights, distances):
+    """Where one of the triangles `among`, up to `ends` of them for each place, is closer, write it down."""
+    begin = 0
+    for place in range(len(places)):
+        for triangle in among[begin : ends[place]]:
+            one, other, apart = _on_triangle(triangles[triangle], places[place])
+            if apart < distances[place] or (apart == distances[place] and triangle < rows[place]):
+                rows[place], distances[place] = triangle, apart
+                weights[place, 0], weights[place, 1], weights[place, 2] = 1.0 - one - other, one, other
+        begin = ends[place]
 
 
-def _on_triangles(
-    triangles: Float64[np.ndarray, "pairs 3 3"], places: Float64[np.ndarray, "pairs 3"]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return barycentric coordinates [pairs, 3] of the point of each triangle closest to its place, and how far it is.
+@compiled(error_model="numpy", nogil=True)
+@no_type_check
+def _on_triangle(corners, place):
+    """Return the second and third barycentric coordinate of a triangle's point closest to a place, and how far it is.
 
     That is the foot of the perpendicular where it falls inside, and the closest point of the three sides elsewhere.
     """
-    first, one, other = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    toward = places - first
-    a, b, c = (one * one).sum(1), (one * other).sum(1), (other * other).sum(1)
-    p, q = (one * toward).sum(1), (other * toward).sum(1)
+    first, second, third = corners[0], corners[1], corners[2]
+    a, b, c, p, q = 0.0, 0.0, 0.0, 0.0, 0.0
+    for axis in range(3):
+        one, other, toward = second[axis] - first[axis], third[axis] - first[axis], place[axis] - first[axis]
+        a, b, c = a + one * one, b + one * other, c + other * other
+        p, q = p + one * toward, q + other * toward
     area = a * c - b * b
     # A triangle without area has only sides.
-    safe = np.where(area > 0, area, 1.0)
-    v, w = (c * p - b * q) / safe, (a * q - b * p) / safe
-    inside = (area > 0) & (v >= 0) & (w >= 0) & (v + w <= 1)
-    options = [np.where(inside[:, None], np.stack([1 - v - w, v, w], axis=1), [1.0, 0.0, 0.0])]
-    for start, end in ((0, 1), (1, 2), (2, 0)):
-        side = triangles[:, end] - triangles[:, start]
-        length = (side * side).sum(1)
-        along = ((places - triangles[:, start]) * side).sum(1) / np.where(length > 0, length, 1.0)
-        part = np.clip(along, 0.0, 1.0)
-        weights = np.zeros((len(places), 3))
-        weights[:, start], weights[:, end] = 1.0 - part, part
-        options.append(weights)
-    stacked = np.stack(options)
-    apart = np.linalg.norm(np.einsum("opc,pcd->opd", stacked, triangles) - places, axis=-1)
-    best, pairs = apart.argmin(axis=0), np.arange(len(places))
-    return stacked[best, pairs], apart[best, pairs]
+    if area > 0.0:
+        v, w = (c * p - b * q) / area, (a * q - b * p) / area
+        if v >= 0.0 and w >= 0.0 and v + w <= 1.0:
+            return v, w, _apart(corners, place, v, w)
+    part = _along(first, second, place)
+    v, w, least = part, 0.0, _apart(corners, place, part, 0.0)
+    part = _along(first, third, place)
+    apart = _apart(corners, place, 0.0, part)
+    if apart < least:
+        v, w, least = 0.0, part, apart
+    part = _along(second, third, place)
+    apart = _apart(corners, place, 1.0 - part, part)
+    if apart < least:
+        v, w, least = 1.0 - part, part, apart
+    return v, w, least
+
+
+@compiled(error_model="numpy", nogil=True)
+@no_type_check
+def _along(start, end, place):
+    """Return which part of the way from start to end is closest to a place."""
+    product, square = 0.0, 0.0
+    for axis in range(3):
+        side = end[axis] - start[axis]
+        product, square = product + side * (place[axis] - start[axis]), square + side * side
+    return min(max(product / square, 0.0), 1.0) if square > 0.0 else 0.0
+
+
+@compiled(error_model="numpy", nogil=True)
+@no_type_check
+def _apart(corners, place, v, w):
+    """Return how far a place is from the point of a triangle with these coordinates."""
+    square = 0.0
+    for axis in range(3):
+        there = (1.0 - v - w) * corners[0, axis] + v * corners[1, axis] + w * corners[2, axis]
+        square += (there - place[axis]) ** 2
+    return np.sqrt(square)
