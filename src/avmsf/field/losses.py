@@ -31,6 +31,10 @@ class SpectralTarget:
     """Their sums over contacts and bins."""
     hops: tuple[int, ...]
     """Samples between frames, one a resolution."""
+    windows: tuple[Float[Tensor, " _size"], ...]
+    """What frames are multiplied by, one a resolution."""
+    floors: tuple[float, ...]
+    """Least powers that count, one a resolution."""
     samples: int
     """Length of the sounds that are compared: those that are longer are cut."""
 
@@ -51,16 +55,17 @@ def spectral_target(
     if odd:
         raise ValueError(f"expected even FFT sizes, found {odd[0]}: half a window lies before a frame's centre")
     cut = sounds[:, :samples]
+    windows = [torch.hann_window(size, dtype=cut.dtype, device=cut.device) for size in fft_sizes]
+    floors = [_SILENT * float(window.square().sum()) for window in windows]
     magnitudes = []
-    for fft_size, hop in zip(fft_sizes, hops, strict=True):
-        window = torch.hann_window(fft_size, dtype=cut.dtype, device=cut.device)
+    for fft_size, hop, window, floor in zip(fft_sizes, hops, windows, floors, strict=True):
         frames = _padded(cut, fft_size).unfold(1, fft_size, hop)
         target = torch.empty(*frames.shape[:2], fft_size // 2 + 1, dtype=cut.dtype, device=cut.device)
         for chunk in _chunks(frames.shape[0], frames.shape[1], fft_size):
-            target[chunk] = magnitude(torch.fft.rfft(frames[chunk] * window), _floor(window))
+            target[chunk] = magnitude(torch.fft.rfft(frames[chunk] * window), floor)
         magnitudes.append(target)
     norms = tuple(each.sum((0, 2)) for each in magnitudes)
-    return SpectralTarget(tuple(magnitudes), norms, tuple(hops), cut.shape[1])
+    return SpectralTarget(tuple(magnitudes), norms, tuple(hops), tuple(windows), tuple(floors), cut.shape[1])
 
 
 def spectral_loss(
@@ -96,14 +101,14 @@ class _SpectralL1(torch.autograd.Function):
         # A hop more than the sound, for the last column of hops that `_overlap_add` fills only in part.
         slope = padded.new_zeros(len(padded), padded.shape[1] + every * max(target.hops) if sought else 0)
         loss = sounds.new_zeros(())
-        for known, norms, hop in zip(target.magnitudes, target.norms, target.hops, strict=True):
+        resolutions = zip(target.magnitudes, target.norms, target.hops, target.windows, target.floors, strict=True)
+        for known, norms, hop, window, floor in resolutions:
             fft_size = _fft_size(known)
             # Short sounds may have fewer frames than are skipped.
             step = min(every, known.shape[1])
             start = first % step
             norm = norms[start::step].sum().clamp_min(torch.finfo(sounds.dtype).tiny)
-            window = torch.hann_window(fft_size, dtype=sounds.dtype, device=sounds.device)
-            floor, slope_window = _floor(window), 0.5 * window / norm
+            slope_window = 0.5 * window / norm
             before = (widest - fft_size) // 2 + start * hop
             frames = padded[:, before : padded.shape[1] - (widest - fft_size) // 2].unfold(1, fft_size, step * hop)
             for rows, part in _chunks(*frames.shape):
@@ -152,7 +157,3 @@ def _chunks(contacts: int, frames: int, fft_size: int) -> list[tuple[slice, slic
 
 def _fft_size(magnitudes: Float[Tensor, "contacts frames bins"]) -> int:
     return 2 * (magnitudes.shape[2] - 1)
-
-
-def _floor(window: Float[Tensor, " size"]) -> float:
-    return _SILENT * float(window.square().sum())

@@ -7,6 +7,7 @@ in decimals is broken by the rounding of float32, and then another split or anot
 
 import math
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from avmsf.compiled import compiled
 from avmsf.errors import CaptureError, EvaluationError, FitError
 
 
@@ -45,15 +47,30 @@ def farthest_points(points: Float[Tensor, "points 3"], count: int, *, start: int
     do not have.
     """
     _expect_rows(points, count, start)
-    places = points.double()
-    distance = _distances(places, start)
-    chosen = [start]
-    while len(chosen) < count:
+    return torch.from_numpy(_farthest(points.double().contiguous().numpy(), count, start))
+
+
+@compiled(error_model="numpy", nogil=True)
+@no_type_check
+def _farthest(places, count, start):
+    """Do what `farthest_points` says."""
+    chosen = np.empty(count, dtype=np.int64)
+    apart = np.full(len(places), np.inf)
+    last = start
+    for turn in range(count):
+        chosen[turn] = last
         # Chosen rows are barred rather than at distance zero, where they would tie with points that coincide.
-        distance[chosen[-1]] = -math.inf
-        chosen.append(int(torch.argmax(distance)))
-        distance = torch.minimum(distance, _distances(places, chosen[-1]))
-    return torch.tensor(chosen)
+        apart[last] = -np.inf
+        x, y, z = places[last]
+        farthest = 0
+        for row in range(len(places)):
+            here = places[row]
+            # The root, for it makes ties of what rounding of the squares would tell apart.
+            apart[row] = min(apart[row], np.sqrt((here[0] - x) ** 2 + (here[1] - y) ** 2 + (here[2] - z) ** 2))
+            if apart[row] > apart[farthest]:
+                farthest = row
+        last = farthest
+    return chosen
 
 
 def closest_points(points: Float[Tensor, "points 3"], count: int, *, start: int = 0) -> Int[Tensor, " chosen"]:
