@@ -89,7 +89,9 @@ def test_closest_points_are_those_of_a_dense_cloud():
     # One long triangle beside many small ones.
     triangles = np.concatenate([triangles, [[[0.0, 0.0, 0.1], [1.0, 0.0, 0.1], [1.0, 0.001, 0.1]]]])
     places = np.random.default_rng(0).uniform(-0.15, 0.15, (30, 3))
-    found = ClosestPoints(triangles)(places)
+    search = ClosestPoints(triangles)
+    assert len(search(places[:0]).rows) == 0
+    found = search(places)
     at = np.einsum("pc,pcd->pd", found.weights, triangles[found.rows])
     np.testing.assert_allclose(np.linalg.norm(at - places, axis=1), found.distances, atol=1e-12)
     assert (found.weights >= 0).all()

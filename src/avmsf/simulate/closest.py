@@ -1,6 +1,7 @@
 """Where a surface of triangles is closest to a place, exactly."""
 
 from dataclasses import dataclass
+from itertools import chain
 from typing import no_type_check
 
 import numpy as np
@@ -43,7 +44,7 @@ class ClosestPoints:
         for group, tree in zip(self._groups, self._trees, strict=True):
             found = tree.query_ball_point(places, bound * (1 + 1e-9) + self._reach[group].max())
             ends = np.cumsum([len(each) for each in found], dtype=np.int64)
-            among = group[np.concatenate(found).astype(np.int64)]
+            among = group[np.fromiter(chain.from_iterable(found), dtype=np.int64, count=sum(map(len, found)))]
             _take_closer(self._triangles, places, among, ends, closest.rows, closest.weights, closest.distances)
         return closest
 
