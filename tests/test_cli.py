@@ -271,6 +271,13 @@ def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys
 SHEET = ("--body.wall", "0.004", "--body.shapes", "8", "--body.freedoms", "1000")
 
 
+def strike_one_place(folder: Path) -> None:
+    header, *rows = [line.split(",") for line in (folder / "impacts.csv").read_text().splitlines()]
+    assert header[:4] == ["file", "x", "y", "z"]
+    rows = [[row[0], *rows[0][1:4], *row[4:]] for row in rows]
+    (folder / "impacts.csv").write_text("\n".join(",".join(row) for row in [header, *rows]))
+
+
 def test_fit_says_why_physics_took_no_part(capture: Path, tmp_path: Path, capsys: Streams) -> None:
     fields = tmp_path / "fields"
     assert main(["fit", str(capture), "--output", str(fields / "two"), "--train-count", "2", *SHEET, *TINY]) == 0
@@ -281,10 +288,7 @@ def test_fit_says_why_physics_took_no_part(capture: Path, tmp_path: Path, capsys
     assert "not by physics: physics needs 3 strikes or more" in told
     assert "gains by spline" in told
     folder = fill_plate(tmp_path / "plate")
-    header, *rows = [line.split(",") for line in (folder / "impacts.csv").read_text().splitlines()]
-    assert header[:4] == ["file", "x", "y", "z"]
-    rows = [[row[0], *rows[0][1:4], *row[4:]] for row in rows]
-    (folder / "impacts.csv").write_text("\n".join(",".join(row) for row in [header, *rows]))
+    strike_one_place(folder)
     assert main(["fit", str(folder), "--output", str(fields / "one"), "--json", *SHEET, *TINY]) == 0
     out, err = capsys.readouterr()
     missing = json.loads(out)["report"]["choice"]["missing"]
@@ -293,6 +297,21 @@ def test_fit_says_why_physics_took_no_part(capture: Path, tmp_path: Path, capsys
     # Told to spread them by splines, it tried nothing else.
     assert main(["fit", str(capture), "--output", str(fields / "told"), "--gains", "spline", *TINY]) == 0
     assert "not by" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("wrong", ["two strikes, seen before the modes", "strikes in one place, seen after them"])
+def test_a_refused_fit_leaves_nothing_behind(tmp_path: Path, capsys: Streams, wrong: str) -> None:
+    folder, output = fill_plate(tmp_path / "plate"), tmp_path / "fields" / "plate"
+    words = ["--gains", "physics", *SHEET, *TINY]
+    if wrong.startswith("two"):
+        words += ["--train-count", "2"]
+    else:
+        strike_one_place(folder)
+    assert main(["fit", str(folder), "--output", str(output), *words]) == 2
+    error = capsys.readouterr().err
+    assert ("needs 3 strikes or more" in error) == wrong.startswith("two")
+    assert ("finding the modes" in error) == wrong.endswith("after them")
+    assert [each.name for each in output.parent.glob("*") if each.suffix != ".bodies"] == []
 
 
 def test_a_surface_in_another_unit_is_noted_once(tmp_path: Path, capsys: Streams) -> None:

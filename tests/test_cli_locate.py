@@ -209,6 +209,7 @@ def test_what_cannot_be_done_is_said_in_one_line(place: Place, tmp_path: Path, c
     wrong = {
         (place.field,): "expected one recording or more",
         (place.field, str(tmp_path / "nowhere.wav")): "there is no such file",
+        (place.field, str(tmp_path)): "is a folder; expected one sound file in it",
         (place.field, hit, "--level", "1.5"): "--level is 1.5; expected a probability between 0 and 1",
         (place.field, hit, "--output", str(tmp_path / "file")): "is a file",
         (place.field, hit, "--capture", str(tmp_path / "nowhere")): "expected a capture folder",

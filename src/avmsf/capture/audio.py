@@ -80,6 +80,8 @@ def read_recording(path: Path, name: str | None = None) -> Recording:
         missing = not path.is_file()
     except OSError as error:
         raise CaptureError(f"{name[:80]}…: no file can be called that ({error.strerror})") from error
+    if path.is_dir():
+        raise CaptureError(f"{name} is a folder; expected one sound file in it")
     if missing:
         raise CaptureError(f"{name}: there is no such file{_nearest_name(path)}")
     try:

@@ -116,9 +116,10 @@ def run(options: Options) -> int:
         expect_on_object(capture.impacts, features.points)
     if len(train) < _FEW:
         say(f"{len(train)} recordings tell little of how loud modes are between contacts; {_FEW} or more tell much")
+    # Before the modes: what is wrong with the object's shape shows in less time than they take.
+    recipe = _recipe(options, capture, train, features)
     say(f"finding the modes of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     modes = extract_once(train, finder(options.method, options.modes), _beside(options.output, "modes"))
-    recipe = _recipe(options, capture, train, features)
     say(f"fitting a field of {len(modes.bank)} modes")
     checkpoint = _beside(options.output, "checkpoint")
     try:
@@ -138,6 +139,9 @@ def run(options: Options) -> int:
         where = f"from {checkpoint}, or delete it" if checkpoint.exists() else "from the start of training"
         say(f"avmsf fit: interrupted; give the same command again to go on {where}")
         return INTERRUPTED
+    except FitError:
+        _beside(options.output, "modes").unlink(missing_ok=True)
+        raise
     save(fitted, options.output)
     for ending in ("modes", "checkpoint"):
         _beside(options.output, ending).unlink(missing_ok=True)
