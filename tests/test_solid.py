@@ -105,6 +105,16 @@ def test_closest_points_are_those_of_a_dense_cloud():
     assert np.median(nearest - found.distances) < 1e-5
 
 
+def test_closest_points_of_single_triangles_are_those_of_trimesh():
+    # Of a closed surface each side belongs to two triangles, and the other one would stand in for a side left out.
+    random = np.random.default_rng(1)
+    for corners in random.uniform(-0.1, 0.1, (20, 3, 3)):
+        places = random.uniform(-0.2, 0.2, (40, 3))
+        found = ClosestPoints(corners[None])(places)
+        expected = trimesh.triangles.closest_point(np.repeat(corners[None], len(places), axis=0), places)
+        np.testing.assert_allclose(found.weights @ corners, expected, atol=1e-12)
+
+
 def test_a_coarser_skin_keeps_its_volume_and_stays_closed():
     skin = Skin.of(ball())
     coarse = skin.remeshed(0.02)

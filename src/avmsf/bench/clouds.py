@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor
 
-from avmsf.bench.sides import AROUND, UP, Side, name_axes, side_words, view_from
+from avmsf.bench.sides import ABOVE, AROUND, UP, Side, name_axes, side_words, view_from
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
 from avmsf.scene.features import FeatureField
@@ -132,7 +132,7 @@ def save_turntable(
     for frame in range(frames):
         figure = Figure(figsize=(_TURNTABLE_INCHES, _TURNTABLE_INCHES), dpi=100)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        view = view_from((360.0 * frame / frames, AROUND[0][1]), up)
+        view = view_from((360.0 * frame / frames, ABOVE), up)
         _scatter(axes, points, colours, view, inches=_TURNTABLE_INCHES)
         if symmetries is not None:
             _draw_symmetries(axes, points, symmetries, view)

@@ -13,7 +13,9 @@ from avmsf.errors import EvaluationError
 Side: TypeAlias = tuple[float, float]
 """Azimuth about the direction to the sky, and elevation above the horizon, of an eye far away; degrees."""
 UP = (0.0, 0.0, 1.0)
-AROUND: tuple[Side, ...] = ((30.0, 25.0), (120.0, 25.0), (210.0, 25.0), (300.0, 25.0))
+ABOVE = 25.0
+"""Elevation of an eye that looks into what is open above and still sees the sides, degrees."""
+AROUND: tuple[Side, ...] = tuple((azimuth, ABOVE) for azimuth in (30.0, 120.0, 210.0, 300.0))
 """Four sides from a little above."""
 ALL_SIDES: tuple[Side, ...] = (
     (-60.0, 25.0),

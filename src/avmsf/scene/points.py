@@ -47,7 +47,7 @@ def farthest_points(points: Float[Tensor, "points 3"], count: int, *, start: int
     do not have.
     """
     _expect_rows(points, count, start)
-    return torch.from_numpy(_farthest(points.double().contiguous().numpy(), count, start))
+    return torch.from_numpy(_farthest(points.double().cpu().contiguous().numpy(), count, start))
 
 
 @compiled(error_model="numpy", nogil=True)
