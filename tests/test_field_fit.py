@@ -244,6 +244,14 @@ def test_a_field_without_residual_has_no_noise():
     assert short_fit().residual.magnitude.min() > 0
 
 
+def test_noise_keeps_its_measured_level_unless_it_is_trained():
+    measured = plate_extraction(plate_impacts()).residual.magnitude
+    assert torch.equal(short_fit().residual.magnitude, measured)
+    trained = fitted(replace(SHORT, noise_rate=0.1)).residual.magnitude
+    # Adam moves each logarithm by about the rate at each of four steps.
+    assert 0.02 < float(torch.log(trained / measured).abs().mean()) < 0.5
+
+
 def test_warm_up_aims_at_the_gains_that_sines_can_express():
     impacts, modes = plate_impacts(), plate_extraction(plate_impacts())
     field = fitted(replace(LONG, steps=0))

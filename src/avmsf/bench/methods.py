@@ -117,8 +117,8 @@ FIELDS = (
     AutomaticField("field-auto"),
     FieldMethod("field-positions", look="positions"),
     FieldMethod("field-unaligned", look="unaligned"),
-    # All steps end to end take long enough without two trials of dampings beforehand.
-    UninformedField("field-no-initialisation", replace(QUICK, damping="shared")),
+    # All steps end to end take long enough without two trials of dampings beforehand. Its noise is not measured.
+    UninformedField("field-no-initialisation", replace(QUICK, damping="shared", noise_rate=0.1)),
     FieldMethod("field-no-residual", replace(QUICK, residual=False)),
     # The warm-up moves no damping, so there is nothing to choose between.
     FieldMethod("field-warmup", replace(QUICK, steps=0, damping="shared")),

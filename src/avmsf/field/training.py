@@ -122,7 +122,7 @@ class TrainingRun:
             return [Group(matrices, rate, config.weight_decay), Group(vectors, rate)]
 
         corrections = [Group([self.shift, self.decay], config.correction_rate)]
-        if config.residual:
+        if config.residual and config.noise_rate:
             corrections.append(Group([self.noise], config.noise_rate))
         self.warmup = Descent(groups(config.warmup_rate))
         self.joint = Descent([*groups(config.learning_rate), *corrections])

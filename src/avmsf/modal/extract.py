@@ -198,8 +198,7 @@ def extract_sounds(
     modes = synthesise(
         gains, bank.frequency, bank.damping, samples=sounds.shape[1], sample_rate=sample_rate, quadrature=quadrature
     )
-    # Without the modes, for the slow ones still ring where everything else is quietest.
-    residual = estimate_residual(sounds - modes, bins=_noise_bins(sounds.shape[1]))
+    residual = estimate_residual(sounds, modes, bins=_noise_bins(sounds.shape[1]))
     return Extraction(bank, gains, residual, quadrature)
 
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -9,6 +10,10 @@ from torch import Tensor
 
 _REFERENCE = 1 << 17
 """Least number of samples of the white noise that the search for the quietest segments is calibrated on."""
+_FINENESS = 8
+"""Frequencies that each band of the residual is measured at."""
+_WEAKEST = 0.25
+"""Part of the frames that the residual is measured in."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +64,7 @@ def noise_power(
 def _quietest_power(
     sounds: Float[Tensor, "contacts samples"], *, bins: int, quietest: float
 ) -> Float[Tensor, "contacts bins"]:
-    fft_size = 2 * (bins - 1)
-    padded = torch.nn.functional.pad(sounds, (0, max(0, fft_size - sounds.shape[1])))
-    window = torch.hann_window(fft_size, dtype=sounds.dtype, device=sounds.device)
-    frames = padded.unfold(1, fft_size, fft_size // 2)
-    power = torch.fft.rfft(frames * window).abs().square() / window.square().sum()
+    power = _frame_power(sounds, 2 * (bins - 1))
     count = max(1, power.shape[1] // 20)
     runs = power.shape[1] // count
     # Whole runs up to the end: the end is where a sound that dies away is quietest.
@@ -76,9 +77,35 @@ def _quietest_power(
     return quiet
 
 
-def estimate_residual(sounds: Float[Tensor, "contacts samples"], *, bins: int) -> Residual:
-    """Return the noise common to all sounds, from the quietest segments of each bin (paper, section 3.4)."""
-    return Residual(noise_power(sounds, bins=bins).mean(0).sqrt())
+def estimate_residual(
+    sounds: Float[Tensor, "contacts samples"], modes: Float[Tensor, "contacts samples"], *, bins: int
+) -> Residual:
+    """Return the noise common to all sounds, measured where their `modes`, which are part of them, are weakest.
+
+    In each band it is the median power of `sounds - modes` over the quarter of the frames in which `modes` have least
+    energy, over all contacts, divided by log 2: the median of Gaussian noise's power is log 2 of its mean. Frames are
+    an eighth of the sound, so a band of noise has many frequencies, and neither a narrow line that the modes leave
+    over nor the beginning of the sound moves the median. Frames are chosen by the modes and not by the noise itself,
+    which leaves the median without bias. In the paper (section 3.4) it is the mean of each band's lowest-energy
+    segments, `noise_power`.
+    """
+    fft_size = _FINENESS * 2 * (bins - 1)
+    left = _frame_power(sounds - modes, fft_size)
+    frames = max(1, round(_WEAKEST * left.shape[1]))
+    weakest = torch.sort(_frame_power(modes, fft_size), dim=1, stable=True).indices[:, :frames]
+    chosen = left.gather(1, weakest)
+    # Spectra are real at 0 Hz and at half the rate, where the power's median is another.
+    edges = [max(1, round(_FINENESS * (band - 0.5))) for band in range(bins)] + [fft_size // 2]
+    power = [chosen[:, :, low:high].median() for low, high in pairwise(edges)]
+    return Residual((torch.stack(power) / math.log(2)).sqrt())
+
+
+def _frame_power(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Float[Tensor, "contacts frames bins"]:
+    """Return the power of half-overlapping Hann frames: white noise of variance one has one in every bin."""
+    padded = torch.nn.functional.pad(sounds, (0, max(0, fft_size - sounds.shape[1])))
+    window = torch.hann_window(fft_size, dtype=sounds.dtype, device=sounds.device)
+    frames = padded.unfold(1, fft_size, fft_size // 2)
+    return torch.fft.rfft(frames * window).abs().square() / window.square().sum()
 
 
 def _even_length(samples: int) -> int:
