@@ -124,6 +124,9 @@ class _SpectralL1(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, outer: Float[Tensor, ""]) -> tuple[Tensor, None, None, None]:
+        # `create_graph=True`: the saved slope would count as a constant, and second derivatives would be wrong.
+        if torch.is_grad_enabled():
+            raise NotImplementedError("spectral_loss has first derivatives only: expected create_graph=False")
         (slope,) = ctx.saved_tensors
         return outer * slope, None, None, None
 
