@@ -1,10 +1,13 @@
 """Blows in a stream: found where and when they fell, whatever rings, and whatever blocks the stream comes in."""
 
+import math
 from dataclasses import fields, replace
 from functools import cache
 
+import numpy as np
 import pytest
 import torch
+from scipy.signal import sosfreqz
 from torch import Tensor
 
 from avmsf.errors import LocationError
@@ -126,6 +129,14 @@ def test_an_offset_and_rumble_are_not_heard() -> None:
     # The filter starts with the stream, and its own start is a jump; it is over before the first blow.
     found = [spot(blow) for blow in blows if blow.seconds > 0.1]
     assert found == list(STRUCK)
+
+
+def test_the_rumble_filter_hardly_changes_the_lowest_mode() -> None:
+    listener = Listener(locator())
+    _, response = sosfreqz(listener.filter, worN=BANK.frequency.min().item(), fs=RATE)
+    # A second-order Butterworth filter at frequency f turns by sqrt(2) c / f and loses (c / f)^4 / 2, c its cut-off.
+    assert np.angle(response) == pytest.approx(math.sqrt(2) * 0.05, rel=0.01)
+    assert 1 - abs(response) == pytest.approx(0.05**4 / 2, rel=0.05)
 
 
 def test_noise_alone_is_no_blow() -> None:
