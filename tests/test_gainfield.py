@@ -186,6 +186,10 @@ def test_a_sound_is_the_sum_of_damped_sines_and_cosines(name):
     # Float32 sums: a millionth of the loudest sample.
     torch.testing.assert_close(sounds.double(), expected, rtol=0, atol=1e-6 * float(expected.abs().max()))
     assert torch.equal(renderer.gains(PLACES, directions=BLOWS), known.mean)
+    poles = -BANK.damping * factors.double() + 2j * torch.pi * BANK.frequency
+    amplitudes = renderer.complex_gains(PLACES, directions=BLOWS)
+    phasors = (amplitudes[..., None] * torch.exp(poles[..., None] * times)).sum(1)
+    torch.testing.assert_close(phasors.real, expected, rtol=0, atol=1e-6 * float(expected.abs().max()))
     if name.endswith("physics"):
         assert not torch.equal(renderer.render(PLACES), sounds)
 

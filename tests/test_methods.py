@@ -159,7 +159,7 @@ def test_training_contacts_sound_as_recorded(name):
 def test_methods_with_modes_give_their_bank_and_gains(name):
     train, test = parts()
     renderer = made(name)
-    gains = renderer.gains(test.contacts)
+    gains = -renderer.complex_gains(test.contacts).imag
     assert gains.shape == (len(test), len(renderer.bank))
     if name != "field-no-initialisation":
         assert len(renderer.bank) == len(plate_extraction(train).bank)

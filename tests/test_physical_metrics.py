@@ -27,29 +27,21 @@ def truth() -> Truth:
 
 
 @dataclass(frozen=True, eq=False)
-class Sines:
+class Modes:
     bank: ModalBank
     table: torch.Tensor
 
-    def gains(self, contacts: torch.Tensor) -> torch.Tensor:
+    def complex_gains(self, contacts: torch.Tensor, *, directions: torch.Tensor | None = None) -> torch.Tensor:
         return self.table[: len(contacts)]
 
 
-@dataclass(frozen=True, eq=False)
-class Both(Sines):
-    cosines: torch.Tensor
-
-    def quadrature(self, contacts: torch.Tensor) -> torch.Tensor:
-        return self.cosines[: len(contacts)]
-
-
-def rendered(amplitudes: torch.Tensor, frequency: torch.Tensor | None = None) -> Both:
+def rendered(amplitudes: torch.Tensor, frequency: torch.Tensor | None = None) -> Modes:
     bank = ModalBank(truth().frequency if frequency is None else frequency, truth().damping)
-    return Both(bank, amplitudes.real, amplitudes.imag)
+    return Modes(bank, amplitudes)
 
 
 def amplitudes() -> torch.Tensor:
-    return torch.complex(truth().gains, truth().quadrature)
+    return truth().amplitudes
 
 
 def test_the_truth_itself_is_perfect():
@@ -99,8 +91,26 @@ def test_what_a_listener_hears_is_not_free():
     single = Truth(one.frequency[:1], one.damping[:1], one.gains[:, :1], one.quadrature[:, :1], one.names)
     assert judge_modes(rendered(wrong), CONTACTS, truth()).figures()["mac"] < 0.9
     # Of a single mode it is nothing but polarity.
-    alone = Both(ModalBank(single.frequency, single.damping), wrong.real[:, :1], wrong.imag[:, :1])
+    alone = Modes(ModalBank(single.frequency, single.damping), wrong[:, :1])
     assert judge_modes(alone, CONTACTS, single).figures()["mac"] == pytest.approx(1.0, rel=1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class Directed(Modes):
+    """Gains in proportion to the direction's third coordinate."""
+
+    def complex_gains(self, contacts: torch.Tensor, *, directions: torch.Tensor | None = None) -> torch.Tensor:
+        assert directions is not None
+        return self.table[: len(contacts)] * directions[:, 2:]
+
+
+def test_gains_are_compared_along_the_impacts_directions():
+    along = torch.linspace(0.1, 1.0, 12, dtype=torch.float64)
+    directions = torch.stack([(1 - along.square()).sqrt(), torch.zeros_like(along), along], dim=1)
+    renderer = Directed(rendered(amplitudes()).bank, amplitudes())
+    one = replace(truth(), gains=truth().gains * along[:, None], quadrature=truth().quadrature * along[:, None])
+    figures = judge_modes(renderer, CONTACTS, one, directions=directions).figures()
+    assert figures["gain_error"] == pytest.approx(0.0, abs=1e-7)
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.5, 1.1, 2.0])
@@ -117,7 +127,7 @@ def test_error_at_right_angles_follows_pythagoras():
     other = torch.randn(12, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     other -= g * ((g * other).sum(0) / g.square().sum(0))
     other *= 0.5 * g.norm(dim=0) / other.norm(dim=0)
-    sines = Sines(ModalBank(one.frequency, one.damping), g + other)
+    sines = Modes(ModalBank(one.frequency, one.damping), -1j * (g + other))
     # cos^2 of the angle between them is 1 / (1 + 1/4).
     scores = judge_modes(sines, CONTACTS, replace(one, quadrature=0 * g))
     assert torch.allclose(scores.gain_error, torch.full((4,), 0.5, dtype=torch.float64), rtol=1e-9)
@@ -131,7 +141,7 @@ def test_unrelated_gains_have_a_mac_near_one_over_contacts():
     bank = ModalBank(torch.linspace(300, 9000, modes, dtype=torch.float64), torch.full((modes,), 10.0).double())
     one = Truth(bank.frequency, bank.damping, table[0], table[1], ("",) * contacts)
     places = torch.zeros(contacts, 3, dtype=torch.float64)
-    mac = judge_modes(Both(bank, table[2], table[3]), places, one).figures()["mac"]
+    mac = judge_modes(Modes(bank, torch.complex(table[2], table[3])), places, one).figures()["mac"]
     # 1 / 200 for complex numbers; polarities chosen at best leave a little more.
     assert 1 / 200 < mac < 5 / 200
 
@@ -139,7 +149,7 @@ def test_unrelated_gains_have_a_mac_near_one_over_contacts():
 def test_frequencies_and_dampings_are_in_proportion():
     one = truth()
     bank = ModalBank(one.frequency * 1.001, one.damping * 2)
-    scores = judge_modes(Both(bank, one.gains, one.quadrature), CONTACTS, one)
+    scores = judge_modes(Modes(bank, one.amplitudes), CONTACTS, one)
     assert torch.allclose(scores.frequency_error, torch.full((4,), 1e-3, dtype=torch.float64), rtol=1e-9)
     assert scores.figures()["frequency_error"] == pytest.approx(1e-3, rel=1e-9)
     assert scores.figures()["damping_error"] == pytest.approx(math.log(2), rel=1e-12)
@@ -163,7 +173,7 @@ def test_missing_modes_count_as_silence_and_others_as_false():
 
 
 def test_a_method_that_finds_nothing_has_no_frequency_error():
-    none = Sines(ModalBank(numbers(), numbers()), torch.zeros(12, 0))
+    none = Modes(ModalBank(numbers(), numbers()), torch.zeros(12, 0, dtype=torch.complex128))
     figures = judge_modes(none, CONTACTS, truth()).figures()
     assert (figures["found"], figures["gain_error"], figures["mac"]) == (0.0, pytest.approx(1.0), 0.0)
     assert figures["frequency_error"] is None
@@ -196,15 +206,13 @@ def test_what_cannot_be_compared_is_refused():
     with pytest.raises(EvaluationError, match="gains at 5 contacts cannot be compared with true ones at 12"):
         judge_modes(good, CONTACTS[:5], one)
     with pytest.raises(EvaluationError, match=r"predicted gains must be .* 4 modes, got the shape \(12, 3\)"):
-        judge_modes(Sines(good.bank, one.gains[:, :3]), CONTACTS, one)
+        judge_modes(Modes(good.bank, one.amplitudes[:, :3]), CONTACTS, one)
     with pytest.raises(EvaluationError, match="the true modes are silent at all contacts"):
         judge_modes(good, CONTACTS, replace(one, gains=0 * one.gains, quadrature=0 * one.gains))
     broken = amplitudes()
     broken[3, 2] = math.nan
     with pytest.raises(EvaluationError, match="the predicted gain of mode 2 at contact 3 is"):
         judge_modes(rendered(broken), CONTACTS, one)
-    with pytest.raises(EvaluationError, match=r"predicted gains have the shape \(12, 4\) and quadrature \(12, 2\)"):
-        judge_modes(Both(good.bank, one.gains, one.gains[:, :2]), CONTACTS, one)
     for widths, relative in ((-1.0, 0.1), (0.0, 0.0), (math.nan, 0.0)):
         with pytest.raises(EvaluationError, match="expected numbers of 0 or more, not both 0"):
             judge_modes(good, CONTACTS, one, widths=widths, relative=relative)

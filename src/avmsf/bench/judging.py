@@ -98,7 +98,7 @@ def _modal_figures(renderer: Renderer, test: Impacts, truth: Truth) -> dict[str,
     """Return how near a method's modes and gains are to the truth; nothing of methods that have no modes."""
     if not isinstance(renderer, ModalRenderer):
         return {}
-    figures = judge_modes(renderer, test.contacts, truth).figures()
+    figures = judge_modes(renderer, test.contacts, truth, directions=test.directions).figures()
     # Gains at a single contact agree with any others.
     return {name: value for name, value in figures.items() if name != "mac" or len(test) > 1}
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
@@ -59,13 +59,15 @@ class ModalBaseline(ABC):
     def amplitudes_at(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts two_modes"]:
         """Return the gains in phase, then in quadrature, that the contacts are given."""
 
-    def gains(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts modes"]:
-        """Return the signed gains in phase (of the sines) at the contacts, in the unit of the training sounds."""
-        return self.amplitudes_at(contacts)[:, : len(self.bank)]
+    def complex_gains(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Complex[Tensor, "contacts modes"]:
+        """Return amplitudes A at the contacts: their sounds are the real part of the sum of A exp((-d + 2 pi i f) t).
 
-    def quadrature(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts modes"]:
-        """Return the signed gains in quadrature (of the cosines) at the contacts."""
-        return self.amplitudes_at(contacts)[:, len(self.bank) :]
+        `directions` make no difference.
+        """
+        gains, quadrature = self.amplitudes_at(contacts).chunk(2, dim=1)
+        return torch.complex(quadrature, -gains)
 
     def render(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None

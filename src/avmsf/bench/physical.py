@@ -1,6 +1,6 @@
 """How far a method's modes and gains are from an object's true ones, which only a simulation knows.
 
-Conventions. A mode's amplitudes at the contacts are complex numbers, gains + i quadrature. It weighs by its true
+Conventions. A mode's amplitudes at the contacts are complex numbers. It weighs by its true
 energy, the sum over contacts of |amplitude|^2 / (4 damping), which is what its damped sine has over all time. True
 modes and a method's are matched one to one by frequency alone (`match_modes`); true ones that found no partner count
 as silence in `gain_error` and as 0 in `mac`, so that no method gains by leaving modes out. Of one contact alone `mac`
@@ -17,7 +17,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Complex128, Float, Float64, Int
+from jaxtyping import Complex, Complex128, Float, Float64, Int
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
@@ -32,18 +32,20 @@ _TURNS = 100
 
 @runtime_checkable
 class ModalRenderer(Protocol):
-    """A method whose sounds are modes times gains, be there noise beside them or not.
-
-    It may have `quadrature(contacts)` too, the amplitudes of the cosines; without it they are zero.
-    """
+    """A method whose sounds are modes times gains, with or without residual noise."""
 
     @property
     def bank(self) -> ModalBank:
         """The modes, the same at all contacts."""
         ...
 
-    def gains(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts modes"]:
-        """Return the signed amplitudes of the sines at the contacts, in the unit of the training sounds."""
+    def complex_gains(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Complex[Tensor, "contacts modes"]:
+        """Return amplitudes A at the contacts: their sounds are the real part of the sum of A exp((-d + 2 pi i f) t).
+
+        In the unit of the training sounds; `directions` are the unit vectors of the impacts, for methods that use them.
+        """
         ...
 
 
@@ -94,18 +96,18 @@ def judge_modes(
     contacts: Float[Tensor, "contacts 3"],
     truth: Truth,
     *,
+    directions: Float[Tensor, "contacts 3"] | None = None,
     widths: float = 1.0,
     relative: float = 0.002,
 ) -> ModalScores:
     """Compare a method's modes and its gains at the contacts with the true ones, row for row.
 
-    `widths` and `relative` as `match_modes` has them. Raises EvaluationError where rows differ in number, for values
-    that are not finite, and where the truth is silence at all contacts.
+    `directions` are the unit vectors of the impacts, which the true gains belong to; `widths` and `relative` as
+    `match_modes` has them. Raises EvaluationError where rows differ in number, for values that are not finite, and
+    where the truth is silence at all contacts.
     """
-    bank, gains = renderer.bank, renderer.gains(contacts)
-    quadrature = getattr(renderer, "quadrature", None)
-    predicted = _amplitudes(gains, torch.zeros_like(gains) if quadrature is None else quadrature(contacts), "predicted")
-    true = _amplitudes(truth.gains, truth.quadrature, "true")
+    bank, true = renderer.bank, truth.amplitudes
+    predicted = renderer.complex_gains(contacts, directions=directions).detach().cpu().to(torch.complex128)
     _expect_amplitudes(predicted, bank.frequency, "predicted")
     _expect_amplitudes(true, truth.frequency, "true")
     if len(predicted) != len(true):
@@ -192,15 +194,6 @@ def _free_agreement(products: Amplitudes, weights: Float64[Tensor, " modes"]) ->
 
 def _signs(values: Float64[Tensor, " contacts"]) -> Float64[Tensor, " contacts"]:
     return torch.where(values < 0.0, -1.0, 1.0).double()
-
-
-def _amplitudes(gains: Float[Tensor, "..."], quadrature: Float[Tensor, "..."], what: str) -> Complex128[Tensor, "..."]:
-    if gains.shape != quadrature.shape:
-        raise EvaluationError(
-            f"{what} gains have the shape {tuple(gains.shape)} and quadrature {tuple(quadrature.shape)}; expected "
-            "[contacts, modes] of both"
-        )
-    return torch.complex(gains.detach().double().cpu(), quadrature.detach().double().cpu())
 
 
 def _expect_amplitudes(amplitudes: Complex128[Tensor, "..."], frequency: Float[Tensor, " modes"], what: str) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Complex, Float, Float64
 from torch import Tensor
 
 from avmsf.capture.settings import CaptureSettings
@@ -69,6 +69,17 @@ class SoundField:
         """
         return self.known(contacts, directions=directions).mean
 
+    def complex_gains(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Complex[Tensor, "contacts modes"]:
+        """Return amplitudes A at the contacts: their sounds are the real part of the sum of A exp((-d + 2 pi i f) t).
+
+        Contacts, directions and unit as in `gains`; dampings d are those of the contacts.
+        """
+        known = self.known(contacts, directions=directions)
+        quadrature = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
+        return torch.complex(quadrature.double(), -known.mean.double()) * torch.exp(1j * self.phase)
+
     def known(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Gains:
@@ -98,7 +109,8 @@ class SoundField:
         every call, so that a contact's sound depends on nothing else. Modes that are not `audible` are silent.
 
         `pulse` is what a softer hammer adds to the recorded blows' own pulses, in which the modes answer it; it has
-        the same impulse, however long it is. The noise, which is no answer of the object, heeds the force alone.
+        the same impulse, however long it is. The noise grows with `force` as the modes do, which is a simplification:
+        recorded background noise does not depend on the force of an impact. The pulse leaves the noise as it is.
         """
         length = self.samples if samples is None else samples
         noise = self.noise(samples)
