@@ -244,9 +244,13 @@ def test_a_field_without_residual_has_no_noise():
     assert short_fit().residual.magnitude.min() > 0
 
 
-def test_noise_keeps_its_measured_level_unless_it_is_trained():
-    measured = plate_extraction(plate_impacts()).residual.magnitude
-    assert torch.equal(short_fit().residual.magnitude, measured)
+def test_noise_is_measured_after_training_or_trained():
+    impacts, measured = plate_impacts(), plate_extraction(plate_impacts()).residual.magnitude
+    field = long_fit()[0]
+    # The plate's noise is white, 40 dB below its sounds on average. What the modes do not yet explain adds to it.
+    level = 0.01 * float(impacts.sounds.square().mean().sqrt())
+    decibels = 20 * torch.log10(field.residual.magnitude / level)
+    assert -1.0 < float(decibels.median()) < 3.0
     trained = fitted(replace(SHORT, noise_rate=0.1)).residual.magnitude
     # Adam moves each logarithm by about the rate at each of four steps.
     assert 0.02 < float(torch.log(trained / measured).abs().mean()) < 0.5

@@ -51,8 +51,8 @@ class FitConfig:
     correction_rate: float = 1e-2
     """Likewise for frequencies, in widths of their modes, and for the logarithms of dampings."""
     noise_rate: float = 0.0
-    """Likewise for the logarithms of the residual noise's magnitudes. 0 keeps the level measured in the recordings. The
-    paper trains it, which ends 2.3 dB too low or lower: see docs/decisions/residual-level.md."""
+    """Likewise for the logarithms of the residual noise's magnitudes (paper). With 0 they are measured instead, after
+    the other parameters are trained, since training ends 2.3 dB too low: see docs/decisions/residual-level.md."""
     weight_decay: float = 1.0
     """Decoupled weight decay on the network's matrices."""
     warmup_steps: int = 1000

@@ -29,7 +29,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction import Extraction
 from avmsf.modal.leastsquares import fit_gains, fit_sine_gains
 from avmsf.modal.phase import common_phase
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual import Residual, estimate_residual
 from avmsf.modal.spectra import envelope
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import farthest_points
@@ -103,7 +103,7 @@ def fit(
         finished = run.network.judged(order, along_phase(*parts, case.phase[order]))
     else:
         finished = run.network.finished(order)
-    return SoundField(
+    field = SoundField(
         bank,
         finished,
         case.phase[order],
@@ -112,6 +112,17 @@ def fit(
         train.sounds.shape[1],
         Origin(capture, train.names, train.forces is not None, config, report, settings or CaptureSettings()),
     )
+    if config.residual and not config.noise_rate and config.steps:
+        return _with_measured_residual(field, train.take(run.network.heeded(len(train))))
+    return field
+
+
+def _with_measured_residual(field: SoundField, train: Impacts) -> SoundField:
+    """Return the field with the noise that its modes lack of the recordings it was fitted to."""
+    bins = len(field.residual.magnitude)
+    silent = replace(field, residual=Residual(torch.zeros(bins)))
+    modes = silent.render(train.contacts, directions=train.directions)
+    return replace(field, residual=estimate_residual(train.sounds, modes, bins=bins))
 
 
 def gain_case(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> GainCase:

@@ -2,10 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 
+import scipy.special
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 _REFERENCE = 1 << 17
@@ -14,6 +14,10 @@ _FINENESS = 8
 """Frequencies that each band of the residual is measured at."""
 _WEAKEST = 0.25
 """Part of the frames that the residual is measured in."""
+_ROUNDS = 50
+"""Most steps of the search for the noise's power, each by at most two nepers."""
+_CONVERGED = 1e-3
+"""Step at which the search ends, nepers of power: .004 dB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,24 +84,47 @@ def _quietest_power(
 def estimate_residual(
     sounds: Float[Tensor, "contacts samples"], modes: Float[Tensor, "contacts samples"], *, bins: int
 ) -> Residual:
-    """Return the noise common to all sounds, measured where their `modes`, which are part of them, are weakest.
+    """Return the noise that explains the log spectra of `sounds` best, given their `modes`, row for row.
 
-    In each band it is the median power of `sounds - modes` over the quarter of the frames in which `modes` have least
-    energy, over all contacts, divided by log 2: the median of Gaussian noise's power is log 2 of its mean. Frames are
-    an eighth of the sound, so a band of noise has many frequencies, and neither a narrow line that the modes leave
-    over nor the beginning of the sound moves the median. Frames are chosen by the modes and not by the noise itself,
-    which leaves the median without bias. In the paper (section 3.4) it is the mean of each band's lowest-energy
-    segments, `noise_power`.
+    A mode's power S and Gaussian noise of power n have E ln|mode + noise|^2 = ln n + ln x + E1(x), x = S / n (E1 is the
+    exponential integral), which changes by exp(-x) with ln n. In every band n is fitted to the recorded log powers by
+    least squares. Logarithms are compared because narrow lines and slow tails that the modes leave over hardly change
+    their mean. For the same reason frames are an eighth of the sound, so that a band has many frequencies, and only the
+    quarter of the frames count in which the modes have least energy. As frames are chosen by the modes and not by the
+    noise, the choice has no bias. In the paper (section 3.4) the magnitudes start from the mean of each band's
+    lowest-energy segments, as in `noise_power`, and are then trained.
     """
     fft_size = _FINENESS * 2 * (bins - 1)
-    left = _frame_power(sounds - modes, fft_size)
-    frames = max(1, round(_WEAKEST * left.shape[1]))
-    weakest = torch.sort(_frame_power(modes, fft_size), dim=1, stable=True).indices[:, :frames]
-    chosen = left.gather(1, weakest)
-    # Spectra are real at 0 Hz and at half the rate, where the power's median is another.
-    edges = [max(1, round(_FINENESS * (band - 0.5))) for band in range(bins)] + [fft_size // 2]
-    power = [chosen[:, :, low:high].median() for low, high in pairwise(edges)]
-    return Residual((torch.stack(power) / math.log(2)).sqrt())
+    ringing = _frame_power(modes.double(), fft_size)
+    frames = max(1, round(_WEAKEST * ringing.shape[1]))
+    weakest = torch.sort(ringing, dim=1, stable=True).indices[:, :frames]
+    recorded = _frame_power(sounds.double(), fft_size).gather(1, weakest)
+    columns = torch.arange(_FINENESS * bins).view(bins, _FINENESS) - _FINENESS // 2
+    # Spectra are real at 0 Hz and at half the rate, where log power has another mean.
+    inside = (columns > 0) & (columns < fft_size // 2)
+    columns = columns.clamp(0, fft_size // 2)
+    power = _noise_beneath(recorded[..., columns], ringing.gather(1, weakest)[..., columns], inside)
+    return Residual(power.sqrt().to(sounds.dtype))
+
+
+def _noise_beneath(
+    recorded: Float64[Tensor, "contacts frames bins columns"],
+    ringing: Float64[Tensor, "contacts frames bins columns"],
+    inside: Bool[Tensor, "bins columns"],
+) -> Float64[Tensor, " bins"]:
+    """Return the noise's power in each band by Gauss-Newton steps, from the powers recorded and those of the modes."""
+    tiny = torch.finfo(torch.float64).tiny
+    recorded_log = torch.log(recorded.clamp_min(tiny))
+    noise = (recorded * inside).amax((0, 1, 3)).clamp_min(tiny)
+    for _ in range(_ROUNDS):
+        ratio = (ringing / noise[:, None]).clamp_min(1e-12)
+        expected = torch.log(noise)[:, None] + torch.log(ratio) + torch.from_numpy(scipy.special.exp1(ratio.numpy()))
+        slope = inside * torch.exp(-ratio)
+        step = (slope * (recorded_log - expected)).sum((0, 1, 3)) / slope.square().sum((0, 1, 3)).clamp_min(1.0)
+        noise = noise * torch.exp(step.clamp(-2.0, 2.0))
+        if float(step.abs().max()) < _CONVERGED:
+            break
+    return noise
 
 
 def _frame_power(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Float[Tensor, "contacts frames bins"]:
