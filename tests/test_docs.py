@@ -1,10 +1,12 @@
 """README and docs: their commands parse, their Python names exist, their links lead somewhere."""
 
 import ast
+import dataclasses
 import inspect
 import pkgutil
 import re
 import shlex
+import tomllib
 from importlib import import_module
 from pathlib import Path
 
@@ -50,12 +52,14 @@ def test_every_name_and_keyword_of_the_docs_python_exists(block: str) -> None:
             inspect.signature(pkgutil.resolve_name(name)).bind(*node.args, **keywords)
 
 
-def test_the_settings_of_the_docs_are_read(tmp_path: Path) -> None:
-    (block,) = _blocks("toml")
-    (tmp_path / "capture.toml").write_text(block)
-    settings = CaptureSettings.read(tmp_path / "capture.toml")
-    assert settings.force_channel == 1
-    assert settings.response_channel == 2
+def test_the_docs_give_every_setting_of_a_capture_and_its_default(tmp_path: Path) -> None:
+    defaults, others = _blocks("toml")
+    (tmp_path / "capture.toml").write_text(defaults)
+    assert CaptureSettings.read(tmp_path / "capture.toml") == CaptureSettings()
+    (tmp_path / "capture.toml").write_text(others)
+    CaptureSettings.read(tmp_path / "capture.toml")
+    named = {*tomllib.loads(defaults), *tomllib.loads(others)}
+    assert named == {field.name for field in dataclasses.fields(CaptureSettings)}
 
 
 @pytest.mark.parametrize("page", LINKED, ids=lambda page: str(page.relative_to(REPOSITORY)))
