@@ -1,0 +1,59 @@
+"""Draw overview.png: `python docs/pictures/overview.py mug.safetensors src/avmsf/example`.
+
+The field is that of `avmsf fit src/avmsf/example --gains physics --train-fraction 0.75 --output mug.safetensors`. The
+object at the left is cut from studio/modes.png.
+"""
+
+import sys
+from pathlib import Path
+
+import matplotlib.image
+import torch
+from matplotlib.figure import Figure
+
+import avmsf
+from avmsf.bench.baselines import MeanWaveform
+from avmsf.modal.spectra import magnitude_stft
+
+HERE = Path(__file__).parent
+CONTACTS = ("012.wav", "014.wav")
+FFT_SIZE, HOP, SECONDS, MAX_HZ, RANGE_DB = 1024, 128, 0.35, 12_000, 70
+
+
+def main() -> None:
+    """Read the field and the capture, draw, write the picture."""
+    field, capture = avmsf.load(Path(sys.argv[1])), avmsf.read_capture(sys.argv[2])
+    train, test = avmsf.split(capture.impacts, fraction=0.75)
+    test = test.take([test.names.index(name) for name in CONTACTS])
+    columns = {
+        "recorded, held out": test.sounds,
+        "avmsf": field.render(test.contacts, directions=test.directions),
+        "mean of 3 nearest recordings": MeanWaveform(train).render(test.contacts),
+    }
+    figure = Figure(figsize=(12.8, 4.4), layout="constrained", dpi=110)
+    left, right = figure.subfigures(1, 2, width_ratios=(0.36, 0.64))
+    axes = left.subplots()
+    axes.imshow(matplotlib.image.imread(HERE / "studio/modes.png")[120:620, 200:710])
+    axes.set_title("gain of the mode at 2762 Hz;\ndots: recorded contacts", fontsize=11)
+    axes.axis("off")
+    grid = right.subplots(len(CONTACTS), len(columns), sharex=True, sharey=True)
+    for column, (name, sounds) in enumerate(columns.items()):
+        spectra = magnitude_stft(sounds, fft_size=FFT_SIZE, hop=HOP)
+        for row, reference in enumerate(magnitude_stft(test.sounds, fft_size=FFT_SIZE, hop=HOP).amax((1, 2))):
+            level = 20 * torch.log10((spectra[row] / reference).clamp_min(1e-10))
+            axes = grid[row, column]
+            extent = (0.0, level.shape[1] * HOP / field.sample_rate, 0.0, field.sample_rate / 2000)
+            image = axes.imshow(
+                level.numpy(), origin="lower", aspect="auto", extent=extent, cmap="magma", vmin=-RANGE_DB, vmax=0.0
+            )
+            axes.set_xlim(0.0, SECONDS)
+            axes.set_ylim(0.0, MAX_HZ / 1000)
+        grid[0, column].set_title(name, fontsize=11)
+        grid[-1, column].set_xlabel("time (s)")
+    for row in range(len(CONTACTS)):
+        grid[row, 0].set_ylabel(f"contact {'AB'[row]}\nfrequency (kHz)")
+    right.colorbar(image, ax=grid, label="level (dB)", shrink=0.8)
+    figure.savefig(HERE / "overview.png")
+
+
+main()
