@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.errors import LocationError
+from avmsf.errors import LocationError, StudioError
 from avmsf.studio.locating import Finder
 from avmsf.studio.opening import open_target
 from avmsf.studio.refusal import echo
+from avmsf.studio.server import serve
 from capture_folder import fill
 from opened_plate import blow, open_plate, wav
 from served import Answer, Served, served
@@ -87,6 +88,13 @@ def test_a_full_temporary_folder_is_named_as_the_cause(plate: Served, monkeypatc
 
     monkeypatch.setattr("tempfile.mkdtemp", full)
     assert "No space left" in refused(plate.ask("POST", "lead?base=1", blow()), 507)
+
+
+def test_a_server_without_a_temporary_folder_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = open_plate(tmp_path / "opened")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
+    with pytest.raises(StudioError, match="TMPDIR"):
+        serve(opened, port=0, browser=False, tell=print)
 
 
 def test_a_capture_folder_that_is_gone_is_said_to_be(capture: Served, tmp_path: Path) -> None:
