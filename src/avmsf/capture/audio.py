@@ -88,7 +88,18 @@ def read_recording(path: Path, name: str | None = None) -> Recording:
     return decode_recording(path, name)
 
 
-def decode_recording(source: Path | io.BytesIO, name: str) -> Recording:
+class SoundBytes(io.BytesIO):
+    """A sound file in memory, for soundfile to read."""
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        """Move; stay where a damaged header asks for a place before the file, as a file on disk does."""
+        try:
+            return super().seek(offset, whence)
+        except ValueError:
+            return self.tell()
+
+
+def decode_recording(source: Path | SoundBytes, name: str) -> Recording:
     """Read every channel of a sound file on disk or in memory. Raises `CaptureError` as `read_recording`."""
     try:
         with soundfile.SoundFile(source) as file:

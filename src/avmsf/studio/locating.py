@@ -2,7 +2,6 @@
 
 import base64
 import dataclasses
-import io
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
@@ -14,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.capture.audio import Recording, decode_recording
+from avmsf.capture.audio import Recording, SoundBytes, decode_recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError
 from avmsf.field.soundfield import SoundField
@@ -108,7 +107,7 @@ def read_upload(content: bytes, *, name: str = "the recording") -> Recording:
     hold hours of silence where it is compressed.
     """
     _expect_short(content, name)
-    recording = decode_recording(io.BytesIO(content), name)
+    recording = decode_recording(SoundBytes(content), name)
     peak = float(np.abs(recording.channels).max())
     if peak > _MAX_PEAK:
         raise CaptureError(f"{name}: expected samples of at most {_MAX_PEAK:g}, got {peak:.3g}: export it again")
@@ -117,7 +116,7 @@ def read_upload(content: bytes, *, name: str = "the recording") -> Recording:
 
 def _expect_short(content: bytes, name: str) -> None:
     try:
-        with soundfile.SoundFile(io.BytesIO(content)) as file:
+        with soundfile.SoundFile(SoundBytes(content)) as file:
             samples, seconds = file.frames * file.channels, file.frames / file.samplerate
     except soundfile.LibsndfileError:
         # The reader says what is wrong with it.
