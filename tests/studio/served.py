@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import uvicorn
-
+from avmsf.studio.connections import limited
 from avmsf.studio.guard import LARGEST_UPLOAD, Guard, new_token
 from avmsf.studio.opening import Opened
 from avmsf.studio.routes import make_app
-from avmsf.studio.server import _listening
+from avmsf.studio.server import PageServer, _listening
 from avmsf.studio.studio import Studio, StudioConfig
 
 
@@ -78,8 +77,7 @@ def served(
     with _listening(0) as listener:
         port = listener.getsockname()[1]
         app = Guard(make_app(studio), token=token, port=port, largest=largest)
-        quiet = uvicorn.Config(app, log_level="critical", access_log=False, timeout_graceful_shutdown=1)
-        server = uvicorn.Server(quiet)
+        server = PageServer(limited(app, timeout_graceful_shutdown=1), announce=lambda: None)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
         try:

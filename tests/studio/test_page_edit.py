@@ -59,6 +59,7 @@ class EditServer:
         page.route("**/jobs/j9/events", lambda route: self._waiting.append(lambda: self._lead(route)))
         for what in ("edit", "undo", "save"):
             page.route(f"**/{what}", self.hear)
+        page.route("**/lead?base=*", self.hear_lead)
 
     def manifest(self) -> dict[str, Any]:
         sliders, shown = self.state
@@ -83,8 +84,6 @@ class EditServer:
             answer(route, {"error": STALE, "revision": self.revision}, 409)
         elif what == "save" and words["name"] in self.taken:
             answer(route, {"error": f"{words['name']} is there: choose another"}, 409)
-        elif "like" in words:
-            answer(route, {"job": "j9"}, 202)
         else:
             self._do(what, words)
             done = {"revision": self.revision, "remarks": [], **({"file": words["name"]} if what == "save" else {})}
@@ -96,6 +95,14 @@ class EditServer:
                 self._waiting.append(send)
             else:
                 send()
+
+    def hear_lead(self, route: "Route", request: "Request") -> None:
+        base = int(request.url.rsplit("=", 1)[1])
+        self.asked.append(("lead", {"base": base}))
+        if base != self.revision:
+            answer(route, {"error": STALE, "revision": self.revision}, 409)
+        else:
+            answer(route, {"job": "j9"}, 202)
 
     def _do(self, what: str, words: dict[str, Any]) -> None:
         if what == "edit":

@@ -1,5 +1,6 @@
 """Sound files as they lie on disk: every channel, the file's own rate, nothing resampled or scaled."""
 
+import io
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -84,13 +85,29 @@ def read_recording(path: Path, name: str | None = None) -> Recording:
         raise CaptureError(f"{name} is a folder; expected one sound file in it")
     if missing:
         raise CaptureError(f"{name}: there is no such file{_nearest_name(path)}")
+    return decode_recording(path, name)
+
+
+class SoundBytes(io.BytesIO):
+    """A sound file in memory, for soundfile to read."""
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        """Move; stay where a damaged header asks for a place before the file, as a file on disk does."""
+        try:
+            return super().seek(offset, whence)
+        except ValueError:
+            return self.tell()
+
+
+def decode_recording(source: Path | SoundBytes, name: str) -> Recording:
+    """Read every channel of a sound file on disk or in memory. Raises `CaptureError` as `read_recording`."""
     try:
-        with soundfile.SoundFile(path) as file:
+        with soundfile.SoundFile(source) as file:
             samples = file.read(dtype="float64", always_2d=True)
             rate, subtype = float(file.samplerate), str(file.subtype)
-    except (soundfile.LibsndfileError, OSError) as error:
+    except (soundfile.LibsndfileError, OSError, UnicodeEncodeError) as error:
         reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
-        size = path.stat().st_size
+        size = source.stat().st_size if isinstance(source, Path) else source.getbuffer().nbytes
         raise CaptureError(
             f"{name}: not a sound file that can be read ({size} bytes: {reason}): export or copy it again as wav"
         ) from error

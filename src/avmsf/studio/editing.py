@@ -1,6 +1,7 @@
 """What the page's sliders ask for, as one value, and the field that comes of it."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -11,7 +12,7 @@ import torch
 from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.simulate.material import MATERIALS, material_named
-from avmsf.studio.refusal import RefusedError
+from avmsf.studio.refusal import RefusedError, echo
 from avmsf.tasks.edits import EDITS, remarks
 from avmsf.tasks.madeof import made_of
 from avmsf.tasks.recast import LAWS, recast
@@ -20,10 +21,23 @@ from avmsf.tasks.retune import retune
 _MATERIAL, _MODE = ("from", "to"), ("mode", "db", "pitch", "decay")
 _OLD_CONTROL = '"Material it is of"'
 """What the page calls its choice of the old material."""
-_MOST = {"db": 120.0, "brightness": 40.0}
-"""Decibels up or down: what is farther off float32 cannot bring back beside the other modes."""
-_SHOWN = 60
-"""Characters of what was found that are told."""
+_LIMITS = {
+    # Lengths of struck objects lie between a millimetre and tens of metres; frequencies go with 1 / size.
+    "size": (1e-3, 1e3),
+    # From one end of hearing, 20 Hz, to the other, 20 kHz. What is farther off is inaudible for every object.
+    "pitch": (1e-3, 1e3),
+    # Decay times of objects lie between 10 ms (rubber) and 10 s (bells).
+    "decay": (1e-3, 1e3),
+    # A mode farther below the others cannot be represented beside them in float32, whose range of precision is 144 dB.
+    "db": (-120.0, 120.0),
+    # Decibels an octave: over the ten octaves of hearing no more than float32 holds.
+    "brightness": (-40.0, 40.0),
+}
+"""The least and the greatest value of each slider. The page's own sliders stay far within."""
+_MAX_ROW = 1 << 31
+"""Rows of a field's bank: far more than any has, and few enough digits to repeat."""
+_MAX_NAME = 100
+"""Characters of a material's name."""
 MUTE = -math.inf
 """Decibels that a mode is muted by; in JSON, where there are no such numbers, null."""
 
@@ -63,23 +77,32 @@ class Sliders:
     modes: tuple[ModeChange, ...] = field(default=())
 
     @classmethod
-    def read(cls, words: Mapping[str, Any]) -> "Sliders":
-        """Return the sliders of a request. Raises RefusedError (400) that names what is no slider or no number."""
+    def read(cls, words: Mapping[str, Any], *, modes: int | None = None) -> "Sliders":
+        """Return the sliders of a request for a field of so many `modes`.
+
+        Raises RefusedError (400) that names what is no slider, no number, outside `_LIMITS`, or more rows than modes.
+        """
         known = ("base", "material", "size", "pitch", "decay", "brightness", "law", "modes")
         _expect_keys(words, known, "an edit")
         material = words.get("material") or {}
         _expect_keys(material, _MATERIAL, "material")
         rows = words.get("modes") or []
         if not isinstance(rows, list):
-            raise RefusedError(400, f"modes: expected a list, found {rows!r}: reload the page")
+            raise RefusedError(400, f"modes: expected a list, found {echo(rows)}: reload the page")
+        if modes is not None and len(rows) > modes:
+            raise RefusedError(400, f"modes: expected at most {modes} rows, one a mode, found {len(rows)}")
+        changes = tuple(_mode(row) for row in rows)
+        repeated = [mode for mode, count in Counter(change.mode for change in changes).items() if count > 1]
+        if repeated:
+            raise RefusedError(400, f"modes: expected one row a mode, found several of mode {repeated[0]}")
         law = words.get("law", "displacement")
         if not isinstance(law, str) or law not in LAWS:
-            raise RefusedError(400, f"law: expected one of {', '.join(LAWS)}, found {law!r}")
+            raise RefusedError(400, f"law: expected one of {', '.join(LAWS)}, found {echo(law)}")
         return cls(
             _name(material.get("to"), "to"),
             _name(material.get("from"), "from"),
             law=law,
-            modes=tuple(_mode(row) for row in rows),
+            modes=changes,
             **{name: _number(words, name, rest) for name, rest in _RESTS.items()},
         )
 
@@ -130,8 +153,8 @@ MATERIAL_NAMES = tuple(MATERIALS)
 def _mode(row: Any) -> ModeChange:
     _expect_keys(row, _MODE, "a mode")
     mode = row.get("mode")
-    if not isinstance(mode, int) or isinstance(mode, bool) or mode < 0:
-        raise RefusedError(400, f"mode: expected a row counted from 0, found {mode!r}: reload the page")
+    if not isinstance(mode, int) or isinstance(mode, bool) or not 0 <= mode < _MAX_ROW:
+        raise RefusedError(400, f"mode: expected a row counted from 0, found {echo(mode)}: reload the page")
     mute = "db" in row and row["db"] is None
     return ModeChange(
         mode, MUTE if mute else _number(row, "db", 0.0), _number(row, "pitch", 1.0), _number(row, "decay", 1.0)
@@ -140,10 +163,12 @@ def _mode(row: Any) -> ModeChange:
 
 def _expect_keys(words: Any, known: tuple[str, ...], what: str) -> None:
     if not isinstance(words, Mapping):
-        raise RefusedError(400, f"{what}: expected an object with {', '.join(known)}, found {words!r}: reload the page")
+        raise RefusedError(
+            400, f"{what}: expected an object with {', '.join(known)}, found {echo(words)}: reload the page"
+        )
     unknown = sorted(set(words) - set(known))
     if unknown:
-        raise RefusedError(400, f"{what}: expected {', '.join(known)}, found {', '.join(unknown)}: reload the page")
+        raise RefusedError(400, f"{what}: expected {', '.join(known)}, found {echo(unknown)}: reload the page")
 
 
 def _number(words: Mapping[str, Any], name: str, rest: float) -> float:
@@ -155,14 +180,14 @@ def _number(words: Mapping[str, Any], name: str, rest: float) -> float:
         with suppress(OverflowError):
             number = float(value)
     if not math.isfinite(number):
-        raise RefusedError(400, f"{name}: expected a number, found {repr(value)[:_SHOWN]}")
-    most = _MOST.get(name, math.inf)
-    if abs(number) > most:
-        raise RefusedError(400, f"{name}: expected {-most:g} to {most:g} dB, found {number:g}")
+        raise RefusedError(400, f"{name}: expected a number, found {echo(value)}")
+    least, greatest = _LIMITS[name]
+    if not least <= number <= greatest:
+        raise RefusedError(400, f"{name}: expected {least:g} to {greatest:g}, found {number:g}")
     return number
 
 
 def _name(value: Any, what: str) -> str | None:
-    if value is not None and not isinstance(value, str):
-        raise RefusedError(400, f'material "{what}": expected a name, found {value!r}')
+    if value is not None and not (isinstance(value, str) and len(value) <= _MAX_NAME):
+        raise RefusedError(400, f'material "{what}": expected a name, found {echo(value)}')
     return value or None

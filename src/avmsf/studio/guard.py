@@ -145,8 +145,10 @@ async def read_words(request: Request, *, largest: int = LARGEST_WORDS) -> dict[
             raise too_large(largest)
     try:
         words = json.loads(bytes(body))
-    except ValueError as error:
-        raise RefusedError(400, f"expected a JSON object, found what is none ({error}): reload the page") from error
+    except (ValueError, RecursionError) as error:
+        raise RefusedError(
+            400, f"expected a JSON object, found what is none ({str(error)[:100]}): reload the page"
+        ) from error
     if not isinstance(words, dict):
         raise RefusedError(400, f"expected a JSON object, found {type(words).__name__}: reload the page")
     return words

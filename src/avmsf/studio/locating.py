@@ -2,10 +2,8 @@
 
 import base64
 import dataclasses
-import tempfile
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from threading import Lock
 from typing import Any
 
@@ -15,8 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.capture.audio import Recording, read_recording
+from avmsf.capture.audio import Recording, SoundBytes, decode_recording
 from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import CaptureError
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.symmetry import Symmetries
 from avmsf.studio.refusal import RefusedError
@@ -27,6 +26,8 @@ from avmsf.tasks.severalblows import locate_blows
 
 _MOST_SAMPLES = 1 << 24
 """Of one recording, in all channels: 6 minutes at 48 kHz, 134 MB as they are read."""
+_MAX_PEAK = 1e15
+"""Largest magnitude of a sample: the squares of `_MOST_SAMPLES` such samples and their sum are finite in float32."""
 
 
 class Likeness:
@@ -105,18 +106,19 @@ def read_upload(content: bytes, *, name: str = "the recording") -> Recording:
     Raises CaptureError for what is no sound file, and RefusedError (413) for one that is long beyond use: a few bytes
     hold hours of silence where it is compressed.
     """
-    with tempfile.TemporaryDirectory(prefix="avmsf-upload-") as folder:
-        path = Path(folder) / "upload.wav"
-        path.write_bytes(content)
-        _expect_short(path, name)
-        return read_recording(path, name)
+    _expect_short(content, name)
+    recording = decode_recording(SoundBytes(content), name)
+    peak = float(np.abs(recording.channels).max())
+    if peak > _MAX_PEAK:
+        raise CaptureError(f"{name}: expected samples of at most {_MAX_PEAK:g}, got {peak:.3g}: export it again")
+    return recording
 
 
-def _expect_short(path: Path, name: str) -> None:
+def _expect_short(content: bytes, name: str) -> None:
     try:
-        with soundfile.SoundFile(path) as file:
+        with soundfile.SoundFile(SoundBytes(content)) as file:
             samples, seconds = file.frames * file.channels, file.frames / file.samplerate
-    except (soundfile.LibsndfileError, OSError):
+    except soundfile.LibsndfileError:
         # The reader says what is wrong with it.
         return
     if samples > _MOST_SAMPLES:

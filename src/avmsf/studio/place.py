@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from avmsf.capture.table import DIRECTION, FARTHEST, REQUIRED
-from avmsf.studio.refusal import RefusedError
+from avmsf.studio.refusal import RefusedError, echo
 
 
 @dataclass(frozen=True)
@@ -51,5 +51,5 @@ def _finite(query: Mapping[str, str], name: str) -> float:
     except (KeyError, ValueError):
         value = math.nan
     if not math.isfinite(value):
-        raise RefusedError(400, f"{name}: expected a number, found {query.get(name, 'none')!r}")
+        raise RefusedError(400, f"{name}: expected a number, found {echo(query.get(name, 'none'))}")
     return value

@@ -10,16 +10,16 @@ from pathlib import Path
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, HTMLResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from avmsf.errors import AvmsfError
 from avmsf.export.webpage import MEDIA_TYPES
-from avmsf.studio.guard import LARGEST_UPLOAD, contained, nothing_here, read_words
+from avmsf.studio.guard import contained, nothing_here, read_words
 from avmsf.studio.modules import find_modules, with_local_modules
 from avmsf.studio.place import Place
 from avmsf.studio.policy import policy_of
-from avmsf.studio.refusal import response_to
+from avmsf.studio.refusal import FORESEEN_ERRORS, NUMERIC_ERRORS, Answer, RefusedError, echo, refusal_of, response_to
 from avmsf.studio.studio import Studio
 
 PAGE = Path(__file__).parent / "page"
@@ -63,6 +63,7 @@ def make_app(studio: Studio) -> Starlette:
         _get("/strikes/{path}", calls.send_measured),
         Route("/locate", calls.locate, methods=["POST"]),
         Route("/edit", calls.edit, methods=["POST"]),
+        Route("/lead", calls.lead, methods=["POST"]),
         Route("/undo", calls.undo, methods=["POST"]),
         Route("/save", calls.save, methods=["POST"]),
         Route("/capture/check", calls.check, methods=["POST"]),
@@ -80,6 +81,7 @@ def make_app(studio: Studio) -> Starlette:
             AvmsfError: _answer_refused,
             HTTPException: _answer_unknown,
             ClientDisconnect: _answer_nobody,
+            **dict.fromkeys(FORESEEN_ERRORS, _answer_foreseen),
             Exception: _answer_broken,
         },
     )
@@ -96,7 +98,7 @@ class Calls:
 
     async def send_manifest(self, request: Request) -> Response:
         """What is shown, and what the server can do."""
-        return JSONResponse(self.studio.manifest())
+        return Answer(self.studio.manifest())
 
     async def send_revision(self, request: Request) -> Response:
         """A file of a revision."""
@@ -106,7 +108,7 @@ class Calls:
         """The table of the current revision, or the object's file; and what the capture holds."""
         name = request.path_params["path"]
         if name == "capture":
-            return JSONResponse(await self.studio.capture())
+            return Answer(await self.studio.capture())
         showcase = self.studio.showcase
         return _file(showcase.object_folder if name.startswith("object.") else showcase.current.folder, request)
 
@@ -116,31 +118,38 @@ class Calls:
 
     async def locate(self, request: Request) -> Response:
         """Where a recorded blow fell."""
-        return JSONResponse(await self.studio.locate(await request.body()))
+        return Answer(await self.studio.locate(await request.body()))
 
     async def edit(self, request: Request) -> Response:
         """Change the field."""
-        done = await self.studio.edit(await read_words(request, largest=LARGEST_UPLOAD))
-        return JSONResponse(done, 202 if "job" in done else 200)
+        done = await self.studio.edit(await read_words(request))
+        return Answer(done, 202 if "job" in done else 200)
+
+    async def lead(self, request: Request) -> Response:
+        """Lead the sound towards a recording."""
+        base = request.query_params.get("base", "")
+        if not (base.isascii() and base.isdigit() and len(base) < 10):
+            raise RefusedError(400, f"base: expected the revision that the change is of, found {echo(base)}")
+        return Answer(await self.studio.lead(int(base), await request.body()), 202)
 
     async def undo(self, request: Request) -> Response:
         """Take a change back."""
-        return JSONResponse(await self.studio.undo(await read_words(request)))
+        return Answer(await self.studio.undo(await read_words(request)))
 
     async def save(self, request: Request) -> Response:
         """Write the field to a file."""
-        return JSONResponse(await self.studio.save(await read_words(request)), 201)
+        return Answer(await self.studio.save(await read_words(request)), 201)
 
     async def check(self, request: Request) -> Response:
         """Judge a recording and forget it."""
         content = await request.body()
-        return JSONResponse(await self.studio.with_book(lambda book: book.judge(content)))
+        return Answer(await self.studio.with_book(lambda book: book.judge(content)))
 
     async def add_strike(self, request: Request) -> Response:
         """Add a strike to the capture."""
         place, key = Place.read(request.query_params), request.headers.get("idempotency-key", "")
         content = await request.body()
-        return JSONResponse(await self.studio.with_book(lambda book: book.add(content, place, key=key)), 201)
+        return Answer(await self.studio.with_book(lambda book: book.add(content, place, key=key)), 201)
 
     async def change_strike(self, request: Request) -> Response:
         """Send, redo or take out one of the capture's recordings."""
@@ -148,21 +157,19 @@ class Calls:
         match, key = _expected(request), request.headers.get("idempotency-key")
         if request.method == "DELETE":
             await self.studio.with_book(lambda book: book.remove(name, match=match))
-            return JSONResponse({"removed": name})
+            return Answer({"removed": name})
         if request.method == "PUT":
             content = await request.body()
-            return JSONResponse(
-                await self.studio.with_book(lambda book: book.redo(name, content, key=key, match=match))
-            )
+            return Answer(await self.studio.with_book(lambda book: book.redo(name, content, key=key, match=match)))
         return _file(self.studio.expect_book().folder, request, only=_SOUNDS)
 
     async def reconstruct(self, request: Request) -> Response:
         """Make a field of the capture."""
-        return JSONResponse({"job": (await self.studio.reconstruct()).identifier}, 202)
+        return Answer({"job": (await self.studio.reconstruct()).identifier}, 202)
 
     async def make_object(self, request: Request) -> Response:
         """Make something to click of the capture's pictures, once more where that has failed."""
-        return JSONResponse({"job": self.studio.make_object().identifier}, 202)
+        return Answer({"job": self.studio.make_object().identifier}, 202)
 
     async def hear_job(self, request: Request) -> Response:
         """What a job says, as server-sent events; a page that has lost the connection hears what it has missed."""
@@ -180,7 +187,7 @@ class Calls:
         """Stop a job, and say whether it was stopped or had ended."""
         job = request.path_params["job"]
         stopped = await self.studio.jobs.named(job).cancel()
-        return JSONResponse({"cancelled" if stopped else "ended": job})
+        return Answer({"cancelled" if stopped else "ended": job})
 
 
 def _expected(request: Request) -> str | None:
@@ -217,15 +224,22 @@ async def _answer_refused(request: Request, error: Exception) -> Response:
 
 async def _answer_unknown(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    return JSONResponse({"error": f"{request.method}: there is nothing of the kind at this address"}, error.status_code)
+    return Answer({"error": f"{request.method}: there is nothing of the kind at this address"}, error.status_code)
 
 
 async def _answer_nobody(request: Request, error: Exception) -> Response:
     return Response(status_code=_GONE)
 
 
+async def _answer_foreseen(request: Request, error: Exception) -> Response:
+    if isinstance(error, NUMERIC_ERRORS):
+        # A check of the values that would name the cause is missing.
+        traceback.print_exception(error)
+    return response_to(refusal_of(error))
+
+
 async def _answer_broken(request: Request, error: Exception) -> Response:
     # The server's own word on it is hidden with all that it says of ordinary requests.
     traceback.print_exception(error)
     words = f"the server failed at this ({type(error).__name__}): its terminal shows more; reload to see what was done"
-    return JSONResponse({"error": words}, 500)
+    return Answer({"error": words}, 500)

@@ -1,10 +1,14 @@
 """The tables that blows are located by, of the current revision: begun as soon as the sliders rest."""
 
 import asyncio
+import sys
+import traceback
 from collections import defaultdict
 
+from avmsf.errors import AvmsfError
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.locating import Finder, Likeness
+from avmsf.studio.refusal import FORESEEN_ERRORS
 from avmsf.studio.sampling import length_of
 from avmsf.studio.session import Revision, Session
 from avmsf.studio.showing import Showcase
@@ -49,5 +53,16 @@ class Searches:
         while (revision := self.session.current) is not prepared and revision.field is not None:
             await asyncio.sleep(_SETTLED)
             if self.session.current is revision:
-                await self.threads.compute_ahead(self.finder_of(revision).prepare)
+                try:
+                    await self.threads.compute_ahead(self.finder_of(revision).prepare)
+                except Exception as error:  # the next revision's tables are to be made all the same
+                    _report(error)
                 prepared = revision
+
+
+def _report(error: Exception) -> None:
+    """Print why tables could not be made. A page that asks to locate on this revision gets the same error."""
+    if not isinstance(error, (AvmsfError, *FORESEEN_ERRORS)):
+        traceback.print_exception(error)
+    words = " ".join(str(error).split())
+    print(f"blows cannot be located on this revision ({type(error).__name__}: {words})", file=sys.stderr)

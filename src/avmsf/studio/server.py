@@ -1,9 +1,11 @@
 """The server of the page: on this machine alone, under an address that nobody else knows, until Ctrl-C."""
 
+import asyncio
 import errno
 import os
 import signal
 import socket
+import sys
 import tempfile
 import threading
 import webbrowser
@@ -11,10 +13,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import uvicorn
 
 from avmsf.errors import StudioError
+from avmsf.studio.connections import limited
 from avmsf.studio.guard import Guard, new_token
 from avmsf.studio.opening import Opened
 from avmsf.studio.routes import make_app
@@ -25,20 +29,32 @@ PORT = 8634
 _HOME = "127.0.0.1"
 _HANGING = 1
 """Seconds that an answer under way may take when the server ends."""
+_LACKING = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
 class PageServer(uvicorn.Server):
-    """Says where the page is as soon as it answers."""
+    """Says where the page is as soon as it answers, and once where it cannot accept more connections."""
 
     def __init__(self, config: uvicorn.Config, announce: Callable[[], None]) -> None:
         super().__init__(config)
         self.announce = announce
+        self._exhausted = False
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begin to listen."""
+        asyncio.get_running_loop().set_exception_handler(self._handle)
         await super().startup(sockets)
         if not self.should_exit:
             self.announce()
+
+    def _handle(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Print what happened outside of any request; of refused connections, the event loop has many a second."""
+        error = context.get("exception")
+        if not (isinstance(error, OSError) and error.errno in _LACKING and "socket" in context):
+            loop.default_exception_handler(context)
+        elif not self._exhausted:
+            self._exhausted = True
+            print(f"no more connections can be accepted for now ({error.strerror})", file=sys.stderr)
 
 
 def serve(
@@ -54,7 +70,7 @@ def serve(
     Returns whether a thread still computes what nobody waits for any more. Raises StudioError where a given port is
     taken, and as the readers of what is opened do.
     """
-    with _listening(port) as listener, tempfile.TemporaryDirectory(prefix="avmsf-studio-") as folder:
+    with _listening(port) as listener, _temporary_folder() as folder:
         number, token = listener.getsockname()[1], new_token()
         address = f"http://{_HOME}:{number}/{token}/"
         studio = Studio(opened, Path(folder), config)
@@ -63,16 +79,12 @@ def serve(
         def announce() -> None:
             tell(address)
             if browser:
-                _open_browser(address, Path(folder))
+                # A browser that cannot be opened is no failure: the address is printed.
+                with suppress(OSError):
+                    _open_browser(address, Path(folder))
 
         server = PageServer(
-            uvicorn.Config(
-                guarded,
-                log_level="critical",
-                access_log=False,
-                server_header=False,
-                timeout_graceful_shutdown=_HANGING,
-            ),
+            limited(guarded, timeout_graceful_shutdown=_HANGING),
             announce,
         )
         before = signal.signal(signal.SIGTERM, _interrupt)
@@ -83,6 +95,17 @@ def serve(
         finally:
             signal.signal(signal.SIGTERM, before)
         return studio.busy
+
+
+def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
+    """Return a folder that is removed with the server. Raises StudioError where none can be made."""
+    try:
+        return tempfile.TemporaryDirectory(prefix="avmsf-studio-")
+    except OSError as error:
+        raise StudioError(
+            f"no temporary folder can be made ({error.strerror or error}): free some space, or name another place in "
+            "the environment variable TMPDIR"
+        ) from error
 
 
 def _open_browser(address: str, folder: Path) -> None:

@@ -17,7 +17,7 @@ from avmsf.studio.jobs import Event, Job, Jobs
 from avmsf.studio.leading import Wish, is_wish, words_model
 from avmsf.studio.locating import read_upload
 from avmsf.studio.opening import Opened, find_object, shows_more
-from avmsf.studio.refusal import RefusedError
+from avmsf.studio.refusal import RefusedError, echo
 from avmsf.studio.searches import Searches
 from avmsf.studio.session import Revision, Session
 from avmsf.studio.showing import Showcase
@@ -94,9 +94,15 @@ class Studio:
         """Set the sliders, or start to lead the field towards a recording or words. Raises as edits do."""
         base = base_of(words)
         if is_wish(words):
-            return await self._lead(base, words)
-        sliders = Sliders.read(words)
+            return await self._lead(base, Wish.read(words, model=self.model))
+        sliders = Sliders.read(words, modes=len(self.session.current.expect_field().bank))
         return self._changed(await self.threads.compute(self.session.edit, base, sliders))
+
+    async def lead(self, base: int, content: bytes) -> dict[str, Any]:
+        """Start to lead the field towards a recording. Raises CaptureError for one that cannot be used."""
+        self.session.expect_current(base)
+        await self.threads.read(read_upload, content)
+        return await self._lead(base, Wish(like=content))
 
     async def undo(self, words: dict[str, Any]) -> dict[str, Any]:
         """Go back by one revision."""
@@ -106,18 +112,18 @@ class Studio:
         """Write the field to a new file."""
         name = words.get("name")
         if not isinstance(name, str):
-            raise RefusedError(400, f'"name": expected the new file\'s name, found {name!r}')
+            raise RefusedError(400, f'"name": expected the new file\'s name, found {echo(name)}')
         path, revision = await self.threads.compute(self.session.save, base_of(words), name)
         return {"file": str(path), **self._changed(revision)}
 
     async def capture(self) -> dict[str, Any]:
         """Return the capture's strikes, and what shows its object."""
         book = self.expect_book()
-        shown = find_object(self.opened)
+        visible = find_object(self.opened)
         running = self.jobs.current
         return {
             **await self.threads.read(book.describe),
-            "object": None if shown is None else shown.name,
+            "object": None if visible is None else visible.name,
             "job": None if running is None else running.identifier,
         }
 
@@ -126,9 +132,14 @@ class Studio:
         return await self.threads.write(act, self.expect_book())
 
     def expect_book(self) -> StrikeBook:
-        """Return the capture's strikes. Raises RefusedError (404) without a capture."""
+        """Return the capture's strikes. Raises RefusedError: 404 without a capture, 503 while its folder is missing."""
         if self.book is None:
             raise RefusedError(404, "expected a capture folder, found a field alone: start avmsf studio with --capture")
+        if not self.book.folder.is_dir():
+            # Not 4xx: the page keeps a recording and sends it again.
+            raise RefusedError(
+                503, f"{self.book.folder}: the capture folder is gone, renamed or deleted: put it back and try again"
+            )
         return self.book
 
     async def reconstruct(self) -> Job:
@@ -148,12 +159,9 @@ class Studio:
         task = {"task": "make_object", "folder": str(book.folder)}
         return self.jobs.start(_MAKING, task, self._take_object)
 
-    async def _lead(self, base: int, words: dict[str, Any]) -> dict[str, Any]:
+    async def _lead(self, base: int, wish: Wish) -> dict[str, Any]:
         self.session.expect_current(base)
         field = self.session.current.expect_field()
-        wish = Wish.read(words, model=self.model)
-        if wish.like is not None:
-            await self.threads.read(read_upload, wish.like)
         self.jobs.expect_none()
         place = Path(tempfile.mkdtemp(prefix="lead-", dir=self.folder))
         try:
@@ -225,5 +233,7 @@ def base_of(words: dict[str, Any]) -> int:
     """Return the revision that a change is of. Raises RefusedError (400) where the page does not say."""
     base = words.get("base")
     if not isinstance(base, int) or isinstance(base, bool):
-        raise RefusedError(400, f'"base": expected the revision that the change is of, found {base!r}: reload the page')
+        raise RefusedError(
+            400, f'"base": expected the revision that the change is of, found {echo(base)}: reload the page'
+        )
     return base

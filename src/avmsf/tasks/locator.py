@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from functools import cached_property
+from threading import RLock
 
 import torch
 from jaxtyping import Complex64, Complex128, Float, Float32, Float64
@@ -48,6 +49,8 @@ class Locator:
     """Whether gains that could be noise count for less."""
     lengths: dict[tuple[int, float], "_Length"] = dataclass_field(default_factory=dict, repr=False)
     """What is known of sounds of lengths met before."""
+    _lock: RLock = dataclass_field(default_factory=RLock, repr=False)
+    """Held while something is cached, so that threads share a locator and none repeats another's computation."""
 
     @classmethod
     def of(
@@ -125,9 +128,14 @@ class Locator:
         for length in samples:
             self._length(min(length, self.field.samples), float("inf"))
 
-    @cached_property
+    @property
     def heed(self) -> float:
         """Factor on what modes tell beside one another: as much as the field's own strikes, left out, bear out."""
+        with self._lock:
+            return self._heed
+
+    @cached_property
+    def _heed(self) -> float:
         return heed_of(self.field)
 
     def _expect_sound(self, sound: Float[Tensor, " samples"]) -> None:
@@ -146,13 +154,14 @@ class Locator:
 
     def _length(self, samples: int, highest: float) -> "_Length":
         key = (samples, highest)
-        # What is used moves to the end, so that what a stream needs again and again is never the oldest.
-        found = self.lengths.pop(key, None)
-        if found is None:
-            while len(self.lengths) >= _KEPT_LENGTHS:
-                del self.lengths[next(iter(self.lengths))]
-            found = _Length.of(self, samples, highest)
-        self.lengths[key] = found
+        with self._lock:
+            # What is used moves to the end, so that what a stream needs again and again is never the oldest.
+            found = self.lengths.pop(key, None)
+            if found is None:
+                while len(self.lengths) >= _KEPT_LENGTHS:
+                    del self.lengths[next(iter(self.lengths))]
+                found = _Length.of(self, samples, highest)
+            self.lengths[key] = found
         return found
 
 

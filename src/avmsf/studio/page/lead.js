@@ -11,12 +11,12 @@ const KIND = "lead the sound";
 export function leadGroup(studio, changes, hold) {
   const progress = new JobProgress();
 
-  const lead = (towards) =>
+  /** `ask()` sends the request that begins it. */
+  const lead = (ask) =>
     hold(async () => {
       progress.begin("It begins …");
-      const start = () => server.edit(studio.revision, towards);
-      const again = () => lead(towards);
-      const begun = await changes.queue(async () => (await changes.settle()) && changes.ask(start, { again }));
+      const again = () => lead(ask);
+      const begun = await changes.queue(async () => (await changes.settle()) && changes.ask(ask, { again }));
       if (begun) await follow(begun.job);
       else progress.end();
     }, "minutes");
@@ -38,12 +38,12 @@ export function leadGroup(studio, changes, hold) {
     }
   };
 
-  const leadLike = async (file) => lead({ like: await base64(file) });
+  const leadLike = async (file) => lead(() => server.lead(studio.revision, file));
   const rows = [filePicker("Towards a recording …", ".wav,audio/wav", leadLike)];
   if (studio.can("words")) {
     const placeholder = "a wooden bowl is hit";
     const text = element("input", { type: "text", "aria-label": "What it should sound like", placeholder });
-    rows.push(text, button("Towards these words", () => lead({ prompt: text.value })));
+    rows.push(text, button("Towards these words", () => lead(() => server.edit(studio.revision, { prompt: text.value }))));
   }
   // One that was under way before the page was loaded goes on. Without a capture there are no jobs of other kinds.
   const { job, jobKind = studio.can("reconstruct") ? null : KIND } = studio.live;
@@ -68,11 +68,4 @@ function summaryOf(steps) {
     `The sound was led: its pitch is × ${last.pitch.toPrecision(3)}, and how far it is off ${closer} from ` +
     `${first.loss.toPrecision(2)} to ${last.loss.toPrecision(2)}. Undo takes it back.`
   );
-}
-
-async function base64(file) {
-  const bytes = new Uint8Array(await file.arrayBuffer());
-  let letters = "";
-  for (const byte of bytes) letters += String.fromCharCode(byte);
-  return btoa(letters);
 }

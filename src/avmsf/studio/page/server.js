@@ -80,6 +80,7 @@ export const server = {
   locate: (recording) => ask("POST", "locate", wav(recording)),
 
   edit: (base, change) => ask("POST", "edit", json({ base, ...change })),
+  lead: (base, recording) => ask("POST", `lead?base=${base}`, wav(recording)),
   undo: (base) => ask("POST", "undo", json({ base })),
   save: (base, name) => ask("POST", "save", json({ base, name })),
 

@@ -1,0 +1,1 @@
+"""How files and requests that are damaged, oversized or hostile are answered."""

@@ -1,0 +1,292 @@
+"""Requests that no page would send, to a studio in a process of its own: the answers, their time and its memory."""
+
+import http.client
+import io
+import json
+import math
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import soundfile
+import torch
+
+from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.store import save
+from avmsf.field.thinplategains import thin_plate_gains
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.residual import Residual
+
+RATE = 8000
+INPUTS = 3000
+QUICK_INPUTS = 100
+_BODY_BYTES = 1 << 18
+_NUMBERS = (
+    *("NaN", "Infinity", "1e400", "1e308", "-1e308", "5e-324", "0", "-0.0", "-1", "1e-3", "1e3", "999.9", "1.5"),
+    *("40", "-40", "120", "-120", "9" * 400, "9" * 5000, "true", "null", '"2"', '"\\ud800"', "[]", "{}", "[[1]]"),
+)
+_NAMES = (
+    *(
+        "bowl",
+        "../x",
+        "con",
+        "a" * 300,
+        "\u202egnp",
+        "\u00e4" * 90,
+        "x\0y",
+        ".",
+        "",
+        "a/b",
+        "C:\\x",
+        "\ud800",
+        "\x1b[2J",
+    ),
+    *("ceramic", "steel", "wood", "STEEL", "cheese", "displacement", "acceleration", "paper"),
+)
+_PATHS = (
+    *(
+        "",
+        "manifest.json",
+        "capture",
+        "field.bin",
+        "revisions/1/field.bin",
+        "revisions/99/x",
+        "page/main.js",
+        "modules/x",
+    ),
+    *(
+        "strikes/0.wav",
+        "capture/strikes/a.wav",
+        "capture/strikes/%00.wav",
+        "capture/strikes/%ff",
+        "object.glb",
+        "jobs/x",
+    ),
+    *("jobs/x/events", "page/%2e%2e/routes.py", "page/" + "a" * 5000, "%ed%a0%80", "undo", "edit", "save", "locate"),
+)
+_METHODS = ("GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH", "TRACE")
+
+Ask = Callable[["Request"], tuple[int, bytes]]
+
+
+@dataclass(frozen=True)
+class Request:
+    """One request, under the studio's secret."""
+
+    method: str
+    path: str
+    body: bytes | None = None
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+class Fuzzer:
+    """An endless, reproducible sequence of requests."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = np.random.default_rng(seed)
+        self.base = 1
+        """The field's revision, without which no edit counts."""
+
+    def requests(self) -> Iterator[Request]:
+        """Yield requests, one kind after another."""
+        kinds = (self._edit, self._upload, self._edit, self._strike, self._other, self._damaged, self._path)
+        while True:
+            for kind in kinds:
+                yield kind()
+
+    def _choose(self, values: Any) -> Any:
+        return values[int(self.random.integers(len(values)))]
+
+    def _chance(self, part: float) -> bool:
+        return bool(self.random.random() < part)
+
+    def _object(self, *names: str) -> str:
+        kept = [name for name in names if self._chance(0.5)]
+        return "{" + ",".join(f"{json.dumps(name)}:{self._choose(_NUMBERS)}" for name in kept) + "}"
+
+    def _edit(self) -> Request:
+        parts = [f'"base":{self.base}', self._object("size", "pitch", "decay", "brightness")[1:-1]]
+        if self._chance(0.5):
+            rows = [self._object("mode", "db", "pitch", "decay") for _ in range(int(self.random.integers(8)))]
+            rows += [f'{{"mode":{k},"pitch":{self._choose(_NUMBERS)}}}' for k in range(int(self.random.integers(4)))]
+            parts.append(f'"modes":[{",".join(rows)}]')
+        if self._chance(0.3):
+            names = {key: self._choose(_NAMES) for key in ("from", "to")}
+            parts.append(f'"material":{json.dumps(names)}')
+        if self._chance(0.2):
+            parts.append(f'"law":{json.dumps(self._choose(_NAMES))}')
+        if self._chance(0.1):
+            parts.append(f"{json.dumps(self._choose(_NAMES))}:{self._choose(_NUMBERS)}")
+        return Request("POST", "edit", ("{" + ",".join(filter(None, parts)) + "}").encode())
+
+    def _other(self) -> Request:
+        if self._chance(0.5):
+            return Request("POST", "undo", json.dumps({"base": self.base}).encode())
+        words = {"base": self.base, "name": self._choose(_NAMES)}
+        return Request("POST", self._choose(("save", "edit", "undo")), json.dumps(words).encode())
+
+    def _damaged(self) -> Request:
+        size = int(self.random.integers(1, _BODY_BYTES))
+        bodies = (
+            b"[" * size,
+            b'{"base":' * (size // 8),
+            b"\xff" * size,
+            b'{"base":1,"law":"' + b"w" * size + b'"}',
+            b"",
+        )
+        return Request("POST", self._choose(("edit", "undo", "save", "lead?base=x")), self._choose(bodies))
+
+    def _path(self) -> Request:
+        headers = {"if-match": self._choose(_NAMES[:3]), "last-event-id": self._choose(("1", "-1", "9" * 30, "x"))}
+        return Request(self._choose(_METHODS), self._choose(_PATHS), None, headers)
+
+    def _upload(self) -> Request:
+        return Request("POST", self._choose(("locate", "capture/check")), self._recording())
+
+    def _strike(self) -> Request:
+        if self._chance(0.2):
+            return Request("PUT", "capture/strikes/a.wav", self._recording())
+        values = [self._choose(("0.01", "-0.02", "0", "nan", "inf", "1e308", "101", "x")) for _ in range(7)]
+        query = "&".join(
+            f"{key}={value}" for key, value in zip(("x", "y", "z", "nx", "ny", "nz", "newtons"), values, strict=True)
+        )
+        key = {"idempotency-key": f"key-{self.random.integers(10**9):010d}"}
+        return Request("POST", f"capture/strikes?{query}", self._recording(), key)
+
+    def _recording(self) -> bytes:
+        """Return a sound file, whole, of hostile samples, or damaged."""
+        frames = int(self._choose((1, 2, 30, 900, 4000)))
+        times = np.arange(frames) / RATE
+        sound = np.exp(-20 * times) * np.sin(2 * math.pi * 850 * times) + 1e-4 * self.random.standard_normal(frames)
+        sound *= self._choose((1.0, 1.0, 1.0, 0.0, 1e-12, 1e16, 1e308, -1.0))
+        if self._chance(0.1):
+            sound[frames // 2] = self._choose((math.nan, math.inf, 1e300))
+        kinds = (("WAV", "FLOAT"), ("WAV", "DOUBLE"), ("WAV", "PCM_16"), ("WAV", "PCM_U8"), ("FLAC", "PCM_16"))
+        kind, subtype = self._choose((*kinds, ("OGG", "VORBIS"), ("AU", "DOUBLE"), ("W64", "FLOAT"), ("AIFF", "FLOAT")))
+        if subtype not in ("FLOAT", "DOUBLE"):
+            sound = np.clip(np.nan_to_num(sound), -1, 1)
+        memory = io.BytesIO()
+        channels = np.repeat(sound[:, None], int(self._choose((1, 1, 1, 2, 8))), axis=1)
+        with np.errstate(over="ignore"):
+            soundfile.write(memory, channels, RATE, subtype=subtype, format=kind)
+        content = bytearray(memory.getvalue())
+        if self._chance(0.6):
+            for place in self.random.integers(0, min(len(content), 80), int(self.random.integers(1, 8))):
+                content[place] = int(self._choose((0, 1, 0x7F, 0x80, 0xFF, int(self.random.integers(256)))))
+        return bytes(content[: int(self.random.integers(len(content)))] if self._chance(0.1) else content)
+
+
+def fuzz(ask: Ask, *, count: int, seed: int = 0) -> dict[str, float]:
+    """Send so many requests and return what came of them.
+
+    `server_errors` counts answers of 500 and above, `unanswered` requests whose connection broke; both must be 0.
+    """
+    fuzzer = Fuzzer(seed)
+    errors = unanswered = 0
+    longest = worst = 0.0
+    for _, request in zip(range(count), fuzzer.requests(), strict=False):
+        begun = time.perf_counter()
+        try:
+            status, content = ask(request)
+        except (http.client.HTTPException, OSError):
+            unanswered += 1
+            continue
+        worst = max(worst, time.perf_counter() - begun)
+        errors += status >= 500
+        if status >= 400:
+            longest = max(longest, len(content))
+        elif request.method == "POST":
+            fuzzer.base = json.loads(content).get("revision", fuzzer.base)
+    return {
+        "inputs": float(count),
+        "server_errors": float(errors),
+        "unanswered": float(unanswered),
+        "worst_seconds": worst,
+        "longest_refusal_bytes": float(longest),
+    }
+
+
+def run(*, quick_look: bool = False, seed: int = 0) -> dict[str, float]:
+    """Start a studio on a small field and capture, send it `INPUTS` requests, and return the counts of `fuzz`.
+
+    And how many tracebacks it printed, and its largest memory in MiB (NaN where the system does not say).
+    """
+    with tempfile.TemporaryDirectory() as name:
+        home = Path(name)
+        path = write_object(home / "object")
+        words = "import sys; from avmsf.cli import main; sys.exit(main())"
+        command = [sys.executable, "-c", words, "studio", str(path), "--no-browser", "--port", "0"]
+        with open(home / "said", "w") as said:
+            process = subprocess.Popen([*command, "--capture", str(path.parent)], stderr=said)
+        try:
+            port, token = _address(home / "said", process)
+            counts = fuzz(
+                lambda request: _ask(port, token, request), count=QUICK_INPUTS if quick_look else INPUTS, seed=seed
+            )
+            memory = _peak_memory(process.pid)
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.wait(60)
+        tracebacks = (home / "said").read_text(errors="replace").count("Traceback (most recent call last)")
+    return {**counts, "tracebacks": float(tracebacks), "worst_mebibytes": memory}
+
+
+def write_object(folder: Path) -> Path:
+    """Write a capture folder of three strikes and a field of five modes into it, and return the field's file."""
+    folder.mkdir(parents=True)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(300, 3, generator=generator) * torch.tensor([0.24, 0.17, 0.004])
+    frequency = torch.tensor([390.0, 850.0, 1300.0, 1360.0, 2300.0], dtype=torch.float64)
+    bank = ModalBank(frequency, 0.02 * frequency)
+    contacts = points[:12].double()
+    parts = torch.rand(12, len(bank), 2, generator=generator, dtype=torch.float64) - 0.5
+    gains = thin_plate_gains(contacts, parts, importance=1.0 / bank.damping, points=points)
+    noise = Residual(torch.full((9,), 1e-6))
+    made = SoundField(bank, gains, torch.zeros_like(frequency), noise, float(RATE), 2400, Origin("plate"))
+    rows = ["file,x,y,z"]
+    for name, contact, sound in zip(("a", "b", "c"), contacts, made.render(contacts[:3].float()), strict=False):
+        soundfile.write(folder / f"{name}.wav", 0.5 * sound.numpy() / float(sound.abs().max()), RATE, subtype="FLOAT")
+        rows.append(f"{name}.wav,{','.join(map(str, contact.tolist()))}")
+    (folder / "impacts.csv").write_text("\n".join([*rows, ""]))
+    save(made, folder / "plate.safetensors")
+    return folder / "plate.safetensors"
+
+
+def _ask(port: int, token: str, request: Request) -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
+    try:
+        path = quote(request.path, safe="/%?=&")
+        headers = {name: quote(value) for name, value in request.headers.items()}
+        connection.request(request.method, f"/{token}/{path}", request.body, headers)
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+    finally:
+        connection.close()
+
+
+def _address(said: Path, process: "subprocess.Popen[bytes]") -> tuple[int, str]:
+    """Return the port and the secret of a studio once it answers."""
+    for _ in range(1200):
+        found = re.search(r"http://127\.0\.0\.1:(\d+)/([\w-]{32})/", text := said.read_text())
+        if found is not None:
+            return int(found[1]), found[2]
+        if process.poll() is not None:
+            raise RuntimeError(f"the studio did not start: {text}")
+        time.sleep(0.1)
+    raise RuntimeError(f"the studio did not start within 120 s: {text}")
+
+
+def _peak_memory(process: int) -> float:
+    path = Path(f"/proc/{process}/status")
+    if not path.is_file():
+        return math.nan
+    return int(re.findall(r"VmHWM:\s*(\d+) kB", path.read_text())[0]) / 1024

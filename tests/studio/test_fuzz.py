@@ -1,0 +1,29 @@
+"""Requests that no page would send: none is answered by 500, none prints a traceback, and no answer is long."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from avmsf.studio.opening import open_target
+from served import served
+
+# The benchmarks are no part of the package.
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks.robustness.studio import Request, fuzz, write_object
+
+
+def test_no_request_breaks_the_studio(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = write_object(tmp_path / "object")
+    with served(open_target(path, capture=path.parent), tmp_path / "files") as running:
+
+        def ask(request: Request) -> tuple[int, bytes]:
+            answer = running.ask(request.method, request.path, request.body, headers=request.headers)
+            return answer.status, answer.content
+
+        found = fuzz(ask, count=150, seed=0)
+        assert running.get("manifest.json").status == 200
+    assert (found["server_errors"], found["unanswered"]) == (0, 0)
+    assert found["longest_refusal_bytes"] < 1000
+    assert "Traceback" not in capfd.readouterr().err

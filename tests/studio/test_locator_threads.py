@@ -1,0 +1,45 @@
+"""One locator, used by several threads at once: no error, and nothing computed twice."""
+
+import threading
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import pytest
+
+from avmsf.tasks import locator as module
+from avmsf.tasks.locator import Locator, _Length
+from opened_plate import plate_field
+
+THREADS = 8
+LENGTHS = (400, 480, 560, 640)
+
+
+def test_threads_share_what_is_cached(monkeypatch: pytest.MonkeyPatch) -> None:
+    locator = Locator.of(plate_field("physics"))
+    made: Counter[Any] = Counter()
+    together = threading.Barrier(THREADS)
+    of, heed_of = _Length.of, module.heed_of
+
+    def slow_length(locator: Locator, samples: int, highest: float) -> _Length:
+        made[samples] += 1
+        time.sleep(0.02)  # lets the other threads come to the same place
+        return of(locator, samples, highest)
+
+    def slow_heed(field: Any) -> float:
+        made["heed"] += 1
+        time.sleep(0.02)
+        return heed_of(field)
+
+    monkeypatch.setattr(module._Length, "of", staticmethod(slow_length))
+    monkeypatch.setattr(module, "heed_of", slow_heed)
+
+    def prepare(_: int) -> None:
+        together.wait(20)
+        locator.prepare(*LENGTHS)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(prepare, range(THREADS)))
+    assert made == {**dict.fromkeys(LENGTHS, 1), "heed": 1}
+    assert sorted(samples for samples, _ in locator.lengths) == sorted(LENGTHS)
