@@ -1,15 +1,16 @@
-"""`python -m benchmarks field`, `extract`, `speed`, `scene`, `proof`, `settings`, `suggest`, `physics`, `tasks` or
-`studio`."""
+"""`python -m benchmarks field`, `extract`, `speed`, `scene`, `proof`, `settings`, `suggest`, `physics`, `residual`,
+`tasks` or `studio`."""
 
 import argparse
 import sys
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from types import ModuleType
 
 from avmsf.capture import CaptureWarning
 from avmsf.errors import AvmsfError
-from benchmarks import extract, field, physics, proof, scene, settings, speed, studio, suggest, tasks
+from benchmarks import extract, field, physics, proof, residual, scene, settings, speed, studio, suggest, tasks
 from benchmarks.material import MissingDataError
 from benchmarks.report import Options, show
 
@@ -22,6 +23,7 @@ BENCHMARKS: dict[str, ModuleType] = {
     "settings": settings,
     "suggest": suggest,
     "physics": physics,
+    "residual": residual,
     "tasks": tasks,
     "studio": studio,
 }
@@ -43,6 +45,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         default=6.0,
         help="speed: minutes for a real run of the paper's recipe (default 6)",
     )
+    parser.add_argument(
+        "--sim-20",
+        type=Path,
+        metavar="FOLDER",
+        help="residual: objects that `avmsf simulate sim-20` has made; without it they are simulated again",
+    )
     chosen = parser.parse_args(arguments)
     benchmark = BENCHMARKS[chosen.name]
     parts = tuple(chosen.parts or benchmark.PARTS)
@@ -51,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"{chosen.name} has no part {', '.join(unknown)}; it has {', '.join(benchmark.PARTS)}")
     if not chosen.paper_minutes > 0:
         parser.error(f"--paper-minutes is {chosen.paper_minutes:g}; expected a number above 0")
-    options = Options(parts, chosen.quick_look, chosen.paper_minutes)
+    options = Options(parts, chosen.quick_look, chosen.paper_minutes, chosen.sim_20)
     # Remarks on a capture are `avmsf check`'s business.
     warnings.simplefilter("ignore", CaptureWarning)
     try:

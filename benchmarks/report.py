@@ -6,6 +6,7 @@ import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TextIO
 
 
@@ -19,6 +20,8 @@ class Options:
     """Small settings that show that everything runs; the figures are not the benchmark's then."""
     paper_minutes: float = 6.0
     """Time for a real run of the paper's recipe, minutes."""
+    sim20: Path | None = None
+    """Folder of the objects that `avmsf simulate sim-20` makes; None to simulate them."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,7 +72,7 @@ def _quietest_power(
     count = max(1, power.shape[1] // 20)
     runs = power.shape[1] // count
     # Whole runs up to the end: the end is where a sound that dies away is quietest.
-    segments = power[:, power.shape[1] - runs * count :].unflatten(1, (runs, count)).mean(2)
+    segments = power[:, power.shape[1] - runs * count :].reshape(len(power), runs, count, -1).mean(2)
     kept = max(1, round(quietest * runs))
     quiet = torch.sort(segments, dim=1).values[:, :kept].mean(1)
     # At 0 Hz and half the rate the spectrum is real and scatters twice as widely: its quietest lie too low.
