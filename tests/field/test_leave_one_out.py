@@ -127,6 +127,20 @@ def test_the_one_contact_off_a_plane_is_predicted_by_splines_over_the_plane() ->
         torch.testing.assert_close(predicted[row : row + 1], expected, rtol=0, atol=1e-7)
 
 
+def test_without_one_of_the_fewest_places_that_splines_bend_between_they_do_not_bend() -> None:
+    contacts = bar_contacts(6)
+    values = drawn_gains(contacts, seed=7)
+    gains = ThinPlateGains(bar_points(), contacts, values, 0.0)
+    assert gains.sites.bending
+    predicted = gains.leave_one_out()
+    for row in range(6):
+        others = [each for each in range(6) if each != row]
+        part = SplineSites(contacts[others], 0.0)
+        assert not part.bending
+        expected = torch.einsum("pc,cmd->pmd", part.weights(contacts[row : row + 1]), values[others])
+        torch.testing.assert_close(predicted[row : row + 1], expected, rtol=0, atol=1e-6)
+
+
 def test_contacts_nearer_than_a_hundredth_of_the_box_are_one_place() -> None:
     contacts, parts = struck_again()
     owner = thinplate.places_of(contacts)
