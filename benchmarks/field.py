@@ -57,8 +57,8 @@ CONVENTIONS = (
     "quarter.",
     f"l1, l1_log, envelope: convention '{PAPER.name}' of avmsf.bench.conventions, mean over held-out contacts.",
     "knn3: of the 3 nearest contacts. warmup: the network after its warm-up alone. field: the network after training, "
-    "quick recipe; thin_plate, physics: the same with splines, with elastic shapes; auto: whichever of the three "
-    "foretells training contacts best that are left out.",
+    "quick recipe; thin_plate, physics: the same with splines, with elastic shapes; auto: whichever of these two "
+    "predicts training contacts better that are left out.",
     "physics_thin, physics_thick: plates of half and of twice the nominal thickness. physics_mislabelled: the labels "
     "of 3 recordings, drawn with the start as seed, have changed places; named: part of these that the fit names.",
     "coverage90: part of the held-out sounds' own gains, all alike, in the 90 % interval of physics; by_energy: by "
@@ -263,7 +263,7 @@ def _judge(
     others: dict[str, GainRecipe | Automatic] = {
         "thin_plate": ThinPlate(),
         "physics": physics,
-        "auto": Automatic((physics, ThinPlate(), Attention())),
+        "auto": Automatic((physics, ThinPlate())),
     }
     fields = {method: fit(train, features, modes, config, gains=gains) for method, gains in others.items()}
     renderers: dict[str, Renderer] = {

@@ -66,7 +66,7 @@ class PhysicsField:
 
 @dataclass(frozen=True)
 class AutomaticField:
-    """A field whose gains are made in the way that foretells training contacts best which are left out in turn."""
+    """A field of elastic mode shapes or splines, whichever predicts training contacts better that are left out."""
 
     name: str
     """What tables call it."""
@@ -82,13 +82,7 @@ class AutomaticField:
             candidates.append(task.physics())
         except AvmsfError as error:
             missing["physics"] = str(error)
-        candidates.append(ThinPlate())
-        try:
-            candidates.append(Attention(task.features("visual")))
-        except AvmsfError as error:
-            missing["looks"] = str(error)
-            candidates.append(Attention())
-        gains = Automatic(tuple(candidates), missing)
+        gains = Automatic((*candidates, ThinPlate()), missing)
         return fit_field(task, task.train, positions, task.modes(), self.config, gains=gains)
 
 

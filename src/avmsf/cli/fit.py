@@ -58,8 +58,8 @@ class Options:
     """File of features that `avmsf lift` wrote, in the frame of the contacts; without it positions on the surface."""
     gains: Literal["auto", "physics", "spline", "attention"] = "auto"
     """How gains are spread over the object: physics, by its elastic mode shapes, of a capture with a mesh; spline, by
-    thin-plate splines; attention, by the paper's network on the features; auto, by what foretells best those training
-    contacts that are left out in turn."""
+    thin-plate splines; attention, by the paper's network on the features; auto, by physics or splines, whichever
+    predicts training contacts better that are left out in turn."""
     body: BodyConfig = field(default_factory=BodyConfig)
     method: Method = "high-resolution"
     """How modes are found; see `avmsf modes --help`."""
@@ -187,7 +187,7 @@ def _recipe(options: Options, capture: Capture, train: Impacts, features: Featur
         return physics_of(capture.surface, options.body, impacts=train, cache=cache, tell=say)
 
     if options.gains == "auto":
-        return all_recipes({"attention": features}, physics, tell=say)
+        return all_recipes(physics, tell=say)
     return recipe_for(options.gains, {"attention": features}, physics)
 
 

@@ -53,8 +53,8 @@ class Options(SceneOptions):
     """Print one JSON object on the standard output, all else on the standard error."""
     gains: Spreading = "auto"
     """How gains are spread over the object: physics, by its elastic mode shapes; spline; visual or positions, by the
-    paper's network on what places look like or on where they are; auto, by what foretells best those training contacts
-    that are left out in turn."""
+    paper's network on what places look like or on where they are; auto, by physics or splines, whichever predicts
+    training contacts better that are left out in turn."""
     body: BodyConfig = field(default_factory=BodyConfig)
     views: ViewsConfig = field(default_factory=ViewsConfig)
     splat: SplatConfig = field(default_factory=SplatConfig)

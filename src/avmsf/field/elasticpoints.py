@@ -34,7 +34,7 @@ class ElasticPoints:
     def of(cls, elastic: ElasticModes, points: Float[Tensor, "points 3"]) -> "ElasticPoints":
         """Return the shapes where the body's surface is nearest to each point; each body's last are kept.
 
-        The same body is asked at the same points whenever strikes are left out to choose by.
+        The same body is asked at the same points for outliers, for the choice between gain models and for the fit.
         """
         kept = _KEPT.get(elastic)
         if kept is not None and torch.equal(kept[0], points.double()):

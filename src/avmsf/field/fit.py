@@ -71,13 +71,13 @@ def fit(
     """Fit a sound field to recordings (paper, section 3.5).
 
     `modes` as extracted from `train`, or `uninformed` where there is no warm-up. `gains` is how the gain field is made,
-    or `Automatic`, which chooses among several ways and is the default: between the paper's network and splines, for of
-    the object's shape nothing is known here. `settings` are the capture's, which the field keeps: recordings that it is
-    asked about later are read by them. What the config leaves open is chosen on a part of the training contacts held
-    out for the purpose, then the field is fitted to all. With `checkpoint`, the state is kept there while the fit runs,
-    on interruption and at the end, and a fit of the same arguments goes on from it to the same result; delete the file
-    once the field is saved. Raises `FitError` for arguments that do not fit together and for a fit that diverges,
-    `FieldFileError` for a checkpoint of another fit.
+    or `Automatic`, which chooses among several ways. The default is thin-plate splines, for of the object's shape
+    nothing is known here. `settings` are the capture's, which the field keeps: recordings that it is asked about later
+    are read by them. What the config leaves open is chosen on a part of the training contacts held out for the purpose,
+    then the field is fitted to all. With `checkpoint`, the state is kept there while the fit runs, on interruption and
+    at the end, and a fit of the same arguments goes on from it to the same result; delete the file once the field is
+    saved. Raises `FitError` for arguments that do not fit together and for a fit that diverges, `FieldFileError` for a
+    checkpoint of another fit.
     """
     config = FitConfig() if config is None else config
     expect_fitting(train, modes)

@@ -1,4 +1,4 @@
-"""By how much each contact's gains are missed by all others', without solving anew for each."""
+"""Leave-one-out predictions of gains in closed form: nothing is solved again for each contact."""
 
 import torch
 from jaxtyping import Float64, Int
@@ -8,30 +8,52 @@ from avmsf.field.hypotheses import Hypotheses
 
 
 def left_out(
-    known: Hypotheses, weights: Float64[Tensor, "hypotheses modes 2"]
+    known: Hypotheses,
+    weights: Float64[Tensor, "hypotheses modes 2"],
+    places: Int[Tensor, " contacts"] | None = None,
 ) -> tuple[Float64[Tensor, "contacts modes 2"], Float64[Tensor, "contacts modes 2"]]:
-    """Return by how much each gain at a contact is missed by all others', and the deviation foretold of that.
+    """Return each gain minus its prediction from all other contacts, and the standard deviation of that difference.
 
-    Hypotheses are weighed without the gain that is left out, by the same belief beforehand; the deviation is of a
-    measured gain, noise and all. `weights` are those with all gains.
+    Contacts of the same number in `places` are left out together; without it, each contact by itself. Hypotheses are
+    weighted by the evidence of the other gains alone, with the same prior; their kernels stay the same. The deviation
+    is that of a measured gain, noise included. `weights` are those with all gains.
     """
-    found = [_left_out(known, weights[:, modes], modes) for modes in known.batches()]
+    apart = torch.arange(len(known.values)) if places is None else places
+    parts = [torch.nonzero(apart == place).flatten() for place in torch.unique(apart)]
+    found = [_left_out(known, weights[:, modes], modes, parts) for modes in known.batches()]
     return torch.cat([missed for missed, _ in found], dim=1), torch.cat([spread for _, spread in found], dim=1)
 
 
 def _left_out(
-    known: Hypotheses, weights: Float64[Tensor, "hypotheses modes 2"], modes: Int[Tensor, " modes"]
+    known: Hypotheses,
+    weights: Float64[Tensor, "hypotheses modes 2"],
+    modes: Int[Tensor, " modes"],
+    parts: list[Int[Tensor, " _rows"]],
 ) -> tuple[Float64[Tensor, "contacts modes 2"], Float64[Tensor, "contacts modes 2"]]:
-    inverse = torch.cholesky_inverse(known.factor(modes))
-    alone = torch.diagonal(inverse, dim1=-2, dim2=-1)[..., None]
-    solved = inverse @ known.values[:, modes].transpose(0, 1)
-    count, tiny = known.count, torch.finfo(torch.float64).tiny
-    whole = known.squares(modes, solved)[:, :, None]
-    rest = (whole - solved.square() / alone).clamp_min(tiny)
-    # A determinant without one row has the inverse's entry there as a factor.
-    change = 0.5 * (count * torch.log(whole) - (count - 1) * torch.log(rest) - torch.log(alone))
-    likely = torch.softmax(torch.log(weights)[:, :, None] + change, dim=0)
-    missed, variance = solved / alone, rest / (max(count - 1, 1) * alone)
-    middle = (likely * missed).sum(0)
-    spread = (likely * (variance + missed.square())).sum(0) - middle.square()
-    return middle.transpose(0, 1), spread.clamp_min(tiny).sqrt().transpose(0, 1)
+    """Return the same of some modes, for contacts left out part by part.
+
+    With B the block of the inverse covariance C^-1 that belongs to a part, the error is B^-1 (C^-1 y), where that is of
+    the part's rows alone, and the covariance of the part given all others is B^-1 (Rasmussen and Williams, Gaussian
+    Processes for Machine Learning, 2006, equations 5.10 to 5.12, for several rows).
+    """
+    inverse, values = torch.cholesky_inverse(known.factor(modes)), known.values[:, modes]
+    solved = inverse @ values.transpose(0, 1)
+    tiny = torch.finfo(torch.float64).tiny
+    whole, silent = known.squares(modes, solved), torch.log(known.noise(modes)) * ~known.heard
+    missed, spread = torch.empty_like(values), torch.empty_like(values)
+    for rows in parts:
+        block, along = inverse[..., rows[:, None], rows], solved[:, :, rows]
+        covariance = torch.linalg.inv(block)
+        error = covariance @ along
+        rest = (whole - (along * error).sum(2)).clamp_min(tiny)
+        others = max(known.count - int(known.heard[rows].sum()), 1)
+        # A determinant without the part has the block's as a factor; contacts that say nothing are not part of the
+        # evidence (`Hypotheses.likelihood`), so that their own noise goes with them.
+        change = known.count * torch.log(whole) - others * torch.log(rest)
+        change = change - (torch.logdet(block) + silent[..., rows].sum(-1))[..., None]
+        likely = torch.softmax(torch.log(weights) + 0.5 * change, dim=0)[:, :, None]
+        variance = rest[:, :, None] / others * torch.diagonal(covariance, dim1=-2, dim2=-1)[..., None]
+        middle = (likely * error).sum(0)
+        square = (likely * (variance + error.square())).sum(0) - middle.square()
+        missed[rows], spread[rows] = middle.transpose(0, 1), square.clamp_min(tiny).sqrt().transpose(0, 1)
+    return missed, spread

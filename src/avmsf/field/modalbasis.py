@@ -13,7 +13,9 @@ from avmsf.field.elasticpoints import ElasticPoints
 from avmsf.field.evidence import Regression
 from avmsf.field.gainfield import Gains
 from avmsf.field.hypotheses import COUNT, UNHEARD, WIDTHS, Sites, nearness
+from avmsf.field.leftout import left_out
 from avmsf.field.records import count_of, like
+from avmsf.field.thinplate import places_of
 
 REACH = 0.15
 """Length of the remainder's kernel over the object's size, the diagonal of the box around it."""
@@ -119,6 +121,15 @@ class ModalBasis:
         missed = errors if self.measured is None else errors + self.measured - self.values
         scores = missed / spread.clamp_min(torch.finfo(torch.float64).tiny)
         return torch.where(self.regression.silent, torch.nan, scores)[self.trusted]
+
+    def leave_one_out(self) -> Float64[Tensor, "contacts modes 2"]:
+        """Return the gains at each contact as predicted from the contacts at all other places, of the same body.
+
+        Hypotheses are weighted by the others' gains alone; body, frequency factor and outliers stay as they were found
+        with all contacts.
+        """
+        known = self.regression
+        return self.values - left_out(known.hypotheses, known.weights, places_of(self.contacts))[0]
 
     def with_values(self, values: Float64[Tensor, "contacts modes 2"]) -> "ModalBasis":
         """Return the field of other gains, with hypotheses as likely as before."""

@@ -171,7 +171,7 @@ def expect_enough(strikes: int) -> None:
 def _expect_one_frame(case: GainCase, body: NominalBody) -> None:
     """Raise FitError where the contacts, or the points that shapes are looked up at, are not on the body's surface."""
     if body.elastic not in _POINTS:
-        # Kept, for the same body is asked whenever strikes are left out to choose by.
+        # Kept, for the choice between gain models and the fit ask the same body.
         _POINTS[body.elastic] = surface_points(Surface(body.elastic.nodes, body.elastic.triangles[:, :3]))
     surface, points = _POINTS[body.elastic], case.features.points
     expect_placed(case.train.contacts, surface, names=case.train.names)

@@ -44,6 +44,13 @@ class LinearGains(GainField, Protocol):
         """Return what each contact's gain counts for at each contact, for each part of each mode."""
         ...
 
+    def leave_one_out(self) -> Float64[Tensor, "contacts modes 2"]:
+        """Return the gains at each contact as predicted from the contacts at all other places.
+
+        What the field chose with all contacts (smoothing, body, outliers) stays. There have to be two places.
+        """
+        ...
+
     def with_values(self, values: Float64[Tensor, "contacts modes 2"]) -> "LinearGains":
         """Return the field made of other gains at the same contacts."""
         ...

@@ -52,7 +52,7 @@ class SplineSites:
     @cached_property
     def _places(self) -> tuple[Float64[Tensor, "sites 3"], Float64[Tensor, "sites contacts"]]:
         """Distinct places, and the matrix that takes the mean of the values at each."""
-        owner = _sites_of(self.contacts)
+        owner = places_of(self.contacts)
         members = (owner[None, :] == torch.arange(int(owner.max()) + 1)[:, None]).double()
         mean = members / members.sum(1, keepdim=True)
         return mean @ self.contacts, mean
@@ -192,8 +192,8 @@ def fit_spline(
     return Spline(trials[0 if few else _least_needed(errors)], values.double())
 
 
-def _sites_of(contacts: Float64[Tensor, "contacts 3"]) -> Int[Tensor, " contacts"]:
-    """Return the row of each contact's site; no two contacts of a site are farther apart than `NEAR`."""
+def places_of(contacts: Float64[Tensor, "contacts 3"]) -> Int[Tensor, " contacts"]:
+    """Return the number of each contact's place, from 0 on; no two contacts of one are farther apart than `NEAR`."""
     places, owner = torch.unique(contacts, dim=0, return_inverse=True)
     distance = NEAR * float((places.amax(0) - places.amin(0)).norm())
     near = np.unique(cKDTree(places.numpy()).query_pairs(distance, output_type="ndarray"))

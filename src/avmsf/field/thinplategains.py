@@ -12,8 +12,11 @@ from torch import Tensor
 from avmsf.field.doubtedgains import Belief
 from avmsf.field.gainfield import Gains
 from avmsf.field.records import count_of, like
-from avmsf.field.thinplate import SplineSites, fit_spline
+from avmsf.field.thinplate import SplineSites, fit_spline, places_of
 
+_UNDETERMINED = 1e-9
+"""Diagonal of the inverse over its largest, below which it is zero but for rounding (about 1e-13): the other sites do
+not determine the linear function."""
 _ASTRAY = 0.02
 """Standard error of measured gains over their root mean square, at least: hammers do not hit twice alike."""
 
@@ -121,6 +124,23 @@ class ThinPlateGains:
         if self.measured is not None:
             errors = errors + self.sites.means(self.measured.flatten(1) - flat)
         return (errors / spread.clamp_min(torch.finfo(torch.float64).tiny)).reshape(len(errors), -1, 2)
+
+    def leave_one_out(self) -> Float64[Tensor, "contacts modes 2"]:
+        """Return the gains at each contact's place by equally smooth splines through the contacts of all other places.
+
+        In closed form, but for what changes without a place: where the others lie in a plane or on a line, or are too
+        few for a linear function, the splines are solved for again.
+        """
+        flat, owner = self.values.flatten(1), places_of(self.contacts)
+        single = torch.diagonal(self.sites.inverse)[: self.places].abs()
+        again = single < _UNDETERMINED * single.max()
+        again |= SplineSites(self.contacts[owner > 0], 0.0).bending != self.sites.bending
+        predicted = (self.sites.means(flat) - self.sites.left_out(flat))[owner].reshape(self.values.shape)
+        for place in torch.nonzero(again).flatten():
+            known = self.without(owner == place).at(self.contacts[owner == place])
+            assert known.quadrature is not None
+            predicted[owner == place] = torch.stack([known.mean, known.quadrature], dim=2).double()
+        return predicted
 
     def with_values(self, values: Float64[Tensor, "contacts modes 2"]) -> "ThinPlateGains":
         """Return the same splines through other gains."""

@@ -11,7 +11,8 @@ from avmsf.scene.features import FeatureField
 
 Spreading = Literal["auto", "physics", "spline", "visual", "positions"]
 """How gains are spread over an object: by its elastic mode shapes, by splines, by the paper's network on what places
-look like or on where they are; auto takes what foretells best those training contacts that are left out in turn."""
+look like or on where they are; auto takes elastic mode shapes or splines, whichever predicts training contacts better
+that are left out in turn."""
 
 
 def recipe_for(name: str, candidates: Mapping[str, FeatureField], physics: Callable[[], Physics]) -> GainRecipe:
@@ -28,13 +29,11 @@ def recipe_for(name: str, candidates: Mapping[str, FeatureField], physics: Calla
     return Attention(candidates[name], name)
 
 
-def all_recipes(
-    candidates: Mapping[str, FeatureField],
-    physics: Callable[[], Physics],
-    *,
-    tell: Callable[[str], None] | None = None,
-) -> Automatic:
-    """Return all ways to choose from; where physics cannot be had, the choice's report says why."""
+def all_recipes(physics: Callable[[], Physics], *, tell: Callable[[str], None] | None = None) -> Automatic:
+    """Return all ways to choose from; where physics cannot be had, the choice's report says why.
+
+    The network is not among them: it would have to be trained once for each contact that is left out.
+    """
     recipes: list[GainRecipe] = []
     missing: dict[str, str] = {}
     try:
@@ -43,6 +42,4 @@ def all_recipes(
         missing["physics"] = str(error)
         if tell is not None:
             tell(f"no physics: {error}")
-    recipes.append(ThinPlate())
-    recipes += [Attention(features, name) for name, features in candidates.items()]
-    return Automatic(tuple(recipes), missing, tell)
+    return Automatic((*recipes, ThinPlate()), missing)

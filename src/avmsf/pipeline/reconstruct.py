@@ -117,7 +117,7 @@ def reconstruct(
 
     def choose(path: Path) -> None:
         listener.tell("choice: how gains are spread, by training contacts left out in turn")
-        recipes = all_recipes(shape.candidates, physics, tell=listener.tell)
+        recipes = all_recipes(physics, tell=listener.tell)
         choice = recipes.choose(gain_case(train, points, modes, config.fit))
         words = json.dumps({"name": choice.recipe.name, **choice.report["choice"]})
         write_whole(path, lambda place: place.write_text(words, encoding="utf-8"), raising=FitError)
