@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.capture.audio import Recording, read_recording
+from avmsf.capture.audio import MAX_SAMPLES, Recording, read_recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.symmetry import Symmetries
@@ -24,9 +24,6 @@ from avmsf.tasks.contactmap import LEVEL, ContactMap
 from avmsf.tasks.located import describe_blow, enlarged, symmetries_of
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.severalblows import locate_blows
-
-_MOST_SAMPLES = 1 << 24
-"""Of one recording, in all channels: 6 minutes at 48 kHz, 134 MB as they are read."""
 
 
 class Likeness:
@@ -119,10 +116,10 @@ def _expect_short(path: Path, name: str) -> None:
     except (soundfile.LibsndfileError, OSError):
         # The reader says what is wrong with it.
         return
-    if samples > _MOST_SAMPLES:
+    if samples > MAX_SAMPLES:
         raise RefusedError(
             413,
-            f"{name}: expected at most {_MOST_SAMPLES:,} samples, minutes of sound, found {samples:,} "
+            f"{name}: expected at most {MAX_SAMPLES:,} samples, minutes of sound, found {samples:,} "
             f"({seconds / 60:.3g} minutes): send the seconds about the blow",
         )
 
