@@ -1,0 +1,23 @@
+"""How files and requests that are damaged, oversized or hostile are answered; tracebacks and crashes must be 0."""
+
+from importlib import import_module
+from importlib.util import find_spec
+
+from benchmarks.report import Options, Report, Table
+from benchmarks.robustness import files
+
+_HAS_STUDIO = find_spec("benchmarks.robustness.studio") is not None
+PARTS = ("files", "studio") if _HAS_STUDIO else ("files",)
+
+
+def measure(options: Options) -> Report:
+    """Run the parts that are asked for."""
+    report = files.measure(options) if "files" in options.parts else Report()
+    return report + _measure_studio(options) if "studio" in options.parts else report
+
+
+def _measure_studio(options: Options) -> Report:
+    """Return the counts that the studio's fuzzer finds, as one row."""
+    counts = import_module("benchmarks.robustness.studio").run(quick_look=options.quick_look)
+    figures = {f"studio.{name}": float(value) for name, value in counts.items()}
+    return Report(tables=(Table("studio", ("studio", *counts), [["requests", *counts.values()]]),), figures=figures)
