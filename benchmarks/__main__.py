@@ -1,5 +1,5 @@
-"""`python -m benchmarks field`, `extract`, `speed`, `scene`, `proof`, `settings`, `suggest`, `physics`, `tasks` or
-`studio`."""
+"""`python -m benchmarks field`, `extract`, `speed`, `scene`, `proof`, `settings`, `suggest`, `physics`, `tasks`,
+`studio` or `robustness`."""
 
 import argparse
 import sys
@@ -9,7 +9,7 @@ from types import ModuleType
 
 from avmsf.capture import CaptureWarning
 from avmsf.errors import AvmsfError
-from benchmarks import extract, field, physics, proof, scene, settings, speed, studio, suggest, tasks
+from benchmarks import extract, field, physics, proof, robustness, scene, settings, speed, studio, suggest, tasks
 from benchmarks.material import MissingDataError
 from benchmarks.report import Options, show
 
@@ -24,6 +24,7 @@ BENCHMARKS: dict[str, ModuleType] = {
     "physics": physics,
     "tasks": tasks,
     "studio": studio,
+    "robustness": robustness,
 }
 
 

@@ -6,11 +6,25 @@ import re
 import struct
 from typing import Any
 
-_NUMBERS = (b"nan", b"inf", b"-1", b"0", b"1e308", b"-1e308", b"1e-320", b"1e19", b"9" * 25, b"9" * 5000, b"1.5", b"")
+_NUMBERS = (
+    b"nan",
+    b"inf",
+    b"-1",
+    b"0",
+    b"1e308",
+    b"-1e308",
+    b"1e-320",
+    b"1e19",
+    b"9" * 25,
+    b"9" * 400,
+    b"9" * 5000,
+    b"1.5",
+    b"",
+)
 _WORDS = (*_NUMBERS, b"null", b"true", b'"x"', b"\x00", b"../../../etc/passwd", "\u202e".encode(), b"[" * 2000, b"{}")
 _VALUES: tuple[Any, ...] = (
-    float("nan"), float("inf"), -1, 0, 1, 2**31, 2**63, 10**30, 1e308, 1e-320, 1e38, True, None, "", "x", "\x00", [],
-    {}, [[]], [1e308] * 3, "../x", "/dev/zero",
+    float("nan"), float("inf"), -1, 0, 1, 2**31, 2**63, 10**30, 10**400, 1e308, 1e-320, 1e38, True, None, "", "x",
+    "\x00", [], {}, [[]], [1e308] * 3, "../x", "/dev/zero",
 )  # fmt: skip
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:e-?\d+)?")
 

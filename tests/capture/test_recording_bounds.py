@@ -90,8 +90,8 @@ def test_a_table_of_too_many_rows_is_refused(tmp_path: Path) -> None:
     assert f"{MAX_ROWS:,}" in report.problems[0]
 
 
-def test_settings_nested_beyond_reason_are_refused(tmp_path: Path) -> None:
-    deep = "a = " + "[" * 3000 + "]" * 3000
-    report = check(fill(tmp_path, settings=deep))
+@pytest.mark.parametrize("settings", ["a = " + "[" * 3000 + "]" * 3000, f"seconds = {10**400}"], ids=["deep", "large"])
+def test_settings_beyond_reason_are_refused(tmp_path: Path, settings: str) -> None:
+    report = check(fill(tmp_path, settings=settings))
     assert not report.readable
     assert "capture.toml" in report.problems[0]

@@ -69,6 +69,17 @@ def test_too_many_frames_are_refused_before_their_poses(tmp_path: Path) -> None:
         read_views(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "changes", [{"fl_x": 10**400}, {"transform_matrix": [[10**400] * 4] * 4}], ids=["focal", "pose"]
+)
+def test_whole_numbers_beyond_every_float_are_refused(tmp_path: Path, changes: dict) -> None:
+    frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 5.0}
+    (tmp_path / "0.png").write_bytes(black_png(8, 8))
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame | changes]}))
+    with pytest.raises(CaptureError, match="frame 0"):
+        read_views(tmp_path)
+
+
 def test_json_nested_beyond_reason_is_refused(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text("[" * 100_000)
     with pytest.raises(CaptureError, match=r"transforms\.json"):

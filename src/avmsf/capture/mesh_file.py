@@ -106,10 +106,13 @@ def _expect_small_gltf(record: Any) -> None:
     _expect_at_most(MAX_PARTS, len(entries(record, "nodes")), "nodes")
     _expect_at_most(MAX_PARTS, sum(primitives), "primitives")
     _expect_at_most(MAX_PARTS, sum(primitives[row] for row in used if 0 <= row < len(primitives)), "parts")
-    counts = [each.get("count") for each in entries(record, "accessors")]
-    if not all(isinstance(count, int) and count >= 0 for count in counts):
-        raise CaptureError("expected whole numbers as the counts of its accessors: export the mesh again")
-    _expect_at_most(_MAX_VALUES, sum(counts), "values")
+    values = 0
+    for each in entries(record, "accessors"):
+        count = each.get("count")
+        if not isinstance(count, int) or count < 0:
+            raise CaptureError(f"expected a whole number as the count of an accessor, got {count!r}: export it again")
+        values += count
+    _expect_at_most(_MAX_VALUES, values, "values")
 
 
 def _expect_at_most(most: int, found: int, what: str) -> None:

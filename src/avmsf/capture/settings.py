@@ -1,6 +1,7 @@
 """What a capture's owner knows about its recordings: the contents of `capture.toml`, every key optional."""
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
@@ -121,7 +122,7 @@ class CaptureSettings:
 
 def _typed(value: object, kinds: tuple[object, ...], where: str) -> object:
     """Return the value as one of the kinds; whole numbers serve as numbers, and `true` as neither."""
-    if float in kinds and type(value) is int:
+    if float in kinds and type(value) is int and abs(value) <= sys.float_info.max:
         return float(value)
     if type(value) not in kinds:
         words = {str: "text", int: "a whole number", float: "a number", bool: "true or false"}

@@ -1,6 +1,7 @@
 """`transforms.json` as nerfstudio, instant-ngp and the synthetic NeRF scenes write it."""
 
 import math
+import sys
 from collections import ChainMap
 from collections.abc import Mapping
 from functools import partial
@@ -109,7 +110,7 @@ def _matrix(frame: dict[str, Any], where: str) -> np.ndarray:
         raise CaptureError(f"{where}: expected transform_matrix, the camera-to-world pose")
     try:
         matrix = np.array(frame["transform_matrix"], dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise CaptureError(f"{where}: transform_matrix is not a table of numbers: {error}") from error
     if matrix.ndim != 2:
         raise CaptureError(f"{where}: expected 4 rows of 4 numbers in transform_matrix, found {matrix.ndim} dimensions")
@@ -118,7 +119,9 @@ def _matrix(frame: dict[str, Any], where: str) -> np.ndarray:
 
 def _number(settings: Mapping[str, Any], key: str, where: str, fallback: float | None = None) -> float:
     value = settings.get(key, fallback)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    # A whole number of a JSON file may be larger than any float.
+    known = not isinstance(value, bool) and isinstance(value, int | float) and abs(value) <= sys.float_info.max
+    if value is None or not known:
         raise CaptureError(f"{where}: expected {key} to be a finite number, found {value!r}")
     return float(value)
 
