@@ -208,8 +208,10 @@ def run(
         write_seeds(seeds)
         for name, read in ((each, FAMILIES[each].read) for each in families):
             # What a verb imports is not what an input costs.
-            path = seeds / FAMILIES[name].seeds[0]
-            result, message = outcome_of(lambda path=path, read=read: read(seeds, path))
+            shutil.rmtree(folder, ignore_errors=True)
+            shutil.copytree(seeds, folder)
+            path = folder / FAMILIES[name].seeds[0]
+            result, message = outcome_of(lambda path=path, read=read: read(folder, path))
             if result != "read":
                 raise RuntimeError(f"{name}: the undamaged file is {result}: {message}")
         for name, what, read in damaged_inputs(seeds, folder, count=count, seed=seed, families=families):

@@ -74,7 +74,7 @@ def test_too_many_frames_are_refused_before_their_poses(tmp_path: Path) -> None:
 )
 def test_whole_numbers_beyond_every_float_are_refused(tmp_path: Path, changes: dict) -> None:
     frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 5.0}
-    (tmp_path / "0.png").write_bytes(black_png(8, 8))
+    (tmp_path / "0.png").write_bytes(cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes())
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame | changes]}))
     with pytest.raises(CaptureError, match="frame 0"):
         read_views(tmp_path)

@@ -55,6 +55,18 @@ def load_mesh(path: Path, *, raising: type[AvmsfError] = CaptureError) -> trimes
     return scene
 
 
+def load_parts(path: Path) -> list[Any]:
+    """Return the parts of `load_mesh`, each where it stands; raises CaptureError as that does."""
+    scene = load_mesh(path)
+    nodes = list(scene.graph.nodes_geometry)
+    if len(nodes) == 1:
+        transform, name = scene.graph[nodes[0]]
+        # A copy of a texture that is cut off would be gray without an error.
+        if np.array_equal(transform, np.eye(4)):
+            return [scene.geometry[name]]
+    return list(scene.dump())
+
+
 def _expect_small(path: Path) -> None:
     """Raise CaptureError where the file's own counts are beyond the bounds, before anything is built."""
     suffix = path.suffix.lower()

@@ -9,7 +9,7 @@ import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avmsf.capture.mesh_file import load_mesh
+from avmsf.capture.mesh_file import load_parts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError
 
@@ -33,7 +33,7 @@ def read_surface(path: str | Path, *, metres: float = 1.0) -> Surface:
     """
     path = Path(path)
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
-    for part in load_mesh(path).dump():
+    for part in load_parts(path):
         points = np.asarray(getattr(part, "vertices", np.zeros((0, 3))), dtype=np.float64)
         vertices.append(points)
         faces.append(np.asarray(getattr(part, "faces", np.zeros((0, 3))), dtype=np.int64).reshape(-1, 3) + count)

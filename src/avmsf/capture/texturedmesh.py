@@ -15,7 +15,7 @@ import trimesh
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from avmsf.capture.mesh_file import load_mesh
+from avmsf.capture.mesh_file import load_parts
 from avmsf.capture.surface import Surface
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
@@ -104,7 +104,7 @@ def read_textured_mesh(path: str | Path, *, metres: float = 1.0) -> TexturedMesh
     file holds no triangles.
     """
     path = Path(path)
-    parts = [part for part in load_mesh(path).dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    parts = [part for part in load_parts(path) if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
         raise CaptureError(
             f"{path}: holds no triangles: a picture can be taken of faces alone; export the mesh with them, or give "

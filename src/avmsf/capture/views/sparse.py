@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avmsf.capture.mesh_file import load_mesh
+from avmsf.capture.mesh_file import load_parts
 from avmsf.capture.views.colmap import find_model, read_points
 from avmsf.capture.views.transforms import load_record
 from avmsf.errors import CaptureError
@@ -40,7 +40,7 @@ def _read_ply(transforms: Path) -> tuple[np.ndarray, np.ndarray] | None:
     if not isinstance(named, str) or not named:
         return None
     path = transforms.parent / named.replace("\\", "/")
-    clouds: list[Any] = load_mesh(path).dump()
+    clouds: list[Any] = load_parts(path)
     if len(clouds) != 1:
         raise CaptureError(f"{path} ({transforms.name} names it): expected one point cloud, got {len(clouds)} parts")
     points = np.asarray(clouds[0].vertices, dtype=np.float64)
