@@ -151,7 +151,7 @@ def _wrong_index(index: int) -> Callable[[], bytes]:
     ).encode()
 
 
-def _field(name: str, value: object) -> Bomb:
+def _field(name: str, value: float) -> Bomb:
     """Return a field whose header says another value."""
 
     def put(folder: Path) -> tuple[str, Path]:

@@ -17,6 +17,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from safetensors.torch import load as from_bytes
@@ -157,7 +158,7 @@ def damaged_inputs(
             shutil.copytree(seeds, folder)
             path = folder / chance.choice(family.seeds)
             path.write_bytes(family.damage(path.read_bytes(), chance))
-            yield name, f"{path.name} {number}", lambda path=path, read=family.read: read(folder, path)
+            yield name, f"{path.name} {number}", partial(family.read, folder, path)
 
 
 def outcome_of(read: Callable[[], None]) -> tuple[str, str]:
@@ -211,16 +212,16 @@ def run(
             shutil.rmtree(folder, ignore_errors=True)
             shutil.copytree(seeds, folder)
             path = folder / FAMILIES[name].seeds[0]
-            result, message = outcome_of(lambda path=path, read=read: read(folder, path))
+            result, message = outcome_of(partial(read, folder, path))
             if result != "read":
                 raise RuntimeError(f"{name}: the undamaged file is {result}: {message}")
-        for name, what, read in damaged_inputs(seeds, folder, count=count, seed=seed, families=families):
-            outcomes.append(run_apart(name, what, read))
+        for name, what, attempt in damaged_inputs(seeds, folder, count=count, seed=seed, families=families):
+            outcomes.append(run_apart(name, what, attempt))
         for name, bomb in BOMBS.items() if bombs else ():
             shutil.rmtree(folder, ignore_errors=True)
             shutil.copytree(seeds, folder)
             family, path = bomb(folder)
-            outcomes.append(run_apart("bombs", name, lambda path=path, read=FAMILIES[family].read: read(folder, path)))
+            outcomes.append(run_apart("bombs", name, partial(FAMILIES[family].read, folder, path)))
     tell(f"files: {len(outcomes)} inputs in {time.monotonic() - started:.0f} s")
     return outcomes
 
@@ -235,7 +236,7 @@ def measure(options: Options) -> Report:
         faults = sum(each.result in FAULTS for each in own)
         worst = [max(getattr(each, key) for each in own) for key in ("seconds", "megabytes")]
         rows.append([family, len(own), *counts, faults, *worst])
-    faulty = [
+    faulty: list[list[str | float]] = [
         [f"{each.family}: {each.name}", each.result, each.seconds, each.megabytes, each.message]
         for each in outcomes
         if each.result in FAULTS

@@ -77,9 +77,8 @@ def _write_views(folder: Path) -> None:
     for number, suffix in enumerate((".png", ".jpg", ".webp", ".png")):
         angle = number * math.pi / 2
         pose = np.eye(4)
-        pose[:3, :3] = [
-            [math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)],
-        ]  # fmt: skip
+        cosine, sine = math.cos(angle), math.sin(angle)
+        pose[:3, :3] = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
         pose[:3, 3] = 0.5 * pose[:3, 2]
         for place in ("transforms", "colmap"):
             for kind, pixels in (("images", picture), ("masks", mask)):
