@@ -1,5 +1,5 @@
 """`python -m benchmarks field`, `extract`, `speed`, `scene`, `proof`, `settings`, `suggest`, `physics`, `residual`,
-`tasks` or `studio`."""
+`tasks`, `studio` or `robustness`."""
 
 import argparse
 import sys
@@ -10,7 +10,20 @@ from types import ModuleType
 
 from avmsf.capture import CaptureWarning
 from avmsf.errors import AvmsfError
-from benchmarks import extract, field, physics, proof, residual, scene, settings, speed, studio, suggest, tasks
+from benchmarks import (
+    extract,
+    field,
+    physics,
+    proof,
+    residual,
+    robustness,
+    scene,
+    settings,
+    speed,
+    studio,
+    suggest,
+    tasks,
+)
 from benchmarks.material import MissingDataError
 from benchmarks.report import Options, show
 
@@ -26,6 +39,7 @@ BENCHMARKS: dict[str, ModuleType] = {
     "residual": residual,
     "tasks": tasks,
     "studio": studio,
+    "robustness": robustness,
 }
 
 

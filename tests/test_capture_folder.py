@@ -172,7 +172,7 @@ def test_a_scene_keeps_each_part_where_it_lies(tmp_path: Path) -> None:
 
 def test_bad_surfaces_are_named(tmp_path: Path) -> None:
     folder = fill(tmp_path)
-    with pytest.raises(CaptureError, match=r"shell\.obj: there is no such surface file"):
+    with pytest.raises(CaptureError, match=r"shell\.obj: there is no such mesh file"):
         read_capture(folder, CaptureSettings(surface="shell.obj"))
     with pytest.raises(CaptureError, match="lies outside the capture folder"):
         read_capture(folder, CaptureSettings(surface="../shell.obj"))

@@ -1,11 +1,11 @@
 """Folders of other people's models: names that the hub has them under, whether it answers, and their settings."""
 
-import json
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
+from avmsf._utils.text_files import read_json
 from avmsf.errors import AvmsfError
 
 HUB_SECONDS = 5.0
@@ -39,7 +39,7 @@ def expect_answer(name: str, file: str) -> None:
 def read_settings(path: Path, *, raising: type[AvmsfError]) -> dict[str, Any]:
     """Return the JSON object in a model's file. Raises `raising` for anything else."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = read_json(path)
     except (OSError, ValueError) as error:
         raise raising(f"{path}: cannot be read as JSON ({error}): copy it again") from error
     if not isinstance(record, dict):

@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 from avmsf.capture.texturedmesh import TexturedMesh
-from avmsf.errors import ExportError
+from avmsf.errors import CaptureError, ExportError
 from avmsf.export.gltf import write_gltf
 from avmsf.export.look import Look, read_look
 from made_tables import MODES, POINTS, apart, summed, table
@@ -171,8 +171,8 @@ def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colours(tmp_path, 
     np.testing.assert_allclose(few.vertices.norm(dim=1), 0.6, atol=0.02)
     high = few.vertices[:, 2] > 0.05
     np.testing.assert_allclose(few.colors[high], torch.tensor([[1.0, 0.0, 0.0]]).expand(int(high.sum()), 3), atol=0.01)
-    monkeypatch.setattr("avmsf.export.objectfile.MOST_READ", 5000)
-    with pytest.raises(ExportError, match="expected at most 5,000 triangles, found 5,120"):
+    monkeypatch.setattr("avmsf.capture.mesh_file.MAX_FACES", 5000)
+    with pytest.raises(CaptureError, match="expected at most 5,000 triangles, got 5,120"):
         read_look(tmp_path / "ball.ply", table())
 
 

@@ -3,6 +3,7 @@
 import io
 from dataclasses import dataclass
 from difflib import get_close_matches
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,14 @@ from avmsf.errors import CaptureError
 
 LOWEST_RATE = 100.0
 HIGHEST_RATE = 192_000.0
+MAX_SAMPLES = 1 << 24
+"""Samples of one recording, in all channels: 6 minutes at 48 kHz, 134 MB as float64. A compressed file of 100 kB may
+hold hours of silence."""
+MIN_PEAK, MAX_PEAK = 1e-15, 1e15
+"""Largest magnitude that a recording may have, in its own unit. Full scale is 1 and raw counts of 32 bits reach 2e9.
+Between these the squares of `MAX_SAMPLES` samples and their sum are ordinary numbers in float32."""
+_MAX_NAMES_COMPARED = 1000
+"""File names among which a misspelt one is sought: a tenth of a second."""
 EIGHT_BIT = frozenset({"PCM_U8", "PCM_S8", "ULAW", "ALAW", "DPCM_8"})
 
 
@@ -74,7 +83,8 @@ class Recording:
 def read_recording(path: Path, name: str | None = None) -> Recording:
     """Read every channel of a sound file.
 
-    Raises `CaptureError` where the file is missing, corrupt or empty, or holds samples that are not numbers.
+    Raises `CaptureError` where the file is missing, corrupt, empty or longer than `MAX_SAMPLES`, or holds samples that
+    are not numbers or larger than `MAX_PEAK`.
     """
     name = name or str(path)
     try:
@@ -103,6 +113,7 @@ def decode_recording(source: Path | SoundBytes, name: str) -> Recording:
     """Read every channel of a sound file on disk or in memory. Raises `CaptureError` as `read_recording`."""
     try:
         with soundfile.SoundFile(source) as file:
+            _refuse_long(file, name)
             samples = file.read(dtype="float64", always_2d=True)
             rate, subtype = float(file.samplerate), str(file.subtype)
     except (soundfile.LibsndfileError, OSError, UnicodeEncodeError) as error:
@@ -116,6 +127,9 @@ def decode_recording(source: Path | SoundBytes, name: str) -> Recording:
     if not np.isfinite(samples).all():
         count = int((~np.isfinite(samples)).sum())
         raise CaptureError(f"{name}: {count} samples are not finite numbers: export it again")
+    peak = float(np.abs(samples).max())
+    if peak > MAX_PEAK:
+        raise CaptureError(f"{name}: expected samples of at most {MAX_PEAK:g}, got {peak:.3g}: export it again")
     return Recording(name, np.ascontiguousarray(samples.T), rate, subtype)
 
 
@@ -138,6 +152,16 @@ def refuse_rate(rate: float, name: str) -> None:
         raise CaptureError(
             f"{name}: a sample rate of {rate:g} Hz; expected {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz "
             "(the file's rate times playback_speed)"
+        )
+
+
+def refuse_faint(sound: Float64[np.ndarray, " frames"], name: str) -> None:
+    """Raise `CaptureError` for a sound whose samples are too large or too small to be computed with in float32."""
+    peak = float(np.abs(sound).max())
+    if not MIN_PEAK <= peak <= MAX_PEAK:
+        raise CaptureError(
+            f"{name}: expected a peak of {MIN_PEAK:g} to {MAX_PEAK:g}, got {peak:.3g}: export it again, or check the "
+            "force that it is divided by"
         )
 
 
@@ -170,10 +194,20 @@ def clipped_samples(samples: Shaped[np.ndarray, " frames"]) -> int:
     return total
 
 
+def _refuse_long(file: soundfile.SoundFile, name: str) -> None:
+    """Raise `CaptureError` for a file of too many samples, by its header."""
+    samples = file.frames * file.channels
+    if samples > MAX_SAMPLES:
+        raise CaptureError(
+            f"{name}: expected at most {MAX_SAMPLES:,} samples in all channels, got {samples:,} "
+            f"({file.frames / file.samplerate / 60:.3g} minutes of {file.channels}): keep the seconds about the blow"
+        )
+
+
 def _nearest_name(path: Path) -> str:
-    """Guess what was meant by a path that does not exist."""
+    """Return the end of an error about a path that does not exist: a file with a similar name, or what to do."""
     if not path.parent.is_dir():
         return f", nor the folder {path.parent}"
-    names = {other.name.lower(): other.name for other in path.parent.iterdir()}
+    names = {other.name.lower(): other.name for other in islice(path.parent.iterdir(), _MAX_NAMES_COMPARED)}
     found = get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)
     return f" (did you mean {names[found[0]]}?)" if found else ": copy it there, or remove its row from impacts.csv"

@@ -1,17 +1,22 @@
 """Everything that is wrong with a capture folder, found without stopping at the first thing."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from avmsf.capture.folder import read_strike, settings_of
 from avmsf.capture.measure import RecordingReport
+from avmsf.capture.prepare import Prepared
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import find_surface
 from avmsf.capture.table import TABLE, Row, Strike, read_rows, refuse_repeated_files, understand
-from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_surface, refuse_few
+from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_levels, judge_surface, refuse_few
 from avmsf.errors import CaptureError
 from avmsf.wording import counted
+
+MAX_SUGGESTIONS = 3
+"""Missing files for which a similar name is sought: each search compares up to a thousand names."""
 
 
 @dataclass(frozen=True)
@@ -34,21 +39,19 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
         rows, problems = read_rows(folder)
     except CaptureError as error:
         return CaptureReport(False, (), (str(error),))
-    reports, strikes, lengths = [], [], []
+    reports, strikes, sounds = list[RecordingReport](), list[Strike](), list[tuple[str, int, float, float]]()
+    missing = list[str]()
     for row in rows:
-        strike, length, report = _check_row(folder, row, settings=settings)
+        strike, prepared, report = _check_row(folder, row, settings=settings, missing=missing)
         reports.append(report)
         if strike is not None:
             strikes.append(strike)
-        if length is not None:
-            lengths.append((report.file, length, report.sample_rate or 0.0))
+        if prepared is not None:
+            sounds.append((report.file, len(prepared.sound), report.sample_rate or 0.0, prepared.peak))
     refused = _check_contacts(folder, strikes, rows, settings=settings, problems=problems)
-    try:
-        if lengths:
-            names, samples, rates = zip(*lengths, strict=True)
-            problems += common_length(samples, names, rate=common_rate(rates, names), settings=settings)[1]
-    except CaptureError as error:
-        refused.append(str(error))
+    if len(missing) > MAX_SUGGESTIONS:
+        refused.append(f"{TABLE}: there are no files for {len(missing)} of {len(rows)} rows")
+    refused += _check_sounds(sounds, settings=settings, problems=problems)
     listed = {report.file for report in reports}
     stray = [name for name in _wav_files(folder) if name not in listed]
     if stray:
@@ -65,17 +68,44 @@ def _wav_files(folder: Path) -> list[str]:
 
 
 def _check_row(
-    folder: Path, row: Row, *, settings: CaptureSettings
-) -> tuple[Strike | None, int | None, RecordingReport]:
-    """Return what could be understood of one row, the samples after its onset, and its report."""
+    folder: Path, row: Row, *, settings: CaptureSettings, missing: list[str]
+) -> tuple[Strike | None, Prepared | None, RecordingReport]:
+    """Return what could be understood of one row, its sound, and its report; add its file to `missing` where it is."""
     strike = None
     try:
         strike = understand(row, settings)
+        if not os.path.exists(folder / strike.file):
+            missing.append(strike.file)
+            if len(missing) > MAX_SUGGESTIONS:
+                raise CaptureError(f"{strike.file}: there is no such file")
         prepared, report = read_strike(folder, strike, settings=settings)
     except CaptureError as error:
         file = strike.file if strike is not None else row.cells["file"]
         return strike, None, RecordingReport(file=file, line=row.line, readable=False, problems=(str(error),))
-    return strike, len(prepared.sound), report
+    return strike, prepared, report
+
+
+def _check_sounds(
+    sounds: list[tuple[str, int, float, float]], *, settings: CaptureSettings, problems: list[str]
+) -> list[str]:
+    """Add to `problems` what looks wrong about all sounds together, and return what makes the folder unreadable.
+
+    Of each sound: its file, samples, sample rate and peak.
+    """
+    if not sounds:
+        return []
+    names, samples, rates, peaks = zip(*sounds, strict=True)
+    refused = []
+    judges: tuple[Callable[[], list[str]], ...] = (
+        lambda: common_length(samples, names, rate=common_rate(rates, names), settings=settings)[1],
+        lambda: judge_levels(peaks, names),
+    )
+    for judge in judges:
+        try:
+            problems += judge()
+        except CaptureError as error:
+            refused.append(str(error))
+    return refused
 
 
 def _check_contacts(

@@ -28,7 +28,7 @@ from avmsf.capture.table import (
     refuse_repeated_files,
     understand,
 )
-from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_surface, refuse_few
+from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_levels, judge_surface, refuse_few
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
 
@@ -60,17 +60,20 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
     strikes = [understand(row, settings) for row in rows]
     refuse_few(len(strikes))
     refuse_repeated_files(strikes)
+    _refuse_missing(folder, strikes)
     remarks += judge_contacts(strikes, settings)
     surface = find_surface(folder, settings)
     if surface is not None:
         remarks += judge_surface(strikes, surface, settings=settings)
-    sounds, forces, reports = [], [], []
+    sounds, forces, reports, peaks = [], [], [], []
     for strike in strikes:
         prepared, report = read_strike(folder, strike, settings=settings)
         sounds.append(prepared.sound.astype(np.float32))
         forces.append(prepared.newtons)
+        peaks.append(prepared.peak)
         reports.append(report)
     names = [strike.file for strike in strikes]
+    remarks += judge_levels(peaks, names)
     rate = common_rate([report.sample_rate or 0.0 for report in reports], names)
     length, cut = common_length([len(sound) for sound in sounds], names, rate=rate, settings=settings)
     for remark in remarks + cut + _summary(reports, folder):
@@ -154,6 +157,17 @@ def _write_files(capture: Capture, folder: Path) -> None:
         "align = false\n",
         encoding="utf-8",
     )
+
+
+def _refuse_missing(folder: Path, strikes: list[Strike]) -> None:
+    """Raise one `CaptureError` where several recordings are missing; of a single one its reader says more."""
+    missing = [strike.file for strike in strikes if not os.path.exists(folder / strike.file)]
+    if len(missing) > 1:
+        shown = f"{', '.join(missing[:5])}{', …' * (len(missing) > 5)}"
+        raise CaptureError(
+            f"{TABLE}: there are no files for {len(missing)} of {len(strikes)} rows: {shown}: copy them into {folder}, "
+            "or mend their names"
+        )
 
 
 def _file_names(names: tuple[str, ...]) -> list[str]:

@@ -101,6 +101,9 @@ def find_second_blow(
     frames = np.lib.stride_tricks.sliding_window_view(kept, size)[::hop]
     power = np.abs(np.fft.rfft(frames * np.hanning(size), axis=1)) ** 2
     first = power[:5].max(axis=0)
+    # A single sample at the onset, before digital silence, lies where the window is zero.
+    if not first.any():
+        return None
     excited = first > 1e-2 * first.max()
     power, first = power[:, excited], first[excited]
     floor = 1e-10 * first.max()

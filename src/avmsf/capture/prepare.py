@@ -8,7 +8,7 @@ import scipy.signal
 from jaxtyping import Float64
 from scipy.fft import irfft, next_fast_len, rfft
 
-from avmsf.capture.audio import Recording, refuse_rate, refuse_silence
+from avmsf.capture.audio import Recording, refuse_faint, refuse_rate, refuse_silence
 from avmsf.capture.onset import Pulse, find_onset, find_pulse
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError
@@ -27,16 +27,23 @@ class Prepared:
     newtons: float | None
     """Peak force that the sound is divided by."""
 
+    @property
+    def peak(self) -> float:
+        """Largest magnitude of the sound."""
+        return float(np.abs(self.sound).max())
+
 
 def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float | None = None) -> Prepared:
     """Align and normalise one recording as the settings say; `newtons` is the peak force that the table gives.
 
     The result keeps everything after the onset; how much of it a capture keeps depends on all its recordings.
-    Raises `CaptureError` for rates outside 100 Hz to 192 kHz, silence, and normalisations that lack their force.
+    Raises `CaptureError` for rates outside 100 Hz to 192 kHz, silence, peaks outside `MIN_PEAK` to `MAX_PEAK`, and
+    normalisations that lack their force.
     """
     refuse_rate(recording.sample_rate * settings.playback_speed, recording.name)
     sound = recording.response(settings.response_channel, force_channel=settings.force_channel)
     refuse_silence(sound, recording.name)
+    refuse_faint(sound, recording.name)
     refuse_short(sound, recording)
     sound = remove_rumble(sound, settings.highpass, recording)
     pulse, onset = None, 0
@@ -62,6 +69,7 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
     refuse_short(kept, recording)
     if manner in ("peak", "deconvolve") and newtons is not None:
         kept = kept / newtons
+    refuse_faint(kept, recording.name)
     return Prepared(kept, onset, pulse, None if manner == "none" else newtons)
 
 

@@ -1,7 +1,7 @@
 """What a capture's owner knows about its recordings: the contents of `capture.toml`, every key optional."""
 
 import math
-import tomllib
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
@@ -9,6 +9,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, get_args
 
+from avmsf._utils.text_files import read_toml
 from avmsf.errors import CaptureError
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
@@ -97,10 +98,10 @@ class CaptureSettings:
         """Read a TOML file of these keys; `CaptureError` names the file, the key and what was expected."""
         path = Path(path)
         try:
-            table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+            table = read_toml(path)
         except FileNotFoundError as error:
             raise CaptureError(f"{path}: there is no such file of capture settings") from error
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        except (OSError, ValueError) as error:
             raise CaptureError(f"{path}: not a TOML file that can be read: {error}") from error
         return cls.of(table, name=str(path))
 
@@ -121,7 +122,7 @@ class CaptureSettings:
 
 def _typed(value: object, kinds: tuple[object, ...], where: str) -> object:
     """Return the value as one of the kinds; whole numbers serve as numbers, and `true` as neither."""
-    if float in kinds and type(value) is int:
+    if float in kinds and type(value) is int and abs(value) <= sys.float_info.max:
         return float(value)
     if type(value) not in kinds:
         words = {str: "text", int: "a whole number", float: "a number", bool: "true or false"}

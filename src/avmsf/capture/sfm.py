@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from avmsf.capture.views.pictures import SUFFIXES, Picture, read_mask, read_picture
+from avmsf.capture.views.pictures import SUFFIXES, Picture, PictureSizeError, read_mask, read_picture
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
 
@@ -155,6 +155,8 @@ def _stage_images(images: Path, begun: Path, *, shared_camera: bool) -> tuple[di
         name = path.relative_to(images).as_posix()
         try:
             picture = read_picture(path)
+        except PictureSizeError:
+            raise
         except CaptureError:
             lost.append(name)
             continue

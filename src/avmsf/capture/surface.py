@@ -9,6 +9,7 @@ import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from avmsf.capture.mesh_file import load_parts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError
 
@@ -28,26 +29,18 @@ class Surface:
 def read_surface(path: str | Path, *, metres: float = 1.0) -> Surface:
     """Read a mesh or a point cloud whose coordinates count `metres` each; vertices keep the file's order.
 
-    A scene of several parts becomes one surface. `CaptureError` where the file is missing, corrupt or without points.
+    A scene of several parts becomes one surface. `CaptureError` as `load_mesh`, and where it holds no points.
     """
     path = Path(path)
-    if not path.is_file():
-        raise CaptureError(f"{path}: there is no such surface file")
-    try:
-        loaded = trimesh.load(path, process=False)
-        parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
-    except Exception as error:  # trimesh's readers raise whatever their format's parsing raises
-        raise CaptureError(f"{path}: not a mesh or point cloud that can be read: {error}") from error
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
-    for part in parts:
+    for part in load_parts(path):
         points = np.asarray(getattr(part, "vertices", np.zeros((0, 3))), dtype=np.float64)
         vertices.append(points)
         faces.append(np.asarray(getattr(part, "faces", np.zeros((0, 3))), dtype=np.int64).reshape(-1, 3) + count)
         count += len(points)
     joined = np.concatenate(vertices)
-    if not len(joined) or not np.isfinite(joined).all():
-        found = "no points" if not len(joined) else "coordinates that are not finite numbers"
-        raise CaptureError(f"{path}: holds {found}: export the surface again")
+    if not len(joined):
+        raise CaptureError(f"{path}: holds no points: export the surface again")
     return Surface(torch.from_numpy((joined * metres).astype(np.float32)), torch.from_numpy(np.concatenate(faces)))
 
 

@@ -5,8 +5,10 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path, PurePosixPath
 
+from avmsf._utils.text_files import read_text
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.errors import CaptureError
 
@@ -14,6 +16,10 @@ TABLE = "impacts.csv"
 REQUIRED = ("file", "x", "y", "z")
 DIRECTION = ("nx", "ny", "nz")
 FORCE = "force_newtons"
+MAX_ROWS = 10_000
+"""Rows of a table: three times the 3,000 recordings that RealImpact, the largest published set, has of an object."""
+MIN_FORCE_NEWTONS, MAX_FORCE_NEWTONS = 1e-6, 1e6
+"""Peak forces that a row may give: from a grain of dust to the largest impact hammers (2e4 N) and beyond."""
 FARTHEST = 100.0
 """Metres from the origin beyond which a contact cannot be meant."""
 HOW_TO_WRITE = (
@@ -51,18 +57,20 @@ class Strike:
 def read_cells(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
     """Return a table's lines that are not blank, each with its number and its cells, and what separates the cells.
 
-    Raises `CaptureError` for a file that is no table of UTF-8 text.
+    Raises `CaptureError` for a file that is no table of UTF-8 text, or has more than `MAX_ROWS` rows.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path)
         first = text.lstrip().split("\n", 1)[0]
         separator = max(",;\t", key=first.count)
         reader = csv.reader(io.StringIO(text), delimiter=separator)
-        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in islice(reader, MAX_ROWS + 2)]
     except UnicodeDecodeError as error:
         raise CaptureError(f"{path}: not UTF-8 text: save it from the spreadsheet as 'CSV UTF-8'") from error
-    except (OSError, csv.Error) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise CaptureError(f"{path}: not a table that can be read: {error}") from error
+    if len(lines) > MAX_ROWS + 1:
+        raise CaptureError(f"{path}: expected at most {MAX_ROWS:,} rows, got more: divide the table")
     return [(line, cells) for line, cells in lines if any(cells)], separator
 
 
@@ -112,8 +120,11 @@ def understand(row: Row, settings: CaptureSettings) -> Strike:
     newtons = None
     if FORCE in row.cells:
         newtons = _number(row, FORCE)
-        if newtons <= 0:
-            raise CaptureError(f"{where}: {FORCE} is {newtons:g}; expected a peak force above 0")
+        if not MIN_FORCE_NEWTONS <= newtons <= MAX_FORCE_NEWTONS:
+            raise CaptureError(
+                f"{where}: {FORCE} is {newtons:g}; expected a peak force of {MIN_FORCE_NEWTONS:g} to "
+                f"{MAX_FORCE_NEWTONS:g} N"
+            )
     return Strike(_inside(row.cells["file"], where), row.line, (contact[0], contact[1], contact[2]), direction, newtons)
 
 

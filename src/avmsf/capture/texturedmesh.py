@@ -15,6 +15,7 @@ import trimesh
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from avmsf.capture.mesh_file import load_parts
 from avmsf.capture.surface import Surface
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
@@ -99,18 +100,11 @@ def read_textured_mesh(path: str | Path, *, metres: float = 1.0) -> TexturedMesh
 
     Parts of a scene become one mesh. Colours are taken as they are written and opaque, whatever the file says of
     light and transparency. Normals in the file are not used. What has no colour at all, or whose texture file is
-    missing or corrupt, is grey, and a `CaptureWarning` says so. Raises CaptureError where the file is missing, is no
-    mesh, holds no triangles or coordinates that are not finite.
+    missing or corrupt, is grey, and a `CaptureWarning` says so. Raises CaptureError as `load_mesh`, and where the
+    file holds no triangles.
     """
     path = Path(path)
-    if not path.is_file():
-        raise CaptureError(f"{path}: there is no such mesh file")
-    try:
-        loaded: Any = trimesh.load(path, process=False)
-        pieces: list[Any] = list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
-    except Exception as error:  # trimesh's readers raise whatever their format's parsing raises
-        raise CaptureError(f"{path}: not a mesh that can be read: {error}") from error
-    parts = [part for part in pieces if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    parts = [part for part in load_parts(path) if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
         raise CaptureError(
             f"{path}: holds no triangles: a picture can be taken of faces alone; export the mesh with them, or give "

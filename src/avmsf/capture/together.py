@@ -19,6 +19,12 @@ WIDEST = 10.0
 """Metres across beyond which contacts are more likely in another unit."""
 NARROWEST = 1e-3
 """Metres across below which they are."""
+USUAL_RANGE_DB = 80.0
+"""Level between a recording and the median beyond which its scale is in doubt: a contact near the nodes of most modes
+takes 40 dB, a soft blow 30."""
+MAX_RANGE_DB = 140.0
+"""Level between the loudest and the faintest recording beyond which the faintest is less than the rounding of the
+loudest in float32 (144 dB), in which they are fitted."""
 
 
 def refuse_few(count: int) -> None:
@@ -42,6 +48,28 @@ def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:
             "a capture has one, and nothing is resampled on reading: convert them to one rate"
         )
     return rates[0]
+
+
+def judge_levels(peaks: Sequence[float], names: Sequence[str]) -> list[str]:
+    """Return a remark where a prepared sound is far louder or fainter than the others; all at zero for one of them.
+
+    Raises `CaptureError` where the loudest is more than `MAX_RANGE_DB` above the faintest.
+    """
+    levels = 20 * np.log10(np.asarray(peaks))
+    away = levels - np.median(levels)
+    worst = int(np.abs(away).argmax())
+    found = (
+        f"{names[worst]}: its peak, {peaks[worst]:.3g}, is {away[worst]:+.0f} dB from that of most recordings "
+        f"({np.median(peaks):.3g})"
+    )
+    if np.ptp(levels) > MAX_RANGE_DB:
+        raise CaptureError(
+            f"{found}; expected at most {MAX_RANGE_DB:g} dB between the loudest and the faintest, got "
+            f"{np.ptp(levels):.0f}: export it at the scale of the others, or remove its row"
+        )
+    if abs(away[worst]) > USUAL_RANGE_DB:
+        return [f"{found}; expected at most {USUAL_RANGE_DB:g} dB: check its scale and its force"]
+    return []
 
 
 def common_length(

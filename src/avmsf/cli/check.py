@@ -11,6 +11,8 @@ from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.wording import counted
 
 UNREADABLE = 2
+MAX_PRINTED = 1000
+"""Rows, and sentences below them, of the printed report: what a terminal's scrollback holds."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +43,11 @@ def run(options: Options) -> int:
     screen = console(errors=options.json)
     if report.recordings:
         screen.print(_table(report, str(options.capture)))
-    for problem in problems_of(report):
+    problems = problems_of(report)
+    for problem in problems[:MAX_PRINTED]:
         screen.print(problem, soft_wrap=True)
+    if len(problems) > MAX_PRINTED:
+        screen.print(f"and {len(problems) - MAX_PRINTED} more; --json prints all", soft_wrap=True)
     if options.json:
         print_json(asdict(report))
     if not report.readable:
@@ -80,6 +85,6 @@ def _table(report: CaptureReport, title: str) -> object:
             decimals(row.onset_seconds, 4),
             decimals(row.double_hit_seconds, 3),
         )
-        for row in report.recordings
+        for row in report.recordings[:MAX_PRINTED]
     ]
     return table(title, columns, rows, words=2)

@@ -11,6 +11,7 @@ import tyro
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf.capture.audio import MAX_SAMPLES
 from avmsf.cli.contacts import Contacts, contacts_at, read_contacts, refuse_far
 from avmsf.cli.printing import say
 from avmsf.cli.writing import Coding, Level, OutputError, expect_writable, write_sound
@@ -129,8 +130,10 @@ def render_sounds(
     if seconds is None:
         return field.render(places, force=force, pulse=pulse)
     samples = round(seconds * field.sample_rate) if math.isfinite(seconds) else 0
-    if samples < 1:
-        raise OutputError(f"--seconds is {seconds:g}; expected a time above 0")
+    if not 1 <= samples <= MAX_SAMPLES:
+        raise OutputError(
+            f"--seconds is {seconds:g}; expected a time above 0 and at most {MAX_SAMPLES / field.sample_rate:g} s"
+        )
     return field.render(places, force=force, samples=samples, pulse=pulse)
 
 

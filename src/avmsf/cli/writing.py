@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 import soundfile
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -39,10 +40,16 @@ class Level:
 
 
 def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: float, coding: Coding) -> None:
-    """Write a mono wav file. Raises `OutputError` for a rate that wav files cannot hold and for what would clip."""
+    """Write a mono wav file. Raises `OutputError` for a rate that wav files cannot hold, for samples that
+    are not finite and for what would clip."""
     rate = round(sample_rate)
     if rate < 1:
         raise OutputError(f"{path}: a wav file's sample rate is a whole number of Hz, at least 1, got {sample_rate:g}")
+    if not bool(torch.isfinite(sound).all()):
+        raise OutputError(
+            f"{path}: expected finite samples, got {int((~torch.isfinite(sound)).sum())} of {len(sound)} that are not: "
+            "fit the field again, or choose a smaller force or level"
+        )
     peak = float(sound.abs().max()) if len(sound) else 0.0
     # One step below full scale, which is as far as 16 bits reach upwards.
     if coding == "int16" and peak > 1 - 2**-15:

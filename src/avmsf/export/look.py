@@ -11,7 +11,7 @@ from torch import Tensor
 from trimesh.visual import ColorVisuals
 
 from avmsf.capture.texturedmesh import TexturedMesh, read_textured_mesh
-from avmsf.export.objectfile import MOST_FACES, expect_alike, expect_few, expect_readable, reduced
+from avmsf.export.objectfile import MOST_FACES, expect_alike, expect_readable, reduced
 from avmsf.export.sampledfield import SampledField
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.start import ZEROTH
@@ -66,7 +66,6 @@ def read_look(path: Path, sampled: SampledField, *, metres: float = 1.0) -> tupl
     faces = len(mesh.faces)
     if faces <= MOST_FACES:
         return Look.of_mesh(mesh), ()
-    expect_few(faces, str(path))
     corners = mesh.vertices[mesh.faces].reshape(-1, 3).numpy()
     painted = (255.0 * _corner_colors(mesh)).round().byte().reshape(-1, 3).numpy()
     solid = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), vertex_colors=painted, process=False)

@@ -13,16 +13,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from trimesh.visual import ColorVisuals
 
+from avmsf.capture.mesh_file import MAX_BYTES, load_mesh
 from avmsf.capture.surface import Surface
 from avmsf.errors import ExportError
 from avmsf.scene.ply import read_splats
 
 MOST_FACES = 200_000
 """Triangles that a browser turns smoothly and picks quickly; a mesh of more is reduced."""
-MOST_READ = 5_000_000
-"""Triangles of a mesh that is still read."""
-MOST_BYTES = 1 << 30
-_MESHES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 _ALIKE = 3.0
 """Factor between the sizes of object and field beyond which they are not in one unit."""
 
@@ -56,7 +53,7 @@ def read_object(
     if source.suffix.lower() == ".ply" and holds_gaussians(source):
         expect_alike(read_splats(source).centers.numpy(), points, str(source))
         return ObjectFile("gaussians", "object.ply", source.read_bytes())
-    scene = _read_mesh(source)
+    scene = load_mesh(source, raising=ExportError)
     scene.apply_scale(metres)  # type: ignore[no-untyped-call]
     return _shown(scene, points, str(source), most)
 
@@ -66,16 +63,10 @@ def expect_readable(path: Path) -> None:
     if not path.is_file():
         raise ExportError(f"{path}: expected a mesh or a .ply of Gaussians, found no such file: check the name")
     size = path.stat().st_size
-    if size > MOST_BYTES:
+    if size > MAX_BYTES:
         raise ExportError(
-            f"{path}: expected a mesh of at most {MOST_BYTES >> 20} MiB, found {size >> 20}: reduce it first"
+            f"{path}: expected a mesh of at most {MAX_BYTES >> 20} MiB, found {size >> 20}: reduce it first"
         )
-
-
-def expect_few(faces: int, what: str) -> None:
-    """Raise `ExportError` for more triangles than are read."""
-    if faces > MOST_READ:
-        raise ExportError(f"{what}: expected at most {MOST_READ:,} triangles, found {faces:,}: reduce the mesh first")
 
 
 def holds_gaussians(path: Path) -> bool:
@@ -85,22 +76,11 @@ def holds_gaussians(path: Path) -> bool:
     return b"scale_0" in header and b"rot_0" in header
 
 
-def _read_mesh(path: Path) -> trimesh.Scene:
-    if path.suffix.lower() not in _MESHES:
-        raise ExportError(f"{path}: expected a mesh ({', '.join(_MESHES)}), found {path.suffix or 'no ending'}")
-    try:
-        scene = trimesh.load_scene(path, process=False)
-    except Exception as error:  # trimesh's readers raise whatever their format's parsing raises
-        raise ExportError(f"{path}: expected a mesh, found a file that cannot be read as one: {error}") from error
-    return scene
-
-
 def _shown(scene: trimesh.Scene, points: Float[Tensor, "points 3"], what: str, most: int) -> ObjectFile:
     meshes = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     faces = sum(len(mesh.faces) for mesh in meshes)
     if not meshes:
         return ObjectFile("points", remarks=(f"{what} has no triangles, so the field's own points are shown",))
-    expect_few(faces, what)
     places = np.concatenate([np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes])
     if not np.isfinite(places).all():
         raise ExportError(f"{what}: expected finite coordinates, found NaN or infinity: export the mesh again")

@@ -35,6 +35,9 @@ class AttentionShape:
     """Whether damping, too, depends on the contact."""
 
 
+_MAX_LAYERS = 64
+"""Hidden layers, or bands of frequency, of a network in a file: thirty times those of the paper's. Each takes time
+to build before it can be compared with the file's tensors."""
 _EXAMPLE = AttentionShape(clusters=1, bands=0, width=1, hidden=1, layers=0, feature_scale=1.0)
 
 
@@ -175,6 +178,8 @@ class AttentionGains(nn.Module):
         """Return tensors like those of a network of these sizes, which take no memory."""
         points, dim, modes = (count_of(record[name], name) for name in ("points", "dim", "modes"))
         shape = record_of(_EXAMPLE, record["shape"], "gain_field.shape")
+        if shape.layers > _MAX_LAYERS or shape.bands > _MAX_LAYERS:
+            raise ValueError(f"layers and bands: expected at most {_MAX_LAYERS}, got {shape.layers} and {shape.bands}")
         with torch.device("meta"):
             features = FeatureField(torch.empty(points, 3), torch.empty(points, dim), "")
             regions = Regions(torch.empty(shape.clusters, 3), torch.empty(shape.clusters, dim))

@@ -14,6 +14,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from avmsf._utils.text_files import parse_json
+from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, FieldFileError, FitError
 from avmsf.field.config import FitConfig
@@ -26,7 +28,7 @@ FORMAT = 6
 
 @dataclass(frozen=True)
 class Header:
-    """What a field's file says about its tensors."""
+    """What a field's file says about its tensors. Raises ValueError for sounds that no recording has."""
 
     sample_rate: float
     """Hz."""
@@ -40,6 +42,13 @@ class Header:
     gain_field: Mapping[str, Any]
     """What the gain field says of itself."""
     origin: Origin
+
+    def __post_init__(self) -> None:
+        # Those of the recordings that a field is fitted to.
+        if not LOWEST_RATE <= self.sample_rate <= HIGHEST_RATE:
+            raise ValueError(f"sample_rate: expected {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz, got {self.sample_rate:g}")
+        if self.samples > MAX_SAMPLES:
+            raise ValueError(f"samples: expected at most {MAX_SAMPLES:,}, got {self.samples:,}")
 
     @classmethod
     def of(cls, field: SoundField) -> "Header":
@@ -80,7 +89,7 @@ class Header:
 def read_header(words: str, path: Path) -> Header:
     """Return the record that the file `path` holds. Raises `FieldFileError` for one that this version cannot read."""
     try:
-        record = json.loads(words)
+        record = parse_json(words)
         found, writer = record["format"], record["version"]
     except (ValueError, TypeError, KeyError) as error:
         raise broken(path, error) from error
@@ -98,11 +107,8 @@ def read_header(words: str, path: Path) -> Header:
 
 def _header(record: dict[str, Any]) -> Header:
     sizes, gains, origin = record["sizes"], dict(record["gain_field"]), record["origin"]
-    rate = float(like(record["sample_rate"], 1.0, "sample_rate"))
-    if not 0 < rate < float("inf"):
-        raise ValueError(f"sample_rate is {rate}")
     return Header(
-        sample_rate=rate,
+        sample_rate=float(like(record["sample_rate"], 1.0, "sample_rate")),
         samples=count_of(record["samples"], "samples"),
         modes=count_of(sizes["modes"], "sizes.modes"),
         bins=count_of(sizes["bins"], "sizes.bins"),

@@ -1,5 +1,6 @@
 """Values out of a file's JSON as what they were before: each of its type, all of them there, none besides."""
 
+import sys
 from dataclasses import fields
 from typing import Any, TypeVar
 
@@ -24,7 +25,7 @@ def like(value: Any, example: Any, name: str) -> Any:
     """Return a JSON value as the type of `example`. Raises TypeError where it is of another."""
     if isinstance(example, tuple) and isinstance(value, list):
         return tuple(like(each, example[0], name) for each in value)
-    if isinstance(example, float) and type(value) is int:
+    if isinstance(example, float) and type(value) is int and abs(value) <= sys.float_info.max:
         return float(value)
     if type(value) is not type(example):
         raise TypeError(f"{name} is {value!r}, not of type {type(example).__name__}")

@@ -4,6 +4,7 @@ Tensors are named by the path of their field: `bank.frequency`, `phase`, `gain_f
 holds under the key `avmsf` the record that `avmsf.field.header` describes.
 """
 
+import math
 from pathlib import Path
 
 import torch
@@ -11,6 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
+from avmsf.capture.audio import MAX_PEAK
 from avmsf.errors import FieldFileError
 from avmsf.field.gainfield import GainField
 from avmsf.field.header import FORMAT, Header, broken, read_header
@@ -24,6 +26,8 @@ from avmsf.modal.residual import Residual
 _KEY = "avmsf"
 _GAIN_FIELD = "gain_field."
 _POSITIVE = ("bank.frequency", "bank.damping")
+_MOST = {"bank.frequency": 1e9, "bank.damping": 1e9, "residual.magnitude": MAX_PEAK}
+"""Largest values: hertz and 1/s beyond any solid's modes, and noise as loud as the loudest recording."""
 _KINDS: dict[str, type[GainField]] = {**FITTED, ScaledGains.kind: ScaledGains}
 """The gain fields that a file may hold, by what it calls them."""
 
@@ -35,7 +39,10 @@ def save(field: SoundField, path: str | Path) -> None:
     `FieldFileError` where the file cannot be written, and for a field that could not be read back.
     """
     path = Path(path)
-    header, tensors = Header.of(field), _tensors(field)
+    try:
+        header, tensors = Header.of(field), _tensors(field)
+    except ValueError as error:
+        raise FieldFileError(f"{path}: {error}: such a field cannot be kept") from error
     _expect_tensors(tensors, header, path)
     content = to_bytes(tensors, {_KEY: header.to_json(path)})
     write_whole(path, lambda place: place.write_bytes(content))
@@ -125,11 +132,13 @@ def _expect_tensors(tensors: dict[str, Tensor], header: Header, path: Path) -> N
                 f"{path}: expected {name} as {_named(like)}, found {_named(tensor)}: the header and the tensors do not "
                 "belong together, fit and save the field again"
             )
-        least = float(tensor.min()) if tensor.numel() else 0.0
+        least, most = (float(each) for each in tensor.aminmax()) if tensor.numel() else (0.0, 0.0)
         negative = least < 0 and name == "residual.magnitude"
         if not bool(torch.isfinite(tensor).all()) or (name in _POSITIVE and least <= 0) or negative:
             wanted = "positive" if name in _POSITIVE else "not negative" if negative else "finite"
             raise FieldFileError(f"{path}: expected {name} to be {wanted} throughout, found otherwise: fit it again")
+        if most > _MOST.get(name, math.inf):
+            raise FieldFileError(f"{path}: expected {name} up to {_MOST[name]:g}, got {most:.3g}: fit the field again")
 
 
 def _skeleton(header: Header, path: Path) -> dict[str, Tensor]:
@@ -138,7 +147,7 @@ def _skeleton(header: Header, path: Path) -> dict[str, Tensor]:
         raise broken(path, ValueError(f"gain_field.kind is {header.kind!r}, not {', '.join(_KINDS)}"))
     try:
         gains = _KINDS[header.kind].skeleton(header.gain_field)
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, RuntimeError) as error:  # RuntimeError: torch, of sizes beyond 2^63
         raise broken(path, error) from error
     if header.gain_field["modes"] != header.modes:
         raise broken(

@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
+from avmsf._utils.text_files import parse_json
 from avmsf.errors import SceneError
 from avmsf.files import write_whole
 from avmsf.scene.features import FeatureField
@@ -101,7 +102,7 @@ def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
 def _understand(words: str, path: Path) -> dict[str, Any]:
     """Return the header's record after looking at every entry of it."""
     try:
-        record = json.loads(words)
+        record = parse_json(words)
         found, writer = record["format"], record["version"]
         if found == FORMAT:
             counts = [record["sizes"][name] for name in ("points", "dim")]

@@ -20,6 +20,8 @@ _TYPES = dict(zip(_WORDS.split(), _KINDS.split(), strict=True))
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 16
 """Bytes; a file whose header has not ended by then is no .ply of Gaussians."""
+_MAX_DIGITS = 18
+"""Digits of a count, which then fits into 64 bits."""
 _MIDDLE, _ZEROTH, _OPACITY = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2"), ("opacity",)
 _SCALES, _ROTATION = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
 _NEEDED = (*_MIDDLE, *_ZEROTH, *_OPACITY, *_SCALES, *_ROTATION)
@@ -77,11 +79,12 @@ def read_splats(path: str | Path) -> GaussianCloud:
     count = sum(name.startswith("f_rest_") for name in table.dtype.names or ())
     others = tuple(f"f_rest_{place}" for place in range(count))
     for name in (*_NEEDED, *others):
-        wrong = np.flatnonzero(~np.isfinite(table[name]))
+        # Text and float64 hold numbers that are infinite as float32, in which Gaussians are computed.
+        wrong = np.flatnonzero(~(np.abs(table[name]) <= np.finfo(np.float32).max))
         if len(wrong):
             raise SceneError(
                 f"{path}: {name} of vertex {wrong[0]} is {table[name][wrong[0]]}, as are {len(wrong) - 1} others; "
-                "expected finite numbers: export the Gaussians again, without the broken ones"
+                "expected finite float32 numbers: export the Gaussians again, without the broken ones"
             )
     columns = [_columns(table, names) for names in (_MIDDLE, _ROTATION, _SCALES, _OPACITY, _ZEROTH)]
     if not bool((columns[1] != 0).any(1).all()):
@@ -104,7 +107,7 @@ def _header(path: Path, content: bytes) -> _Header:
         match line.split():
             case ["format", word, *_] if word in _ORDERS:
                 order = word
-            case ["element", name, count] if count.isdecimal():
+            case ["element", name, count] if count.isdecimal() and len(count) <= _MAX_DIGITS:
                 elements.append(_Element(name, int(count), ()))
             case ["property", "list", _, _, name] if elements:
                 elements[-1] = _with(elements[-1], name, "list")

@@ -14,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
+from avmsf._utils.text_files import parse_json
 from avmsf.errors import SimulationError
 from avmsf.files import write_whole
 from avmsf.simulate.elastic import ElasticModes
@@ -59,7 +60,7 @@ def load_modes(path: str | Path) -> ElasticModes:
     path = Path(path)
     words, tensors = _read(path)
     try:
-        record = json.loads(words)
+        record = parse_json(words)
         found, writer = record["format"], record["version"]
         if found != FORMAT:
             raise SimulationError(

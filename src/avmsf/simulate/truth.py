@@ -16,6 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
+from avmsf._utils.text_files import parse_json
 from avmsf.errors import SimulationError
 from avmsf.files import write_whole
 
@@ -118,7 +119,7 @@ def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
 def _understand(words: str, path: Path) -> dict[str, Any]:
     """Return the header's record after looking at every entry of it."""
     try:
-        record = json.loads(words)
+        record = parse_json(words)
         found, writer, names = record["format"], record["version"], record["names"]
         listed = isinstance(names, list) and all(isinstance(name, str) for name in names)
         if found == FORMAT and not (listed and isinstance(record["recipe"], dict)):

@@ -2,12 +2,12 @@
 
 import csv
 import io
-import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from avmsf._utils.text_files import parse_json, read_text
 from avmsf.capture.datasets.dataset import ObjectFacts
 from avmsf.capture.datasets.numbering import (
     REALIMPACT_NAMES,
@@ -71,8 +71,8 @@ def facts_of(identifier: str, listed: Mapping[int, ObjectFacts]) -> ObjectFacts:
 
 def _entries(path: Path) -> list[_Entry]:
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        rows = _json_rows(json.loads(text)) if path.suffix.lower() == ".json" else _csv_rows(text)
+        text = read_text(path)
+        rows = _json_rows(parse_json(text)) if path.suffix.lower() == ".json" else _csv_rows(text)
     except FileNotFoundError as error:
         raise DatasetError(f"{path}: there is no such list of objects; {_HOW_TO_WRITE}") from error
     except (OSError, ValueError, csv.Error) as error:

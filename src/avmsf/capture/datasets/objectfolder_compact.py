@@ -1,6 +1,5 @@
 """ObjectFolder Real as its contact-localization benchmark copies it: 53 objects, no forces, a split of its own."""
 
-import json
 import math
 from collections.abc import Iterator
 from functools import cached_property
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from avmsf._utils.text_files import read_json
 from avmsf.capture.audio import read_recording
 from avmsf.capture.datasets.arrays import ArrayForm, judge_array, read_array
 from avmsf.capture.datasets.blows import Blow, gather, judge_wav, listed, refuse_few
@@ -163,7 +163,7 @@ class ObjectFolderCompact:
     def _json(self, name: str) -> dict[str, Any]:
         path = self.folder / name
         try:
-            value = json.loads(path.read_text(encoding="utf-8"))
+            value = read_json(path)
         except FileNotFoundError as error:
             raise DatasetError(f"{path}: there is no such file; the contact-localization benchmark has it") from error
         except (OSError, ValueError) as error:

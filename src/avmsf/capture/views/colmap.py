@@ -10,7 +10,7 @@ import torch
 from avmsf.capture.views import colmap_binary, colmap_text
 from avmsf.capture.views.colmap_records import CameraRecord, ImageRecord
 from avmsf.capture.views.lenses import Lens
-from avmsf.capture.views.shots import Shot, Shots
+from avmsf.capture.views.shots import Shot, Shots, refuse_many
 from avmsf.errors import CaptureError
 
 PLACES = ("sparse/0", "sparse", ".")
@@ -64,7 +64,9 @@ def read_colmap(model: Path, images: Path) -> Shots:
         record.number: _lens(record, f"{cameras_file}, camera {record.number}")
         for record in reader.read_cameras(cameras_file)
     }
-    shots = [_shot(record, lenses, images_file, images) for record in reader.read_images(images_file)]
+    records = reader.read_images(images_file)
+    refuse_many(len(records), images_file)
+    shots = [_shot(record, lenses, images_file, images) for record in records]
     return Shots(model, tuple(shots))
 
 

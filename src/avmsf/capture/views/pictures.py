@@ -1,15 +1,31 @@
 """Photographs and masks as files hold them: PNG, JPEG or WebP, 8 or 16 bit, grey or colour, with or without alpha."""
 
+import contextlib
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
+from PIL import Image, ImageFile, JpegImagePlugin, PngImagePlugin, WebPImagePlugin
 
 from avmsf.errors import CaptureError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+MAX_PIXELS = 200_000_000
+"""Pixels of a picture: as many as the largest sensors of cameras and telephones have (16,320 x 12,240). Reading one
+takes 0.6 GB in 8 bits, 3 GB with 16 bits and alpha; a PNG file of 110 kB may claim 900 million."""
+_HEADERS: tuple[tuple[bytes, type[ImageFile.ImageFile]], ...] = (
+    (b"\x89PNG", PngImagePlugin.PngImageFile),
+    (b"\xff\xd8", JpegImagePlugin.JpegImageFile),
+    (b"RIFF", WebPImagePlugin.WebPImageFile),
+)
+"""How a file of each kind begins, and what reads its size without its pixels."""
+
+
+class PictureSizeError(CaptureError):
+    """A picture has more than `MAX_PIXELS`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +60,8 @@ def read_picture(path: Path) -> Picture:
     """Read a photograph, its pixels as they are stored; alpha becomes the mask and lays the colour before black.
 
     An alpha channel that is opaque everywhere is no mask. 16 bits become 8. An orientation tag (EXIF) has no effect:
-    see `read_upright`. Raises CaptureError where the file is missing, corrupt or of another kind.
+    see `read_upright`. Raises CaptureError where the file is missing, corrupt or of another kind, PictureSizeError
+    where it has more than `MAX_PIXELS`.
     """
     pixels = _decode(path, cv2.IMREAD_UNCHANGED)
     if pixels.ndim == 2:
@@ -77,16 +94,34 @@ def read_mask(path: Path) -> UInt8[np.ndarray, "height width"]:
     return np.ascontiguousarray(mask * 255 if mask.max(initial=0) == 1 else mask)
 
 
+def _is_small(content: bytes, path: Path) -> bool:
+    """Whether a file is a picture by its header; raises PictureSizeError for one of more than `MAX_PIXELS`."""
+    read_header = next((header for start, header in _HEADERS if content.startswith(start)), None)
+    try:
+        if read_header is None:
+            return False
+        width, height = read_header(io.BytesIO(content)).size
+    except Image.DecompressionBombError as error:
+        raise PictureSizeError(f"{path}: expected at most {MAX_PIXELS:,} pixels: {error}: scale it down") from error
+    except Exception:  # Pillow raises whatever the parsing of a damaged header raises
+        return False
+    if width * height > MAX_PIXELS:
+        raise PictureSizeError(
+            f"{path}: expected at most {MAX_PIXELS:,} pixels, got {width:,} x {height:,}: scale the picture down"
+        )
+    return True
+
+
 def _decode(path: Path, flags: int) -> np.ndarray:
     """Return the file's pixels as 8 bits, blue first where there are colours."""
     try:
-        content = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+        content = path.read_bytes()
     except OSError as error:
         raise CaptureError(f"{path}: there is no such image file ({error.strerror})") from error
-    try:
-        pixels = cv2.imdecode(content, flags) if len(content) else None
-    except cv2.error:
-        pixels = None
+    pixels = None
+    if _is_small(content, path):
+        with contextlib.suppress(cv2.error):
+            pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     if pixels is None:
         raise CaptureError(f"{path}: not a PNG, JPEG or WebP image that can be read whole: copy or export it again")
     if pixels.dtype == np.uint16:

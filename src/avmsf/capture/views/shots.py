@@ -9,6 +9,10 @@ from torch import Tensor
 
 from avmsf.capture.views.lenses import Lens
 from avmsf.capture.views.pictures import SUFFIXES
+from avmsf.errors import CaptureError
+
+MAX_SHOTS = 10_000
+"""Photographs of one object: a video of five minutes, frame by frame. Splatting uses some hundreds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +51,12 @@ def without_camera(shots: Sequence[Shot], folder: Path) -> list[str]:
         candidates = {path for parent in {shot.image.parent for shot in shots} for path in parent.glob("*")}
     strangers = [path for path in candidates if path.suffix.lower() in SUFFIXES and path.resolve() not in known]
     return sorted(path.relative_to(images).as_posix() if images.is_dir() else path.name for path in strangers)
+
+
+def refuse_many(count: int, where: Path) -> None:
+    """Raise CaptureError for more than `MAX_SHOTS` photographs."""
+    if count > MAX_SHOTS:
+        raise CaptureError(f"{where}: expected at most {MAX_SHOTS:,} photographs, got {count:,}: keep some hundreds")
 
 
 def mask_places(shot: Shot, folder: Path) -> list[Path]:

@@ -7,7 +7,7 @@ import torch
 
 from avmsf.capture.cameras import View
 from avmsf.capture.views.lenses import Lens, straighten
-from avmsf.capture.views.pictures import Picture, read_mask, read_picture, read_upright, scale
+from avmsf.capture.views.pictures import Picture, PictureSizeError, read_mask, read_picture, read_upright, scale
 from avmsf.capture.views.shots import Shot, listed, mask_places
 from avmsf.errors import CaptureError
 
@@ -41,6 +41,8 @@ def read_view(shot: Shot, base: Path, longest: int | None, metres: float, findin
     """Read one shot's image and mask into a pinhole's view; None, and a finding, where there is nothing to see."""
     try:
         picture = read_picture(shot.image)
+    except PictureSizeError:
+        raise
     except CaptureError:
         findings.lost.append(shot.name)
         return None
@@ -92,6 +94,8 @@ def _with_mask(shot: Shot, base: Path, picture: Picture, findings: Findings) -> 
         return picture
     try:
         mask = read_mask(path)
+    except PictureSizeError:
+        raise
     except CaptureError:
         findings.unmasked.append(shot.name)
         return picture

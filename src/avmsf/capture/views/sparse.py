@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from avmsf.capture.mesh_file import load_parts
 from avmsf.capture.views.colmap import find_model, read_points
 from avmsf.capture.views.transforms import load_record
 from avmsf.errors import CaptureError
@@ -40,15 +40,12 @@ def _read_ply(transforms: Path) -> tuple[np.ndarray, np.ndarray] | None:
     if not isinstance(named, str) or not named:
         return None
     path = transforms.parent / named.replace("\\", "/")
-    try:
-        cloud: Any = trimesh.load(path, process=False)
-        points = np.asarray(cloud.vertices, dtype=np.float64)
-    except Exception as error:  # trimesh's readers raise whatever their format's parsing raises
-        raise CaptureError(
-            f"{path} ({transforms.name} names it): not a point cloud that can be read: {error}"
-        ) from error
+    clouds: list[Any] = load_parts(path)
+    if len(clouds) != 1:
+        raise CaptureError(f"{path} ({transforms.name} names it): expected one point cloud, got {len(clouds)} parts")
+    points = np.asarray(clouds[0].vertices, dtype=np.float64)
     colors = np.full((len(points), 3), 128, dtype=np.uint8)
-    painted = np.asarray(getattr(cloud.visual, "vertex_colors", colors))
+    painted = np.asarray(getattr(clouds[0].visual, "vertex_colors", colors))
     if painted.shape[:1] == points.shape[:1]:
         colors = painted[:, :3].astype(np.uint8)
     return (points, colors) if len(points) else None

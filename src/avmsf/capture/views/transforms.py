@@ -1,17 +1,20 @@
 """`transforms.json` as nerfstudio, instant-ngp and the synthetic NeRF scenes write it."""
 
-import json
 import math
+import sys
+from collections import ChainMap
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
+from avmsf._utils.text_files import read_json
 from avmsf.capture.views.lenses import Lens
 from avmsf.capture.views.pictures import SUFFIXES
 from avmsf.capture.views.poses import TOLERANCE, opencv_from_opengl, rigid
-from avmsf.capture.views.shots import Shot, Shots, listed
+from avmsf.capture.views.shots import Shot, Shots, listed, refuse_many
 from avmsf.errors import CaptureError
 
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -28,6 +31,8 @@ def read_transforms(path: Path) -> Shots:
     frames = record.get("frames")
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise CaptureError(f"{path}: expected a list named 'frames', each with file_path and transform_matrix")
+    refuse_many(len(frames), path)
+    common = {key: value for key, value in record.items() if key != "frames"}
     shots, scaled = [], []
     for row, frame in enumerate(frames):
         where = f"{path}, frame {row}"
@@ -38,7 +43,7 @@ def read_transforms(path: Path) -> Shots:
         name = _name(file, image)
         if abs(scale - 1) > TOLERANCE:
             scaled.append(f"{name} ({scale:.4g})")
-        settings = {key: value for key, value in record.items() if key != "frames"} | frame
+        settings = ChainMap(frame, common)
         mask = path.parent / _text(frame, "mask_path", where) if frame.get("mask_path") else None
         _camera_model(settings, where)
         shots.append(Shot(name, image, opencv_from_opengl(pose), partial(_lens, settings, where), mask))
@@ -49,7 +54,7 @@ def read_transforms(path: Path) -> Shots:
 def load_record(path: Path) -> dict[str, Any]:
     """Return the file's JSON object; raises CaptureError where it is none."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8-sig"))
+        record = read_json(path)
     except (OSError, ValueError) as error:
         raise CaptureError(f"{path}: not a JSON file that can be read: {error}") from error
     if not isinstance(record, dict):
@@ -57,7 +62,7 @@ def load_record(path: Path) -> dict[str, Any]:
     return record
 
 
-def _lens(settings: dict[str, Any], where: str, image_width: int, image_height: int) -> Lens:
+def _lens(settings: Mapping[str, Any], where: str, image_width: int, image_height: int) -> Lens:
     """Return a frame's lens; the image's size counts where the file states none."""
     fisheye = _camera_model(settings, where) in FISHEYE
     sized = "w" in settings and "h" in settings
@@ -77,7 +82,7 @@ def _lens(settings: dict[str, Any], where: str, image_width: int, image_height: 
     return Lens(focal, principal, width, height, distortion, fisheye, where)
 
 
-def _focal(settings: dict[str, Any], axis: str, pixels: int, where: str) -> float | None:
+def _focal(settings: Mapping[str, Any], axis: str, pixels: int, where: str) -> float | None:
     if f"fl_{axis}" in settings:
         return _number(settings, f"fl_{axis}", where)
     if f"camera_angle_{axis}" not in settings:
@@ -88,7 +93,7 @@ def _focal(settings: dict[str, Any], axis: str, pixels: int, where: str) -> floa
     return pixels / 2 / math.tan(angle / 2)
 
 
-def _camera_model(settings: dict[str, Any], where: str) -> str:
+def _camera_model(settings: Mapping[str, Any], where: str) -> str:
     """Return the name of the frame's camera model, refusing what is neither perspective nor fisheye."""
     fallback = "OPENCV_FISHEYE" if settings.get("is_fisheye") else "OPENCV"
     name = str(settings.get("camera_model") or fallback).upper()
@@ -105,16 +110,18 @@ def _matrix(frame: dict[str, Any], where: str) -> np.ndarray:
         raise CaptureError(f"{where}: expected transform_matrix, the camera-to-world pose")
     try:
         matrix = np.array(frame["transform_matrix"], dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise CaptureError(f"{where}: transform_matrix is not a table of numbers: {error}") from error
     if matrix.ndim != 2:
         raise CaptureError(f"{where}: expected 4 rows of 4 numbers in transform_matrix, found {matrix.ndim} dimensions")
     return matrix
 
 
-def _number(settings: dict[str, Any], key: str, where: str, fallback: float | None = None) -> float:
+def _number(settings: Mapping[str, Any], key: str, where: str, fallback: float | None = None) -> float:
     value = settings.get(key, fallback)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    # A whole number of a JSON file may be larger than any float.
+    known = not isinstance(value, bool) and isinstance(value, int | float) and abs(value) <= sys.float_info.max
+    if value is None or not known:
         raise CaptureError(f"{where}: expected {key} to be a finite number, found {value!r}")
     return float(value)
 

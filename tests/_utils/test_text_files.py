@@ -1,0 +1,39 @@
+"""Texts of others are read whole, or refused by `ValueError`, whatever they hold."""
+
+from pathlib import Path
+
+import pytest
+
+from avmsf._utils.text_files import MAX_TOML_BYTES, parse_json, read_json, read_text, read_toml
+
+
+def test_line_ends_and_marks_do_not_matter(tmp_path: Path) -> None:
+    path = tmp_path / "x.txt"
+    path.write_bytes(b"\xef\xbb\xbfa\r\nb\rc\n")
+    assert read_text(path) == "a\nb\nc\n"
+
+
+def test_length_is_bounded_whatever_the_file_says_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "x.txt"
+    path.write_text("x" * 10)
+    assert read_text(path, max_bytes=10) == "x" * 10
+    with pytest.raises(ValueError, match="9"):
+        read_text(path, max_bytes=9)
+    # A device has no size, and no end.
+    with pytest.raises(ValueError, match="16,777,216"):
+        read_text(Path("/dev/zero"))
+
+
+def test_json_and_toml_have_bounded_depth(tmp_path: Path) -> None:
+    assert parse_json("[" * 100 + "]" * 100)
+    with pytest.raises(ValueError, match="nested"):
+        parse_json("[" * 100_000)
+    (tmp_path / "x.json").write_text('{"a":' * 100_000)
+    with pytest.raises(ValueError, match="nested"):
+        read_json(tmp_path / "x.json")
+    (tmp_path / "x.toml").write_text("a = " + "[" * 3000 + "]" * 3000)
+    with pytest.raises(ValueError, match="nested"):
+        read_toml(tmp_path / "x.toml")
+    (tmp_path / "x.toml").write_text("#" * (MAX_TOML_BYTES + 1))
+    with pytest.raises(ValueError, match=f"{MAX_TOML_BYTES:,}"):
+        read_toml(tmp_path / "x.toml")

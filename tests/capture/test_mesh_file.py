@@ -1,0 +1,107 @@
+"""What `load_mesh` returns has indices that exist and finite coordinates; what is beyond its bounds is refused."""
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from avmsf.capture import read_surface
+from avmsf.capture.texturedmesh import read_textured_mesh
+from avmsf.errors import CaptureError
+
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty double x\nproperty double y\nproperty double z\n"
+    "element face 1\nproperty list uchar int vertex_indices\nend_header\n{x} 0 0\n1 0 0\n0 1 0\n3 0 1 {row}\n"
+)
+
+
+def glb(record: dict, binary: bytes = bytes(36)) -> bytes:
+    text = json.dumps({"asset": {"version": "2.0"}, "scene": 0, **record}).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def triangle(*, nodes: int = 1, count: int = 3, matrix: list[float] | None = None) -> bytes:
+    corners = np.eye(3, dtype="<f4").tobytes()
+    node = {"mesh": 0} if matrix is None else {"mesh": 0, "matrix": matrix}
+    accessor = {"componentType": 5126, "count": count, "type": "VEC3"}
+    return glb(
+        {
+            "scenes": [{"nodes": list(range(nodes))}],
+            "nodes": [node] * nodes,
+            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 4}]}],
+            "accessors": [accessor if count > 3 else accessor | {"bufferView": 0}],
+            "bufferViews": [{"buffer": 0, "byteLength": 36}],
+            "buffers": [{"byteLength": 36}],
+        },
+        corners,
+    )
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "stl", "off"])
+def test_every_format_gives_the_same_triangles(tmp_path: Path, suffix: str) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.25)
+    ball.export(tmp_path / f"ball.{suffix}")
+    surface = read_surface(tmp_path / f"ball.{suffix}")
+    corners = surface.vertices[surface.faces]
+    assert surface.faces.shape == (len(ball.faces), 3)
+    torch.testing.assert_close(corners, torch.tensor(np.array(ball.triangles)).float(), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("row", [3, 99, -1])
+@pytest.mark.parametrize("read", [read_surface, read_textured_mesh])
+def test_faces_that_name_no_vertex_are_refused(tmp_path: Path, row: int, read) -> None:
+    path = tmp_path / "surface.ply"
+    path.write_text(PLY.format(x=0, row=row))
+    with pytest.raises(CaptureError, match=f"vertex {row} "):
+        read(path)
+
+
+@pytest.mark.parametrize("x", ["nan", "inf", "1e200"])
+def test_coordinates_that_are_no_places_are_refused(tmp_path: Path, x: str) -> None:
+    path = tmp_path / "surface.ply"
+    path.write_text(PLY.format(x=x, row=2))
+    with pytest.raises(CaptureError, match=r"surface\.ply"):
+        read_surface(path)
+
+
+def test_a_part_moved_out_of_the_world_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "surface.glb"
+    path.write_bytes(triangle())
+    assert len(read_surface(path).faces) == 1
+    path.write_bytes(triangle(matrix=[1e30, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]))
+    with pytest.raises(CaptureError, match="1e\\+30"):
+        read_surface(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "found"),
+    [
+        ("nodes.glb", triangle(nodes=2000), "2,000"),
+        ("empty.glb", triangle(count=100_000_000), "100,000,000"),
+        ("face.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf " + b"1 2 3 " * 1000, "3,000"),
+        ("folded.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf " + b"1 2 \\\n3 " * 1000, "3,0|3,9"),
+    ],
+)
+def test_counts_in_the_file_are_bounded_before_anything_is_built(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes, found: str
+) -> None:
+    def build(*_: object, **__: object) -> None:
+        raise AssertionError("built before its counts were looked at")
+
+    (tmp_path / name).write_bytes(content)
+    monkeypatch.setattr(trimesh, "load", build)
+    monkeypatch.setattr(trimesh, "load_scene", build)
+    with pytest.raises(CaptureError, match=found):
+        read_surface(tmp_path / name)
+
+
+def test_an_archive_is_no_mesh(tmp_path: Path) -> None:
+    (tmp_path / "surface.zip").write_bytes(b"PK\x03\x04")
+    with pytest.raises(CaptureError, match=r"\.zip"):
+        read_surface(tmp_path / "surface.zip")

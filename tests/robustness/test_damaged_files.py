@@ -1,0 +1,49 @@
+"""Files with random damage are read, or refused by the package's own error: never a traceback."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+# The benchmarks are no part of the package.
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks.robustness import files
+from benchmarks.robustness.seeds import write_seeds
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("robustness") / "seeds"
+    write_seeds(folder)
+    return folder
+
+
+@pytest.mark.parametrize("family", files.FAMILIES)
+def test_damage_is_refused_or_harmless(tmp_path: Path, seeds: Path, family: str) -> None:
+    inputs = files.damaged_inputs(seeds, tmp_path / "input", count=4, seed=1, families=(family,))
+    results = {name: files.outcome_of(read) for _, name, read in inputs}
+    assert len(results) == 4
+    assert not {name: said for name, (result, said) in results.items() if result not in ("read", "refused")}
+
+
+def test_an_error_of_another_kind_is_a_traceback() -> None:
+    def read() -> None:
+        raise IndexError("index 99 is out of bounds")
+
+    assert files.outcome_of(read) == ("traceback", "IndexError: index 99 is out of bounds")
+    assert files.run_apart("family", "name", read).result == "traceback"
+
+
+def test_memory_is_bounded_and_measured() -> None:
+    def grow(megabytes: int) -> None:
+        bytearray(megabytes << 20)
+
+    assert files.run_apart("family", "name", lambda: grow(2 * files.MAX_MEGABYTES)).result == "too large"
+    small = files.run_apart("family", "name", lambda: grow(200))
+    assert (small.result, round(small.megabytes, -2)) == ("read", 200)
+
+
+@pytest.mark.slow
+def test_no_input_of_the_benchmark_is_a_fault() -> None:
+    assert [each for each in files.run(count=60, seed=0) if each.result in files.FAULTS] == []
