@@ -63,7 +63,9 @@ class _Similarity(torch.autograd.Function):
     @staticmethod
     def forward(context: Any, image: Tensor, target: Tensor) -> Tensor:
         x, y = image.detach().contiguous().numpy(), target.contiguous().numpy()
-        means = [_filtered(each) for each in (x, y, x * x + y * y, x * y)]
+        # Of a run that diverges the loss says so.
+        with np.errstate(over="ignore", invalid="ignore"):
+            means = [_filtered(each) for each in (x, y, x * x + y * y, x * y)]
         total = _compare(*(each.reshape(-1) for each in means))
         if context.needs_input_grad[0]:
             # The filter is its own transpose.
