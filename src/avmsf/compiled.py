@@ -1,12 +1,14 @@
 """Loops compiled for the processor, kept from one run to the next where that is possible, and run on several cores."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
 import numba
+from numba.core import event
 
 MAX_LANES = 8
 """Most threads that one kernel runs on: with more, handing out the work costs what they save (kernels take ms)."""
@@ -30,6 +32,31 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
         return made
 
     return decorate
+
+
+@contextmanager
+def announced(tell: Callable[[str], None]) -> Iterator[None]:
+    """Tell, in words, what is compiled meanwhile: once for each part of the package. Nothing where all is kept."""
+    with event.install_listener("numba:compile", _Announcer(tell)):
+        yield
+
+
+class _Announcer(event.Listener):
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self.tell, self.told = tell, set[str]()
+
+    def on_start(self, event: event.Event) -> None:
+        package, _, rest = event.data["dispatcher"].py_func.__module__.partition(".")
+        part = rest.partition(".")[0]
+        if package == __package__ and part not in self.told:
+            self.told.add(part)
+            self.tell(f"compiling {_PARTS.get(part, part)} for this processor (once: the result is kept)")
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+_PARTS = {"field": "the fit", "modal": "the search for modes", "scene": "the rasterizer", "simulate": "distances"}
 
 
 def lane_count() -> int:
