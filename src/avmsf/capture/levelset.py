@@ -39,7 +39,8 @@ def enclose(
     # Imported here, for it takes a third of a second that hardly any command needs.
     from skimage import measure
 
-    vertices, triangles, _, _ = measure.marching_cubes(values, level, gradient_direction="ascent")
+    drawn = measure.marching_cubes(values, level, gradient_direction="ascent")  # type: ignore[no-untyped-call]
+    vertices, triangles = drawn[:2]
     vertices, triangles = _without_specks(vertices.astype(np.float64), triangles.astype(np.int64))
     if faces is not None and len(triangles) > faces:
         vertices, triangles = _coarser(vertices, triangles, faces)
