@@ -7,6 +7,7 @@ BIN := .venv/bin
 install: .venv/developed
 
 .venv/installed: pyproject.toml
+	@echo "Installing avmsf into .venv, once: one to a few minutes, most of it downloads."
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --editable .
 	touch $@

@@ -17,7 +17,6 @@ from avmsf.capture import read_capture
 from avmsf.cli import VERBS, main
 from avmsf.field.store import load
 from avmsf.modal.extract import HighResolution, extract
-from avmsf.scene.ply import read_splats
 from avmsf.simulate.plate import plate_modes
 from plate_capture import CONTACT_TIME, HIGHEST, PLATE, RATE, TINY, fill_plate
 
@@ -416,51 +415,3 @@ def test_show_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
     # Without a capture, and without pictures.
     assert main(["show", str(field)]) == 0
     assert "field of plate" in capsys.readouterr().out
-
-
-def test_the_demo_goes_all_the_way(tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
-    from avmsf.cli import demo
-    from avmsf.pipeline.features import LiftConfig
-    from avmsf.pipeline.reconstruct import ReconstructConfig
-    from avmsf.pipeline.scene import SceneConfig
-    from avmsf.pipeline.sources import ViewsConfig
-    from avmsf.scene.splatconfig import SplatConfig
-    from plate_field import QUICK
-
-    small = SceneConfig(
-        ViewsConfig(count=6), SplatConfig(steps=30, start_points=400), LiftConfig(encoder="descriptors")
-    )
-    monkeypatch.setattr(demo, "CONFIG", ReconstructConfig("visual", scene=small, fit=QUICK))
-    folder = tmp_path / "demo"
-    assert main(["demo", str(folder)]) == 0
-    assert f"Listen to {folder}/sounds/walk.wav" in capsys.readouterr().out
-    told = json.loads((folder / "demo.json").read_text())
-    error = {method: each["relative_stft"] for method, each in told["scores"].items()}
-    assert error["floor: the test strikes' own gains"] < error["field"] < error["white noise"]
-    assert "| field |" in (folder / "scores.md").read_text()
-    assert {each.name for each in (folder / "pictures").iterdir()} == {
-        "cloud.png",
-        "gains.png",
-        "modes.png",
-        "scores.png",
-        "spectrograms.png",
-    }
-    assert len(read_splats(folder / "mug.ply")) > 100
-    sounds = sorted((folder / "sounds").iterdir())
-    assert len(sounds) == 10
-    assert all(np.abs(soundfile.read(sound)[0]).max() <= 1 for sound in sounds)
-    assert len((folder / "capture" / "impacts.csv").read_text().splitlines()) == 17
-    assert len(load(folder / "mug.safetensors").origin.trained_on) == 12
-    assert list(tmp_path.iterdir()) == [folder]
-    # A demo's own folder is replaced as a whole, another's is left alone, and Ctrl-C leaves all as it was.
-    monkeypatch.setattr(demo, "reconstruct", interrupt)
-    assert main(["demo", str(folder)]) == 130
-    assert capsys.readouterr().err.splitlines()[-1] == "avmsf demo: interrupted"
-    assert list(tmp_path.iterdir()) == [folder]
-    monkeypatch.setattr(demo, "_go_all_the_way", lambda begun: (begun / "new.txt").write_text("new") and "told")
-    assert main(["demo", str(folder)]) == 0
-    assert [each.name for each in folder.iterdir()] == ["new.txt"]
-    capsys.readouterr()
-    assert main(["demo", str(folder)]) == 2
-    assert "holds no earlier demo" in error_line(capsys)
-    assert (folder / "new.txt").exists()

@@ -67,8 +67,8 @@ WRONG = {
     "render field.safetensors --contacts outside.csv --output s": "line 2: file is '../a.wav'",
     "show nowhere.safetensors": "found no such file",
     "show field.safetensors fast": "9000 Hz",
-    "demo plate": "holds no earlier demo",
-    "demo words.csv": "holds no earlier demo",
+    "demo plate": "files that no demo wrote",
+    "demo words.csv": "expected a folder, got a file",
 }
 
 

@@ -12,9 +12,6 @@ from avmsf.scene.gaussiansurface import gaussian_surface
 from avmsf.scene.start import StartPoints, starting_cloud
 from ball_views import MIDDLE, RADIUS, ball_cameras
 
-pytest.importorskip("skimage", reason="surfaces from Gaussians need scikit-image: pip install 'avmsf[fem]'")
-pytest.importorskip("fast_simplification", reason="coarser surfaces need fast-simplification: pip install 'avmsf[fem]'")
-
 CELLS = 40
 """A cell is 2.5 mm of the ball."""
 DEEP, WIDE, WALL = 0.05, 0.05, 0.008

@@ -1,7 +1,5 @@
 """The surface around what a grid's values enclose: closed, in place, and as coarse as asked for."""
 
-import sys
-
 import numpy as np
 import pytest
 import trimesh
@@ -9,9 +7,6 @@ import trimesh
 from avmsf.capture.levelset import enclose
 from avmsf.capture.surface import Surface
 from avmsf.errors import CaptureError
-
-pytest.importorskip("skimage", reason="surfaces from grids need scikit-image: pip install 'avmsf[fem]'")
-pytest.importorskip("fast_simplification", reason="coarser surfaces need fast-simplification: pip install 'avmsf[fem]'")
 
 RADIUS, SPACING, CELLS = 0.05, 0.0025, 52
 MIDDLE = np.array([0.3, -0.2, 0.1])
@@ -82,11 +77,3 @@ def test_what_encloses_nothing_or_reaches_the_edge_is_refused() -> None:
     for values in (empty, full):
         with pytest.raises(CaptureError, match=r"enclose nothing at the level 0\.5"):
             enclose(values, 0.5, lowest=np.zeros(3), spacing=0.1)
-
-
-def test_a_missing_package_is_named_with_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module, package in (("skimage.measure", "scikit-image"), ("fast_simplification", "fast-simplification")):
-        with monkeypatch.context() as patch:
-            patch.setitem(sys.modules, module, None)
-            with pytest.raises(CaptureError, match=rf"need {package}.*pip install 'avmsf\[fem\]'"):
-                ball(faces=1000)

@@ -1,6 +1,5 @@
 """Geometry to elastic shapes: which bodies a surface may hide, and what is said of surfaces that hide none."""
 
-import importlib.util
 import math
 import re
 from pathlib import Path
@@ -16,10 +15,6 @@ from avmsf.simulate import nominal, nominalsolid
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
 from avmsf.simulate.nominal import NOMINAL, NominalBody, nominal_bodies, refined
-
-needs_pytetwild = pytest.mark.skipif(
-    importlib.util.find_spec("pytetwild") is None, reason="needs pytetwild: pip install 'avmsf[fem]'"
-)
 
 
 def surface_of(mesh: trimesh.Trimesh) -> Surface:
@@ -72,7 +67,6 @@ def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkey
     assert float((fine.elastic.frequency / body.elastic.frequency - 1).abs()[:2].max()) < 0.05
 
 
-@needs_pytetwild
 def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path: Path):
     told: list[str] = []
     inwards = Surface(ball().vertices, ball().faces.flip(1))
@@ -106,7 +100,6 @@ def test_a_damaged_kept_file_is_made_again(tmp_path: Path):
     assert kept.read_bytes() == whole
 
 
-@needs_pytetwild
 def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
     outer, inner = trimesh.creation.icosphere(3, radius=0.06), trimesh.creation.icosphere(3, radius=0.054)
     inner.invert()
@@ -120,7 +113,6 @@ def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
     assert all("both sides of what is 6 mm thick" in reason or "2 parts" in reason for reason in reasons)
 
 
-@needs_pytetwild
 def test_boxes_that_overlap_are_one_body():
     one, other = trimesh.creation.box((0.3, 0.05, 0.02)), trimesh.creation.box((0.05, 0.2, 0.015))
     found = nominal_bodies(
@@ -132,7 +124,6 @@ def test_boxes_that_overlap_are_one_body():
     assert "2 parts that share no vertex" in found.refused[0.001]
 
 
-@needs_pytetwild
 def test_the_aircraft_is_filled(shared: Path):
     surface = read_surface(shared / "aircraft_response/surface.obj")
     found = nominal_bodies(surface, count=6, freedoms=12_000)
@@ -141,7 +132,6 @@ def test_the_aircraft_is_filled(shared: Path):
     assert 10 < float(found.bodies[0].elastic.frequency[0]) < 20
 
 
-@needs_pytetwild
 def test_parts_that_do_not_touch_are_refused_with_all_reasons():
     one, other = trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.1, 0.1, 0.1))
     other.apply_translation((0.3, 0.0, 0.0))

@@ -1,7 +1,6 @@
 """Dense meshes: thinned to the same body, without their noise, and with their rims where they were."""
 
-import importlib
-
+import fast_simplification
 import numpy as np
 import pytest
 import torch
@@ -14,8 +13,6 @@ from avmsf.simulate.nominal import nominal_bodies
 from avmsf.simulate.nominalsolid import Coarsening
 from avmsf.simulate.nominalthin import thinned
 from avmsf.simulate.skin import Skin
-
-pytest.importorskip("fast_simplification", reason="thinning needs fast-simplification: pip install 'avmsf[fem]'")
 
 
 def ellipsoid(subdivisions: int) -> Skin:
@@ -89,27 +86,12 @@ def test_more_triangles_are_left_where_fewer_would_tear_the_skin(monkeypatch: py
     def tearing(points: np.ndarray, faces: np.ndarray, *, target_count: int) -> tuple[np.ndarray, np.ndarray]:
         return points, faces if target_count >= 4000 else faces[:target_count]
 
-    monkeypatch.setattr(importlib.import_module("fast_simplification"), "simplify", tearing)
+    monkeypatch.setattr(fast_simplification, "simplify", tearing)
     monkeypatch.setattr(nominalthin, "MOST", 1000)
     found = thinned(ball, tell=lambda words: None)
     assert np.array_equal(found.faces, ball.faces)
     monkeypatch.setattr(nominalthin, "MOST", 3000)
     assert thinned(ball, tell=lambda words: None) is ball
-
-
-def test_without_the_package_a_dense_mesh_stays_and_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> None:
-        raise ImportError(name)
-
-    ball, told = ellipsoid(2), []
-    monkeypatch.setattr(nominalthin, "import_module", missing)
-    assert thinned(ball, tell=told.append) is ball
-    assert told == []
-    monkeypatch.setattr(nominalthin, "MOST", 100)
-    assert thinned(ball, tell=told.append) is ball
-    assert len(told) == 1
-    assert "checking a mesh of 320 triangles, which may take many minutes" in told[0]
-    assert "pip install 'avmsf[fem]'" in told[0]
 
 
 def test_a_coarser_skin_starts_from_the_last_one_that_is_finer() -> None:

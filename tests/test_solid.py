@@ -1,6 +1,5 @@
 """Tetrahedra: their volume, their outside, and bodies made of meshes that are closed, open or broken."""
 
-import importlib.util
 import math
 from collections.abc import Callable
 
@@ -20,10 +19,6 @@ from avmsf.simulate.shell import shell
 from avmsf.simulate.skin import Skin
 from avmsf.simulate.solid import Solid
 from avmsf.simulate.tetrahedra import fill
-
-needs_pytetwild = pytest.mark.skipif(
-    importlib.util.find_spec("pytetwild") is None, reason="needs pytetwild: pip install 'avmsf[fem]'"
-)
 
 
 def surface_of(mesh: trimesh.Trimesh) -> Surface:
@@ -174,7 +169,6 @@ def test_an_open_bowl_gets_a_wall():
     assert int(solid.parts.max()) == 0
 
 
-@needs_pytetwild
 def test_where_prisms_stay_folded_both_sides_of_the_wall_are_filled(monkeypatch):
     monkeypatch.setattr(shells, "_offsets", lambda skin, thickness: None)
     solid = shell(half(ball()), thickness=0.01, detail=0.1)
@@ -221,7 +215,6 @@ def mixed(surface: Surface) -> Surface:
     return Surface(surface.vertices, faces)
 
 
-@needs_pytetwild
 def test_two_balls_that_cross_with_a_hole_are_one_body():
     one = ball()
     pierced = Surface(one.vertices, one.faces[8:])
@@ -234,7 +227,6 @@ def test_two_balls_that_cross_with_a_hole_are_one_body():
     assert int(solid.parts.max()) == 0
 
 
-@needs_pytetwild
 def test_a_skin_that_runs_through_itself_is_filled_once():
     # A tube wider than the ring that it is bent to: the part around the axis lies inside of it twice.
     ring, tube = 0.03, 0.04
@@ -249,13 +241,11 @@ def test_a_skin_that_runs_through_itself_is_filled_once():
     assert int(solid.parts.max()) == 0
 
 
-@needs_pytetwild
 def test_triangles_that_face_different_ways_are_filled_all_the_same():
     solid = fill(mixed(ball()), detail=0.1)
     assert solid.volume == pytest.approx(4 / 3 * math.pi * 0.05**3, rel=0.06)
 
 
-@needs_pytetwild
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -277,19 +267,11 @@ def apart(surface: Surface) -> Surface:
     return Surface(vertices, torch.cat([surface.faces, surface.faces + len(surface.vertices)]))
 
 
-@needs_pytetwild
 def test_filling_that_takes_too_long_says_so():
     with pytest.raises(SimulationError, match=r"took more than 0.01 s: simplify the mesh, or ask for coarser"):
         fill(ball(subdivisions=1), timeout=0.01)
 
 
-def test_without_pytetwild_the_extra_is_named(monkeypatch):
-    monkeypatch.setattr(tetrahedra.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(SimulationError, match=r"pip install 'avmsf\[fem\]'"):
-        fill(ball(subdivisions=1))
-
-
-@needs_pytetwild
 def test_a_crash_of_pytetwild_is_told(monkeypatch, tmp_path):
     crashing = tmp_path / "worker.py"
     crashing.write_text("import os; os.abort()")

@@ -1,20 +1,29 @@
-"""Loops compiled for the processor, kept from one run to the next where that is possible."""
+"""Loops compiled for the processor, kept from one run to the next where that is possible, and run on several cores."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import numba
+from numba.core import event
+
+MAX_LANES = 8
+"""Most threads that one kernel runs on: with more, handing out the work costs what they save (kernels take ms)."""
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator that compiles a function at its first call, by numba's `options`.
+    """Return a decorator that compiles a function at its first call, by numba's `options`; it releases the GIL.
 
     What was compiled is kept beside the package, or in the user's cache, so that later runs load it. Where neither
-    folder may be written to, as in a container without a home, every run compiles anew: `NUMBA_CACHE_DIR` names
+    folder may be written to, as in a container without a home, every run compiles again: `NUMBA_CACHE_DIR` names
     another.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        options.setdefault("nogil", True)
         try:
             made: Callable[..., Any] = numba.njit(cache=True, **options)(function)
         except RuntimeError:
@@ -23,3 +32,56 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
         return made
 
     return decorate
+
+
+@contextmanager
+def announced(tell: Callable[[str], None]) -> Iterator[None]:
+    """Tell, in words, what is compiled meanwhile: once for each part of the package. Nothing where all is kept."""
+    with event.install_listener("numba:compile", _Announcer(tell)):
+        yield
+
+
+class _Announcer(event.Listener):
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self.tell, self.told = tell, set[str]()
+
+    def on_start(self, event: event.Event) -> None:
+        package, _, rest = event.data["dispatcher"].py_func.__module__.partition(".")
+        part = rest.partition(".")[0]
+        if package == __package__ and part not in self.told:
+            self.told.add(part)
+            self.tell(f"compiling {_PARTS.get(part, part)} for this processor (once: the result is kept)")
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+_PARTS = {"field": "the fit", "modal": "the search for modes", "scene": "the rasterizer", "simulate": "distances"}
+
+
+def lane_count() -> int:
+    """Return how many threads a kernel runs on: as many as numba is given, `NUMBA_NUM_THREADS`, up to `MAX_LANES`."""
+    return min(numba.get_num_threads(), MAX_LANES)
+
+
+def run_lanes(kernel: Callable[..., Any], lanes: int, *arguments: Any) -> None:
+    """Call a compiled `kernel(lane, lanes, *arguments)` for each lane, side by side, and wait for all.
+
+    Numba's own `parallel=True` doubles the time that a kernel takes to compile.
+    """
+    others = [_pool().submit(kernel, lane, lanes, *arguments) for lane in range(1, lanes)]
+    try:
+        kernel(0, lanes, *arguments)
+    finally:
+        for each in others:
+            each.result()
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(MAX_LANES - 1, thread_name_prefix="avmsf-lane")
+
+
+if hasattr(os, "register_at_fork"):
+    # Threads do not outlive a fork.
+    os.register_at_fork(after_in_child=_pool.cache_clear)

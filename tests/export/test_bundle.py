@@ -164,7 +164,6 @@ def test_colours_of_a_mesh_are_kept(tmp_path: Path) -> None:
 
 
 def test_a_mesh_of_too_many_triangles_is_reduced_with_a_word() -> None:
-    pytest.importorskip("fast_simplification", reason="needs avmsf[fem]")
     surface = ball_surface(divisions=4)
     shown = read_object(surface, ball_points(), most=1000)
     (mesh,) = trimesh.load_scene(trimesh.util.wrap_as_stream(shown.content), file_type="glb").dump()

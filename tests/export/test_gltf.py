@@ -157,7 +157,6 @@ def test_a_texture_becomes_the_corners_colours():
 
 
 def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colours(tmp_path, monkeypatch):
-    pytest.importorskip("fast_simplification", reason="needs pip install 'avmsf[fem]'")
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.6)
     upper = ball.vertices[:, 2] > 0
     ball.visual.vertex_colors = np.where(upper[:, None], [255, 0, 0, 255], [0, 0, 255, 255]).astype(np.uint8)

@@ -1,8 +1,6 @@
 """From values on a grid to the closed surface of what they enclose, drawn and thinned by libraries."""
 
-import importlib
-from types import ModuleType
-
+import fast_simplification
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int
@@ -29,8 +27,7 @@ def enclose(
     `lowest` is the place of the first value and `spacing` the distance between two, metres; the values at the grid's
     edge must be below the level. Parts much smaller than the largest are left out. With `faces` the surface is made
     coarser until it has at most so many triangles, twice or four times as many where fewer would pinch it open. Raises
-    CaptureError where nothing or everything is above the level, and where scikit-image or fast-simplification is
-    missing.
+    CaptureError where nothing or everything is above the level.
     """
     if not float(values.max()) > level or any(
         float(values.take(end, axis=axis).max()) >= level for axis in range(3) for end in (0, -1)
@@ -39,8 +36,11 @@ def enclose(
             f"values from {values.min():g} to {values.max():g} enclose nothing at the level {level:g}: expected some "
             "above it, and none at the edge of the grid"
         )
-    measure = _package("skimage.measure", "scikit-image")
-    vertices, triangles, _, _ = measure.marching_cubes(values, level, gradient_direction="ascent")
+    # Imported here, for it takes a third of a second that hardly any command needs.
+    from skimage import measure
+
+    drawn = measure.marching_cubes(values, level, gradient_direction="ascent")  # type: ignore[no-untyped-call]
+    vertices, triangles = drawn[:2]
     vertices, triangles = _without_specks(vertices.astype(np.float64), triangles.astype(np.int64))
     if faces is not None and len(triangles) > faces:
         vertices, triangles = _coarser(vertices, triangles, faces)
@@ -70,10 +70,9 @@ def _compact(
 def _coarser(
     vertices: Float64[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "faces 3"], faces: int
 ) -> tuple[Float64[np.ndarray, "fewer 3"], Int[np.ndarray, "coarse 3"]]:
-    simplify = _package("fast_simplification", "fast-simplification").simplify
     wanted = faces
     while wanted < len(triangles):
-        places, rows = simplify(vertices, triangles, target_count=wanted)
+        places, rows = fast_simplification.simplify(vertices, triangles, target_count=wanted)
         fewer, coarse = _compact(places.astype(np.float64), rows.astype(np.int64))
         if _closed(coarse):
             return fewer, coarse
@@ -87,13 +86,3 @@ def _closed(triangles: Int[np.ndarray, "faces 3"]) -> bool:
     edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     once = np.unique(edges, axis=0)
     return len(once) == len(edges) and bool(np.array_equal(once, np.unique(edges[:, ::-1], axis=0)))
-
-
-def _package(module: str, package: str) -> ModuleType:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise CaptureError(
-            f"surfaces from points and Gaussians need {package}, which cannot be imported ({error}): "
-            "pip install 'avmsf[fem]'"
-        ) from error

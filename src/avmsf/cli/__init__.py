@@ -4,7 +4,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib import import_module
 from typing import TextIO
 
@@ -60,7 +60,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with _loading():
                 verb = import_module(f"avmsf.cli.{words[0].replace('-', '_')}")
             _show_plainly()
-            return verb.run(verb.parse(words[1:]))
+            options = verb.parse(words[1:])
+            with _compilation_announced():
+                return verb.run(options)
         except AvmsfError as error:
             print(f"avmsf {words[0]}: {' '.join(str(error).split())}", file=sys.stderr)
             return 2
@@ -84,6 +86,12 @@ def _loading() -> Iterator[None]:
         yield
     finally:
         print("\r           \r", end="", file=sys.stderr, flush=True)
+
+
+def _compilation_announced() -> AbstractContextManager[None]:
+    """Let the standard error say what is compiled, for it takes seconds; verbs that compile nothing import nothing."""
+    module = sys.modules.get("avmsf.compiled")
+    return nullcontext() if module is None else module.announced(lambda words: print(words, file=sys.stderr))
 
 
 def _explain(words: list[str]) -> None:

@@ -25,7 +25,7 @@ class Options:
 
     `avmsf simulate sim-20 --output FOLDER` makes the benchmark set, one folder an object; what is whole is kept, so
     that an interrupted run goes on with the same command. One object of the set by its name, any other by --kind or
-    --mesh, goes into FOLDER itself. Needs pip install 'avmsf[fem]'.
+    --mesh, goes into FOLDER itself.
     """
 
     what: tyro.conf.Positional[str | None] = None

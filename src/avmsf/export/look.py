@@ -69,7 +69,7 @@ def read_look(path: Path, sampled: SampledField, *, metres: float = 1.0) -> tupl
     corners = mesh.vertices[mesh.faces].reshape(-1, 3).numpy()
     painted = (255.0 * _corner_colors(mesh)).round().byte().reshape(-1, 3).numpy()
     solid = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), vertex_colors=painted, process=False)
-    small = reduced(solid, MOST_FACES / faces, str(path))
+    small = reduced(solid, MOST_FACES / faces)
     assert isinstance(small.visual, ColorVisuals)
     corner_rows = torch.from_numpy(np.array(small.faces, dtype=np.int64))
     shown = torch.from_numpy(np.array(small.visual.vertex_colors[:, :3], dtype=np.float32)) / 255.0

@@ -2,10 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Literal
 
+import fast_simplification
 import numpy as np
 import trimesh
 from jaxtyping import Float
@@ -87,7 +87,7 @@ def _shown(scene: trimesh.Scene, points: Float[Tensor, "points 3"], what: str, m
     expect_alike(places, points, what)
     if faces <= most:
         return ObjectFile("mesh", "object.glb", _as_glb(scene))
-    smaller = trimesh.Scene([reduced(mesh, most / faces, what) for mesh in meshes])
+    smaller = trimesh.Scene([reduced(mesh, most / faces) for mesh in meshes])
     left = sum(len(mesh.faces) for mesh in smaller.geometry.values())
     remark = f"{what} has {faces:,} triangles, too many for a browser: {left:,} are shown, without its textures"
     return ObjectFile("mesh", "object.glb", _as_glb(smaller), (remark,))
@@ -99,20 +99,15 @@ def _as_glb(scene: trimesh.Scene) -> bytes:
     return content
 
 
-def reduced(mesh: trimesh.Trimesh, share: float, what: str) -> trimesh.Trimesh:
-    """Return a mesh of such a share of the triangles, with vertex colours but no textures; raises `ExportError`."""
-    try:
-        simplify = import_module("fast_simplification").simplify
-    except ImportError as error:
-        raise ExportError(
-            f"{what}: has too many triangles for a browser, and reducing it needs fast-simplification: "
-            "pip install 'avmsf[fem]', or reduce the mesh first"
-        ) from error
+def reduced(mesh: trimesh.Trimesh, share: float) -> trimesh.Trimesh:
+    """Return a mesh of such a share of the triangles, with vertex colours but no textures."""
     # Faces without shared corners cannot be merged, and many files have no others.
     merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     merged.merge_vertices(merge_tex=True, merge_norm=True)
     target = max(4, math.floor(share * len(mesh.faces)))
-    vertices, faces = simplify(np.asarray(merged.vertices, np.float32), np.asarray(merged.faces), target_count=target)
+    vertices, faces = fast_simplification.simplify(
+        np.asarray(merged.vertices, np.float32), np.asarray(merged.faces), target_count=target
+    )
     small = trimesh.Trimesh(vertices, faces, process=False)
     if isinstance(mesh.visual, ColorVisuals) and mesh.visual.kind == "vertex":
         _, rows = cKDTree(mesh.vertices).query(vertices)

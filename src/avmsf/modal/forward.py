@@ -32,27 +32,30 @@ def choose(
     # Each mode's sine and cosine side by side.
     inner = gram.reshape(2, modes, 2, modes).permute(1, 0, 3, 2).reshape(2 * modes, 2 * modes).contiguous()
     left = products.permute(2, 1, 0).contiguous()
-    chosen = _choose(inner.numpy(), left.numpy(), noise.T.contiguous().numpy(), given.numpy(), significance, reach)
+    chosen, done = np.zeros(modes), np.zeros(modes, dtype=np.bool_)
+    # Numbers to work with: arrays that are made in the loops themselves make them slow to compile.
+    scratch = np.empty(modes), np.empty((4, 2 * modes)), np.empty((2, products.shape[0]))
+    energies = left.numpy(), noise.T.contiguous().numpy()
+    _choose(inner.numpy(), *energies, given.numpy(), significance, reach, *scratch, done, chosen)
     return gram.new_tensor(chosen)
 
 
 @compiled(error_model="numpy", nogil=True)
 @no_type_check
-def _choose(inner, products, noise, given, significance, reach):
+def _choose(inner, products, noise, given, significance, reach, whole, rows, own, done, chosen):
     """Do what `choose` says, and leave of `inner` and `products` what the chosen ones do not span."""
     modes, _, contacts = products.shape
-    whole = np.empty(modes)
     for mode in range(modes):
         whole[mode] = _area(inner, mode)
-    done, chosen = np.zeros(modes, dtype=np.bool_), np.zeros(modes)
     for mode in range(modes):
         if given[mode]:
             done[mode] = True
             if _area(inner, mode) > _DISTINCT * whole[mode]:
-                _eliminate(mode, inner, products, done)
+                _eliminate(mode, inner, products, done, rows, own)
     greatest = 0.0
     for _ in range(modes):
-        best, most = -1, reach * greatest
+        # No mode yet; a literal number would have all that is called with it compiled twice.
+        best, most = modes, reach * greatest
         for mode in range(modes):
             area = _area(inner, mode)
             # What the chosen ones span already cannot be judged: only rounding is left of it.
@@ -68,11 +71,10 @@ def _choose(inner, products, noise, given, significance, reach):
                 ratio += energy / area / noise[mode, contact]
             if ratio > 2 * contacts * significance and total > most:
                 best, most = mode, total
-        if best < 0:
+        if best == modes:
             break
         chosen[best], greatest, done[best] = most, max(greatest, most), True
-        _eliminate(best, inner, products, done)
-    return chosen
+        _eliminate(best, inner, products, done, rows, own)
 
 
 @compiled(error_model="numpy", nogil=True)
@@ -85,19 +87,23 @@ def _area(inner, mode):
 
 @compiled(error_model="numpy", nogil=True, fastmath={"contract"})
 @no_type_check
-def _eliminate(mode, inner, products, done):
+def _eliminate(mode, inner, products, done, rows, own):
     """Make all modes that are not done orthogonal to one."""
     sine, cosine = 2 * mode, 2 * mode + 1
     area = _area(inner, mode)
-    columns = inner[:, sine : cosine + 1].copy()
-    own = products[mode].copy()
+    first, second, leading, following = rows[0], rows[1], rows[2], rows[3]
     # Of the mode's own two by two matrix the inverse, times its two rows.
-    first = (inner[cosine, cosine] * inner[sine] - inner[sine, cosine] * inner[cosine]) / area
-    second = (inner[sine, sine] * inner[cosine] - inner[cosine, sine] * inner[sine]) / area
+    for row in range(len(inner)):
+        one, other = inner[sine, row], inner[cosine, row]
+        first[row] = (inner[cosine, cosine] * one - inner[sine, cosine] * other) / area
+        second[row] = (inner[sine, sine] * other - inner[cosine, sine] * one) / area
+        leading[row], following[row] = inner[row, sine], inner[row, cosine]
+    for contact in range(own.shape[1]):
+        own[0, contact], own[1, contact] = products[mode, 0, contact], products[mode, 1, contact]
     for row in range(len(inner)):
         if done[row // 2]:
             continue
-        one, other = columns[row]
+        one, other = leading[row], following[row]
         for column in range(len(inner)):
             inner[row, column] -= one * first[column] + other * second[column]
         for contact in range(own.shape[1]):

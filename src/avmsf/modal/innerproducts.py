@@ -35,7 +35,7 @@ def gram(poles: Complex128[Tensor, " modes"], samples: int, *, power: int) -> Fl
 def own_gram(poles: Complex128[Tensor, " modes"], samples: int) -> Float64[Tensor, "modes 2 2"]:
     """Return the inner products over time of each mode's own sine and cosine: the two by two blocks of `gram`."""
     blocks = torch.empty(len(poles), 2, 2, dtype=torch.float64)
-    _own_gram(poles.numpy(), (poles**samples).numpy(), samples, blocks.numpy())
+    _own_gram(poles.numpy(), (poles**samples).numpy(), samples, 0, blocks.numpy())
     return blocks
 
 
@@ -100,12 +100,12 @@ def _gram(poles, last, samples, power, products):
 
 @compiled(error_model="numpy", nogil=True)
 @no_type_check
-def _own_gram(poles, last, samples, blocks):
-    """Write what `own_gram` returns."""
+def _own_gram(poles, last, samples, power, blocks):
+    """Write what `own_gram` returns, where `power` is 0: a literal would have the sums compiled once more."""
     for mode in range(len(poles)):
         pole, end = poles[mode], last[mode]
-        straight = _power_sum(pole * pole, end * end, samples, 0)
-        crossed = _power_sum(pole * pole.conjugate(), end * end.conjugate(), samples, 0)
+        straight = _power_sum(pole * pole, end * end, samples, power)
+        crossed = _power_sum(pole * pole.conjugate(), end * end.conjugate(), samples, power)
         blocks[mode, 0, 0], blocks[mode, 1, 1] = (
             0.5 * (crossed.real - straight.real),
             0.5 * (crossed.real + straight.real),

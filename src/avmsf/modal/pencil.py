@@ -10,7 +10,6 @@ in narrow bands, and ever shorter beginnings, for modes that die early, in ever 
 import math
 from typing import no_type_check
 
-import numpy as np
 import torch
 from jaxtyping import Complex, Complex128, Float, Float64
 from torch import Tensor
@@ -124,15 +123,15 @@ def _poles(band: Complex[Tensor, "contacts times"]) -> Complex128[Tensor, " pole
 
 def _correlation(band: Complex128[Tensor, "contacts times"], span: int) -> Complex128[Tensor, "span span"]:
     """Return the sum of x x^H over all runs x of `span` samples: H^T H* of the signals' Hankel matrices H."""
-    whole = torch.empty(span, span, dtype=band.dtype)
-    _correlate(band.numpy(), whole.numpy())
+    whole = torch.zeros(span, span, dtype=band.dtype)
+    _correlate(band.numpy(), band.conj().resolve_conj().numpy(), whole.numpy())
     return whole
 
 
 @compiled(error_model="numpy", nogil=True, fastmath={"reassoc", "contract"})
 @no_type_check
-def _correlate(band, whole):
-    """Write what `_correlation` returns.
+def _correlate(band, conjugate, whole):
+    """Write what `_correlation` returns into zeros.
 
     From one entry to the next along a diagonal one product leaves the sum and one enters it, so that only the first
     row is summed in full.
@@ -140,11 +139,12 @@ def _correlate(band, whole):
     contacts, times = band.shape
     span = len(whole)
     runs = times - span + 1
-    conjugate = np.conj(band)
-    whole[:] = 0.0
     for contact in range(contacts):
         for column in range(span):
-            whole[0, column] += (band[contact, :runs] * conjugate[contact, column : column + runs]).sum()
+            total = 0.0j
+            for time in range(runs):
+                total += band[contact, time] * conjugate[contact, column + time]
+            whole[0, column] += total
         for row in range(span - 1):
             enters, leaves = band[contact, runs + row], band[contact, row]
             for column in range(row, span - 1):

@@ -9,17 +9,16 @@ in an order that does not depend on the number of threads.
 import math
 from typing import Any, no_type_check
 
-import numba
 import numpy as np
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Float64, Int32, Int64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from avmsf.compiled import compiled
+from avmsf.compiled import compiled, lane_count, run_lanes
 from avmsf.scene.ellipses import FAINTEST
-from avmsf.scene.pixels import PIXELS, SIDE, blend, blend_back
-from avmsf.scene.tiles import KERNELS, list_tiles, rank
+from avmsf.scene.pixels import PIXELS, SIDE, blend, blend_back, working_numbers
+from avmsf.scene.tiles import count_tiles, fill_tiles
 
 _WIDTH = 16
 """Numbers a Gaussian's packed row holds: one cache line."""
@@ -58,16 +57,14 @@ class Blending(torch.autograd.Function):
         paint = background.detach().contiguous().numpy()
         color, alpha, depth = (screen.new_empty(height, width, *more) for more in ((3,), (), ()))
         outputs = [each.numpy() for each in (color, alpha, depth)]
-        lanes = numba.get_num_threads()
-        with KERNELS:
-            seen = np.flatnonzero(radii.numpy()[:, 0] > 0)
-            # The bits of positive floats rise with them.
-            chosen = seen[rank(depths.detach().numpy()[seen, 0].view(np.uint32))]
-            places, packed, reaches = _pack(chosen, FAINTEST, *inputs)
-            starts, rows, slots, ends = list_tiles(places, packed, reaches, width, height, SIDE, lanes)
-            bounds = _bounds(starts, lanes)
-            kept = np.empty((len(starts) - 1, 3, PIXELS), np.float32)
-            blend(places, packed, starts, rows, bounds, paint, _FAINT, *outputs, kept)
+        chosen = _from_front_to_back(radii.numpy()[:, 0], inputs[-1][:, 0])
+        places, packed, reaches = _pack(*(each[chosen] for each in inputs))
+        lanes = lane_count()
+        starts, rows, slots, ends = list_tiles(places, packed, reaches, size, lanes=lanes)
+        bounds = _bounds(starts, lanes)
+        kept = np.empty((len(starts) - 1, 3, PIXELS), np.float32)
+        listed = places, packed, starts, rows, bounds, paint, _FAINT, working_numbers(lanes)
+        run_lanes(blend, lanes, *listed, *outputs, kept)
         ctx.kept = chosen, places, packed, starts, rows, slots, ends, bounds, paint, kept
         ctx.points = len(screen)
         return color, alpha, depth
@@ -80,10 +77,12 @@ class Blending(torch.autograd.Function):
         results = [by_color.new_zeros(ctx.points, width) for width in (2, 3, 1, 3, 1)]
         parts = np.empty((len(rows), 10), np.float32)
         slopes = [each.contiguous().numpy() for each in (by_color, by_alpha, by_depth)]
-        lanes = numba.get_num_threads()
-        with KERNELS:
-            blend_back(places, packed, starts, rows, slots, bounds, paint, _FAINT, *slopes, kept, parts)
-            _gather(parts, ends, chosen, packed, lanes, *(each.numpy() for each in results))
+        lanes = len(bounds) - 1
+        listed = places, packed, starts, rows, slots, bounds, paint, _FAINT, working_numbers(lanes)
+        run_lanes(blend_back, lanes, *listed, *slopes, kept, parts)
+        run_lanes(
+            _gather, lanes, parts, ends, chosen, packed, np.empty((lanes, 10)), *(each.numpy() for each in results)
+        )
         return *results, None, None, None, None
 
 
@@ -95,48 +94,85 @@ def _bounds(starts: Int64[np.ndarray, " edges"], lanes: int) -> Int64[np.ndarray
     return bounds
 
 
-@compiled(error_model="numpy")
-@no_type_check
-def _pack(chosen, faintest, screen, remainders, ellipses, opacities, colors, depths):
-    """Return the chosen Gaussians' places in float64, packed rows and squared reach.
+def _from_front_to_back(
+    radii: Float32[np.ndarray, " points"], depths: Float32[np.ndarray, " points"]
+) -> Int64[np.ndarray, " seen"]:
+    """Return the rows of the Gaussians that are seen, in order of depth, equal ones as they come."""
+    seen = np.flatnonzero(radii > 0)
+    # The bits of positive floats rise with them; numbers that hold the row too sort faster than rows by their depths.
+    keys = (depths[seen].view(np.uint32).astype(np.uint64) << np.uint64(32)) | seen.astype(np.uint64)
+    keys.sort()
+    return (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
+
+
+def _pack(
+    screen: Float32[np.ndarray, "seen 2"],
+    remainders: Float32[np.ndarray, "seen 2"],
+    ellipses: Float32[np.ndarray, "seen 3"],
+    opacities: Float32[np.ndarray, "seen 1"],
+    colors: Float32[np.ndarray, "seen 3"],
+    depths: Float32[np.ndarray, "seen 1"],
+) -> tuple[Float64[np.ndarray, "seen 2"], Float32[np.ndarray, "seen 16"], Float64[np.ndarray, " seen"]]:
+    """Return Gaussians' places, packed rows and squared reach.
 
     A packed row: p, r, s in units of `_SCALE`, log2 of opacity, red, green, blue, depth, half the height in pixels.
     """
-    places, reaches = np.empty((len(chosen), 2)), np.empty(len(chosen))
-    packed = np.zeros((len(chosen), _WIDTH), np.float32)
-    for k in range(len(chosen)):
-        i = chosen[k]
-        places[k, 0] = float(screen[i, 0]) + float(remainders[i, 0])
-        places[k, 1] = float(screen[i, 1]) + float(remainders[i, 1])
-        opacity = float(opacities[i, 0])
-        reaches[k] = max(math.log2(opacity / faintest), 0.0) + _SLACK
-        for j in range(3):
-            packed[k, j] = ellipses[i, j] * _SCALE
-            packed[k, 4 + j] = colors[i, j]
-        packed[k, 3], packed[k, 7] = math.log2(opacity), depths[i, 0]
-        packed[k, 8] = math.sqrt(reaches[k]) / float(packed[k, 2])
-    return places, packed, reaches
+    level = np.log2(opacities[:, 0].astype(np.float64))
+    reaches = np.maximum(level - math.log2(FAINTEST), 0.0) + _SLACK
+    packed = np.zeros((len(screen), _WIDTH), np.float32)
+    packed[:, :3], packed[:, 4:7] = ellipses * _SCALE, colors
+    packed[:, 3], packed[:, 7], packed[:, 8] = level, depths[:, 0], np.sqrt(reaches) / packed[:, 2]
+    return screen.astype(np.float64) + remainders, packed, reaches
 
 
-@compiled(parallel=True, error_model="numpy")
+def list_tiles(
+    places: Float64[np.ndarray, "seen 2"],
+    packed: Float32[np.ndarray, "seen 16"],
+    reaches: Float64[np.ndarray, " seen"],
+    size: tuple[int, int],
+    *,
+    lanes: int,
+) -> tuple[
+    Int64[np.ndarray, " edges"], Int32[np.ndarray, " pairs"], Int64[np.ndarray, " pairs"], Int64[np.ndarray, " ends"]
+]:
+    """Return the tiles' lists for Gaussians in order of depth.
+
+    `starts` [tiles + 1] of each tile's stretch of `rows` [pairs], the Gaussians, and `slots` [pairs], where each pair
+    comes if they are counted Gaussian by Gaussian, with `ends` [seen + 1] there.
+    """
+    tiles = -(-size[0] // SIDE) * -(-size[1] // SIDE)
+    counts, ends = np.zeros((lanes, tiles), np.int64), np.zeros(len(places) + 1, np.int64)
+    given = places, packed, reaches, size, SIDE
+    run_lanes(count_tiles, lanes, *given, counts, ends[1:])
+    np.cumsum(ends, out=ends)
+    # Tile by tile, and lane by lane within.
+    begins = np.concatenate([[0], np.cumsum(counts.T)])
+    counts = begins[:-1].reshape(tiles, lanes).T.copy()
+    rows, slots = np.empty(ends[-1], np.int32), np.empty(ends[-1], np.int64)
+    run_lanes(fill_tiles, lanes, *given, counts, ends, rows, slots)
+    return begins[::lanes].copy(), rows, slots, ends
+
+
+@compiled(error_model="numpy")
 @no_type_check
-def _gather(parts, ends, chosen, packed, lanes, by_screen, by_ellipses, by_opacities, by_colors, by_depths):
-    """Sum each Gaussian's rows and turn the sums into derivatives."""
-    seen, scale = len(chosen), float(_SCALE)
+def _gather(
+    lane, lanes, parts, ends, chosen, packed, scratch, by_screen, by_ellipses, by_opacities, by_colors, by_depths
+):
+    """Sum each Gaussian's rows and turn the sums into derivatives; `scratch` [lanes, 10] are numbers to work with."""
+    seen, scale, total = len(chosen), float(_SCALE), scratch[lane]
     # The exponent's derivative by u and w is -2 u, -2 w times ln 2 = 1 / (2 scale^2).
     unit = 1.0 / (scale * scale)
-    for lane in numba.prange(lanes):
-        total = np.empty(10)
-        for k in range(lane * seen // lanes, (lane + 1) * seen // lanes):
-            total[:] = 0.0
-            for slot in range(ends[k], ends[k + 1]):
-                for j in range(10):
-                    total[j] += parts[slot, j]
-            i = chosen[k]
-            by_screen[i, 0] = unit * total[1] * packed[k, 0]
-            by_screen[i, 1] = unit * (total[1] * packed[k, 1] + total[2] * packed[k, 2])
-            for j in range(3):
-                by_ellipses[i, j] = -unit * scale * total[3 + j]
-                by_colors[i, j] = total[6 + j]
-            by_opacities[i, 0] = total[0] / 2.0 ** float(packed[k, 3])
-            by_depths[i, 0] = total[9]
+    for k in range(lane * seen // lanes, (lane + 1) * seen // lanes):
+        for j in range(10):
+            total[j] = 0.0
+        for slot in range(ends[k], ends[k + 1]):
+            for j in range(10):
+                total[j] += parts[slot, j]
+        i = chosen[k]
+        by_screen[i, 0] = unit * total[1] * packed[k, 0]
+        by_screen[i, 1] = unit * (total[1] * packed[k, 1] + total[2] * packed[k, 2])
+        for j in range(3):
+            by_ellipses[i, j] = -unit * scale * total[3 + j]
+            by_colors[i, j] = total[6 + j]
+        by_opacities[i, 0] = total[0] / 2.0 ** float(packed[k, 3])
+        by_depths[i, 0] = total[9]

@@ -12,7 +12,6 @@ file changes, and looks at no other.
 import math
 from typing import no_type_check
 
-import numba
 import numpy as np
 
 from avmsf.compiled import compiled
@@ -116,9 +115,11 @@ def _usable(center, rotation, log_scale, logit, weights):
     return math.isfinite(total) and 0.0 < length < math.inf
 
 
-@compiled(parallel=True, error_model="numpy")
+@compiled(error_model="numpy")
 @no_type_check
 def project_points(
+    lane,
+    lanes,
     centers,
     rotations,
     log_scales,
@@ -126,7 +127,7 @@ def project_points(
     harmonics,
     pose,
     lens,
-    lanes,
+    scratch,
     screen,
     ellipses,
     opacities,
@@ -134,47 +135,47 @@ def project_points(
     radii,
     remainders,
 ):
-    """Write what `Projection.forward` returns, all but the colours, of which only the finiteness is looked at."""
+    """Write what `Projection.forward` returns into arrays of zeros, all but the colours, which are only checked.
+
+    `scratch` [lanes, 16, 3] are float64 numbers to work with.
+    """
     points = len(centers)
-    for lane in numba.prange(lanes):
-        turn, slope, axes = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3))
-        scales = np.empty(3)
-        for i in range(lane * points // lanes, (lane + 1) * points // lanes):
-            screen[i, 0], screen[i, 1], remainders[i, 0], remainders[i, 1] = 0.0, 0.0, 0.0, 0.0
-            ellipses[i, 0], ellipses[i, 1], ellipses[i, 2] = 0.0, 0.0, 0.0
-            opacities[i, 0], depths[i, 0], radii[i, 0] = 0.0, 0.0, 0.0
-            if not _usable(centers[i], rotations[i], log_scales[i], logits[i], harmonics[i]):
-                radii[i, 0] = np.nan
-                continue
-            x, y, z = _inside(centers[i], pose)
-            opacity = 1.0 / (1.0 + math.exp(-float(logits[i])))
-            if z < NEAR or opacity < FAINTEST:
-                continue
-            for j in range(3):
-                scales[j] = math.exp(float(log_scales[i, j]))
-            _rotate(rotations[i], turn)
-            _axes(turn, scales, pose, x, y, z, lens, slope, axes)
-            xx, xy, yy, determinant = _variances(axes)
-            # Also false for what is not a number.
-            if not xx + yy < _WIDEST:
-                continue
-            across, down = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
-            reach = math.sqrt(2.0 * math.log(opacity / FAINTEST))
-            wide, high = reach * math.sqrt(xx), reach * math.sqrt(yy)
-            if across + wide <= 0 or across - wide >= lens[4] or down + high <= 0 or down - high >= lens[5]:
-                continue
-            screen[i, 0], screen[i, 1] = across, down
-            remainders[i, 0], remainders[i, 1] = across - float(screen[i, 0]), down - float(screen[i, 1])
-            steep = math.sqrt(yy / determinant)
-            ellipses[i, 0], ellipses[i, 1], ellipses[i, 2] = steep, -xy / yy * steep, 1.0 / math.sqrt(yy)
-            half = 0.5 * (xx + yy)
-            radii[i, 0] = reach * math.sqrt(half + math.sqrt(max(half * half - determinant, 0.0)))
-            opacities[i, 0], depths[i, 0] = opacity, z
+    turn, slope, axes, scales = scratch[lane, :3], scratch[lane, 3:5], scratch[lane, 5:7], scratch[lane, 7]
+    for i in range(lane * points // lanes, (lane + 1) * points // lanes):
+        if not _usable(centers[i], rotations[i], log_scales[i], logits[i], harmonics[i]):
+            radii[i, 0] = np.nan
+            continue
+        x, y, z = _inside(centers[i], pose)
+        opacity = 1.0 / (1.0 + math.exp(-float(logits[i])))
+        if z < NEAR or opacity < FAINTEST:
+            continue
+        for j in range(3):
+            scales[j] = math.exp(float(log_scales[i, j]))
+        _rotate(rotations[i], turn)
+        _axes(turn, scales, pose, x, y, z, lens, slope, axes)
+        xx, xy, yy, determinant = _variances(axes)
+        # Also false for what is not a number.
+        if not xx + yy < _WIDEST:
+            continue
+        across, down = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
+        reach = math.sqrt(2.0 * math.log(opacity / FAINTEST))
+        wide, high = reach * math.sqrt(xx), reach * math.sqrt(yy)
+        if across + wide <= 0 or across - wide >= lens[4] or down + high <= 0 or down - high >= lens[5]:
+            continue
+        screen[i, 0], screen[i, 1] = across, down
+        remainders[i, 0], remainders[i, 1] = across - float(screen[i, 0]), down - float(screen[i, 1])
+        steep = math.sqrt(yy / determinant)
+        ellipses[i, 0], ellipses[i, 1], ellipses[i, 2] = steep, -xy / yy * steep, 1.0 / math.sqrt(yy)
+        half = 0.5 * (xx + yy)
+        radii[i, 0] = reach * math.sqrt(half + math.sqrt(max(half * half - determinant, 0.0)))
+        opacities[i, 0], depths[i, 0] = opacity, z
 
 
-@compiled(parallel=True, error_model="numpy")
+@compiled(error_model="numpy")
 @no_type_check
 def project_points_back(
+    lane,
+    lanes,
     centers,
     rotations,
     log_scales,
@@ -186,67 +187,68 @@ def project_points_back(
     by_depths,
     pose,
     lens,
-    lanes,
+    scratch,
     by_centers,
     by_rotations,
     by_log_scales,
     by_logits,
 ):
-    """Write the derivatives by centers, rotations, sizes and opacities, without what the colours add to the centers."""
+    """Write the derivatives by centers, rotations, sizes and opacities, without what the colours add to the centers.
+
+    The arrays come as zeros, and stay so where the radius is zero. `scratch` is that of `project_points`.
+    """
     points = len(centers)
-    for lane in numba.prange(lanes):
-        turn, slope, axes = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3))
-        scales, inner = np.empty(3), np.empty(3)
-        by_turn, by_axes, by_slope = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3))
-        for i in range(lane * points // lanes, (lane + 1) * points // lanes):
-            if not radii[i, 0] > 0.0:
-                by_centers[i, :], by_rotations[i, :], by_log_scales[i, :], by_logits[i] = 0.0, 0.0, 0.0, 0.0
-                continue
-            x, y, z = _inside(centers[i], pose)
-            for j in range(3):
-                scales[j] = math.exp(float(log_scales[i, j]))
-            length = _rotate(rotations[i], turn)
-            across, down = _axes(turn, scales, pose, x, y, z, lens, slope, axes)
-            _, xy, yy, determinant = _variances(axes)
+    turn, slope, axes, scales = scratch[lane, :3], scratch[lane, 3:5], scratch[lane, 5:7], scratch[lane, 7]
+    by_turn, by_slope, by_axes = scratch[lane, 8:11], scratch[lane, 11:13], scratch[lane, 13:15]
+    inner = scratch[lane, 15]
+    for i in range(lane * points // lanes, (lane + 1) * points // lanes):
+        if not radii[i, 0] > 0.0:
+            continue
+        x, y, z = _inside(centers[i], pose)
+        for j in range(3):
+            scales[j] = math.exp(float(log_scales[i, j]))
+        length = _rotate(rotations[i], turn)
+        across, down = _axes(turn, scales, pose, x, y, z, lens, slope, axes)
+        _, xy, yy, determinant = _variances(axes)
 
-            # p = D^(-1/2), r = -p xy / yy, s = yy^(-1/2), where D = xx - xy^2 / yy.
-            steep, lean = math.sqrt(yy / determinant), xy / yy
-            by_p, by_r, by_s = float(by_ellipses[i, 0]), float(by_ellipses[i, 1]), float(by_ellipses[i, 2])
-            by_xx = -0.5 * steep * steep * steep * (by_p - lean * by_r)
-            by_xy = -2.0 * lean * by_xx - steep / yy * by_r
-            by_yy = lean * lean * by_xx + lean * steep / yy * by_r - 0.5 * by_s / (yy * math.sqrt(yy))
-            for j in range(3):
-                by_axes[0, j] = 2.0 * by_xx * axes[0, j] + by_xy * axes[1, j]
-                by_axes[1, j] = 2.0 * by_yy * axes[1, j] + by_xy * axes[0, j]
+        # p = D^(-1/2), r = -p xy / yy, s = yy^(-1/2), where D = xx - xy^2 / yy.
+        steep, lean = math.sqrt(yy / determinant), xy / yy
+        by_p, by_r, by_s = float(by_ellipses[i, 0]), float(by_ellipses[i, 1]), float(by_ellipses[i, 2])
+        by_xx = -0.5 * steep * steep * steep * (by_p - lean * by_r)
+        by_xy = -2.0 * lean * by_xx - steep / yy * by_r
+        by_yy = lean * lean * by_xx + lean * steep / yy * by_r - 0.5 * by_s / (yy * math.sqrt(yy))
+        for j in range(3):
+            by_axes[0, j] = 2.0 * by_xx * axes[0, j] + by_xy * axes[1, j]
+            by_axes[1, j] = 2.0 * by_yy * axes[1, j] + by_xy * axes[0, j]
 
-            for j in range(3):
-                by_log_scales[i, j] = by_axes[0, j] * axes[0, j] + by_axes[1, j] * axes[1, j]
-                for k in range(3):
-                    by_turn[k, j] = (slope[0, k] * by_axes[0, j] + slope[1, k] * by_axes[1, j]) * scales[j]
-            _unrotate(rotations[i], length, by_turn, by_rotations[i])
-            for row in range(2):
-                for k in range(3):
-                    by_slope[row, k] = 0.0
-                    for j in range(3):
-                        by_slope[row, k] += by_axes[row, j] * turn[k, j] * scales[j]
+        for j in range(3):
+            by_log_scales[i, j] = by_axes[0, j] * axes[0, j] + by_axes[1, j] * axes[1, j]
+            for k in range(3):
+                by_turn[k, j] = (slope[0, k] * by_axes[0, j] + slope[1, k] * by_axes[1, j]) * scales[j]
+        _unrotate(rotations[i], length, by_turn, by_rotations[i])
+        for row in range(2):
+            for k in range(3):
+                by_slope[row, k] = 0.0
+                for j in range(3):
+                    by_slope[row, k] += by_axes[row, j] * turn[k, j] * scales[j]
 
-            # Through the places in the image, and through J, whose first row is focal / z (1, 0, -x / z).
-            inner[0] = lens[0] / z * float(by_screen[i, 0])
-            inner[1] = lens[1] / z * float(by_screen[i, 1])
-            inner[2] = -(x * inner[0] + y * inner[1]) / z + float(by_depths[i, 0])
-            for row in range(2):
-                focal = lens[row] / z
-                tangent, place, clear = (across, x, across == x / z) if row == 0 else (down, y, down == y / z)
-                along, ahead = 0.0, 0.0
-                for k in range(3):
-                    along += by_slope[row, k] * pose[row, k]
-                    ahead += by_slope[row, k] * pose[2, k]
-                inner[2] -= focal / z * (along - tangent * ahead)
-                if clear:
-                    inner[row] -= focal / z * ahead
-                    inner[2] += focal / z * ahead * place / z
+        # Through the places in the image, and through J, whose first row is focal / z (1, 0, -x / z).
+        inner[0] = lens[0] / z * float(by_screen[i, 0])
+        inner[1] = lens[1] / z * float(by_screen[i, 1])
+        inner[2] = -(x * inner[0] + y * inner[1]) / z + float(by_depths[i, 0])
+        for row in range(2):
+            focal = lens[row] / z
+            tangent, place, clear = (across, x, across == x / z) if row == 0 else (down, y, down == y / z)
+            along, ahead = 0.0, 0.0
+            for k in range(3):
+                along += by_slope[row, k] * pose[row, k]
+                ahead += by_slope[row, k] * pose[2, k]
+            inner[2] -= focal / z * (along - tangent * ahead)
+            if clear:
+                inner[row] -= focal / z * ahead
+                inner[2] += focal / z * ahead * place / z
 
-            opacity = 1.0 / (1.0 + math.exp(-float(logits[i])))
-            by_logits[i] = float(by_opacities[i, 0]) * opacity * (1.0 - opacity)
-            for j in range(3):
-                by_centers[i, j] = pose[0, j] * inner[0] + pose[1, j] * inner[1] + pose[2, j] * inner[2]
+        opacity = 1.0 / (1.0 + math.exp(-float(logits[i])))
+        by_logits[i] = float(by_opacities[i, 0]) * opacity * (1.0 - opacity)
+        for j in range(3):
+            by_centers[i, j] = pose[0, j] * inner[0] + pose[1, j] * inner[1] + pose[2, j] * inner[2]

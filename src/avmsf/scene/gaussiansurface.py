@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import fields
 from typing import no_type_check
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
@@ -18,11 +17,10 @@ from avmsf.capture.cameras import Camera
 from avmsf.capture.levelset import enclose
 from avmsf.capture.meshviews import orbit_cameras
 from avmsf.capture.surface import Surface
-from avmsf.compiled import compiled
+from avmsf.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import CaptureError, SceneError
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
-from avmsf.scene.tiles import KERNELS
 from avmsf.scene.visibility import DepthMap, depth_of_cloud
 
 _FEWEST = 100
@@ -145,17 +143,17 @@ def _carve(
         depth = depth_map(camera).cpu().double()
         reached = torch.where(depth > 0, depth, torch.inf).numpy()
         projection = (camera.intrinsics @ camera.world_to_camera[:3]).numpy()
-        with KERNELS:
-            _look(projection, reached, lowest, spacing, _STEP * spacing, free, seen)
+        run_lanes(_look, lane_count(), projection, reached, lowest, spacing, _STEP * spacing, free, seen)
     return free, seen
 
 
-@compiled(parallel=True)
+@compiled(error_model="numpy")
 @no_type_check
-def _look(projection, reached, first, spacing, step, free, seen):
+def _look(lane, lanes, projection, reached, first, spacing, step, free, seen):
     """Count, for each cell whose middle is in the image, that it was seen and how far it lies before the surface."""
     height, width = reached.shape
-    for i in numba.prange(seen.shape[0]):
+    cells = seen.shape[0]
+    for i in range(lane * cells // lanes, (lane + 1) * cells // lanes):
         x = first[0] + i * spacing
         for j in range(seen.shape[1]):
             y = first[1] + j * spacing

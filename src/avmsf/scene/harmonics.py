@@ -7,7 +7,6 @@ Harmonics Tricks", with the Condon-Shortley sign on odd orders). A colour is one
 import math
 from typing import no_type_check
 
-import numba
 import numpy as np
 from jaxtyping import Float64
 
@@ -81,51 +80,52 @@ def _direction(center, position):
     return x / distance, y / distance, z / distance, distance
 
 
-@compiled(parallel=True, error_model="numpy")
+@compiled(error_model="numpy")
 @no_type_check
-def shade(centers, weights, radii, position, lanes, colors):
-    """Write the colours [points, 3] in which a camera at `position` sees Gaussians, zero where their radius is."""
-    points, count = len(centers), weights.shape[1]
-    for lane in numba.prange(lanes):
-        basis = np.empty(16)
-        for i in range(lane * points // lanes, (lane + 1) * points // lanes):
-            colors[i, 0], colors[i, 1], colors[i, 2] = 0.0, 0.0, 0.0
-            if radii[i, 0] > 0.0:
-                x, y, z, _ = _direction(centers[i], position)
-                _harmonics(x, y, z, count, basis)
-                for j in range(3):
-                    color = 0.5
-                    for k in range(count):
-                        color += basis[k] * float(weights[i, k, j])
-                    colors[i, j] = max(color, 0.0)
+def shade(lane, lanes, centers, weights, radii, position, scratch, colors):
+    """Write the colours [points, 3] in which a camera at `position` sees Gaussians, all but those with radius zero.
 
-
-@compiled(parallel=True, error_model="numpy")
-@no_type_check
-def shade_back(centers, weights, radii, position, by_colors, lanes, by_centers, by_weights):
-    """Add to `by_centers` [points, 3] what the colours' derivatives bring, and write those by the weights."""
-    points, count = len(centers), weights.shape[1]
-    for lane in numba.prange(lanes):
-        basis, mixed, by_color = np.empty(16), np.empty(16), np.empty(3)
-        for i in range(lane * points // lanes, (lane + 1) * points // lanes):
-            if not radii[i, 0] > 0.0:
-                by_weights[i, :, :] = 0.0
-                continue
-            x, y, z, distance = _direction(centers[i], position)
+    `scratch` [lanes, 35] are float64 numbers to work with.
+    """
+    points, count, basis = len(centers), weights.shape[1], scratch[lane]
+    for i in range(lane * points // lanes, (lane + 1) * points // lanes):
+        if radii[i, 0] > 0.0:
+            x, y, z, _ = _direction(centers[i], position)
             _harmonics(x, y, z, count, basis)
             for j in range(3):
                 color = 0.5
                 for k in range(count):
                     color += basis[k] * float(weights[i, k, j])
-                # Where a colour is held at zero nothing moves it.
-                by_color[j] = float(by_colors[i, j]) if color > 0.0 else 0.0
+                colors[i, j] = color if color > 0.0 else 0.0
+
+
+@compiled(error_model="numpy")
+@no_type_check
+def shade_back(lane, lanes, centers, weights, radii, position, by_colors, scratch, by_centers, by_weights):
+    """Add to `by_centers` [points, 3] what the colours' derivatives bring, and write those by the weights.
+
+    Gaussians with radius zero are left out. `scratch` is that of `shade`.
+    """
+    points, count = len(centers), weights.shape[1]
+    basis, mixed, by_color = scratch[lane, :16], scratch[lane, 16:32], scratch[lane, 32:]
+    for i in range(lane * points // lanes, (lane + 1) * points // lanes):
+        if not radii[i, 0] > 0.0:
+            continue
+        x, y, z, distance = _direction(centers[i], position)
+        _harmonics(x, y, z, count, basis)
+        for j in range(3):
+            color = 0.5
             for k in range(count):
-                mixed[k] = 0.0
-                for j in range(3):
-                    by_weights[i, k, j] = basis[k] * by_color[j]
-                    mixed[k] += float(weights[i, k, j]) * by_color[j]
-            by_x, by_y, by_z = _slope(x, y, z, count, mixed)
-            along = by_x * x + by_y * y + by_z * z
-            by_centers[i, 0] += (by_x - along * x) / distance
-            by_centers[i, 1] += (by_y - along * y) / distance
-            by_centers[i, 2] += (by_z - along * z) / distance
+                color += basis[k] * float(weights[i, k, j])
+            # Where a colour is held at zero nothing moves it.
+            by_color[j] = float(by_colors[i, j]) if color > 0.0 else 0.0
+        for k in range(count):
+            mixed[k] = 0.0
+            for j in range(3):
+                by_weights[i, k, j] = basis[k] * by_color[j]
+                mixed[k] += float(weights[i, k, j]) * by_color[j]
+        by_x, by_y, by_z = _slope(x, y, z, count, mixed)
+        along = by_x * x + by_y * y + by_z * z
+        by_centers[i, 0] += (by_x - along * x) / distance
+        by_centers[i, 1] += (by_y - along * y) / distance
+        by_centers[i, 2] += (by_z - along * z) / distance

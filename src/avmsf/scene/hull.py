@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import no_type_check
 
 import cv2
-import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -16,9 +15,8 @@ from torch import Tensor
 
 from avmsf.capture.cameras import View
 from avmsf.capture.warning import CaptureWarning
-from avmsf.compiled import compiled
+from avmsf.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import SceneError
-from avmsf.scene.tiles import KERNELS
 
 _ROUGH = 48
 """Voxels along the longest side of the first carving, which finds where the object is."""
@@ -141,20 +139,21 @@ def _carve(
         grown = 0.5 * spacing * view.camera.focal[0] / max(depth, 1e-9)
         if grown >= 1.0:
             mask = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) <= grown
-        with KERNELS:
-            _vote(view.camera.intrinsics.numpy() @ pose[:3], mask, lowest + 0.5 * spacing, spacing, seen, against)
+        projection = view.camera.intrinsics.numpy() @ pose[:3]
+        run_lanes(_vote, lane_count(), projection, mask, lowest + 0.5 * spacing, spacing, seen, against)
     agreed = against <= dissent * seen
     looks = seen[agreed & (seen > 0)]
     enough = 0.5 * float(np.quantile(looks, 0.9)) if len(looks) else 1.0
     return agreed & (seen >= max(1.0, enough))
 
 
-@compiled(parallel=True)
+@compiled(error_model="numpy")
 @no_type_check
-def _vote(projection, mask, first, spacing, seen, against):
+def _vote(lane, lanes, projection, mask, first, spacing, seen, against):
     """Count, for each voxel whose middle is in the image, that it was seen and whether the mask speaks against it."""
     height, width = mask.shape
-    for i in numba.prange(seen.shape[0]):
+    cells = seen.shape[0]
+    for i in range(lane * cells // lanes, (lane + 1) * cells // lanes):
         x = first[0] + i * spacing
         for j in range(seen.shape[1]):
             y = first[1] + j * spacing

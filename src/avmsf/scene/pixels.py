@@ -7,8 +7,8 @@ for the exponential, and only those pairs of rows that the ellipse reaches.
 import math
 from typing import Any, no_type_check
 
-import numba
 import numpy as np
+from jaxtyping import Float32
 from numba.core import types
 from numba.extending import intrinsic
 
@@ -58,15 +58,11 @@ def _exponential(x):
     return value * _power(whole)
 
 
-@compiled()
-@no_type_check
-def _scratch():
-    """Return a tile's working numbers, nine for each of its pixels, with the pixels' places in the first two."""
-    scratch = np.empty(9 * PIXELS, np.float32)
-    for p in range(PIXELS):
-        scratch[p] = np.float32(p % SIDE) + np.float32(0.5)
-        scratch[PIXELS + p] = np.float32(p // SIDE) + np.float32(0.5)
-    return scratch
+def working_numbers(lanes: int) -> Float32[np.ndarray, "lanes numbers"]:
+    """Return each lane's numbers for a tile, nine for each of its pixels, with the pixels' places in the first two."""
+    numbers = np.empty((lanes, 9, SIDE, SIDE), np.float32)
+    numbers[:, 0], numbers[:, 1] = np.arange(SIDE) + 0.5, np.arange(SIDE)[:, None] + 0.5
+    return numbers.reshape(lanes, 9 * PIXELS)
 
 
 @compiled()
@@ -108,49 +104,49 @@ def _cover(scratch, packed, row, middle, center, first, last, number, faint):
         scratch[_NUMBER + p] = number if drawn else previous
 
 
-@compiled(parallel=True, error_model="numpy", fastmath=_FAST)
+@compiled(error_model="numpy", fastmath=_FAST)
 @no_type_check
-def blend(places, packed, starts, rows, bounds, paint, faint, color, alpha, depth, kept):
+def blend(lane, lanes, places, packed, starts, rows, bounds, paint, faint, numbers, color, alpha, depth, kept):
     """Blend the tiles' lists into `color`, `alpha` and `depth`, and keep what the way back needs of every tile.
 
     Each lane takes the tiles from one of the `bounds` to the next. `kept` [tiles, 3, 64] gets what is left of each
     pixel, the place in the list of the last Gaussian drawn, and the mean depth. Below `faint`, the binary logarithm of
-    what it covers, a Gaussian does not count.
+    what it covers, a Gaussian does not count. `numbers` are those of `working_numbers`.
     """
     height, width = alpha.shape
     across = (width + SIDE - 1) // SIDE
-    for lane in numba.prange(len(bounds) - 1):
-        scratch = _scratch()
-        for tile in range(bounds[lane], bounds[lane + 1]):
-            left, top = (tile % across) * SIDE, (tile // across) * SIDE
-            for p in range(PIXELS):
-                inside = left + p % SIDE < width and top + p // SIDE < height
-                # Nothing is left where the image ends, so that those pixels keep no other waiting.
-                scratch[2 * PIXELS + p] = _ONE if inside else _ZERO
-                scratch[3 * PIXELS + p] = _ONE
-                scratch[8 * PIXELS + p] = _NONE
-            scratch[4 * PIXELS : 8 * PIXELS] = _ZERO
-            for k in range(starts[tile + 1] - starts[tile]):
-                row = rows[starts[tile] + k]
-                middle, center = places[row, 0] - left, places[row, 1] - top
-                first, last = _stretch(center, packed[row, 8])
-                _cover(scratch, packed, row, np.float32(middle), np.float32(center), first, last, np.float32(k), faint)
-                if k % 4 == 3:
-                    most = _ZERO
-                    for p in range(PIXELS):
-                        most = max(most, scratch[2 * PIXELS + p])
-                    if most == _ZERO:
-                        break
-            for p in range(PIXELS):
-                rest = scratch[3 * PIXELS + p]
-                mean = scratch[7 * PIXELS + p] / (_ONE - rest) if rest < _ONE else _ZERO
-                kept[tile, 0, p], kept[tile, 1, p], kept[tile, 2, p] = rest, scratch[8 * PIXELS + p], mean
-                i, j = top + p // SIDE, left + p % SIDE
-                if i < height and j < width:
-                    color[i, j, 0] = scratch[4 * PIXELS + p] + rest * paint[0]
-                    color[i, j, 1] = scratch[5 * PIXELS + p] + rest * paint[1]
-                    color[i, j, 2] = scratch[6 * PIXELS + p] + rest * paint[2]
-                    alpha[i, j], depth[i, j] = _ONE - rest, mean
+    scratch = numbers[lane]
+    for tile in range(bounds[lane], bounds[lane + 1]):
+        left, top = (tile % across) * SIDE, (tile // across) * SIDE
+        for p in range(PIXELS):
+            inside = left + p % SIDE < width and top + p // SIDE < height
+            # Nothing is left where the image ends, so that those pixels keep no other waiting.
+            scratch[2 * PIXELS + p] = _ONE if inside else _ZERO
+            scratch[3 * PIXELS + p] = _ONE
+            scratch[8 * PIXELS + p] = _NONE
+        for p in range(4 * PIXELS, 8 * PIXELS):
+            scratch[p] = _ZERO
+        for k in range(starts[tile + 1] - starts[tile]):
+            row = rows[starts[tile] + k]
+            middle, center = places[row, 0] - left, places[row, 1] - top
+            first, last = _stretch(center, packed[row, 8])
+            _cover(scratch, packed, row, np.float32(middle), np.float32(center), first, last, np.float32(k), faint)
+            if k % 4 == 3:
+                most = _ZERO
+                for p in range(PIXELS):
+                    most = max(most, scratch[2 * PIXELS + p])
+                if most == _ZERO:
+                    break
+        for p in range(PIXELS):
+            rest = scratch[3 * PIXELS + p]
+            mean = scratch[7 * PIXELS + p] / (_ONE - rest) if rest < _ONE else _ZERO
+            kept[tile, 0, p], kept[tile, 1, p], kept[tile, 2, p] = rest, scratch[8 * PIXELS + p], mean
+            i, j = top + p // SIDE, left + p % SIDE
+            if i < height and j < width:
+                color[i, j, 0] = scratch[4 * PIXELS + p] + rest * paint[0]
+                color[i, j, 1] = scratch[5 * PIXELS + p] + rest * paint[1]
+                color[i, j, 2] = scratch[6 * PIXELS + p] + rest * paint[2]
+                alpha[i, j], depth[i, j] = _ONE - rest, mean
 
 
 @compiled(error_model="numpy", fastmath=_FAST)
@@ -199,37 +195,54 @@ def _uncover(scratch, packed, row, middle, center, first, last, number, faint, p
     parts[slot, 8], parts[slot, 9] = sum_blue, sum_away
 
 
-@compiled(parallel=True, error_model="numpy", fastmath=_FAST)
+@compiled(error_model="numpy", fastmath=_FAST)
 @no_type_check
-def blend_back(places, packed, starts, rows, slots, bounds, paint, faint, by_color, by_alpha, by_depth, kept, parts):
+def blend_back(
+    lane,
+    lanes,
+    places,
+    packed,
+    starts,
+    rows,
+    slots,
+    bounds,
+    paint,
+    faint,
+    numbers,
+    by_color,
+    by_alpha,
+    by_depth,
+    kept,
+    parts,
+):
     """Write for each pair of tile and Gaussian the sums that `_uncover` makes into its row of `parts`."""
     height, width = by_alpha.shape
     across = (width + SIDE - 1) // SIDE
-    for lane in numba.prange(len(bounds) - 1):
-        scratch = _scratch()
-        for tile in range(bounds[lane], bounds[lane + 1]):
-            if starts[tile + 1] == starts[tile]:
-                continue
-            left, top = (tile % across) * SIDE, (tile // across) * SIDE
-            most = _NONE
-            for p in range(PIXELS):
-                i, j = top + p // SIDE, left + p % SIDE
-                inside = i < height and j < width
-                rest, last, mean = kept[tile, 0, p], kept[tile, 1, p], kept[tile, 2, p]
-                by_red, by_green = (by_color[i, j, 0], by_color[i, j, 1]) if inside else (_ZERO, _ZERO)
-                by_blue, by_rest = (by_color[i, j, 2], -by_alpha[i, j]) if inside else (_ZERO, _ZERO)
-                by_sum = by_depth[i, j] / (_ONE - rest) if inside and rest < _ONE else _ZERO
-                by_rest += by_sum * mean + by_red * paint[0] + by_green * paint[1] + by_blue * paint[2]
-                scratch[2 * PIXELS + p], scratch[3 * PIXELS + p] = rest, rest * by_rest
-                scratch[4 * PIXELS + p], scratch[5 * PIXELS + p] = by_red, by_green
-                scratch[6 * PIXELS + p], scratch[7 * PIXELS + p] = by_blue, by_sum
-                scratch[8 * PIXELS + p] = last
-                most = max(most, last)
-            reached = int(most) + 1
-            for k in range(reached, starts[tile + 1] - starts[tile]):
-                parts[slots[starts[tile] + k], :] = _ZERO
-            for k in range(reached - 1, -1, -1):
-                row, slot = rows[starts[tile] + k], slots[starts[tile] + k]
-                middle, center = np.float32(places[row, 0] - left), np.float32(places[row, 1] - top)
-                first, last = _stretch(places[row, 1] - top, packed[row, 8])
-                _uncover(scratch, packed, row, middle, center, first, last, np.float32(k), faint, parts, slot)
+    scratch = numbers[lane]
+    for tile in range(bounds[lane], bounds[lane + 1]):
+        if starts[tile + 1] == starts[tile]:
+            continue
+        left, top = (tile % across) * SIDE, (tile // across) * SIDE
+        most = _NONE
+        for p in range(PIXELS):
+            i, j = top + p // SIDE, left + p % SIDE
+            inside = i < height and j < width
+            rest, last, mean = kept[tile, 0, p], kept[tile, 1, p], kept[tile, 2, p]
+            by_red, by_green = (by_color[i, j, 0], by_color[i, j, 1]) if inside else (_ZERO, _ZERO)
+            by_blue, by_rest = (by_color[i, j, 2], -by_alpha[i, j]) if inside else (_ZERO, _ZERO)
+            by_sum = by_depth[i, j] / (_ONE - rest) if inside and rest < _ONE else _ZERO
+            by_rest += by_sum * mean + by_red * paint[0] + by_green * paint[1] + by_blue * paint[2]
+            scratch[2 * PIXELS + p], scratch[3 * PIXELS + p] = rest, rest * by_rest
+            scratch[4 * PIXELS + p], scratch[5 * PIXELS + p] = by_red, by_green
+            scratch[6 * PIXELS + p], scratch[7 * PIXELS + p] = by_blue, by_sum
+            scratch[8 * PIXELS + p] = last
+            most = max(most, last)
+        reached = int(most) + 1
+        for k in range(reached, starts[tile + 1] - starts[tile]):
+            for j in range(10):
+                parts[slots[starts[tile] + k], j] = _ZERO
+        for k in range(reached - 1, -1, -1):
+            row, slot = rows[starts[tile] + k], slots[starts[tile] + k]
+            middle, center = np.float32(places[row, 0] - left), np.float32(places[row, 1] - top)
+            first, last = _stretch(places[row, 1] - top, packed[row, 8])
+            _uncover(scratch, packed, row, middle, center, first, last, np.float32(k), faint, parts, slot)

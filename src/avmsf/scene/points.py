@@ -47,30 +47,31 @@ def farthest_points(points: Float[Tensor, "points 3"], count: int, *, start: int
     do not have.
     """
     _expect_rows(points, count, start)
-    return torch.from_numpy(_farthest(points.double().cpu().contiguous().numpy(), count, start))
+    places = points.double().cpu().contiguous().numpy()
+    chosen = np.empty(count, dtype=np.int64)
+    _farthest(places, start, np.full(len(places), np.inf), chosen)
+    return torch.from_numpy(chosen)
 
 
 @compiled(error_model="numpy", nogil=True)
 @no_type_check
-def _farthest(places, count, start):
-    """Do what `farthest_points` says."""
-    chosen = np.empty(count, dtype=np.int64)
-    apart = np.full(len(places), np.inf)
+def _farthest(places, start, apart, chosen):
+    """Write what `farthest_points` returns; `apart` comes as infinities and becomes distances from all chosen."""
     last = start
-    for turn in range(count):
+    for turn in range(len(chosen)):
         chosen[turn] = last
         # Chosen rows are barred rather than at distance zero, where they would tie with points that coincide.
         apart[last] = -np.inf
-        x, y, z = places[last]
+        x, y, z = places[last, 0], places[last, 1], places[last, 2]
         farthest = 0
         for row in range(len(places)):
-            here = places[row]
             # The root, for it makes ties of what rounding of the squares would tell apart.
-            apart[row] = min(apart[row], np.sqrt((here[0] - x) ** 2 + (here[1] - y) ** 2 + (here[2] - z) ** 2))
+            away = math.sqrt((places[row, 0] - x) ** 2 + (places[row, 1] - y) ** 2 + (places[row, 2] - z) ** 2)
+            if away < apart[row]:
+                apart[row] = away
             if apart[row] > apart[farthest]:
                 farthest = row
         last = farthest
-    return chosen
 
 
 def closest_points(points: Float[Tensor, "points 3"], count: int, *, start: int = 0) -> Int[Tensor, " chosen"]:

@@ -5,7 +5,6 @@ The conventions are gsplat's. `ellipses` and `harmonics` hold the kernels.
 
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
@@ -13,10 +12,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from avmsf.capture.cameras import Camera
+from avmsf.compiled import lane_count, run_lanes
 from avmsf.scene.ellipses import project_points, project_points_back
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.harmonics import shade, shade_back
-from avmsf.scene.tiles import KERNELS
 
 _MARGIN = 0.3
 """The perspective's slope is taken no further off axis than the image's edge and this part of half its width (3DGS)."""
@@ -44,14 +43,13 @@ class Projection(torch.autograd.Function):
         inputs = [each.detach().contiguous() for each in (centers, rotations, log_scales, logit_opacities, weights)]
         lens, pose = _lens(camera), np.ascontiguousarray(camera.world_to_camera[:3].double().numpy())
         count = len(centers)
-        outputs = [inputs[0].new_empty(count, width) for width in (2, 3, 1, 3, 1, 1, 2)]
+        outputs = [inputs[0].new_zeros(count, width) for width in (2, 3, 1, 3, 1, 1, 2)]
         screen, ellipses, opacities, colors, depths, radii, remainders = outputs
         results = [each.numpy() for each in (screen, ellipses, opacities, depths, radii, remainders)]
-        given, lanes = [each.numpy() for each in inputs], numba.get_num_threads()
+        given, lanes = [each.numpy() for each in inputs], lane_count()
         position = camera.position.double().numpy()
-        with KERNELS:
-            project_points(*given, pose, lens, lanes, *results)
-            shade(given[0], given[4], radii.numpy(), position, lanes, colors.numpy())
+        run_lanes(project_points, lanes, *given, pose, lens, np.empty((lanes, 16, 3)), *results)
+        run_lanes(shade, lanes, given[0], given[4], radii.numpy(), position, np.empty((lanes, 35)), colors.numpy())
         ctx.save_for_backward(*inputs, radii)
         ctx.pose, ctx.lens, ctx.position = pose, lens, position
         ctx.mark_non_differentiable(radii, remainders)
@@ -64,13 +62,13 @@ class Projection(torch.autograd.Function):
         *inputs, radii = ctx.saved_tensors
         centers, rotations, log_scales, logits, weights, reach = (each.numpy() for each in (*inputs, radii))
         by_screen, by_ellipses, by_opacities, by_colors, by_depths = (each.contiguous().numpy() for each in slopes[:5])
-        outputs = [torch.empty_like(each) for each in inputs]
+        outputs = [torch.zeros_like(each) for each in inputs]
         *results, by_weights = (each.numpy() for each in outputs)
         given = centers, rotations, log_scales, logits, reach, by_screen, by_ellipses, by_opacities, by_depths
-        lanes = numba.get_num_threads()
-        with KERNELS:
-            project_points_back(*given, ctx.pose, ctx.lens, lanes, *results)
-            shade_back(centers, weights, reach, ctx.position, by_colors, lanes, results[0], by_weights)
+        lanes = lane_count()
+        run_lanes(project_points_back, lanes, *given, ctx.pose, ctx.lens, np.empty((lanes, 16, 3)), *results)
+        shaded = centers, weights, reach, ctx.position, by_colors, np.empty((lanes, 35))
+        run_lanes(shade_back, lanes, *shaded, results[0], by_weights)
         return *outputs, None
 
 

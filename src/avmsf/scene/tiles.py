@@ -6,38 +6,9 @@ of the work counts and then fills its own stretch of that order, so that the out
 """
 
 import math
-import threading
 from typing import no_type_check
 
-import numba
-import numpy as np
-
 from avmsf.compiled import compiled
-
-KERNELS = threading.Lock()
-"""Held while kernels run: where numba has no OpenMP, two threads in its own pool at once end the process."""
-
-
-@compiled()
-@no_type_check
-def rank(keys):
-    """Return the order that sorts unsigned 32-bit keys upwards, equal ones as they come: least digit first."""
-    count = len(keys)
-    order, other = np.arange(count).astype(np.int32), np.empty(count, np.int32)
-    for shift in (0, 11, 22):
-        starts = np.zeros(2049, np.int64)
-        for i in range(count):
-            starts[((keys[i] >> np.uint32(shift)) & np.uint32(2047)) + 1] += 1
-        if starts.max() == count:
-            continue
-        for digit in range(2048):
-            starts[digit + 1] += starts[digit]
-        for i in range(count):
-            digit = (keys[order[i]] >> np.uint32(shift)) & np.uint32(2047)
-            other[starts[digit]] = order[i]
-            starts[digit] += 1
-        order, other = other, order
-    return order
 
 
 @compiled()
@@ -70,55 +41,49 @@ def _rows(place, packed, reach, height, side):
     return int(first) // side, (int(last) // side if last >= 0 else -1)
 
 
-@compiled(parallel=True, error_model="numpy")
+@compiled(error_model="numpy")
 @no_type_check
-def list_tiles(places, packed, reaches, width, height, side, lanes):
-    """Return the tiles' lists for Gaussians in order of depth.
+def count_tiles(lane, lanes, places, packed, reaches, size, side, counts, numbers):
+    """Add to `counts` [lanes, tiles] how many Gaussians of each lane touch each tile; write each one's number of tiles.
 
-    `places` [seen, 2] pixels float64, `packed` [seen, 16] of which the ellipse's p, r, s come first, `reaches` [seen]
-    the squared reach, `side` the tiles' in pixels. Returns `starts` [tiles + 1] of each tile's stretch of `rows`
-    [pairs], the Gaussians, and `slots` [pairs], where each pair comes if they are counted Gaussian by Gaussian, with
-    `ends` [seen + 1] there.
+    Gaussians come in order of depth: `places` [seen, 2] pixels float64, `packed` [seen, 16] of which the ellipse's p,
+    r, s come first, `reaches` [seen] the squared reach. `size` is the image's width and height, `side` the tiles' own,
+    pixels. Each lane takes its own stretch of the Gaussians.
     """
-    seen = len(places)
-    across, down = (width + side - 1) // side, (height + side - 1) // side
-    counts, ends = np.zeros((lanes, across * down), np.int64), np.zeros(seen + 1, np.int64)
-    for lane in numba.prange(lanes):
-        for i in range(lane * seen // lanes, (lane + 1) * seen // lanes):
-            reach, number = reaches[i], 0
-            upper, lower = _rows(places[i], packed[i], reach, height, side)
-            for row in range(upper, lower + 1):
-                first, last = _columns(
-                    places[i], packed[i], reach, row * side, min(row * side + side, height) - 1, width
-                )
-                if first <= last:
-                    for column in range(first // side, last // side + 1):
-                        counts[lane, row * across + column] += 1
-                        number += 1
-            ends[i + 1] = number
-    starts = np.zeros(across * down + 1, np.int64)
-    for tile in range(across * down):
-        total = starts[tile]
-        for lane in range(lanes):
-            number = counts[lane, tile]
-            counts[lane, tile] = total
-            total += number
-        starts[tile + 1] = total
-    for i in range(seen):
-        ends[i + 1] += ends[i]
-    rows, slots = np.empty(ends[seen], np.int32), np.empty(ends[seen], np.int64)
-    for lane in numba.prange(lanes):
-        for i in range(lane * seen // lanes, (lane + 1) * seen // lanes):
-            reach, slot = reaches[i], ends[i]
-            upper, lower = _rows(places[i], packed[i], reach, height, side)
-            for row in range(upper, lower + 1):
-                first, last = _columns(
-                    places[i], packed[i], reach, row * side, min(row * side + side, height) - 1, width
-                )
-                if first <= last:
-                    for column in range(first // side, last // side + 1):
-                        at = counts[lane, row * across + column]
-                        counts[lane, row * across + column] = at + 1
-                        rows[at], slots[at] = i, slot
-                        slot += 1
-    return starts, rows, slots, ends
+    seen, width, height = len(places), size[0], size[1]
+    across = (width + side - 1) // side
+    for i in range(lane * seen // lanes, (lane + 1) * seen // lanes):
+        number = 0
+        upper, lower = _rows(places[i], packed[i], reaches[i], height, side)
+        for row in range(upper, lower + 1):
+            bottom = min(row * side + side, height) - 1
+            first, last = _columns(places[i], packed[i], reaches[i], row * side, bottom, width)
+            if first <= last:
+                for column in range(first // side, last // side + 1):
+                    counts[lane, row * across + column] += 1
+                    number += 1
+        numbers[i] = number
+
+
+@compiled(error_model="numpy")
+@no_type_check
+def fill_tiles(lane, lanes, places, packed, reaches, size, side, counts, begins, rows, slots):
+    """Write each tile's Gaussians into its stretch of `rows` [pairs], and each pair's place Gaussian by Gaussian.
+
+    As `count_tiles`, but `counts` says where each lane's part of each tile's stretch begins, and is used up; `begins`
+    where each Gaussian's own pairs begin, which `slots` [pairs] tells of.
+    """
+    seen, width, height = len(places), size[0], size[1]
+    across = (width + side - 1) // side
+    for i in range(lane * seen // lanes, (lane + 1) * seen // lanes):
+        slot = begins[i]
+        upper, lower = _rows(places[i], packed[i], reaches[i], height, side)
+        for row in range(upper, lower + 1):
+            bottom = min(row * side + side, height) - 1
+            first, last = _columns(places[i], packed[i], reaches[i], row * side, bottom, width)
+            if first <= last:
+                for column in range(first // side, last // side + 1):
+                    at = counts[lane, row * across + column]
+                    counts[lane, row * across + column] = at + 1
+                    rows[at], slots[at] = i, slot
+                    slot += 1

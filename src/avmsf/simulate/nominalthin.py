@@ -5,8 +5,8 @@ What follows takes a minute or so for each hundred thousand triangles, and bodie
 
 import math
 from collections.abc import Callable
-from importlib import import_module
 
+import fast_simplification
 import numpy as np
 
 from avmsf.simulate.nominalsmooth import ROUGH, averaged, roughness
@@ -21,19 +21,10 @@ _ROUNDS = 4
 def thinned(skin: Skin, *, tell: Callable[[str], None]) -> Skin:
     """Return a skin of at most `MOST` triangles, and tell what was done to a larger one.
 
-    More are left where fewer would open a seam or share an edge among three; all of them where fast-simplification is
-    missing, and `tell` hears that this takes long.
+    More are left where fewer would open a seam or share an edge among three.
     """
     count = len(skin.faces)
     if count <= MOST:
-        return skin
-    try:
-        simplify = import_module("fast_simplification").simplify
-    except ImportError:
-        tell(
-            f"checking a mesh of {count} triangles, which may take many minutes: simplify it, or pip install "
-            "'avmsf[fem]', which thins it first"
-        )
         return skin
     tell(f"checking a mesh of {count} triangles")
     rough = roughness(skin)
@@ -42,7 +33,7 @@ def thinned(skin: Skin, *, tell: Callable[[str], None]) -> Skin:
     opened, crowded = skin.open_edges, skin.crowded_edges
     wanted = MOST
     while wanted < count:
-        points, faces = simplify(even.points, even.faces, target_count=wanted)
+        points, faces = fast_simplification.simplify(even.points, even.faces, target_count=wanted)
         found = Skin.compact(points.astype(np.float64), faces.astype(np.int64))
         if found.open_edges <= opened and found.crowded_edges <= crowded:
             noise = "" if even is skin else f", its noise of {rough:.0f} degrees from one to the next averaged out"

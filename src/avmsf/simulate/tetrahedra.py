@@ -40,7 +40,7 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
 
     `detail` is the length of the tetrahedra's edges over the body's size, the diagonal of the box around it, where
     nothing asks for shorter ones; the solid's surface keeps within a 25th of that length of the mesh. Takes some
-    seconds to a minute. Raises SimulationError where pytetwild is missing, fails or takes more than `timeout`
+    seconds to a minute. Raises SimulationError where pytetwild fails or takes more than `timeout`
     seconds, and for what encloses no body: points, sheets, parts that do not touch and walls too thin for the detail.
     """
     if not 0 < detail < 1:
@@ -62,8 +62,8 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
 def _tetrahedralise(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
     """Return points and cells as pytetwild's process leaves them."""
     found = importlib.util.find_spec("pytetwild")
-    if found is None or not found.submodule_search_locations:
-        raise SimulationError("solids from meshes need pytetwild: pip install 'avmsf[fem]'")
+    assert found is not None
+    assert found.submodule_search_locations
     with tempfile.TemporaryDirectory(prefix="avmsf-fill-") as name:
         job, result = Path(name) / "job.npz", Path(name) / "result.npz"
         np.savez(

@@ -1,0 +1,103 @@
+"""The folder that `avmsf demo` fills: what was there stays whole until all of the new demo is."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from avmsf.cli.writing import OutputError
+from avmsf.files import way_out
+
+FORMAT = "avmsf demo 1"
+"""What `demo.json` says its folder is."""
+RECORD = "demo.json"
+"""File that names all files of a finished demo."""
+UNFINISHED, REPLACED = ".avmsf-demo-unfinished", ".avmsf-demo-replaced"
+"""Folders inside the demo's own that hold the new demo until it is complete, and the old one while it is replaced."""
+_SHOWN = 3
+"""Foreign files that an error names."""
+
+
+@contextmanager
+def replaced_whole(folder: Path) -> Iterator[Path]:
+    """Give an empty folder to fill, inside `folder`; in the end its content takes the place of an earlier demo's.
+
+    Whatever is raised meanwhile, Ctrl-C included, leaves `folder` as it was. Raises `OutputError` for a folder with
+    files that no demo wrote, and where nothing can be written.
+    """
+    known = folder.exists()
+    _expect_own(folder)
+    begun = folder / UNFINISHED
+    try:
+        shutil.rmtree(begun, ignore_errors=True)
+        begun.mkdir(parents=True)
+        yield begun
+        _expect_own(folder)
+        _replace(folder, begun)
+    except OSError as error:
+        raise OutputError(
+            f"{error.filename or folder}: cannot be written ({error.strerror or error}): {way_out(error)}"
+        ) from error
+    finally:
+        shutil.rmtree(begun, ignore_errors=True)
+        if not known:
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def record(folder: Path) -> dict[str, object]:
+    """Return what a finished demo's record says of it: its format and the files in `folder`, the record included."""
+    files = {RECORD} | {each.relative_to(folder).as_posix() for each in folder.rglob("*") if not each.is_dir()}
+    return {"format": FORMAT, "files": sorted(files)}
+
+
+def _own_files(folder: Path) -> set[str]:
+    """Return the files of the finished demo in a folder, none where there is no record of one."""
+    try:
+        known = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return set()
+    if not isinstance(known, dict) or known.get("format") != FORMAT or not isinstance(known.get("files"), list):
+        return set()
+    return {str(each) for each in known["files"]}
+
+
+def _expect_own(folder: Path) -> None:
+    """Raise `OutputError` where a folder holds more than a demo."""
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise OutputError(f"{folder}: expected a folder, got a file: choose another name")
+    own = _own_files(folder)
+    found = {each.relative_to(folder) for each in folder.rglob("*") if not each.is_dir() or each.is_symlink()}
+    # An old demo that was being deleted when its successor was already complete.
+    passed = {UNFINISHED, REPLACED} if own else {UNFINISHED}
+    foreign = sorted(each.as_posix() for each in found if each.as_posix() not in own and each.parts[0] not in passed)
+    if foreign:
+        shown = ", ".join(foreign[:_SHOWN]) + (", ..." if len(foreign) > _SHOWN else "")
+        raise OutputError(
+            f"{folder}: expected an empty folder or an earlier demo, got {len(foreign)} files that no demo wrote "
+            f"({shown}): choose another folder, or move them away"
+        )
+
+
+def _replace(folder: Path, begun: Path) -> None:
+    """Move the old demo aside and the new one in, the record first and last, or all back where that fails."""
+    aside = folder / REPLACED
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir()
+    old = sorted({each.split("/")[0] for each in _own_files(folder) if (folder / each).exists()})
+    new = sorted(each.name for each in begun.iterdir())
+    out = [(folder / name, aside / name) for name in sorted(old, key=lambda name: name != RECORD)]
+    moves = out + [(begun / name, folder / name) for name in sorted(new, key=lambda name: name == RECORD)]
+    try:
+        for source, target in moves:
+            source.rename(target)
+    except BaseException:
+        for source, target in reversed(moves):
+            if not source.exists() and target.exists():
+                target.rename(source)
+        aside.rmdir()
+        raise
+    shutil.rmtree(aside, ignore_errors=True)

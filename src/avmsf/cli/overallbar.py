@@ -1,0 +1,102 @@
+"""How far a run of several stages is, and the time that it still takes, on the standard error."""
+
+import sys
+import time
+from collections.abc import Mapping
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+from rich.text import Text
+
+from avmsf.cli.printing import say
+from avmsf.field.fit import Progress as FitProgress
+from avmsf.pipeline.scene import Listener
+from avmsf.scene.lift import LiftProgress
+from avmsf.scene.splat import SplatProgress
+
+_PRIOR = 0.15
+"""Part of the run by which its pace here counts as much as the usual one in the estimate of the time left."""
+
+
+class OverallBar:
+    """One bar for the whole run, with its stage; in a file or a pipe, a line for each thing that begins."""
+
+    def __init__(self, stages: Mapping[str, float]) -> None:
+        """Take the stages in order, with the seconds that each usually takes."""
+        self.stages, self.usual = stages, sum(stages.values())
+        self.begun = time.monotonic()
+        self.done = 0.0
+        self._estimate = (self.begun, self.usual)
+        self._stage = next(iter(stages))
+        self._live = sys.stderr.isatty()
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.percentage:.0f} %"),
+            _TimeLeft(self),
+            console=Console(file=sys.stderr, markup=False, highlight=False),
+            disable=not self._live,
+            transient=True,
+        )
+        self._task = self._bar.add_task(self._stage, total=1.0)
+
+    def __enter__(self) -> "OverallBar":
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    @property
+    def listener(self) -> Listener:
+        """Who hears of the stages that lead to features."""
+        return Listener(self.tell, self._splatting, self._lifting)
+
+    @property
+    def left(self) -> float:
+        """The time that the run probably still takes, seconds."""
+        at, seconds = self._estimate
+        return max(0.0, seconds - (time.monotonic() - at))
+
+    def tell(self, words: str) -> None:
+        """Take note of what begins: of a stage, where the words are `stage: ...`, else of a part of the same stage."""
+        stage = words.partition(":")[0]
+        if stage in self.stages:
+            self._stage = stage
+            self._advance(0.0)
+        if self._live:
+            self._bar.update(self._task, description=words[:60])
+        else:
+            say(f"[{100 * self.done:3.0f} %, about {self.left:.0f} s left] {words}")
+
+    def fitting(self, progress: FitProgress) -> None:
+        """Take note of a step of the fit."""
+        self._advance(progress.step / progress.steps)
+
+    def _splatting(self, progress: SplatProgress) -> None:
+        self._advance(progress.step / progress.steps)
+
+    def _lifting(self, progress: LiftProgress) -> None:
+        self._advance(progress.done / progress.total)
+
+    def _advance(self, part: float) -> None:
+        """Take note that such a part of the stage is done, and of all stages before it."""
+        names, seconds = list(self.stages), list(self.stages.values())
+        place = names.index(self._stage)
+        self.done = max(self.done, (sum(seconds[:place]) + part * seconds[place]) / self.usual)
+        now = time.monotonic()
+        whole = (now - self.begun + _PRIOR * self.usual) / (self.done + _PRIOR)
+        self._estimate = (now, (1.0 - self.done) * whole)
+        self._bar.update(self._task, completed=self.done)
+
+
+class _TimeLeft(ProgressColumn):
+    def __init__(self, bar: OverallBar) -> None:
+        super().__init__()
+        self._overall = bar
+
+    def render(self, task: Task) -> Text:
+        return Text(f"about {self._overall.left:.0f} s left")

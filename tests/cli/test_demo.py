@@ -1,0 +1,99 @@
+"""The demo goes all the way, and says of itself what was measured."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from avmsf.bench.evaluation import Scores
+from avmsf.cli import demo, main
+from avmsf.cli.demo import verdict
+from avmsf.cli.overallbar import OverallBar
+from avmsf.field.store import load
+from avmsf.pipeline.features import LiftConfig
+from avmsf.pipeline.reconstruct import ReconstructConfig
+from avmsf.pipeline.scene import SceneConfig
+from avmsf.pipeline.sources import ViewsConfig
+from avmsf.scene.ply import read_splats
+from avmsf.scene.splatconfig import SplatConfig
+from plate_field import QUICK
+
+METHODS = {
+    "field": "the model",
+    "nearest strike": "the nearest recording",
+    "mean waveform of 3 nearest": "the mean of the three nearest recordings",
+}
+
+
+def test_the_demo_goes_all_the_way(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = SceneConfig(
+        ViewsConfig(count=6), SplatConfig(steps=30, start_points=400), LiftConfig(encoder="descriptors")
+    )
+    monkeypatch.setattr(demo, "CONFIG", ReconstructConfig("visual", scene=small, fit=QUICK))
+    folder = tmp_path / "demo"
+    assert main(["demo", str(folder)]) == 0
+    out, err = capsys.readouterr()
+    assert all(f"{stage}: " in err for stage in ("check", "splat", "lift", "modes", "fit", "page"))
+    told = json.loads((folder / "demo.json").read_text())
+    error = {method: each["relative_stft"] for method, each in told["scores"].items()}
+    assert error["floor: the test strikes' own gains"] < error["field"] < error["white noise"]
+    best = min(METHODS, key=lambda name: error[name])
+    assert f"{METHODS[best]} comes closest" in out
+    assert "| field |" in (folder / "scores.md").read_text()
+    files = {each.relative_to(folder).as_posix() for each in folder.rglob("*") if each.is_file()}
+    assert files == set(told["files"])
+    assert {name for name in files if not name.startswith("capture/")} == {
+        *("demo.json", "mug.html", "mug.ply", "mug.safetensors", "scores.md"),
+        *(f"pictures/{name}.png" for name in ("modes", "scores", "spectrograms")),
+        *(
+            f"sounds/strike-{row}-{kind}.wav"
+            for row in (1, 2)
+            for kind in ("1-recorded", "2-model", "3-mean-of-nearest")
+        ),
+    }
+    assert len(read_splats(folder / "mug.ply")) > 100
+    assert all(np.abs(soundfile.read(sound)[0]).max() <= 1 for sound in (folder / "sounds").iterdir())
+    assert len(load(folder / "mug.safetensors").origin.trained_on) == 12
+    assert list(tmp_path.iterdir()) == [folder]
+
+
+def test_the_built_in_settings_spread_gains_by_physics() -> None:
+    # The example has a mesh, which gains by elastic mode shapes need; they are among what is chosen from.
+    assert demo.CONFIG.gains == "auto"
+    assert (demo.EXAMPLE_FOLDER / "surface.ply").is_file()
+
+
+@pytest.mark.parametrize("best", METHODS)
+def test_the_verdict_names_what_is_nearest_whatever_that_is(best: str) -> None:
+    errors = torch.tensor([0.2, 0.3], dtype=torch.float64)
+    scores = {name: Scores("paper", ("a", "b"), {"relative_stft": errors + (name != best)}) for name in METHODS}
+    words = verdict(scores, 2)
+    assert f"{METHODS[best]} comes closest" in words
+    assert f"{METHODS[best]} has 0.25" in words
+    assert words.count("has 1.2") == 2
+
+
+def test_the_time_left_is_that_of_the_pace_so_far(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = 0.0
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    with OverallBar({"first": 30.0, "second": 10.0}) as bar:
+        assert bar.left == 40.0
+        bar.tell("first: a beginning")
+        now = 60.0
+        bar.tell("second: twice as slow as usual")
+        assert bar.done == 0.75
+        # At the usual pace 10 s are left, at this one 20 s, in which there is more trust by now.
+        assert 15.0 < bar.left < 20.0
+        now = 63.0
+        assert bar.left == pytest.approx(bar._estimate[1] - 3.0)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith("[  0 %, about 40 s left] first")
+    assert lines[1].startswith("[ 75 %")
