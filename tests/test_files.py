@@ -2,7 +2,6 @@
 
 import errno
 import os
-import tempfile
 from pathlib import Path
 
 import pytest
@@ -26,8 +25,8 @@ def test_what_helps_fits_what_the_system_says(tmp_path: Path, monkeypatch: pytes
     def refuse(*arguments: object, **settings: object) -> None:
         raise OSError(number, os.strerror(number))
 
-    for name in ("mkstemp", "mkdtemp"):
-        monkeypatch.setattr(tempfile, name, refuse)
+    for name in ("open", "mkdir"):
+        monkeypatch.setattr(os, name, refuse)
     with pytest.raises(ExportError) as refused:
         write_whole(tmp_path / "file", lambda place: None, raising=ExportError)
     words = f"cannot be written ({os.strerror(number)})"
@@ -45,3 +44,21 @@ def test_a_file_in_a_folders_place_and_a_folder_in_a_files_are_told_apart(tmp_pa
             write_whole(tmp_path / name, lambda place: None, raising=ExportError)
     with pytest.raises(ExportError, match="a folder of this name is there, name a file in it or choose another"):
         write_whole(tmp_path / "folder", lambda place: None, raising=ExportError)
+
+
+def test_new_files_and_folders_have_the_mode_of_the_umask_which_stays_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    changed: list[int] = []
+    before = os.umask(0o027)
+    try:
+        with monkeypatch.context() as patched:
+            # Another thread that makes a file meanwhile would see the change.
+            patched.setattr(os, "umask", lambda mask: changed.append(mask) or 0o027)
+            write_whole(tmp_path / "file", lambda place: place.write_text("words"))
+            write_folder(tmp_path / "folder", lambda place: (place / "inside").touch(), {})
+    finally:
+        os.umask(before)
+    modes = [(tmp_path / name).stat().st_mode & 0o777 for name in ("file", "folder", "folder/inside")]
+    assert modes == [0o640, 0o750, 0o640]
+    assert changed == []

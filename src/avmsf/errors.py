@@ -3,6 +3,9 @@
 And one of warnings, `AvmsfWarning`: what goes on all the same, and the user should know.
 """
 
+from collections.abc import Mapping
+from pathlib import Path
+
 
 class AvmsfError(Exception):
     """Something the user gave cannot be used; the message says what was expected, what was found and what to do."""
@@ -10,6 +13,16 @@ class AvmsfError(Exception):
 
 class AvmsfWarning(UserWarning):
     """Something is not as it should be, and the work goes on; the message says what, and what to do."""
+
+
+class FolderInUseError(AvmsfError):
+    """Another process writes into this folder; `holder` says which, where that is known."""
+
+    def __init__(self, folder: Path, holder: Mapping[str, object], advice: str = "") -> None:
+        self.folder, self.holder = folder, holder
+        names = ("command", "process", "since")
+        who = ", ".join(f"{name} {holder[name]}" for name in names if name in holder) or "it does not say which"
+        super().__init__(f"{folder}: another process writes there ({who}): wait until it has ended{advice}")
 
 
 class CaptureError(AvmsfError):

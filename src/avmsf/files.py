@@ -2,7 +2,7 @@
 
 import errno
 import os
-import tempfile
+import secrets
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -28,6 +28,11 @@ def way_out(error: OSError) -> str:
     return _WAYS_OUT.get(error.errno, "choose another place")
 
 
+def temporary_path(path: Path) -> Path:
+    """Return a name, free in all likelihood, of a hidden file or folder in the same folder as `path`."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+
+
 def write_whole(path: Path, write: Callable[[Path], object], *, raising: type[AvmsfError] = FieldFileError) -> None:
     """Let `write` fill a temporary file beside `path`, then move it there in one step; missing folders are made.
 
@@ -37,16 +42,12 @@ def write_whole(path: Path, write: Callable[[Path], object], *, raising: type[Av
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-        os.close(handle)
-        temporary = Path(name)
+        temporary = temporary_path(path)
+        # Unlike tempfile.mkstemp, this lets the system apply the umask, as for any file that is to be shared.
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         write(temporary)
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
-        # mkstemp makes files that only their owner reads; a field is for sharing like any other file.
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
         os.replace(temporary, path)
     except OSError as error:
         raise raising(

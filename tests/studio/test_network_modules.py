@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 NETWORK = "https://cdn.jsdelivr.net/npm/"
 TAMPERED = "three.core.js"
+HEARD = "window.refused = []; addEventListener('securitypolicyviolation', (e) => refused.push(e.violatedDirective));"
 
 
 def digests() -> dict[str, str]:
@@ -68,8 +69,19 @@ def test_every_file_that_the_page_fetches_is_known(
     if name == "folder":
         place = request.getfixturevalue("serve")(tmp_path / name)
     page = browser.new_page()
+    page.add_init_script(HEARD)
     asked = opened(page, place, modules)
     assert page.evaluate("avmsf.studio.view !== null && avmsf.studio.view !== undefined")
+    assert page.evaluate("avmsf.renderOffline([{ row: 5 }]).then((sound) => Math.max(...sound))") > 0
+    assert page.evaluate("refused") == []
+    page.evaluate(
+        "() => { const script = document.createElement('script'); script.textContent = 'window.evil = 1';"
+        "document.body.append(script); document.body.insertAdjacentHTML('beforeend',"
+        '\'<img src="x:" onerror="window.evil = 2">\');'
+        "return new Promise((done) => setTimeout(done, 200)) }"
+    )
+    assert page.evaluate("window.evil ?? null") is None
+    assert {"script-src-elem", "script-src-attr"} <= set(page.evaluate("refused"))
     assert asked
     assert set(asked) <= digests().keys()
     page.close()

@@ -9,6 +9,7 @@ from avmsf.bench.judging import spread
 from avmsf.bench.listening import Heard, draw_spectrogram, loudest_of, picture_span
 from avmsf.bench.reporttables import Grid, Section, figure
 from avmsf.bench.results import CaseRecord, ObjectRecord, Outcome
+from avmsf.export.policy import report_directives, with_policy
 
 LARGEST = 13_000_000
 """Characters beyond which no further contact is put on the page."""
@@ -62,7 +63,7 @@ def page(parts: Sequence[Section], records: Sequence[ObjectRecord], folder: Path
         links.insert(1, ("listen", "Look and listen"))
     entries = "".join(f'<li><a href="#{place}">{escape(words)}</a></li>' for place, words in links)
     opening = "".join(f"<p>{escape(words)}</p>" for words in title.words)
-    return (
+    whole = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title.title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
@@ -71,6 +72,7 @@ def page(parts: Sequence[Section], records: Sequence[ObjectRecord], folder: Path
         + "\n".join(blocks)
         + f"\n</main>\n<script>{_SCRIPT}</script>\n</body>\n</html>\n"
     )
+    return with_policy(whole, report_directives(whole))
 
 
 def _section(part: Section, place: str) -> str:

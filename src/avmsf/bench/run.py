@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf.bench.caserun import CaseRun
 from avmsf.bench.cases import Case
-from avmsf.bench.knowntruth import truth_of
+from avmsf.bench.knowntruth import truth_at, truth_of
 from avmsf.bench.otherobjects import draw_stranger
 from avmsf.bench.plan import Evaluation
 from avmsf.bench.results import CaseRecord, ObjectRecord, ResultsFolder, one_line
@@ -40,6 +40,8 @@ def run_object(
             facts = evaluation.dataset.facts(identifier)
             truth = truth_of(evaluation.dataset, identifier)
             cases = evaluation.protocol.choosing.cases(impacts)
+            if truth is not None:
+                truth_at(truth, impacts.names)
         except AvmsfError as error:
             results.write(replace(record, failure=one_line(error)))
             return
@@ -47,6 +49,9 @@ def run_object(
             results.write(replace(record, failure=f"{type(error).__name__}: {one_line(error)}"))
             return
         digest = digest_of(impacts, truth)
+        if record.digest != digest and all(each.failure is not None for each in record.outcomes):
+            # Nothing is mixed where there are no figures yet.
+            record = ObjectRecord(identifier)
         if record.digest not in ("", digest):
             raise EvaluationError(
                 f"{results.path}: holds figures of other recordings of {identifier} than {evaluation.title} "

@@ -1,6 +1,7 @@
 """A capture folder: `impacts.csv`, its wav files, perhaps `capture.toml` and a surface; read and written whole."""
 
 import csv
+import io
 import os
 import shutil
 import uuid
@@ -132,7 +133,10 @@ def _write_files(capture: Capture, folder: Path) -> None:
     rate, speed = _whole_rate(impacts.sample_rate)
     for name, sound in zip(names, impacts.sounds.numpy(), strict=True):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        soundfile.write(folder / name, sound, rate, subtype="FLOAT", format="WAV")
+        memory = io.BytesIO()
+        soundfile.write(memory, sound, rate, subtype="FLOAT", format="WAV")
+        # Soundfile's own error of a full disk does not say that it is full.
+        (folder / name).write_bytes(memory.getvalue())
     header, columns = list(REQUIRED), [impacts.contacts]
     if impacts.directions is not None:
         header, columns = [*header, *DIRECTION], [*columns, impacts.directions]

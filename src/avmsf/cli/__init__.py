@@ -1,16 +1,21 @@
 """The command `avmsf`: one module a verb, and what happens around all of them."""
 
+import _thread
 import os
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib import import_module
+from types import FrameType
 from typing import TextIO
 
 import tyro
 
 import avmsf
+from avmsf._utils.text import printable
 from avmsf.errors import AvmsfError, AvmsfWarning
 
 VERBS = {
@@ -40,10 +45,16 @@ CLOSED = 141
 """The exit code that shells give a command whose output nobody reads any more."""
 INTERRUPTED = 130
 """The exit code that shells give a command ended by Ctrl-C."""
+TERMINATED = 143
+"""The exit code that shells give a command ended by SIGTERM."""
+_AGAIN = 0.05
+"""Seconds after which an interruption that was dropped is raised again: a finalizer ends sooner, or it is repeated."""
+_MEMORY = "the memory does not suffice: end other programs, or use less data, fewer modes or smaller pictures"
+_DEPTH = "a file is nested too deeply to be read, as none of this package is: check the files that were named"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one verb and return its exit code: 0, 2 for input that cannot be used, 130 after Ctrl-C.
+    """Run one verb and return its exit code: 0, 2 for input that cannot be used, 130 after Ctrl-C, 143 after SIGTERM.
 
     Raises SystemExit, as command lines do, for help (0) and for arguments that cannot be understood (2).
     """
@@ -54,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not words or words[0] not in VERBS:
         _explain(words)
         return 2
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _interrupting() as received:
         try:
             # Only the verb that is asked for is imported: torch takes seconds, and help on the whole needs none of it.
             with _loading():
@@ -62,9 +73,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _show_plainly()
             options = verb.parse(words[1:])
             with _compilation_announced():
-                return verb.run(options)
-        except AvmsfError as error:
-            print(f"avmsf {words[0]}: {' '.join(str(error).split())}", file=sys.stderr)
+                code: int = verb.run(options)
+        except (AvmsfError, MemoryError, RecursionError) as error:
+            told = _MEMORY if isinstance(error, MemoryError) else _DEPTH if isinstance(error, RecursionError) else error
+            print(f"avmsf {words[0]}: {printable(' '.join(str(told).split()))}", file=sys.stderr)
             return 2
         except BrokenPipeError:
             # Whoever read the output has closed it, as `head` does; Python would complain again when it flushes.
@@ -72,7 +84,48 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return CLOSED
         except KeyboardInterrupt:
             print(f"avmsf {words[0]}: interrupted", file=sys.stderr)
-            return INTERRUPTED
+            code = INTERRUPTED
+        return TERMINATED if code == INTERRUPTED and signal.SIGTERM in received else code
+
+
+@contextmanager
+def _interrupting() -> Iterator[list[int]]:
+    """Let SIGTERM interrupt a verb as Ctrl-C does, and let neither be lost; yields the signals that have come.
+
+    Python raises KeyboardInterrupt wherever the main thread is. In a finalizer, or in a function that compiled code
+    calls back, it reports the exception and drops it; then the verb would go on, so it is raised once more.
+    """
+    received: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield received
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        raise KeyboardInterrupt
+
+    def raise_again() -> None:
+        if running:
+            _thread.interrupt_main()
+
+    def hear(dropped: "sys.UnraisableHookArgs") -> None:
+        if issubclass(dropped.exc_type, KeyboardInterrupt):
+            # Raised at once, it would be dropped with what this hook raises.
+            timer = threading.Timer(_AGAIN, raise_again)
+            timer.daemon = True
+            timer.start()
+        else:
+            report(dropped)
+
+    report, sys.unraisablehook = sys.unraisablehook, hear
+    running = [True]
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield received
+    finally:
+        running.clear()
+        signal.signal(signal.SIGTERM, before)
+        sys.unraisablehook = report
 
 
 @contextmanager
@@ -125,7 +178,7 @@ def _show_plainly() -> None:
         line: str | None = None,
     ) -> None:
         if issubclass(category, AvmsfWarning):
-            print(f"note: {message}", file=sys.stderr)
+            print(f"note: {printable(str(message))}", file=sys.stderr)
         else:
             others(message, category, filename, lineno, file, line)
 

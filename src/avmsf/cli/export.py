@@ -10,7 +10,7 @@ import tyro
 from avmsf.capture.folder import read_capture, settings_of
 from avmsf.capture.surface import find_surface_file
 from avmsf.cli.exportoptions import POINTS, Options, refuse_idle, refuse_name
-from avmsf.cli.printing import figure, say
+from avmsf.cli.printing import figure, print_text, say
 from avmsf.cli.render import METRES
 from avmsf.errors import ExportError
 from avmsf.export.faust import fitted, write_faust
@@ -50,7 +50,7 @@ def run(options: Options) -> int:
         )
     largest = max(written.sizes, key=lambda path: written.sizes[path])
     files = f"{len(written.sizes)} files, the largest {largest.name}" if len(written.sizes) > 1 else "one file"
-    print(f"wrote {options.output}: {options.to}, {written.size / 1e6:.3g} MB, {files}")
+    print_text(f"wrote {options.output}: {options.to}, {written.size / 1e6:.3g} MB, {files}")
     return 0
 
 

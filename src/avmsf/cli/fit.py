@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
+from avmsf._utils.caching import discard
 from avmsf.bench.evaluation import split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.cli import INTERRUPTED
@@ -140,11 +141,11 @@ def run(options: Options) -> int:
         say(f"avmsf fit: interrupted; give the same command again to go on {where}")
         return INTERRUPTED
     except FitError:
-        _beside(options.output, "modes").unlink(missing_ok=True)
+        discard(_beside(options.output, "modes"))
         raise
     save(fitted, options.output)
     for ending in ("modes", "checkpoint"):
-        _beside(options.output, ending).unlink(missing_ok=True)
+        discard(_beside(options.output, ending))
     scores = {} if test is None else compare(fitted, train, test, modes)
     screen = console(errors=options.json)
     if test is not None:

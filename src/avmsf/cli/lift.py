@@ -46,26 +46,30 @@ def run(options: Options) -> int:
     """Make the features; return 130 where Ctrl-C stopped it."""
     if options.output is not None:
         expect_writable(options.output)
+    stages = StageFolder(options.kept)
     try:
         with SceneBar() as bar:
             scene = SceneStages(
                 options.folder,
-                StageFolder(options.kept),
+                stages,
                 SceneConfig(options.views, options.splat, options.config),
                 settings=options.read_settings(),
                 listener=bar.listener,
             )
-            features = scene.features
+            scene.expect_any()
+            with stages.lock("avmsf lift"):
+                features = scene.features
+                report = read_report(features.path)
+                if options.output is not None:
+                    copy_whole(features.path, options.output)
     except KeyboardInterrupt:
         say("avmsf lift: interrupted; the same command goes on from where it was")
         return INTERRUPTED
-    report = read_report(features.path)
     screen = console(errors=options.json)
     screen.print(features_words(report), soft_wrap=True)
     for name, kept in scene.made().items():
         screen.print(stage_line(name, kept), soft_wrap=True)
     if options.output is not None:
-        copy_whole(features.path, options.output)
         screen.print(f"wrote {options.output}", soft_wrap=True)
     if options.json:
         print_json({"features": str(options.output or features.path), **report})

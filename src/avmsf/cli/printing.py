@@ -8,9 +8,20 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
+
+from avmsf._utils.text import printable
 
 _WIDTH = 120
 """Columns of tables that go to a file or a pipe, which have no width of their own."""
+
+
+class _SafeConsole(Console):
+    """A console on which what stands in files is only text: names and reports hold what others have written there."""
+
+    def render_str(self, text: str, **settings: Any) -> Text:
+        """Return text to print, in which control characters are written out."""
+        return super().render_str(printable(text), **settings)
 
 
 def console(*, errors: bool) -> Console:
@@ -18,7 +29,7 @@ def console(*, errors: bool) -> Console:
     stream = sys.stderr if errors else sys.stdout
     # File names and messages hold square brackets, which would be taken for markup.
     width = None if stream.isatty() else _WIDTH
-    return Console(file=stream, width=width, markup=False, highlight=False, emoji=False)
+    return _SafeConsole(file=stream, width=width, markup=False, highlight=False, emoji=False)
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, words: int = 1) -> Table:
@@ -49,12 +60,17 @@ def decimals(value: float | int | None, places: int) -> str:
 
 def say(text: str) -> None:
     """Print one line of progress or remark to the standard error."""
-    print(text, file=sys.stderr, flush=True)
+    print(printable(text), file=sys.stderr, flush=True)
+
+
+def print_text(text: str) -> None:
+    """Print a result to the standard output."""
+    print(printable(text))
 
 
 def print_json(value: Mapping[str, Any]) -> None:
     """Print one JSON object to the standard output."""
-    print(json_text(value))
+    print_text(json_text(value))
 
 
 def json_text(value: Mapping[str, Any]) -> str:

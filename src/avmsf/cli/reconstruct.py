@@ -26,6 +26,7 @@ from avmsf.pipeline.physics import BodyConfig
 from avmsf.pipeline.reconstruct import ReconstructConfig, reconstruct
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.splatconfig import SplatConfig
 
 
@@ -93,7 +94,7 @@ def run(options: Options) -> int:
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
     )
     try:
-        with SceneBar() as scene_bar, FitBar() as fit_bar:
+        with SceneBar() as scene_bar, FitBar() as fit_bar, StageFolder(options.kept).lock("avmsf reconstruct"):
             made = reconstruct(
                 options.folder,
                 capture,
@@ -110,10 +111,12 @@ def run(options: Options) -> int:
                 listener=scene_bar.listener,
                 fitting=lambda progress: show_fit(progress, scene_bar, fit_bar),
             )
+            fitted = load(made.field)
+            if options.output is not None:
+                copy_whole(made.field, options.output)
     except KeyboardInterrupt:
         say("avmsf reconstruct: interrupted; the same command goes on from where it was")
         return INTERRUPTED
-    fitted = load(made.field)
     scores = {} if test is None else compare(fitted, train, test, made.modes)
     screen = console(errors=options.json)
     if made.report:
@@ -130,7 +133,6 @@ def run(options: Options) -> int:
     screen.print(summary(fitted, len(train)), soft_wrap=True)
     screen.print(f"the field is {made.field}", soft_wrap=True)
     if options.output is not None:
-        copy_whole(made.field, options.output)
         screen.print(f"wrote {options.output}", soft_wrap=True)
     if options.json:
         print_json(

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf.capture.audio import MAX_SAMPLES
 from avmsf.cli.contacts import Contacts, contacts_at, read_contacts, refuse_far
-from avmsf.cli.printing import say
+from avmsf.cli.printing import print_text, say
 from avmsf.cli.writing import Coding, Level, OutputError, expect_writable, write_sound
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
@@ -103,7 +103,9 @@ def run(options: Options) -> int:
     for path, sound in zip(paths, sounds, strict=True):
         write_sound(path, sound, sample_rate=field.sample_rate, coding=options.coding)
     wrote = paths[0] if len(paths) == 1 else f"{len(paths)} sounds to {options.output}"
-    print(f"wrote {wrote}: {sounds.shape[1] / field.sample_rate:.3g} s at {field.sample_rate:g} Hz, {options.coding}")
+    print_text(
+        f"wrote {wrote}: {sounds.shape[1] / field.sample_rate:.3g} s at {field.sample_rate:g} Hz, {options.coding}"
+    )
     return 0
 
 

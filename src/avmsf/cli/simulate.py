@@ -9,7 +9,7 @@ import tyro
 
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.objectbar import ObjectBar
-from avmsf.cli.printing import console, say, table
+from avmsf.cli.printing import console, print_text, say, table
 from avmsf.errors import SimulationError
 from avmsf.simulate.example import EXAMPLE
 from avmsf.simulate.material import MATERIALS
@@ -67,7 +67,7 @@ def run(options: Options) -> int:
     except KeyboardInterrupt:
         say("avmsf simulate: interrupted; the same command goes on from where it was")
         return INTERRUPTED
-    print(f"wrote {options.output}" if len(recipes) == 1 else f"wrote {len(recipes)} objects to {options.output}")
+    print_text(f"wrote {options.output}" if len(recipes) == 1 else f"wrote {len(recipes)} objects to {options.output}")
     return 0
 
 
@@ -106,5 +106,5 @@ def _list() -> None:
         for name, recipe in SIM20.items()
     ]
     screen.print(table(SET, ("object", "shape", "material", "seed", "symmetric by turns"), rows, words=3))
-    print(f"shapes for --kind: {', '.join(KINDS)}")
-    print(f"materials: {', '.join(MATERIALS)}")
+    print_text(f"shapes for --kind: {', '.join(KINDS)}")
+    print_text(f"materials: {', '.join(MATERIALS)}")

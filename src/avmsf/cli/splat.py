@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.printing import say
+from avmsf.cli.printing import print_text, say
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import SceneOptions, copy_whole, stage_line
 from avmsf.cli.writing import expect_writable
@@ -52,14 +52,18 @@ def run(options: Options) -> int:
                 settings=options.read_settings(),
                 listener=bar.listener,
             )
-            cloud = scene.cloud
+            scene.expect_any()
+            with stages.lock("avmsf splat"):
+                cloud = scene.cloud
+                gaussians = len(read_splats(cloud.path))
+                if options.output is not None:
+                    copy_whole(cloud.path, options.output)
     except KeyboardInterrupt:
         say("avmsf splat: interrupted; the same command goes on from where it was")
         return INTERRUPTED
-    print(f"{len(read_splats(cloud.path))} Gaussians")
+    print_text(f"{gaussians} Gaussians")
     for name, kept in scene.made().items():
-        print(stage_line(name, kept))
+        print_text(stage_line(name, kept))
     if options.output is not None:
-        copy_whole(cloud.path, options.output)
-        print(f"wrote {options.output}")
+        print_text(f"wrote {options.output}")
     return 0

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf.bench.clouds import component_colours, draw_cloud, draw_features, save_turntable
 from avmsf.bench.pictures import save_picture
-from avmsf.cli.printing import say
+from avmsf.cli.printing import print_text, say
 from avmsf.cli.scenes import features_words
 from avmsf.errors import SceneError
 from avmsf.scene.features import GEOMETRY, FeatureField
@@ -68,7 +68,7 @@ def _draw_features(options: Options) -> None:
     features, report = load_features(options.file), read_report(options.file)
     symmetries = Symmetries.from_dict(report["symmetries"]) if "symmetries" in report else None
     if "encoder" in report:
-        print(features_words(report))
+        print_text(features_words(report))
     shown = without_positions(features)
     figure = draw_features(
         shown,

@@ -17,6 +17,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import Surface
 from avmsf.errors import ExportError
 from avmsf.export.bundle import MOST_POINTS, Bundle, make_bundle, write_files
+from avmsf.export.policy import directives_of, with_policy
 from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, generator, write_file, write_folder
 from avmsf.field.soundfield import SoundField
@@ -67,6 +68,8 @@ def write_webpage(
     if output.suffix.lower() in SUFFIXES:
         return Written(write_file(output, single_file(bundle).encode(), force=force), bundle.remarks)
     content = {**page_files(), **bundle.files}
+    html = content["index.html"].decode()
+    content["index.html"] = with_policy(html, directives_of(html)).encode()
     sizes = write_folder(output, lambda place: write_files(content, place), dict(bundle.manifest), force=force)
     return Written(sizes, bundle.remarks)
 
@@ -95,7 +98,8 @@ def single_file(bundle: Bundle, page: Mapping[str, bytes] | None = None) -> str:
     )
     # Who made it stands at its beginning, where a later export looks before it writes over it.
     html = html.replace("<!doctype html>\n", f"<!doctype html>\n<!-- {generator()} -->\n", 1)
-    return _once(_START, html, lambda found: begin.replace("{name}", found[1]), "script that starts the page")
+    html = _once(_START, html, lambda found: begin.replace("{name}", found[1]), "script that starts the page")
+    return with_policy(html, directives_of(html, single=True))
 
 
 def _bare(source: str) -> str:

@@ -4,14 +4,13 @@ import json
 import os
 import re
 import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
 from avmsf.errors import ExportError
-from avmsf.files import way_out, write_whole
+from avmsf.files import temporary_path, way_out, write_whole
 
 MANIFEST = "manifest.json"
 _READ = 4096
@@ -95,7 +94,8 @@ def write_folder(
         raise _foreign(folder, "a folder with files that no export wrote")
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{place.name}.", suffix=".part", dir=place.parent))
+        temporary = temporary_path(place)
+        temporary.mkdir()
         try:
             fill(temporary)
             names = sorted(str(path.relative_to(temporary)) for path in temporary.rglob("*") if path.is_file())
@@ -111,9 +111,6 @@ def write_folder(
 
 
 def _place(temporary: Path, folder: Path, *, whole: bool) -> None:
-    mask = os.umask(0)
-    os.umask(mask)
-    temporary.chmod(0o777 & ~mask)
     if not whole:
         for path in sorted(temporary.rglob("*")):
             if path.is_file():

@@ -12,6 +12,7 @@ from pathlib import Path
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
+from avmsf._utils.caching import keep_if_possible, source_digest
 from avmsf.capture import Impacts
 from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
@@ -22,10 +23,13 @@ from avmsf.modal.residual import Residual
 _KEY = "avmsf-modes"
 
 
-def extract_once(train: Impacts, method: ModeFinder, path: Path, *, lone: bool = False) -> Extraction:
+def extract_once(
+    train: Impacts, method: ModeFinder, path: Path, *, lone: bool = False, needed: bool = False
+) -> Extraction:
     """Return the modes that `path` keeps of these recordings and this method; find and keep them where it has none.
 
-    With `lone`, one recording is enough. Raises as `extract` and `write_whole`.
+    With `lone`, one recording is enough. Where the file cannot be written, the modes are found again next time; it is
+    an error if the file is `needed`. Raises as `extract`, and FieldFileError.
     """
     digest = _digest(train, method)
     kept = _read(path, digest)
@@ -43,7 +47,14 @@ def extract_once(train: Impacts, method: ModeFinder, path: Path, *, lone: bool =
         "residual": found.residual.magnitude,
     }
     content = save({name: tensor.contiguous() for name, tensor in tensors.items()}, {_KEY: digest})
-    write_whole(path, lambda place: place.write_bytes(content))
+
+    def write() -> None:
+        write_whole(path, lambda place: place.write_bytes(content))
+
+    if needed:
+        write()
+    else:
+        keep_if_possible(write, path)
     return found
 
 
@@ -62,7 +73,7 @@ def _read(path: Path, digest: str) -> Extraction | None:
 
 
 def _digest(train: Impacts, method: ModeFinder) -> str:
-    words = [version("avmsf"), repr(method), train.names, train.sample_rate]
+    words = [version("avmsf"), source_digest(), repr(method), train.names, train.sample_rate]
     digest = hashlib.sha256(json.dumps(words).encode())
     digest.update(train.sounds.contiguous().numpy().tobytes())
     return digest.hexdigest()

@@ -8,6 +8,7 @@ from avmsf.capture.datasets.dataset import Dataset
 from avmsf.capture.surface import Surface
 from avmsf.errors import SceneError
 from avmsf.field.physics import Physics
+from avmsf.pipeline.objectlooks import WAIT
 from avmsf.pipeline.physics import BodyConfig, physics_of, roughened
 from avmsf.pipeline.scene import SceneConfig, SceneStages
 from avmsf.pipeline.sources import ViewsConfig
@@ -54,4 +55,5 @@ class ObjectBodies:
         stages = SceneStages(
             seen.folder, StageFolder(self.cache / identifier / "all views"), scene, settings=seen.settings
         )
-        return gaussian_surface(read_splats(stages.cloud.path))
+        with stages.stages.lock("avmsf evaluate", wait=WAIT):
+            return gaussian_surface(read_splats(stages.cloud.path))

@@ -11,6 +11,8 @@ from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features
 
+WAIT = 3600.0
+"""Seconds to wait for another evaluation that makes the features of the same object: they take minutes to an hour."""
 UNALIGNED = "unaligned.safetensors"
 
 
@@ -44,7 +46,8 @@ class ObjectLooks:
             settings=seen.settings,
             name=UNALIGNED if look == "unaligned" else FEATURES,
         )
-        features = load_features(stages.features.path)
+        with stages.stages.lock("avmsf evaluate", wait=WAIT):
+            features = load_features(stages.features.path)
         return FeatureField.from_points(features.points) if look == "positions" else features
 
     def _bare(self, identifier: str) -> FeatureField:

@@ -98,13 +98,39 @@ def reconstruct(
     """Make views, Gaussians, features, modes and a field of a capture, or what of these has to be made anew.
 
     `train` are the recordings to fit to; `cache` keeps what each stage makes, and an interrupted stage goes on from
-    where it was. Raises as the stages do.
+    where it was. Raises as the stages do, and FolderInUseError where another process makes stages in `cache`; who
+    reads the field's file afterwards holds `StageFolder(cache).lock` around both.
     """
-    stages = StageFolder(cache)
+    with StageFolder(cache).lock("reconstruct"):
+        return _reconstruct(
+            folder,
+            capture,
+            train,
+            config,
+            method=method,
+            stages=StageFolder(cache),
+            settings=settings,
+            listener=listener,
+            fitting=fitting,
+        )
+
+
+def _reconstruct(
+    folder: Path,
+    capture: Capture,
+    train: Impacts,
+    config: ReconstructConfig,
+    *,
+    method: ModeFinder,
+    stages: StageFolder,
+    settings: CaptureSettings,
+    listener: Listener,
+    fitting: Callable[[Progress], None] | None,
+) -> Reconstruction:
     shape = _shape(folder, capture, config, stages, settings=settings, listener=listener)
     heard = {"impacts": train.digest(), "method": repr(method)}
     listener.tell(f"modes: of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
-    found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path))
+    found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path, needed=True))
     modes = extract_once(train, method, found.path)
     basis = {**heard, "features": shape.digest, "fit": asdict(config.fit)}
 
@@ -113,26 +139,33 @@ def reconstruct(
     @cache_result
     def physics() -> Physics:
         listener.tell("bodies: what the object may be behind its surface")
-        return physics_of(shape.surface(), config.body, impacts=train, cache=cache / BODIES, tell=listener.tell)
+        return physics_of(shape.surface(), config.body, impacts=train, cache=stages.folder / BODIES, tell=listener.tell)
 
     def choose(path: Path) -> None:
         listener.tell("choice: how gains are spread, by training contacts left out in turn")
         recipes = all_recipes(physics, tell=listener.tell)
         choice = recipes.choose(gain_case(train, points, modes, config.fit))
-        words = json.dumps({"name": choice.recipe.name, **choice.report["choice"]})
+        has_physics = "physics" not in recipes.unavailable
+        words = json.dumps({"name": choice.recipe.name, "has_physics": has_physics, **choice.report["choice"]})
         write_whole(path, lambda place: place.write_text(words, encoding="utf-8"), raising=FitError)
 
     chosen, choice = None, {"name": config.gains}
     if config.gains == "auto":
         asked = {"candidates": list(shape.candidates), "body": asdict(config.body), "surface": shape.surface_digest}
-        # A choice that was made without physics is made anew once there is physics.
-        try:
-            physics()
-            asked["missing"] = ""
-        except AvmsfError as error:
-            asked["missing"] = str(error)
-        chosen = stages.keep(CHOICE, {**basis, **asked}, choose)
+
+        def is_final(path: Path) -> bool:
+            """Whether a choice was made with physics, or there is still none, as for want of memory."""
+            if json.loads(path.read_text(encoding="utf-8"))["has_physics"]:
+                return True
+            try:
+                physics()
+            except AvmsfError:
+                return True
+            return False
+
+        chosen = stages.keep(CHOICE, {**basis, **asked}, choose, usable=is_final)
         choice = json.loads(chosen.path.read_text(encoding="utf-8"))
+        del choice["has_physics"]
     name = choice.pop("name")
 
     def make(path: Path) -> None:

@@ -90,6 +90,11 @@ class SceneStages:
         """Whether the folder shows anything of the object."""
         return self.source is not None or self.splats is not None
 
+    def expect_any(self) -> None:
+        """Raise SceneError, before anything is written, where the folder shows nothing of the object."""
+        if not self:
+            self._source()
+
     @cached_property
     def views(self) -> Kept:
         """The folder of views."""

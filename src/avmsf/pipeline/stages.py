@@ -3,14 +3,17 @@
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import avmsf
+from avmsf._utils.caching import discard, source_digest
+from avmsf._utils.locks import WAIT, write_lock
 from avmsf.errors import CaptureError
-from avmsf.files import write_whole
+from avmsf.files import way_out, write_whole
 
 _BLOCK = 1 << 20
 
@@ -32,13 +35,22 @@ class Kept:
 class StageFolder:
     """A folder of stages' outputs, `NAME` beside `NAME.stage.json`, its recipe.
 
-    A stage runs again where its recipe has changed, where its output was changed or is missing, and where another
-    version of this package made it. The record gets the output's digest last, so that an interrupted stage runs again;
+    A stage runs again where its recipe has changed, where its output was changed or is missing, and where other source
+    files of this package made it. The record gets the output's digest last, so that an interrupted stage runs again;
     what it left in its checkpoint is there then, unless its recipe has changed meanwhile.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+
+    def lock(self, command: str, *, wait: float = WAIT) -> AbstractContextManager[None]:
+        """Return a context in which no other process or thread makes or replaces a stage here.
+
+        Hold it from the first stage until the last output is read: stages read each other's files. Raises
+        FolderInUseError where another process, which is told `command`, holds it for longer than `wait` seconds.
+        """
+        advice = ", or keep this one's stages in another folder (--cache)"
+        return write_lock(self.folder, "stages", command=command, wait=wait, advice=advice, parents=True)
 
     def path(self, name: str) -> Path:
         """Return where a stage's output is."""
@@ -48,26 +60,49 @@ class StageFolder:
         """Return where a stage may leave its state until it is done."""
         return self.folder / f"{name}.checkpoint"
 
-    def keep(self, name: str, recipe: Mapping[str, Any], make: Callable[[Path], object]) -> Kept:
+    def keep(
+        self,
+        name: str,
+        recipe: Mapping[str, Any],
+        make: Callable[[Path], object],
+        *,
+        usable: Callable[[Path], bool] | None = None,
+    ) -> Kept:
         """Return the output called `name`, made by `make(path)` where what is kept is not of this recipe.
 
         `recipe` holds plain values that decide the output, digests of inputs among them. `make` leaves the output whole
-        or not at all. Raises as `make`, and `CaptureError` where the folder cannot be written.
+        or not at all. An output of this recipe that `usable(path)` finds wanting is made again too. Raises as `make`,
+        and `CaptureError` where the folder cannot be written.
         """
         path, record = self.path(name), self.folder / f"{name}.stage.json"
-        wanted = json.loads(json.dumps({"version": avmsf.__version__, **recipe}, sort_keys=True))
+        key = {"version": avmsf.__version__, "source": source_digest(), **recipe}
+        wanted = json.loads(json.dumps(key, sort_keys=True))
         known = _read(record)
-        if known.get("recipe") == wanted and path.exists() and digest_of(path) == known.get("digest"):
+        same = known.get("recipe") == wanted
+        with self._explaining(name):
+            current = same and path.exists() and digest_of(path) == known.get("digest")
+            if not same:
+                self.checkpoint(name).unlink(missing_ok=True)
+        if current and (usable is None or usable(path)):
             return Kept(path, known["digest"], float(known["seconds"]), fresh=False)
-        if known.get("recipe") != wanted:
-            self.checkpoint(name).unlink(missing_ok=True)
         _write(record, {"recipe": wanted, "digest": None, "seconds": 0.0})
         begun = time.monotonic()
         make(path)
-        digest, seconds = digest_of(path), time.monotonic() - begun
+        with self._explaining(name):
+            digest, seconds = digest_of(path), time.monotonic() - begun
         _write(record, {"recipe": wanted, "digest": digest, "seconds": round(seconds, 3)})
-        self.checkpoint(name).unlink(missing_ok=True)
+        discard(self.checkpoint(name))
         return Kept(path, digest, seconds, fresh=True)
+
+    @contextmanager
+    def _explaining(self, name: str) -> Iterator[None]:
+        """Let an OSError become a CaptureError that says what to do."""
+        try:
+            yield
+        except OSError as error:
+            raise CaptureError(
+                f"{self.path(name)}: cannot be made again ({error.strerror or error}): {way_out(error)}, as by --cache"
+            ) from error
 
 
 def digest_of(path: Path) -> str:

@@ -12,7 +12,7 @@ from avmsf.capture.surface import Surface
 from avmsf.capture.texturedmesh import TexturedMesh, read_textured_mesh
 from avmsf.errors import SimulationError
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.elasticstore import load_modes, save_modes
+from avmsf.simulate.elasticstore import modes_once
 from avmsf.simulate.imperfections import smooth_field, stream, support_places, support_springs
 from avmsf.simulate.material import material_named
 from avmsf.simulate.recipe import AXES, ObjectRecipe, key_of
@@ -53,18 +53,14 @@ def make_body(recipe: ObjectRecipe, *, cache: Path | None, tell: Tell) -> Body:
     mesh, make_solid = _shape(recipe)
     legs = support_places(mesh.surface.vertices.double(), up_of(recipe), generator=stream(recipe.seed, "supports"))
     kept = None if cache is None else cache / f"modes-{key_of(recipe.elastic_values())}.safetensors"
-    if kept is not None and kept.is_file():
-        try:
-            return Body(mesh, load_modes(kept), legs)
-        except SimulationError as error:
-            tell(f"computing again what cannot be read ({error})")
-    tell("solid")
-    solid = _uneven(recipe, make_solid())
-    tell(f"elastic modes of {len(solid.cells)} tetrahedra")
-    elastic = _elastic(recipe, solid, legs)
-    if kept is not None:
-        save_modes(elastic, kept)
-    return Body(mesh, elastic, legs)
+
+    def compute() -> ElasticModes:
+        tell("solid")
+        solid = _uneven(recipe, make_solid())
+        tell(f"elastic modes of {len(solid.cells)} tetrahedra")
+        return _elastic(recipe, solid, legs)
+
+    return Body(mesh, modes_once(kept, compute, tell=tell), legs)
 
 
 def up_of(recipe: ObjectRecipe) -> Float64[Tensor, " 3"]:

@@ -5,6 +5,7 @@
 """
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -14,6 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
+from avmsf._utils.caching import is_kept, keep_if_possible
 from avmsf._utils.text_files import parse_json
 from avmsf.errors import SimulationError
 from avmsf.files import write_whole
@@ -85,6 +87,22 @@ def load_modes(path: str | Path) -> ElasticModes:
     if len(rows) and (int(rows.min()) < 0 or int(rows.max()) >= sizes["nodes"]):
         raise SimulationError(f"{path}: a triangle names a node that is not there: compute the modes again")
     return ElasticModes(tensors["frequency"], tensors["nodes"], rows, tensors["shapes"], material, weight)
+
+
+def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, tell: Callable[[str], None]) -> ElasticModes:
+    """Return the modes that `path` keeps, or compute them and keep them there, where that is possible; None keeps none.
+
+    A damaged file is made again, and `tell` hears of it. Raises as `compute`.
+    """
+    if path is not None and is_kept(path):
+        try:
+            return load_modes(path)
+        except SimulationError as error:
+            tell(f"computing again what cannot be read ({error})")
+    modes = compute()
+    if path is not None:
+        keep_if_possible(lambda: save_modes(modes, path), path)
+    return modes
 
 
 def _read(path: Path) -> tuple[str, dict[str, Tensor]]:

@@ -13,7 +13,7 @@ import numpy as np
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.elasticstore import load_modes, save_modes
+from avmsf.simulate.elasticstore import modes_once
 from avmsf.simulate.material import Material
 from avmsf.simulate.nominalcheck import CheckedSurface, checked
 from avmsf.simulate.nominalsolid import FEWEST, expect_memory, filled_solid, freedoms_of, wall_solids
@@ -160,26 +160,21 @@ class _Maker:
     def _modes(self, wall: float | None, freedoms: int) -> ElasticModes:
         """Return the modes of one body, read from where they are kept."""
         kept = self._kept(wall, freedoms)
-        if kept is not None and kept.is_file():
-            try:
-                return load_modes(kept)
-            except SimulationError as error:
-                self._tell(f"computing again what cannot be read ({error})")
+        return modes_once(kept, lambda: self._computed(wall, freedoms), tell=self._tell)
+
+    def _computed(self, wall: float | None, freedoms: int) -> ElasticModes:
         expect_memory(freedoms)
         self._tell(f"tetrahedra of the body, {body_name(wall)}")
         solid = self._solid(wall, freedoms)
         size = freedoms_of(solid)
         self._tell(f"{self._count} elastic modes of {size} degrees of freedom")
         try:
-            elastic = elastic_modes(solid, NOMINAL, count=self._count)
+            return elastic_modes(solid, NOMINAL, count=self._count)
         except MemoryError as error:
             raise SimulationError(
                 f"the modes of {size} degrees of freedom do not fit into the memory: ask for fewer, as "
                 f"freedoms={max(freedoms // 2, FEWEST)}, or end other programs"
             ) from error
-        if kept is not None:
-            save_modes(elastic, kept)
-        return elastic
 
     def _solid(self, wall: float | None, freedoms: int) -> Solid:
         if wall is None:

@@ -1,12 +1,14 @@
 """Capture mode: strikes added to an ordinary capture folder, one recording at a time, each whole or not at all.
 
-What the table holds is read anew for every request, so that a spreadsheet beside the page is no matter. A recording is
-written before its row, and before both a note of what is about to be written, under the page's key: where the
-connection breaks, or the server, the page sends it again and nothing is there twice.
+What the table holds is read again for every request, so that a spreadsheet beside the page is no matter, and changed
+under a lock of the folder, so that two studios on one folder lose nothing of each other's. A recording is written
+before its row, and before both a note of what is about to be written, under the page's key: where the connection
+breaks, or the server, the page sends it again and nothing is there twice.
 """
 
 import hashlib
 import re
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from threading import RLock
 from typing import Any
@@ -85,7 +87,7 @@ class StrikeBook:
         """
         _expect_key(key)
         digest = hashlib.sha256(content + repr(place).encode()).hexdigest()
-        with self._lock:
+        with self._lock, self.files.lock():
             journal = self.files.journal()
             known = journal.get(key)
             if known is not None and known["digest"] != digest:
@@ -111,7 +113,7 @@ class StrikeBook:
         already. Raises RefusedError (409) where the recording is not the one whose digest is `match`.
         """
         digest = hashlib.sha256(content + repr(file).encode()).hexdigest()
-        with self._lock:
+        with self._lock, self.files.lock():
             journal = self.files.journal()
             if key is not None:
                 _expect_key(key)
@@ -121,11 +123,11 @@ class StrikeBook:
             recording = read_upload(content)
             self._expect_usable(recording, newtons=1.0, beside=file)
             new = self._as_wav(file)
-            self.files.set_aside(file, keep=True)
+            self.files.set_aside(file)
             self.files.write(new, content, recording)
             if new != file:
                 self.table.rename(file, new)
-                self.files.own(file).unlink(missing_ok=True)
+                self.files.remove(file)
             changed = {name: each | {"file": new} if each["file"] == file else each for name, each in journal.items()}
             if key is not None:
                 changed[key] = {"digest": digest, "file": new}
@@ -138,13 +140,20 @@ class StrikeBook:
 
         Raises RefusedError, 404 for no such strike, 409 where the recording is not the one whose digest is `match`.
         """
-        with self._lock:
+        with self._lock, self.files.lock():
             self._expect_own(file, match)
-            self.table.remove(file)
+            # All that needs space on the disk comes before the row goes.
+            self.files.set_aside(file)
             journal = self.files.journal()
             gone = {key: each | {"removed": True} if each["file"] == file else each for key, each in journal.items()}
             self.files.write_journal(gone)
-            self.files.set_aside(file, keep=False)
+            try:
+                self.table.remove(file)
+            except BaseException:
+                with suppress(CaptureError):
+                    self.files.write_journal(journal)
+                raise
+            self.files.remove(file)
 
     def _described(self, number: int, row: Row, settings: CaptureSettings) -> dict[str, Any]:
         values: dict[str, Any] = {"row": number, "file": file_of(row), "contact": None, "direction": None}

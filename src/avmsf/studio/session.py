@@ -118,7 +118,12 @@ class Session:
             path = self.home / file_name(name)
             _write_new(field, path)
             saved = replace(self._current, ground=field, sliders=REST, name=path.name.removesuffix(SUFFIX))
-            return path, self._advance(saved)
+            try:
+                return path, self._advance(saved)
+            except BaseException:
+                # What is answered by an error was not done, so that it can be asked for again.
+                path.unlink(missing_ok=True)
+                raise
 
     def keep(self, field: SoundField, stem: str) -> Path:
         """Write a field that is not heard to a new file of the folder, `stem` with a number where that is taken."""

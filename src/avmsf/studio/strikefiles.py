@@ -5,7 +5,8 @@ import io
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +14,19 @@ from typing import Any
 import numpy as np
 import soundfile
 
+from avmsf._utils.locks import write_lock
 from avmsf.capture.audio import Recording
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, FolderInUseError
 from avmsf.files import write_whole
 from avmsf.pipeline.reconstruct import CACHE
 from avmsf.studio.refusal import RefusedError
 
 JOURNAL, REMOVED = "studio.json", "removed"
 """In the capture's cache: what was written under which key, and the recordings that were redone or taken out."""
+COMMAND = "avmsf studio"
+"""What other processes are told to wait for."""
+_WAIT = 10.0
+"""Seconds to wait for another studio's change, which takes a fraction of one."""
 WAV = ".wav"
 _NUMBERED = re.compile(r"(\d{1,6})\.wav", re.IGNORECASE)
 _KEPT_KEYS = 10_000
@@ -32,6 +38,19 @@ class StrikeFiles:
 
     folder: Path
     """Without links."""
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Let no other studio change the table, the recordings or the note of keys meanwhile.
+
+        Raises RefusedError (409) where another one does for long.
+        """
+        with ExitStack() as held:
+            try:
+                held.enter_context(write_lock(self.folder / CACHE, "capture", command=COMMAND, wait=_WAIT))
+            except FolderInUseError as error:
+                raise RefusedError(409, f"{error}, and try again; nothing was changed") from error
+            yield
 
     def readable(self, file: str) -> Path:
         """Return a recording's path. Raises RefusedError (404) for one that leads out of the folder by a link."""
@@ -74,17 +93,25 @@ class StrikeFiles:
             content = memory.getvalue()
         write_whole(self.own(file), lambda place: place.write_bytes(content), raising=CaptureError)
 
-    def set_aside(self, file: str, *, keep: bool) -> None:
-        """Keep a recording in the cache, and with `keep` where it is too, until another takes its place."""
+    def set_aside(self, file: str) -> None:
+        """Keep a recording in the cache too: under a second name, which needs no space, or as a copy."""
         path = self.own(file)
         if not path.is_file():
             return
         content = path.read_bytes()
         digest = hashlib.sha256(content).hexdigest()[:12]
         kept = self.folder / CACHE / REMOVED / f"{path.stem}-{digest}{path.suffix}"
-        write_whole(kept, lambda place: place.write_bytes(content), raising=CaptureError)
-        if not keep:
-            os.unlink(path)
+        if kept.is_file():
+            return
+        try:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            os.link(path, kept)
+        except OSError:
+            write_whole(kept, lambda place: place.write_bytes(content), raising=CaptureError)
+
+    def remove(self, file: str) -> None:
+        """Remove a recording that is set aside and that no row names."""
+        self.own(file).unlink(missing_ok=True)
 
     def journal(self) -> dict[str, dict[str, Any]]:
         """Return what was written under which key; nothing where the note is damaged."""

@@ -28,6 +28,7 @@ from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.lift import LiftProgress
 from avmsf.scene.splat import SplatProgress
 from avmsf.studio.lifeline import end_with_server
+from avmsf.studio.strikefiles import COMMAND
 from avmsf.tasks.distillation import DecoderDistillation
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
@@ -89,17 +90,18 @@ def make_field(task: Values, voice: Voice) -> Values:
     settings = settings_of(folder)
     voice.tell("capture: reading the recordings")
     capture = read_capture(folder, settings)
-    made = reconstruct(
-        folder,
-        capture,
-        capture.impacts,
-        ReconstructConfig(),
-        method=HighResolution(modes=int(task["modes"])),
-        cache=folder / CACHE,
-        settings=settings,
-        listener=voice.listener,
-        fitting=voice.fitting,
-    )
+    with StageFolder(folder / CACHE).lock(COMMAND):
+        made = reconstruct(
+            folder,
+            capture,
+            capture.impacts,
+            ReconstructConfig(),
+            method=HighResolution(modes=int(task["modes"])),
+            cache=folder / CACHE,
+            settings=settings,
+            listener=voice.listener,
+            fitting=voice.fitting,
+        )
     return {"field": str(made.field), "gains": made.gains, "stages": [each.stage for each in made.stages if each.fresh]}
 
 
@@ -108,7 +110,9 @@ def make_object(task: Values, voice: Voice) -> Values:
     folder = Path(task["folder"])
     stages = StageFolder(folder / CACHE)
     scene = SceneStages(folder, stages, SceneConfig(), settings=settings_of(folder), listener=voice.listener)
-    return {"object": str(scene.cloud.path)}
+    scene.expect_any()
+    with stages.lock(COMMAND):
+        return {"object": str(scene.cloud.path)}
 
 
 def lead(task: Values, voice: Voice) -> Values:

@@ -1,0 +1,86 @@
+"""A cache that cannot be written changes no result."""
+
+import warnings
+from pathlib import Path
+
+import numba.core.caching
+import pytest
+import torch
+import trimesh
+
+from avmsf._utils import caching
+from avmsf.capture.surface import Surface
+from avmsf.cli import main
+from avmsf.compiled import compiled
+from avmsf.errors import AvmsfWarning, FieldFileError, FitError
+from avmsf.field.store import load
+from avmsf.files import write_whole
+from avmsf.pipeline.physics import BodyConfig, physics_of
+from plate_capture import TINY, fill_plate
+
+Streams = pytest.CaptureFixture[str]
+
+
+def a_file(path: Path) -> Path:
+    path.write_text("in the way")
+    return path
+
+
+def a_disk_that_is_full(*arguments: object, **named: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def test_bodies_are_used_where_they_cannot_be_kept_and_the_cause_is_told_once(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+    surface = Surface(torch.from_numpy(ball.vertices).float(), torch.from_numpy(ball.faces).long())
+    blocked = a_file(tmp_path / "bodies")
+    with pytest.warns(AvmsfWarning, match=f"{blocked}.*File exists"):
+        [body] = physics_of(surface, BodyConfig(wall=0.0, shapes=6, freedoms=1200), cache=blocked).bodies.bodies
+    assert len(body.elastic) == 6
+    # A second warning would be an error here.
+    physics_of(surface, BodyConfig(wall=0.0, shapes=6, freedoms=1600), cache=blocked)
+
+
+def test_what_is_wrong_with_the_work_itself_is_no_matter_of_the_disk(tmp_path: Path) -> None:
+    def refuse() -> None:
+        raise FitError("too few")
+
+    with pytest.raises(FitError):
+        caching.keep_if_possible(refuse, tmp_path / "kept")
+
+
+def test_a_fit_does_without_the_files_that_it_goes_on_from(tmp_path: Path, capsys: Streams) -> None:
+    folder, output = fill_plate(tmp_path / "plate"), tmp_path / "field.safetensors"
+    (tmp_path / "field.safetensors.modes").mkdir()
+    assert main(["fit", str(folder), "--output", str(output), "--gains", "spline", *TINY]) == 0
+    assert "Is a directory" in capsys.readouterr().err
+    assert len(load(output).bank)
+
+
+def test_a_loop_is_compiled_where_it_cannot_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    def thrice(value: float) -> float:
+        return 3 * value
+
+    monkeypatch.setattr(numba.core.caching.IndexDataCacheFile, "_save_index", a_disk_that_is_full)
+    assert compiled()(thrice)(1.5) == 4.5
+
+
+def test_keys_know_every_source_file() -> None:
+    found = caching.source_digest()
+    assert found == caching.source_digest.__wrapped__()
+    probe = Path(caching.__file__).with_name("_probe.py")
+    probe.write_text("")
+    try:
+        assert caching.source_digest.__wrapped__() != found
+    finally:
+        probe.unlink()
+
+
+def test_a_file_that_can_be_kept_is_kept_without_a_word(tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        caching.keep_if_possible(
+            lambda: write_whole(tmp_path / "kept", lambda place: place.write_text("a"), raising=FieldFileError),
+            tmp_path / "kept",
+        )
+    assert (tmp_path / "kept").read_text() == "a"

@@ -1,0 +1,102 @@
+"""One writer at a time in a folder, whatever happens to the one before."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from avmsf._utils.locks import write_lock
+from avmsf.errors import FolderInUseError
+
+HOLD = """
+import sys
+from pathlib import Path
+from avmsf._utils.locks import write_lock
+with write_lock(Path(sys.argv[1]), "stages", command="avmsf splat mug"):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def hold(folder: Path) -> subprocess.Popen[str]:
+    """Return a process that holds the lock of a folder until its standard input is closed."""
+    command = [sys.executable, "-c", HOLD, str(folder)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "held\n"
+    return process
+
+
+def test_a_second_process_is_refused_and_hears_of_the_first(tmp_path: Path) -> None:
+    with hold(tmp_path) as other:
+        with pytest.raises(FolderInUseError) as refused, write_lock(tmp_path, "stages", command="me", wait=0.1):
+            pytest.fail("two processes hold the lock")
+        assert refused.value.holder["command"] == "avmsf splat mug"
+        assert refused.value.holder["process"] == other.pid
+        assert "since" in refused.value.holder
+        # Another lock of the folder is free.
+        with write_lock(tmp_path, "capture", command="me", wait=0.0):
+            pass
+        other.communicate()
+    with write_lock(tmp_path, "stages", command="me", wait=0.0):
+        pass
+
+
+def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
+    with hold(tmp_path) as other:
+        other.send_signal(signal.SIGKILL)
+        other.wait()
+        with write_lock(tmp_path, "stages", command="me", wait=0.0):
+            pass
+
+
+def test_who_waits_gets_the_lock_when_it_is_free(tmp_path: Path) -> None:
+    with hold(tmp_path) as other:
+        threading.Timer(0.2, other.communicate).start()
+        with write_lock(tmp_path, "stages", command="me", wait=30.0):
+            assert other.wait() == 0
+
+
+def test_a_thread_takes_its_lock_again_and_another_one_does_not(tmp_path: Path) -> None:
+    refused: list[FolderInUseError] = []
+
+    def intrude() -> None:
+        try:
+            with write_lock(tmp_path, "stages", command="other", wait=0.1):
+                pass
+        except FolderInUseError as error:
+            refused.append(error)
+
+    with write_lock(tmp_path, "stages", command="me"):
+        with write_lock(tmp_path, "stages", command="again", wait=0.0):
+            pass
+        thread = threading.Thread(target=intrude)
+        thread.start()
+        thread.join()
+    assert [each.holder["command"] for each in refused] == ["me"]
+
+
+@pytest.mark.parametrize("missing", ["file/inside", "nowhere/inside"])
+def test_where_nothing_can_be_written_there_is_no_lock_and_no_error(tmp_path: Path, missing: str) -> None:
+    (tmp_path / "file").touch()
+    with write_lock(tmp_path / missing, "stages", command="me"):
+        pass
+    assert [each.name for each in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_read_only_folder_is_used_without_a_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = os.open
+
+    def refuse(path: str, flags: int, *rest: int, **named: int) -> int:
+        if flags & os.O_CREAT or flags & os.O_RDWR:
+            raise OSError(30, os.strerror(30), path)
+        return opened(path, flags, *rest, **named)
+
+    monkeypatch.setattr(os, "open", refuse)
+    with write_lock(tmp_path, "stages", command="me"):
+        pass
+    assert list(tmp_path.iterdir()) == []

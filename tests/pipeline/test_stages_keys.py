@@ -1,0 +1,113 @@
+"""What decides whether a stage runs again: its inputs and the code, not the state of the machine."""
+
+import json
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from avmsf.capture import CaptureSettings, read_capture
+from avmsf.errors import CaptureError, SimulationError
+from avmsf.field.automatic import Choice
+from avmsf.field.config import FitConfig
+from avmsf.field.physics import Physics
+from avmsf.field.recipes import ThinPlate
+from avmsf.modal.extract import HighResolution
+from avmsf.pipeline import reconstruct as module
+from avmsf.pipeline import stages
+from avmsf.pipeline.scene import Listener
+from avmsf.pipeline.stages import StageFolder
+from plate_capture import fill_plate
+
+
+def write(path: Path) -> None:
+    path.write_text("made")
+
+
+def test_a_stale_stage_of_a_read_only_folder_is_refused_by_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = StageFolder(tmp_path)
+    folder.keep("cloud.ply", {"steps": 1}, write)
+
+    def refuse(self: Path, missing_ok: bool = False) -> None:
+        raise OSError(30, os.strerror(30), str(self))
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(CaptureError):
+        folder.keep("cloud.ply", {"steps": 2}, write)
+    assert not folder.keep("cloud.ply", {"steps": 1}, write).fresh
+
+
+def test_other_code_makes_a_stage_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = StageFolder(tmp_path)
+    folder.keep("cloud.ply", {}, write)
+    monkeypatch.setattr(stages, "source_digest", lambda: "changed")
+    assert folder.keep("cloud.ply", {}, write).fresh
+    assert not folder.keep("cloud.ply", {}, write).fresh
+
+
+def test_the_choice_does_not_depend_on_free_memory_and_is_made_again_once_there_is_physics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = read_capture(fill_plate(tmp_path / "plate"))
+    asked: list[str] = []
+    answers: list[Exception | None] = []
+
+    def physics_of(*arguments: Any, **named: Any) -> object:
+        asked.append("physics")
+        if answers[0] is not None:
+            raise answers[0]
+        return object.__new__(Physics)
+
+    def all_recipes(candidates: object, physics: Any, *, tell: object) -> object:
+        missing = {}
+        try:
+            physics()
+        except SimulationError as error:
+            missing["physics"] = str(error)
+        report = {"choice": {"errors": {}, "missing": missing}}
+        return SimpleNamespace(unavailable=missing, choose=lambda case: Choice(ThinPlate(), report))
+
+    monkeypatch.setattr(module, "physics_of", physics_of)
+    monkeypatch.setattr(module, "all_recipes", all_recipes)
+
+    def run() -> dict[str, bool]:
+        made = module.reconstruct(
+            tmp_path / "plate",
+            capture,
+            capture.impacts,
+            module.ReconstructConfig(fit=FitConfig(clusters=8, warmup_steps=2, steps=2, fft_sizes=(1024, 256))),
+            method=HighResolution(modes=6),
+            cache=tmp_path / "cache",
+            settings=CaptureSettings(),
+            listener=Listener(),
+        )
+        assert set(made.choice) == {"errors", "missing"}
+        return {each.stage: each.fresh for each in made.stages}
+
+    # The plate has a surface, of which features are made by pictures: not what is tested.
+    monkeypatch.setattr(module, "SceneStages", NoScene)
+    answers[:] = [SimulationError("3.1 GB are free")]
+    assert run()["choice"]
+    answers[:] = [SimulationError("2.9 GB are free")]
+    assert not run()["choice"]
+    answers[:] = [None]
+    assert run()["choice"]
+    asked.clear()
+    assert not run()["choice"]
+    assert asked == []
+    recipe = json.loads((tmp_path / "cache" / "choice.json.stage.json").read_text())["recipe"]
+    assert "GB" not in json.dumps(recipe)
+
+
+class NoScene:
+    """Stages of a folder that shows nothing."""
+
+    def __init__(self, *arguments: object, **named: object) -> None:
+        self.source = None
+
+    def __bool__(self) -> bool:
+        return False
