@@ -119,7 +119,7 @@ def _expect(grid: Grid) -> None:
 
 
 def _wav(sound: Float32[Tensor, " samples"], rate: int) -> bytes:
-    if not bool(torch.isfinite(sound).all()):
+    if not bool(sound.isfinite().all()):
         raise ExportError("expected finite samples, got others: fit the field again, or export smaller forces")
     memory = io.BytesIO()
     soundfile.write(memory, sound.numpy(), rate, subtype="FLOAT", format="WAV")
