@@ -418,6 +418,7 @@ def test_show_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
     assert "field of plate" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_demo_goes_all_the_way(tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
     from avmsf.cli import demo
     from avmsf.pipeline.features import LiftConfig

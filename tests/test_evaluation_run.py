@@ -365,6 +365,7 @@ def test_killed_five_times_it_comes_to_the_same_summary(tmp_path: Path) -> None:
     assert set(whole["methods"]) == set(CHEAP)
 
 
+@pytest.mark.slow
 def test_many_at_a_time_come_to_the_same_figures(plates: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray")
     heard: list[RunProgress] = []

@@ -72,6 +72,7 @@ def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkey
     assert float((fine.elastic.frequency / body.elastic.frequency - 1).abs()[:2].max()) < 0.05
 
 
+@pytest.mark.slow
 @needs_pytetwild
 def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path: Path):
     told: list[str] = []
@@ -132,6 +133,7 @@ def test_boxes_that_overlap_are_one_body():
     assert "2 parts that share no vertex" in found.refused[0.001]
 
 
+@pytest.mark.slow
 @needs_pytetwild
 def test_the_aircraft_is_filled(shared: Path):
     surface = read_surface(shared / "aircraft_response/surface.obj")
