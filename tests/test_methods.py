@@ -112,7 +112,9 @@ def test_a_sound_depends_on_its_contact_alone(name):
     assert renderer.render(test.contacts[:0]).shape == (0, SAMPLES)
 
 
-@every_method
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "field-auto" else name for name in METHODS]
+)
 def test_a_seed_decides_all_chance(name):
     train, test = parts()
     again = tiny(METHODS[name]).fit(plate_task(train)).render(test.contacts)

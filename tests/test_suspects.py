@@ -73,7 +73,10 @@ def test_a_direction_turned_round_is_found_as_such(row: int):
 
 @pytest.mark.parametrize(
     ("seed", "row", "axis"),
-    [(0, 0, 1), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((1, 4, 0), (1, 8, 0), (2, 4, 0), (3, 0, 0)))],
+    [
+        (0, 0, 1),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((1, 4, 0), (1, 8, 0), (2, 4, 0), (3, 0, 0))),
+    ],
 )
 def test_a_label_on_the_other_side_is_found_though_half_of_the_modes_are_as_strong_there(
     seed: int, row: int, axis: int

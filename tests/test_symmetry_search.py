@@ -69,6 +69,7 @@ def test_a_prism_of_six_is_no_round_column_though_its_inertia_is():
     assert degrees(found.rotations[0].axis, (0, 0, 1)) < 1.0
 
 
+@pytest.mark.slow
 def test_a_cone_is_round_and_its_planes_are_not_listed():
     found = find(draw(trimesh.creation.cone(1.0, 2.0, sections=256)))
     assert [each.order for each in found.rotations] == [None]
@@ -127,6 +128,7 @@ def test_a_blob_has_none():
     assert found.rejected > found.tolerance
 
 
+@pytest.mark.slow
 def test_the_same_seed_finds_the_same_to_the_last_bit():
     points = draw(trimesh.creation.box((1.0, 0.7, 0.4)), count=300)
     assert find(points, seed=3).to_dict() == find(points, seed=3).to_dict()
