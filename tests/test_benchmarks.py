@@ -123,6 +123,7 @@ def test_modes_are_matched_one_to_one_and_the_rest_is_spurious() -> None:
     assert figures["damping_error"] == pytest.approx(0.1)
 
 
+@pytest.mark.slow
 def test_the_plain_form_of_a_step_has_the_same_loss_and_gradient() -> None:
     setting = full_setting(0.2)
     runs = []

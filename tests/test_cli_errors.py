@@ -86,6 +86,7 @@ def test_one_line_says_what_is_wrong(words: str, place: Path, capsys: Streams, m
     assert {path.name for path in place.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_a_process_ends_with_2_and_an_empty_standard_output(place: Path) -> None:
     code = "import sys; from avmsf.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "modes", "nowhere", "--json"]

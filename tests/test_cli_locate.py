@@ -123,6 +123,7 @@ def test_several_blows_are_told_apart(place: Place, tmp_path: Path, capsys: Stre
     assert "holds more than one blow" in err
 
 
+@pytest.mark.slow
 def test_no_blows_files_are_anothers(place: Place, tmp_path: Path, capsys: Streams) -> None:
     first, second = place.blow(STRUCK, before=0.1), place.blow(SECOND, before=0.4)
     both = torch.cat([first, torch.zeros(len(second) - len(first), dtype=torch.float64)]) + second

@@ -86,6 +86,7 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     assert made_now(capsys) == kept_all | {"features": True, "fit": True}
 
 
+@pytest.mark.slow
 def test_a_changed_picture_makes_everything_anew(capture: Path, kept: Path, tmp_path: Path, capsys: Streams) -> None:
     cache, changed = tmp_path / "cache", tmp_path / "slab"
     shutil.copytree(kept, cache)
@@ -130,6 +131,7 @@ def test_an_interrupted_splatting_goes_on_to_the_same_gaussians(
     assert sorted(each.name for each in cache.iterdir() if "checkpoint" in each.name) == []
 
 
+@pytest.mark.slow
 def test_a_mesh_is_the_object_itself(tmp_path: Path, capsys: Streams) -> None:
     folder = tmp_path / "slab"
     folder.mkdir()
@@ -149,6 +151,7 @@ def test_a_mesh_is_the_object_itself(tmp_path: Path, capsys: Streams) -> None:
     assert float(sides.amin(1).max()) < 1e-6
 
 
+@pytest.mark.slow
 def test_gaussians_made_elsewhere_are_looked_at_from_all_sides(kept: Path, tmp_path: Path, capsys: Streams) -> None:
     folder = tmp_path / "slab"
     folder.mkdir()

@@ -348,6 +348,7 @@ def evaluate_plates(data: Path, results: Path, progress: Callable[[RunProgress],
     summed(results)
 
 
+@pytest.mark.slow
 def test_killed_five_times_it_comes_to_the_same_summary(tmp_path: Path) -> None:
     plates = fill_plates(tmp_path / "plates", count=6)
     evaluate_plates(plates, tmp_path / "whole")

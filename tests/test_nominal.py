@@ -107,6 +107,7 @@ def test_a_damaged_kept_file_is_made_again(tmp_path: Path):
     assert kept.read_bytes() == whole
 
 
+@pytest.mark.slow
 @needs_pytetwild
 def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
     outer, inner = trimesh.creation.icosphere(3, radius=0.06), trimesh.creation.icosphere(3, radius=0.054)

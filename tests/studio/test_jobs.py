@@ -2,6 +2,8 @@
 
 import asyncio
 import gc
+import io
+import json
 import sys
 import time
 from collections.abc import Awaitable, Callable, Iterator
@@ -13,6 +15,7 @@ import pytest
 from avmsf.errors import CaptureError
 from avmsf.studio.jobs import Job, Jobs
 from avmsf.studio.refusal import RefusedError
+from avmsf.studio.worker import Voice
 
 # A loop that a test closes right after a process was killed leaves pipes for the collector, which warns of them.
 pytestmark = [
@@ -75,10 +78,11 @@ def test_a_job_that_was_killed_says_by_what_and_not_what_its_process_said(number
 
 def test_a_stage_is_named_once() -> None:
     told = ["capture: reading the recordings", "choice: physics, 1 of 6", "128 elastic modes"]
-    heard = run(
-        f"from avmsf.studio.worker import Voice\nfor words in {told}: Voice(sys.stdout).tell(words)\nsay(result=0)"
-    )
-    assert [(event["stage"], event["words"]) for event in heard[:-1]] == [
+    out = io.StringIO()
+    for words in told:
+        Voice(out).tell(words)
+    heard = [json.loads(line) for line in out.getvalue().splitlines()]
+    assert [(event["stage"], event["words"]) for event in heard] == [
         ("capture", "reading the recordings"),
         ("choice", "physics, 1 of 6"),
         ("128 elastic modes", ""),
