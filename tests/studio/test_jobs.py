@@ -2,7 +2,6 @@
 
 import asyncio
 import gc
-import io
 import json
 import sys
 import time
@@ -76,12 +75,11 @@ def test_a_job_that_was_killed_says_by_what_and_not_what_its_process_said(number
     )
 
 
-def test_a_stage_is_named_once() -> None:
+def test_a_stage_is_named_once(capsys: pytest.CaptureFixture[str]) -> None:
     told = ["capture: reading the recordings", "choice: physics, 1 of 6", "128 elastic modes"]
-    out = io.StringIO()
     for words in told:
-        Voice(out).tell(words)
-    heard = [json.loads(line) for line in out.getvalue().splitlines()]
+        Voice(sys.stdout).tell(words)
+    heard = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [(event["stage"], event["words"]) for event in heard] == [
         ("capture", "reading the recordings"),
         ("choice", "physics, 1 of 6"),
