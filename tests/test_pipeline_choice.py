@@ -36,7 +36,6 @@ def no_physics():
     raise SimulationError("no body can be made of this surface")
 
 
-@pytest.mark.slow
 def test_features_that_tell_where_a_place_is_win_over_the_same_ones_shuffled() -> None:
     train = blows(12)
     recipes = all_recipes(candidates(), no_physics)
