@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo example test page lint install clean
+.PHONY: demo example test test-all lint install clean
 
 install: .venv/developed
 
@@ -24,12 +24,16 @@ example: .venv/developed
 	rm -rf src/avmsf/example
 	$(BIN)/avmsf simulate example --output src/avmsf/example
 
-test: .venv/developed
-	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto
+# Neighbors stay on one worker where possible (worksteal), so that a module's fixtures are made once.
+PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
 
-# What the page does, in Debian's chromium: minutes in real time, which `test` has the centre of.
-page: .venv/developed
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto -m page tests/studio
+# The fast tests of every package: 5 minutes at most on two idle cores.
+test: .venv/developed
+	$(PYTEST)
+
+# All tests: the fast ones, then the slow ones and those of the page (Debian's chromium).
+test-all: test
+	$(PYTEST) -m "slow or page"
 
 lint: .venv/developed
 	$(BIN)/ruff check .

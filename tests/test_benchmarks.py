@@ -95,6 +95,7 @@ def test_every_benchmark_measures_all_its_parts_unless_told(
     assert set(json.loads(capsys.readouterr().out.splitlines()[-1])) == {"a", "b", "quick_look"}
 
 
+@pytest.mark.slow
 def test_the_field_benchmark_has_every_method_and_metric_by_its_key() -> None:
     report = field.measure(Options(("plate",), quick_look=True))
     for method in ("white_noise", "nearest", "knn3_waveform", "knn3_gains", "warmup", "field", "floor", "sine_floor"):
@@ -122,6 +123,7 @@ def test_modes_are_matched_one_to_one_and_the_rest_is_spurious() -> None:
     assert figures["damping_error"] == pytest.approx(0.1)
 
 
+@pytest.mark.slow
 def test_the_plain_form_of_a_step_has_the_same_loss_and_gradient() -> None:
     setting = full_setting(0.2)
     runs = []

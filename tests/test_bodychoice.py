@@ -15,7 +15,7 @@ from made_dome import STIFFER, WALLS, bodies, points, struck
 
 
 @pytest.mark.parametrize("wall", WALLS)
-@pytest.mark.parametrize("count", [6, 12])
+@pytest.mark.parametrize("count", [6, pytest.param(12, marks=pytest.mark.slow)])
 def test_the_wall_and_the_stiffness_are_found_among_candidates(wall: float, count: int):
     measured = struck(wall, count)
     found = likely_bodies(bodies(), points(), measured)

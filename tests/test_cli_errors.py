@@ -19,7 +19,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fill_plate(folder / "plate")
     fill_plate(folder / "fast", rate=9000.0)
     words = ["fit", str(folder / "plate"), "--output", str(folder / "field.safetensors"), *TINY]
-    assert main([*words, "--warmup-steps", "1", "--steps", "1"]) == 0
+    assert main([*words, "--gains", "spline", "--steps", "1"]) == 0
     (folder / "not-ours.safetensors").write_bytes(b"RIFF and so on")
     (folder / "no-z.csv").write_text("file,x,y\na.wav,0,0\n")
     (folder / "empty.csv").write_text("x,y,z\n")
@@ -86,6 +86,7 @@ def test_one_line_says_what_is_wrong(words: str, place: Path, capsys: Streams, m
     assert {path.name for path in place.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_a_process_ends_with_2_and_an_empty_standard_output(place: Path) -> None:
     code = "import sys; from avmsf.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "modes", "nowhere", "--json"]

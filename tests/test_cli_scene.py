@@ -2,15 +2,17 @@
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 
+from avmsf.bench.clouds import save_turntable
 from avmsf.capture import Surface
 from avmsf.capture.surface import write_surface
 from avmsf.capture.views.write import write_views
-from avmsf.cli import main
+from avmsf.cli import main, view_cloud
 from avmsf.cli.scenebar import SceneBar
 from avmsf.field.store import load
 from avmsf.scene.featurestore import load_features, read_report
@@ -21,6 +23,7 @@ from small_scene import SMALL_SPLAT, THICKNESS, slab_views, write_surface_file
 
 Streams = pytest.CaptureFixture[str]
 LIFT = ("--lift.encoder", "descriptors", "--lift.points", "600")
+RENDERED = ("--views.rendered", "48", "--views.count", "18")
 MODES = ("--modes", "12")
 FIT = tuple(f"--fit.{word[2:]}" if word.startswith("--") else word for word in TINY[: -len(MODES)])
 SMALL = (*SMALL_SPLAT, *LIFT, *FIT, *MODES, "--gains", "visual")
@@ -83,6 +86,7 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     assert made_now(capsys) == kept_all | {"features": True, "fit": True}
 
 
+@pytest.mark.slow
 def test_a_changed_picture_makes_everything_anew(capture: Path, kept: Path, tmp_path: Path, capsys: Streams) -> None:
     cache, changed = tmp_path / "cache", tmp_path / "slab"
     shutil.copytree(kept, cache)
@@ -127,12 +131,13 @@ def test_an_interrupted_splatting_goes_on_to_the_same_gaussians(
     assert sorted(each.name for each in cache.iterdir() if "checkpoint" in each.name) == []
 
 
+@pytest.mark.slow
 def test_a_mesh_is_the_object_itself(tmp_path: Path, capsys: Streams) -> None:
     folder = tmp_path / "slab"
     folder.mkdir()
     write_surface_file(folder)
     output = tmp_path / "features.safetensors"
-    words = ["lift", str(folder), "--encoder", "descriptors", "--points", "700", "--views.rendered", "48"]
+    words = ["lift", str(folder), "--encoder", "descriptors", "--points", "700", *RENDERED]
     assert main([*words, "--output", str(output)]) == 0
     capsys.readouterr()
     features, report = load_features(output), read_report(output)
@@ -146,11 +151,12 @@ def test_a_mesh_is_the_object_itself(tmp_path: Path, capsys: Streams) -> None:
     assert float(sides.amin(1).max()) < 1e-6
 
 
+@pytest.mark.slow
 def test_gaussians_made_elsewhere_are_looked_at_from_all_sides(kept: Path, tmp_path: Path, capsys: Streams) -> None:
     folder = tmp_path / "slab"
     folder.mkdir()
     shutil.copy(kept / "cloud.ply", folder / "splats.ply")
-    assert main(["lift", str(folder), "--encoder", "descriptors", "--views.rendered", "48"]) == 0
+    assert main(["lift", str(folder), "--encoder", "descriptors", *RENDERED]) == 0
     out, _ = capsys.readouterr()
     assert "features: descriptors" in out
     features = load_features(folder / ".avmsf" / "features.safetensors")
@@ -166,7 +172,10 @@ def test_features_serve_the_fit_of_another_command(kept: Path, capture: Path, tm
     assert torch.equal(load(output).gain_field.points, load(kept / "field.safetensors").gain_field.points)
 
 
-def test_clouds_and_features_are_drawn(kept: Path, tmp_path: Path, capsys: Streams) -> None:
+def test_clouds_and_features_are_drawn(
+    kept: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(view_cloud, "save_turntable", partial(save_turntable, frames=3))
     assert main(["view-cloud", str(kept / "cloud.ply"), "--output", str(tmp_path / "a")]) == 0
     words = ["view-cloud", str(kept / "features.safetensors"), "--cloud", str(kept / "cloud.ply"), "--clusters", "8"]
     assert main([*words, "--output", str(tmp_path / "b")]) == 0

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import pytest
 import torch
 from torch import nn
 
@@ -68,6 +69,7 @@ def test_a_descent_goes_on_from_its_state() -> None:
         assert torch.equal(one, two)
 
 
+@pytest.mark.slow
 def test_a_step_brings_no_compiler_in() -> None:
     program = (
         "import sys, torch; from avmsf.field.descent import Descent, Group; "

@@ -259,6 +259,7 @@ def test_every_simulated_material_is_left_and_reached_once():
     assert set(SIMULATED_TRANSITIONS) <= {*SEVEN_TRANSITIONS}
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`torch.nn.utils.weight_norm` is deprecated:FutureWarning")
 def test_the_protocol_of_words_runs_on_simulated_objects(plates_alone, tmp_path, monkeypatch, capsys):
     pytest.importorskip("diffusers", reason="needs pip install 'avmsf[text]'")
@@ -292,6 +293,7 @@ def test_the_protocol_of_words_runs_on_simulated_objects(plates_alone, tmp_path,
     assert len(json.loads(record.read_text(encoding="utf-8"))["spaces"]["pitches"]["names"]) == 4 * 7
 
 
+@pytest.mark.slow
 def test_the_simulated_protocol_without_a_model_goes_by_recordings(plates_alone, tmp_path, monkeypatch):
     monkeypatch.setattr(protocol, "SEVEN_TRANSITIONS", SEVEN_TRANSITIONS[5:6])
     record = tmp_path / "scores.json"

@@ -348,6 +348,7 @@ def evaluate_plates(data: Path, results: Path, progress: Callable[[RunProgress],
     summed(results)
 
 
+@pytest.mark.slow
 def test_killed_five_times_it_comes_to_the_same_summary(tmp_path: Path) -> None:
     plates = fill_plates(tmp_path / "plates", count=6)
     evaluate_plates(plates, tmp_path / "whole")
@@ -365,6 +366,7 @@ def test_killed_five_times_it_comes_to_the_same_summary(tmp_path: Path) -> None:
     assert set(whole["methods"]) == set(CHEAP)
 
 
+@pytest.mark.slow
 def test_many_at_a_time_come_to_the_same_figures(plates: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray")
     heard: list[RunProgress] = []

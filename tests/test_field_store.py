@@ -177,6 +177,7 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ["plate.safetensors"]
 
 
+@pytest.mark.slow
 def test_a_kill_while_saving_leaves_one_whole_field_or_the_other(tmp_path):
     source, folder = tmp_path / "source", tmp_path / "there"
     path = folder / "plate.safetensors"

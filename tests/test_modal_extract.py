@@ -274,6 +274,7 @@ def test_samples_that_are_no_numbers_are_refused():
         extract(impacts_of(broken))
 
 
+@pytest.mark.slow
 def test_the_bowls_doublet_is_resolved(shared: Path):
     clips = []
     for row in range(8):

@@ -1,5 +1,6 @@
 """Vectors of mode sets in closed form, and the space that UMAP makes of them: seeded, stored, and made again."""
 
+import importlib.util
 import json
 import math
 import sys
@@ -91,10 +92,13 @@ def labelled(count: int = 8) -> tuple[list[ModalBank], list[str]]:
 
 @pytest.fixture(scope="module")
 def space() -> MaterialSpace:
-    pytest.importorskip("umap", reason="needs pip install 'avmsf[eval]'")
+    # Importing it compiles for many seconds, which only its embeddings need.
+    if importlib.util.find_spec("umap") is None:
+        pytest.skip("needs pip install 'avmsf[eval]'")
     return MaterialSpace.of(*labelled(), seed=3)
 
 
+@pytest.mark.slow
 def test_an_objects_like_is_near_and_its_opposite_far(space):
     wood, glass = random_bank(25, seed=99), random_bank(25, seed=98, pitch=3.0)
     assert space.distance(wood, "wood") < 0.5 * space.distance(wood, "glass")
@@ -111,6 +115,7 @@ def test_the_plain_distance_is_that_of_the_vectors(space):
     assert space.plain_distance(far, "wood") == pytest.approx(space.plain_distance(near, "wood") + 1.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_space(space):
     again = MaterialSpace.of(*labelled(), seed=3)
     assert np.array_equal(again.embedding, space.embedding)
@@ -122,6 +127,7 @@ def test_the_same_seed_gives_the_same_space(space):
     assert not np.array_equal(MaterialSpace.of(*labelled(), seed=4).embedding, space.embedding)
 
 
+@pytest.mark.slow
 def test_a_space_outlives_the_process_in_a_file(space, tmp_path):
     path = tmp_path / "space.json"
     space.save(path)
@@ -137,6 +143,7 @@ def test_a_space_outlives_the_process_in_a_file(space, tmp_path):
     assert record["centres"]["wood"] == pytest.approx(np.mean(record["embedding"][:8], axis=0).tolist(), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_an_embedding_that_does_not_come_out_again_is_refused(space, tmp_path):
     path = tmp_path / "space.json"
     space.save(path)

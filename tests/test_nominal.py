@@ -67,6 +67,7 @@ def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkey
     assert float((fine.elastic.frequency / body.elastic.frequency - 1).abs()[:2].max()) < 0.05
 
 
+@pytest.mark.slow
 def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path: Path):
     told: list[str] = []
     inwards = Surface(ball().vertices, ball().faces.flip(1))
@@ -100,6 +101,7 @@ def test_a_damaged_kept_file_is_made_again(tmp_path: Path):
     assert kept.read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
     outer, inner = trimesh.creation.icosphere(3, radius=0.06), trimesh.creation.icosphere(3, radius=0.054)
     inner.invert()
@@ -124,6 +126,7 @@ def test_boxes_that_overlap_are_one_body():
     assert "2 parts that share no vertex" in found.refused[0.001]
 
 
+@pytest.mark.slow
 def test_the_aircraft_is_filled(shared: Path):
     surface = read_surface(shared / "aircraft_response/surface.obj")
     found = nominal_bodies(surface, count=6, freedoms=12_000)

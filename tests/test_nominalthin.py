@@ -32,6 +32,7 @@ def surface_of(skin: Skin) -> Surface:
     return Surface(torch.from_numpy(skin.points).float(), torch.from_numpy(skin.faces))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dense", "coarse"), [(ellipsoid(5), ellipsoid(4)), (vessel(160), vessel(70))])
 def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
     dense: Skin, coarse: Skin, monkeypatch: pytest.MonkeyPatch

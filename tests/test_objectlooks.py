@@ -71,6 +71,7 @@ def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tm
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")} == before
 
 
+@pytest.mark.slow
 def test_fewer_views_are_kept_apart_from_all(seen: Path, tmp_path: Path) -> None:
     looks = ObjectLooks(OneObject(seen), tmp_path, CONFIG)
     few, every = looks("slab", "visual", 6), looks("slab", "visual")

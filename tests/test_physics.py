@@ -249,6 +249,7 @@ def test_points_of_features_in_another_frame_are_refused():
         recipe().start(replace(case(), features=elsewhere), "shared")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [4, 12])
 def test_rough_surfaces_thick_glue_and_a_wrong_row_are_not_refused(count: int):
     generator = torch.Generator().manual_seed(4)

@@ -149,6 +149,7 @@ def test_cameras_that_are_there_are_not_overwritten(found: tuple[Path, Estimated
         estimate_cameras(folder / "images", folder)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_masks_count(taken: tuple[View, ...], tmp_path: Path) -> None:
     contents = []
     for name in ("one", "two", "masked"):

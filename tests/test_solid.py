@@ -215,6 +215,7 @@ def mixed(surface: Surface) -> Surface:
     return Surface(surface.vertices, faces)
 
 
+@pytest.mark.slow
 def test_two_balls_that_cross_with_a_hole_are_one_body():
     one = ball()
     pierced = Surface(one.vertices, one.faces[8:])
@@ -227,6 +228,7 @@ def test_two_balls_that_cross_with_a_hole_are_one_body():
     assert int(solid.parts.max()) == 0
 
 
+@pytest.mark.slow
 def test_a_skin_that_runs_through_itself_is_filled_once():
     # A tube wider than the ring that it is bent to: the part around the axis lies inside of it twice.
     ring, tube = 0.03, 0.04

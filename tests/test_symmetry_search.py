@@ -61,6 +61,7 @@ def test_a_box_has_three_half_turns_and_three_planes_in_any_pose_and_size():
     assert found.spacing == pytest.approx(3e-3 * 0.016 * math.sqrt(1.0 + 0.49 + 0.16), rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_prism_of_six_is_no_round_column_though_its_inertia_is():
     found = find(draw(trimesh.creation.cylinder(1.0, 1.5, sections=6)))
     assert sorted(each.order for each in found.rotations) == [2] * 6 + [6]
@@ -68,6 +69,7 @@ def test_a_prism_of_six_is_no_round_column_though_its_inertia_is():
     assert degrees(found.rotations[0].axis, (0, 0, 1)) < 1.0
 
 
+@pytest.mark.slow
 def test_a_cone_is_round_and_its_planes_are_not_listed():
     found = find(draw(trimesh.creation.cone(1.0, 2.0, sections=256)))
     assert [each.order for each in found.rotations] == [None]
@@ -75,6 +77,7 @@ def test_a_cone_is_round_and_its_planes_are_not_listed():
     assert degrees(found.rotations[0].axis, (0, 0, 1)) < 1.0
 
 
+@pytest.mark.slow
 def test_a_handle_leaves_a_cup_one_plane_only():
     found = find(cup(handle=True))
     assert found.rotations == ()
@@ -82,12 +85,14 @@ def test_a_handle_leaves_a_cup_one_plane_only():
     assert degrees(found.mirrors[0].normal, (0, 1, 0)) < 2.0
 
 
+@pytest.mark.slow
 def test_an_open_can_is_not_half_of_a_closed_one():
     found = find(cup(handle=False))
     assert [each.order for each in found.rotations] == [None]
     assert found.mirrors == ()
 
 
+@pytest.mark.slow
 def test_noise_and_uneven_cover_hide_no_symmetry():
     # Not seed 0, with which trimesh draws the faces: what is dropped would be one part of the ball.
     random = np.random.default_rng(9)
@@ -100,6 +105,7 @@ def test_noise_and_uneven_cover_hide_no_symmetry():
     assert max(min(degrees(each.normal, axis) for axis in np.eye(3)) for each in found.mirrors) < 2.0
 
 
+@pytest.mark.slow
 def test_a_hole_kills_no_symmetry():
     points = draw(trimesh.creation.box((1.0, 0.7, 0.4)), count=6000)
     distance = np.linalg.norm(points - np.array([0.5, 0.35, 0.2]), axis=1)
@@ -122,11 +128,13 @@ def test_a_blob_has_none():
     assert found.rejected > found.tolerance
 
 
+@pytest.mark.slow
 def test_the_same_seed_finds_the_same_to_the_last_bit():
     points = draw(trimesh.creation.box((1.0, 0.7, 0.4)), count=300)
     assert find(points, seed=3).to_dict() == find(points, seed=3).to_dict()
 
 
+@pytest.mark.slow
 def test_a_scanned_bowl_is_round(shared: Path):
     surface = read_surface(shared / "meshes" / "bowl" / "textured.obj")
     mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)

@@ -72,6 +72,7 @@ def test_a_colmap_model_of_them_says_the_same(shared: Path, dino: tuple[View, ..
         assert other.camera.focal == pytest.approx((331.04, 332.55))
 
 
+@pytest.mark.slow
 def test_the_foreground_is_the_dinosaur(dino: tuple[View, ...]) -> None:
     views = find_foreground(dino[::2])
     assert [view.name for view in views] == [view.name for view in dino[::2]]

@@ -2,6 +2,7 @@
 
 import asyncio
 import gc
+import json
 import sys
 import time
 from collections.abc import Awaitable, Callable, Iterator
@@ -13,6 +14,7 @@ import pytest
 from avmsf.errors import CaptureError
 from avmsf.studio.jobs import Job, Jobs
 from avmsf.studio.refusal import RefusedError
+from avmsf.studio.worker import Voice
 
 # A loop that a test closes right after a process was killed leaves pipes for the collector, which warns of them.
 pytestmark = [
@@ -73,12 +75,13 @@ def test_a_job_that_was_killed_says_by_what_and_not_what_its_process_said(number
     )
 
 
-def test_a_stage_is_named_once() -> None:
+def test_a_stage_is_named_once(tmp_path: Path) -> None:
     told = ["capture: reading the recordings", "choice: physics, 1 of 6", "128 elastic modes"]
-    heard = run(
-        f"from avmsf.studio.worker import Voice\nfor words in {told}: Voice(sys.stdout).tell(words)\nsay(result=0)"
-    )
-    assert [(event["stage"], event["words"]) for event in heard[:-1]] == [
+    with (tmp_path / "told").open("w") as stream:
+        for words in told:
+            Voice(stream).tell(words)
+    heard = [json.loads(line) for line in (tmp_path / "told").read_text().splitlines()]
+    assert [(event["stage"], event["words"]) for event in heard] == [
         ("capture", "reading the recordings"),
         ("choice", "physics, 1 of 6"),
         ("128 elastic modes", ""),

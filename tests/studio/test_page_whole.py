@@ -44,6 +44,7 @@ def opened_page(browser: "Browser", opened: Opened, scratch: Path, *, wait_for_j
         context.close()
 
 
+@pytest.mark.slow
 def test_pictures_that_show_nothing_are_said_to_and_can_be_tried_again(
     browser: "Browser", home: Path, tmp_path: Path
 ) -> None:

@@ -265,6 +265,7 @@ def test_only_the_current_revision_is_prepared_and_symmetries_once(
     assert {"locator", "_heed"} <= vars(finder).keys() | vars(finder.locator).keys()
 
 
+@pytest.mark.slow
 def test_a_larger_object_has_the_same_symmetries_farther_out() -> None:
     grid = torch.cartesian_prod(torch.linspace(-0.1, 0.1, 21), torch.linspace(-0.06, 0.06, 13))
     points = torch.cat([grid, torch.full((len(grid), 1), 0.03)], dim=1) + torch.tensor([0.2, 0.0, 0.0])
