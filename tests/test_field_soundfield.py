@@ -44,9 +44,11 @@ def test_a_sound_is_its_modes_and_the_noise(damping):
     noise = sounds[:2].double() - torch.stack([by_hand(sound_field, row) for row in (0, 1)])
     # Float32 sounds: the same noise is left at both contacts, to a millionth of the loudest sample.
     torch.testing.assert_close(noise[0], noise[1], rtol=0, atol=1e-6 * loudest)
-    # Noise of flat magnitude has that as its standard deviation; 2400 samples tell it to 2 %.
-    level = float(sound_field.residual.magnitude.mean())
-    assert float(noise.std()) == pytest.approx(level, rel=0.06)
+    # Its variance is the mean of the squared magnitudes, between bins on the lines that join them.
+    low, high = sound_field.residual.magnitude[:-1], sound_field.residual.magnitude[1:]
+    level = float(((low.square() + low * high + high.square()) / 3).mean().sqrt())
+    # 2400 samples tell it to 2 % where it is white, and to less where few bands hold most of it.
+    assert float(noise[0].std()) == pytest.approx(level, rel=0.15)
 
 
 def test_the_noise_is_the_same_at_every_contact_and_in_every_call():

@@ -74,6 +74,6 @@ def test_regions_are_the_wider_the_less_modes_are_heeded() -> None:
     sound, sizes = field.render(field.gain_field.points[200:201])[0], []
     for heed in (1.0, 0.1, 0.01):
         locator = Locator.of(field)
-        vars(locator)["heed"] = heed
+        vars(locator)["_heed"] = heed
         sizes.append(int(locator.locate(sound).region().sum()))
     assert sizes[0] < sizes[1] < sizes[2]

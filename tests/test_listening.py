@@ -58,7 +58,7 @@ def spot(blow: Blow) -> int:
 def test_nothing_is_left_to_compute_for_the_first_blow() -> None:
     fresh = Locator.of(locator().field)
     listener = Listener(fresh, later=0.2)
-    assert "heed" in vars(fresh)
+    assert "_heed" in vars(fresh)
     assert {length for length, _ in fresh.lengths} == {listener.window, listener.later}
 
 

@@ -62,7 +62,7 @@ def test_the_choice_does_not_depend_on_free_memory_and_is_made_again_once_there_
             raise answers[0]
         return object.__new__(Physics)
 
-    def all_recipes(candidates: object, physics: Any, *, tell: object) -> object:
+    def all_recipes(physics: Any, *, tell: object) -> object:
         missing = {}
         try:
             physics()

@@ -18,6 +18,8 @@ _ROUNDS = 50
 """Most steps of the search for the noise's power, each by at most two nepers."""
 _CONVERGED = 1e-3
 """Step at which the search ends, nepers of power: .004 dB."""
+_ROUNDING = 1e-16
+"""Power of a float32 number's rounding over its square, 2^-48 / 12 to 2^-46 / 12: fainter sound is not recorded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,36 +93,55 @@ def estimate_residual(
     least squares. Logarithms are compared because narrow lines and slow tails that the modes leave over hardly change
     their mean. For the same reason frames are an eighth of the sound, so that a band has many frequencies, and only the
     quarter of the frames count in which the modes have least energy. As frames are chosen by the modes and not by the
-    noise, the choice has no bias. In the paper (section 3.4) the magnitudes start from the mean of each band's
+    noise, the choice has no bias. Of recordings with noise of unequal level the result is near the geometric mean of
+    their levels. In the paper (section 3.4) the magnitudes start from the mean of each band's
     lowest-energy segments, as in `noise_power`, and are then trained.
     """
     fft_size = _FINENESS * 2 * (bins - 1)
-    ringing = _frame_power(modes.double(), fft_size)
-    frames = max(1, round(_WEAKEST * ringing.shape[1]))
-    weakest = torch.sort(ringing, dim=1, stable=True).indices[:, :frames]
-    recorded = _frame_power(sounds.double(), fft_size).gather(1, weakest)
+    pairs = [_weakest_frames(sound, mode, fft_size) for sound, mode in zip(sounds, modes, strict=True)]
+    recorded, ringing = (torch.cat(each) for each in zip(*pairs, strict=True))
     columns = torch.arange(_FINENESS * bins).view(bins, _FINENESS) - _FINENESS // 2
     # Spectra are real at 0 Hz and at half the rate, where log power has another mean.
     inside = (columns > 0) & (columns < fft_size // 2)
     columns = columns.clamp(0, fft_size // 2)
-    power = _noise_beneath(recorded[..., columns], ringing.gather(1, weakest)[..., columns], inside)
+    power = _noise_power_given_modes(recorded[:, columns], ringing[:, columns], inside)
     return Residual(power.sqrt().to(sounds.dtype))
 
 
-def _noise_beneath(
-    recorded: Float64[Tensor, "contacts frames bins columns"],
-    ringing: Float64[Tensor, "contacts frames bins columns"],
+def _weakest_frames(
+    sound: Float[Tensor, " samples"], mode: Float[Tensor, " samples"], fft_size: int
+) -> tuple[Float64[Tensor, "frames bins"], Float64[Tensor, "frames bins"]]:
+    """Return the power of a recording and of its modes in the frames where these are weakest, bin by bin.
+
+    Frames of digital silence, as after a noise gate or where a recording was padded, say nothing of the noise, nor do
+    the frames next to them, which overlap them.
+    """
+    recorded, ringing = (_frame_power(each.double()[None], fft_size)[0] for each in (sound, mode))
+    energy = recorded.sum(1)
+    sounding = energy > _ROUNDING * energy.max()
+    sounding &= torch.nn.functional.pad(sounding[1:], (0, 1), value=True)
+    sounding &= torch.nn.functional.pad(sounding[:-1], (1, 0), value=True)
+    recorded, ringing = recorded[sounding].clamp_min(_ROUNDING * float(recorded.max())), ringing[sounding]
+    frames = min(len(ringing), max(1, round(_WEAKEST * len(ringing))))
+    weakest = torch.sort(ringing, dim=0, stable=True).indices[:frames]
+    return recorded.gather(0, weakest), ringing.gather(0, weakest)
+
+
+def _noise_power_given_modes(
+    recorded: Float64[Tensor, "frames bins columns"],
+    ringing: Float64[Tensor, "frames bins columns"],
     inside: Bool[Tensor, "bins columns"],
 ) -> Float64[Tensor, " bins"]:
     """Return the noise's power in each band by Gauss-Newton steps, from the powers recorded and those of the modes."""
-    tiny = torch.finfo(torch.float64).tiny
-    recorded_log = torch.log(recorded.clamp_min(tiny))
-    noise = (recorded * inside).amax((0, 1, 3)).clamp_min(tiny)
+    if not len(recorded):
+        return recorded.new_zeros(len(inside))
+    recorded_log = torch.log(recorded)
+    noise = (recorded * inside).amax((0, 2))
     for _ in range(_ROUNDS):
-        ratio = (ringing / noise[:, None]).clamp_min(1e-12)
+        ratio = (ringing / noise[:, None]).clamp(1e-12, 1e6)
         expected = torch.log(noise)[:, None] + torch.log(ratio) + torch.from_numpy(scipy.special.exp1(ratio.numpy()))
         slope = inside * torch.exp(-ratio)
-        step = (slope * (recorded_log - expected)).sum((0, 1, 3)) / slope.square().sum((0, 1, 3)).clamp_min(1.0)
+        step = (slope * (recorded_log - expected)).sum((0, 2)) / slope.square().sum((0, 2)).clamp_min(1.0)
         noise = noise * torch.exp(step.clamp(-2.0, 2.0))
         if float(step.abs().max()) < _CONVERGED:
             break
