@@ -1,4 +1,4 @@
-"""How loud the residual noise of a field is beside the noise of recordings, trained as in the paper and measured."""
+"""Level of a field's residual noise relative to the recordings' noise, trained as in the paper and measured."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

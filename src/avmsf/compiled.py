@@ -29,9 +29,11 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
         except RuntimeError:
             # Numba looks for a folder at once, and raises this where it finds none.
             return numba.njit(**options)(function)
-        # Numba lets errors of the disk through to who calls the function.
+        # Numba lets errors of the disk through to the caller. Its cache is not part of its public interface.
+        cache = getattr(made, "_cache", None)
         for step in ("load_overload", "save_overload"):
-            setattr(made._cache, step, _without_disk_errors(getattr(made._cache, step)))
+            if hasattr(cache, step):
+                setattr(cache, step, _without_disk_errors(getattr(cache, step)))
         return made
 
     return decorate

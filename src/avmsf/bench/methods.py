@@ -117,7 +117,8 @@ FIELDS = (
     AutomaticField("field-auto"),
     FieldMethod("field-positions", look="positions"),
     FieldMethod("field-unaligned", look="unaligned"),
-    # All steps end to end take long enough without two trials of dampings beforehand. Its noise is not measured.
+    # All steps end to end take long enough without two trials of dampings beforehand. The noise is
+    # trained, as measuring it needs the modes.
     UninformedField("field-no-initialisation", replace(QUICK, damping="shared", noise_rate=0.1)),
     FieldMethod("field-no-residual", replace(QUICK, residual=False)),
     # The warm-up moves no damping, so there is nothing to choose between.

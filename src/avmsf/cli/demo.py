@@ -1,4 +1,4 @@
-"""`avmsf demo`: all the way from pictures and taps of a mug to its sound anywhere, and how good that is."""
+"""`avmsf demo`: a complete example, from pictures and recordings of a mug to its sound anywhere, with its errors."""
 
 import shlex
 import shutil

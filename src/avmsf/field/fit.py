@@ -118,7 +118,7 @@ def fit(
 
 
 def _with_measured_residual(field: SoundField, train: Impacts) -> SoundField:
-    """Return the field with the noise that its modes lack of the recordings it was fitted to."""
+    """Return the field with the noise measured from what its modes do not explain of the recordings."""
     bins = len(field.residual.magnitude)
     silent = replace(field, residual=Residual(torch.zeros(bins)))
     modes = silent.render(train.contacts, directions=train.directions)

@@ -47,8 +47,8 @@ def _left_out(
         error = covariance @ along
         rest = (whole - (along * error).sum(2)).clamp_min(tiny)
         others = max(known.count - int(known.heard[rows].sum()), 1)
-        # A determinant without the part has the block's as a factor; contacts that say nothing are not part of the
-        # evidence (`Hypotheses.likelihood`), so that their own noise goes with them.
+        # A determinant without the part has the block's as a factor; excluded contacts are not part of the
+        # evidence (`Hypotheses.likelihood`), so their noise term is subtracted too.
         change = known.count * torch.log(whole) - others * torch.log(rest)
         change = change - (torch.logdet(block) + silent[..., rows].sum(-1))[..., None]
         likely = torch.softmax(torch.log(weights) + 0.5 * change, dim=0)[:, :, None]

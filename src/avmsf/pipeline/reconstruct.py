@@ -151,7 +151,7 @@ def _reconstruct(
 
     chosen, choice = None, {"name": config.gains}
     if config.gains == "auto":
-        asked = {"candidates": list(shape.candidates), "body": asdict(config.body), "surface": shape.surface_digest}
+        asked = {"body": asdict(config.body), "surface": shape.surface_digest}
 
         def is_final(path: Path) -> bool:
             """Whether a choice was made with physics, or there is still none, as for want of memory."""
