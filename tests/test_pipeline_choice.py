@@ -1,4 +1,4 @@
-"""How gains are spread is chosen by what foretells training contacts, and what cannot be had is told."""
+"""Gain models are chosen by their errors on training contacts, and a model that cannot be used is reported."""
 
 import pytest
 import torch
