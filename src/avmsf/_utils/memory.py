@@ -8,11 +8,9 @@ def lacks_memory(error: BaseException) -> bool:
     """Return whether an error means that the memory does not suffice.
 
     Beside MemoryError these are RuntimeError of torch's allocator, ImportError of a module's library, and OSError of a
-    library that a module opens by itself, as llvmlite does.
+    library that a module opens by itself, as llvmlite does, whose error has the loader's as its context.
     """
-    words = str(error)
-    return (
-        isinstance(error, MemoryError)
-        or (isinstance(error, RuntimeError) and "DefaultCPUAllocator" in words)
-        or (isinstance(error, (ImportError, OSError)) and any(each in words.lower() for each in _UNLOADED))
-    )
+    if isinstance(error, (ImportError, OSError)):
+        said = any(words in str(error).lower() for words in _UNLOADED)
+        return said or (error.__context__ is not None and lacks_memory(error.__context__))
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "DefaultCPUAllocator" in str(error))
