@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 from safetensors.torch import load as from_bytes
@@ -25,7 +26,6 @@ from safetensors.torch import save as to_bytes
 
 from avmsf.capture.texturedmesh import read_textured_mesh
 from avmsf.capture.views import read_sparse_points, read_views
-from avmsf.cli import main
 from avmsf.errors import AvmsfError
 from avmsf.scene.ply import read_splats
 from benchmarks.report import Options, Report, Table, tell
@@ -65,9 +65,11 @@ class Family:
 
 
 def run_verb(*words: str) -> None:
-    """Run a verb of the command line in this process; raises AvmsfError where it refuses its input."""
+    """Run a verb in this process, without what turns errors into exit codes; raises AvmsfError for a refusal."""
+    verb = import_module(f"avmsf.cli.{words[0]}")
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
-        code = main(words)
+        code = verb.run(verb.parse(words[1:]))
+    # `check` refuses a capture by its code: its report says why.
     if code == 2:
         raise AvmsfError(" ".join(words))
     if code:
@@ -169,7 +171,7 @@ def outcome_of(read: Callable[[], None]) -> tuple[str, str]:
             read()
     except AvmsfError as error:
         return "refused", str(error)
-    except BaseException as error:  # whatever the reader lets through is what is looked for
+    except (Exception, SystemExit) as error:  # whatever the reader lets through is what is looked for
         return "traceback", f"{type(error).__name__}: {error}"
     return "read", ""
 
@@ -194,7 +196,7 @@ def run_apart(family: str, name: str, read: Callable[[], None]) -> Outcome:
         result, message = "too slow" if slow else "killed", signal.Signals(os.WTERMSIG(status)).name
     else:
         result, message, megabytes = json.loads(said) if said else ("killed", f"status {status}", megabytes)
-        if "MemoryError" in message or "not enough memory" in message:
+        if "MemoryError" in message or "can't allocate memory" in message:
             result = "too large"
     return Outcome(family, name, result, seconds, megabytes, message)
 

@@ -3,6 +3,7 @@
 import errno
 import os
 import secrets
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -56,3 +57,8 @@ def write_whole(path: Path, write: Callable[[Path], object], *, raising: type[Av
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+def copy_whole(source: Path, path: Path, *, raising: type[AvmsfError] = FieldFileError) -> None:
+    """Copy a file as `write_whole` writes one. Raises `raising`."""
+    write_whole(path, lambda place: shutil.copyfile(source, place), raising=raising)

@@ -8,6 +8,7 @@ import pytest
 import torch
 import trimesh
 
+import avmsf
 from avmsf._utils import caching
 from avmsf.capture.surface import Surface
 from avmsf.cli import main
@@ -65,15 +66,23 @@ def test_a_loop_is_compiled_where_it_cannot_be_kept(monkeypatch: pytest.MonkeyPa
     assert compiled()(thrice)(1.5) == 4.5
 
 
-def test_keys_know_every_source_file() -> None:
-    found = caching.source_digest()
-    assert found == caching.source_digest.__wrapped__()
-    probe = Path(caching.__file__).with_name("_probe.py")
-    probe.write_text("")
-    try:
-        assert caching.source_digest.__wrapped__() != found
-    finally:
-        probe.unlink()
+def test_keys_know_every_source_file_by_name_and_content(tmp_path: Path) -> None:
+    (tmp_path / "inner").mkdir()
+    found = {caching.digest_of_sources(tmp_path)}
+    (tmp_path / "inner" / "one.py").write_text("")
+    found.add(caching.digest_of_sources(tmp_path))
+    (tmp_path / "inner" / "one.py").write_text("x = 1")
+    found.add(caching.digest_of_sources(tmp_path))
+    (tmp_path / "inner" / "one.py").rename(tmp_path / "one.py")
+    found.add(caching.digest_of_sources(tmp_path))
+    assert len(found) == 4
+    (tmp_path / "notes.txt").touch()
+    assert caching.digest_of_sources(tmp_path) in found
+
+
+def test_the_sources_are_those_of_the_whole_package() -> None:
+    root = Path(avmsf.__file__).parent
+    assert caching.source_digest() == caching.digest_of_sources(root)
 
 
 def test_a_file_that_can_be_kept_is_kept_without_a_word(tmp_path: Path) -> None:

@@ -1,16 +1,20 @@
 """One writer at a time in a folder, whatever happens to the one before."""
 
+import errno
+import fcntl
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import threading
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
-from avmsf._utils.locks import write_lock
-from avmsf.errors import FolderInUseError
+from avmsf._utils.locks import NO_LIMIT, write_lock
+from avmsf.errors import AvmsfError, FolderInUseError
 
 HOLD = """
 import sys
@@ -56,9 +60,11 @@ def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
 
 def test_who_waits_gets_the_lock_when_it_is_free(tmp_path: Path) -> None:
     with hold(tmp_path) as other:
-        threading.Timer(0.2, other.communicate).start()
-        with write_lock(tmp_path, "stages", command="me", wait=30.0):
-            assert other.wait() == 0
+        timer = threading.Timer(0.2, other.communicate)
+        timer.start()
+        with write_lock(tmp_path, "stages", command="me", wait=NO_LIMIT):
+            timer.join()
+            assert other.returncode == 0
 
 
 def test_a_thread_takes_its_lock_again_and_another_one_does_not(tmp_path: Path) -> None:
@@ -86,6 +92,48 @@ def test_where_nothing_can_be_written_there_is_no_lock_and_no_error(tmp_path: Pa
     with write_lock(tmp_path / missing, "stages", command="me"):
         pass
     assert [each.name for each in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("number", "writable", "held"),
+    [
+        (errno.EACCES, True, False),
+        (errno.EACCES, False, True),
+        (errno.EMFILE, True, False),
+        (errno.ENOSPC, True, False),
+    ],
+)
+def test_only_where_nobody_can_write_a_lock_that_cannot_be_opened_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, writable: bool, held: bool
+) -> None:
+    def refuse(path: str, *rest: int, **named: int) -> int:
+        raise OSError(number, os.strerror(number), path)
+
+    monkeypatch.setattr(os, "open", refuse)
+    monkeypatch.setattr(os, "access", lambda *arguments: writable)
+    with nullcontext() if held else pytest.raises(AvmsfError), write_lock(tmp_path, "stages", command="me"):
+        assert held
+
+
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_disk_without_locks_gets_no_file_that_outlives_its_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def refuse(descriptor: int, operation: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with write_lock(tmp_path, "stages", command="me"):
+        # A lock by a file's existence would stay after a kill, and let nobody else in.
+        monkeypatch.undo()
+        with hold(tmp_path) as other:
+            other.communicate()
+
+
+def test_a_refusal_can_be_sent_between_processes() -> None:
+    error = FolderInUseError(Path("mug"), {"command": "avmsf splat"}, ", or copy it")
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.folder, again.holder) == (str(error), error.folder, error.holder)
 
 
 def test_a_read_only_folder_is_used_without_a_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,12 +1,14 @@
 """A demo's folder is replaced as a whole or stays as it was, and nobody else's files are touched."""
 
 import json
+import threading
 from pathlib import Path
 
 import pytest
 
 from avmsf.cli.demofolder import RECORD, record, replaced_whole
 from avmsf.cli.writing import OutputError
+from avmsf.errors import FolderInUseError
 
 
 def fill(folder: Path, names: dict[str, str]) -> None:
@@ -117,6 +119,33 @@ def test_what_a_killed_run_left_is_in_nobodys_way(demo: Path) -> None:
         assert list(begun.iterdir()) == []
         finish(begun, NEW)
     assert set(content(demo)) == {*NEW, RECORD}
+
+
+def test_a_second_demo_is_refused_while_the_first_one_works(tmp_path: Path) -> None:
+    folder, refused = tmp_path / "demo", []
+
+    def intrude() -> None:
+        try:
+            with replaced_whole(folder):
+                pass
+        except FolderInUseError as error:
+            refused.append(error)
+
+    with replaced_whole(folder) as begun:
+        fill(begun, NEW)
+        second = threading.Thread(target=intrude)
+        second.start()
+        second.join()
+        finish(begun, {})
+    assert [each.holder["command"] for each in refused] == ["avmsf demo"]
+    assert set(content(folder)) == {*NEW, RECORD}
+
+
+def test_a_demo_that_was_killed_leaves_no_lock_behind(tmp_path: Path) -> None:
+    fill(tmp_path, {".avmsf-demo.lock": "", ".avmsf-demo.lock.json": "{}"})
+    with replaced_whole(tmp_path) as begun:
+        finish(begun, NEW)
+    assert set(content(tmp_path)) == {*NEW, RECORD}
 
 
 def test_a_first_demo_that_fails_leaves_no_folder(tmp_path: Path) -> None:

@@ -43,12 +43,29 @@ def guarded() -> Iterator[None]:
     assert signal.signal(signal.SIGTERM, before) is stray
 
 
+def a_library_that_was_not_opened() -> OSError:
+    """Return what llvmlite raises where its library does not fit into the memory."""
+    error = OSError("Could not find/load shared object file 'libllvmlite.so'")
+    error.__context__ = OSError("libllvmlite.so: failed to map segment from shared object")
+    return error
+
+
 def wait() -> None:
     for _ in range(200):
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("error", [MemoryError(), RecursionError("maximum recursion depth exceeded")])
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("[enforce fail] . DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes."),
+        ImportError("libtorch_cpu.so: failed to map segment from shared object"),
+        a_library_that_was_not_opened(),
+        RecursionError("maximum recursion depth exceeded"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
 def test_what_no_memory_and_no_stack_can_hold_ends_with_a_sentence(
     run: Callable[..., int], error: Exception, capsys: Streams
 ) -> None:
@@ -58,6 +75,14 @@ def test_what_no_memory_and_no_stack_can_hold_ends_with_a_sentence(
     assert run(fail) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert line.startswith("avmsf check: ")
+
+
+def test_an_error_of_another_kind_is_shown_whole(run: Callable[..., int]) -> None:
+    def fail() -> None:
+        raise RuntimeError("a bug")
+
+    with pytest.raises(RuntimeError, match="a bug"):
+        run(fail)
 
 
 def test_sigterm_ends_a_verb_as_ctrl_c_does(run: Callable[..., int], guarded: None, capsys: Streams) -> None:

@@ -2,16 +2,22 @@
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 
 from avmsf.capture import CaptureSettings, read_capture
+from avmsf.capture.surface import Surface
 from avmsf.errors import CaptureError, SimulationError
+from avmsf.field import arguments
+from avmsf.field.arguments import fingerprint
 from avmsf.field.automatic import Choice
 from avmsf.field.config import FitConfig
+from avmsf.field.fit import gain_case
 from avmsf.field.physics import Physics
 from avmsf.field.recipes import ThinPlate
 from avmsf.modal.extract import HighResolution
@@ -19,7 +25,11 @@ from avmsf.pipeline import reconstruct as module
 from avmsf.pipeline import stages
 from avmsf.pipeline.scene import Listener
 from avmsf.pipeline.stages import StageFolder
+from avmsf.simulate import nominal, recipe
+from avmsf.tasks import steercheckpoint
 from plate_capture import fill_plate
+from plate_field import plate_extraction, plate_features, plate_impacts
+from ringing_field import ringing_field
 
 
 def write(path: Path) -> None:
@@ -47,6 +57,40 @@ def test_other_code_makes_a_stage_again(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(stages, "source_digest", lambda: "changed")
     assert folder.keep("cloud.ply", {}, write).fresh
     assert not folder.keep("cloud.ply", {}, write).fresh
+
+
+def body_key() -> Path | None:
+    surface = Surface(torch.eye(3), torch.tensor([[0, 1, 2]]))
+    return nominal._Maker(surface, 6, Path("bodies"), print)._kept(None, 1200)
+
+
+def fit_key() -> str:
+    impacts = plate_impacts(6, seconds=0.1)
+    return fingerprint(gain_case(impacts, plate_features(60), plate_extraction(impacts), FitConfig()), ThinPlate())
+
+
+def edit_key() -> dict[str, str]:
+    field = ringing_field()
+    return steercheckpoint.asked(field, field.gain_field.points[:2], {}, {})
+
+
+@pytest.mark.parametrize(
+    ("module", "key"),
+    [
+        (recipe, lambda: recipe.ObjectRecipe().elastic_values()),
+        (nominal, body_key),
+        (arguments, fit_key),
+        (steercheckpoint, edit_key),
+    ],
+    ids=["elastic modes", "body", "fit", "edit"],
+)
+def test_other_code_has_another_key(
+    module: ModuleType, key: Callable[[], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = key()
+    assert key() == before
+    monkeypatch.setattr(module, "source_digest", lambda: "changed")
+    assert key() != before
 
 
 def test_the_choice_does_not_depend_on_free_memory_and_is_made_again_once_there_is_physics(

@@ -4,6 +4,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+
+from avmsf.cli import check
 
 # The benchmarks are no part of the package.
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -33,6 +36,25 @@ def test_an_error_of_another_kind_is_a_traceback() -> None:
 
     assert files.outcome_of(read) == ("traceback", "IndexError: index 99 is out of bounds")
     assert files.run_apart("family", "name", read).result == "traceback"
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RecursionError("too deep"), SystemExit(2)], ids=repr)
+def test_a_verb_that_runs_out_of_memory_or_depth_refuses_nothing(
+    error: BaseException, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(options: check.Options) -> int:
+        raise error
+
+    monkeypatch.setattr(check, "run", fail)
+    result, message = files.outcome_of(lambda: files.run_verb("check", "folder"))
+    assert (result, message.split(":")[0]) == ("traceback", type(error).__name__)
+
+
+def test_torch_is_bounded_too() -> None:
+    def grow() -> None:
+        torch.empty(2 * files.MAX_MEGABYTES << 20, dtype=torch.uint8)
+
+    assert files.run_apart("family", "name", grow).result == "too large"
 
 
 def test_memory_is_bounded_and_measured() -> None:

@@ -4,7 +4,9 @@ import csv
 import hashlib
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -263,6 +265,33 @@ def test_a_recording_that_cannot_be_used_is_refused_in_words(tmp_path: Path, con
         with pytest.raises(CaptureError, match=message):
             act()
     assert [each.name for each in tmp_path.rglob("*") if each.is_file()] == ["capture.lock"]
+
+
+def test_a_strike_whose_removal_was_killed_is_there_for_its_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    strikes = book(tmp_path)
+    added = strikes.add(blow(), place(0.1), key=key(0))
+    write, written = StrikeFiles.write_journal, []
+
+    def write_once(self: StrikeFiles, journal: Mapping[str, Any]) -> None:
+        if not written:
+            write(self, journal)
+        written.append(journal)
+
+    def kill(self: StrikeTable, file: str) -> None:
+        raise KeyboardInterrupt
+
+    # A killed process takes nothing back.
+    monkeypatch.setattr(StrikeFiles, "write_journal", write_once)
+    monkeypatch.setattr(StrikeTable, "remove", kill)
+    with pytest.raises(KeyboardInterrupt):
+        strikes.remove(added["file"])
+    monkeypatch.undo()
+    assert strikes.add(blow(), place(0.1), key=key(0)) == added
+    strikes.remove(added["file"])
+    with pytest.raises(RefusedError):
+        strikes.add(blow(), place(0.1), key=key(0))
 
 
 def test_another_rate_is_refused_at_once(tmp_path: Path) -> None:

@@ -51,10 +51,10 @@ def refused(answer: Answer, *statuses: int) -> str:
         (OSError("no number"), 503),
         (MemoryError(), 503),
         (RecursionError("maximum recursion depth exceeded"), 400),
-        (ValueError("x" * 10_000), 422),
-        (UnicodeEncodeError("utf-8", "\ud800" * 10_000, 0, 1, "surrogates"), 422),
-        (OverflowError("too large"), 422),
-        (torch.linalg.LinAlgError("singular"), 422),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes"), 503),
+        (ImportError("libtorch.so: failed to map segment from shared object"), 503),
+        (ValueError("a bug"), 500),
+        (RuntimeError("another bug"), 500),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, Exception) else str(value),
 )
@@ -66,6 +66,28 @@ def test_a_failure_becomes_a_sentence(
 
     monkeypatch.setattr(plate.studio.session, "undo", fail)
     refused(plate.ask("POST", "undo", {"base": 1}), status)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("x" * 10_000),
+        UnicodeEncodeError("utf-8", "\ud800" * 10_000, 0, 1, "surrogates"),
+        OverflowError("too large"),
+        torch.linalg.LinAlgError("singular"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_a_computation_that_leads_nowhere_asks_for_other_values(
+    plate: Served, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def fail(*arguments: object) -> None:
+        raise error
+
+    monkeypatch.setattr(plate.studio.session, "edit", fail)
+    monkeypatch.setattr(Finder, "locate", fail)
+    refused(plate.ask("POST", "edit", {"base": 1, "pitch": 1.5}), 422)
+    refused(plate.ask("POST", "locate", blow()), 422)
 
 
 def test_recordings_need_no_temporary_folder(capture: Served, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import quote
 
@@ -23,17 +24,20 @@ import pytest
 import soundfile
 import torch
 import trimesh
+from filelock import FileLock
 
 from avmsf.cli import main
 from avmsf.errors import AvmsfError, StudioError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
+from avmsf.files import copy_whole
+from avmsf.pipeline.reconstruct import CACHE
 from avmsf.pipeline.sources import SPLATS
 from avmsf.scene.ply import write_splats
 from avmsf.scene.start import StartPoints, starting_cloud
 from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.simulate.material import CERAMIC, WOOD
-from avmsf.studio import leading, locating, modules, server, studio
+from avmsf.studio import leading, locating, modules, server, studio, worker
 from avmsf.studio.locating import Finder
 from avmsf.studio.modules import find_modules, with_local_modules
 from avmsf.studio.opening import MESHES, Opened, find_object, open_target
@@ -367,6 +371,48 @@ def test_a_reconstruction_that_fails_says_why_and_one_can_be_stopped(tmp_path: P
         again = running.ask("POST", "reconstruct", {}).words["job"]
         assert running.ask("DELETE", f"jobs/{again}").words == {"cancelled": again}
         assert running.events(again)[-1]["stage"] == "cancelled"
+
+
+def test_the_field_that_a_job_made_is_opened_whatever_has_replaced_it_since(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = retune(plate_field(), pitch=1.25)
+    save(made, tmp_path / "made")
+    save(plate_field(), tmp_path / "replaced")
+    script = (
+        "import json, shutil, sys; task = json.loads(input()); shutil.copy(sys.argv[1], task['output'])\n"
+        "print(json.dumps({'result': {'field': sys.argv[2], 'output': task['output']}}))"
+    )
+    with served(open_target(fill(tmp_path / "struck")), tmp_path / "files") as running:
+        start, jobs = running.studio.jobs.start, running.studio.jobs
+        worker = (sys.executable, "-c", script, str(tmp_path / "made"), str(tmp_path / "replaced"))
+        monkeypatch.setattr(jobs, "start", lambda kind, task, take: start(kind, task, take, worker))
+        last = running.events(running.ask("POST", "reconstruct", {}).words["job"])[-1]
+        assert last["field"] == str(tmp_path / "replaced")
+        assert torch.equal(running.studio.session.current.expect_field().bank.frequency, made.bank.frequency)
+
+
+def test_a_worker_copies_its_field_before_another_process_may_replace_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = fill(tmp_path / "struck")
+    field = folder / CACHE / "field.safetensors"
+    locked: list[bool] = []
+
+    def stand_in(*arguments: object, **named: object) -> object:
+        field.write_text("made")
+        return SimpleNamespace(field=field, gains="spline", stages=[])
+
+    def copy(source: Path, path: Path) -> None:
+        locked.append(FileLock(folder / CACHE / "stages.lock", is_singleton=True, fallback_to_soft=False).is_locked)
+        copy_whole(source, path)
+
+    monkeypatch.setattr(worker, "reconstruct", stand_in)
+    monkeypatch.setattr(worker, "copy_whole", copy)
+    task = {"folder": str(folder), "modes": 6, "output": str(tmp_path / "files" / "reconstructed")}
+    with open(tmp_path / "said", "w") as said:
+        result = worker.make_field(task, worker.Voice(said))
+    assert (locked, Path(result["output"]).read_text()) == ([True], "made")
 
 
 def test_a_capture_with_a_field_is_struck_and_its_strikes_are_marked(tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def test_a_change_that_another_process_does_not_let_through_is_refused_and_chang
     finally:
         done.set()
         other.join()
-    assert refused.value.status == 409
+    assert refused.value.status == 503
     assert not (tmp_path / "impacts.csv").exists()
     assert strikes.add(blow(0), PLACE, key="strike-0000")["file"] == "001.wav"
 

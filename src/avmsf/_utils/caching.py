@@ -1,7 +1,6 @@
 """Files that only save time: where one cannot be written, the work goes on without it."""
 
 import hashlib
-import os
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -24,11 +23,6 @@ def keep_if_possible(write: Callable[[], object], path: Path) -> None:
         _warn_once(path.parent, error.__cause__.strerror or str(error.__cause__))
 
 
-def is_kept(path: Path) -> bool:
-    """Return whether there is such a file; where its folder cannot be read, there is none."""
-    return os.path.isfile(path)
-
-
 def discard(path: Path) -> None:
     """Remove a file that is not needed any more; one that cannot be removed costs nothing but its space."""
     with suppress(OSError):
@@ -42,7 +36,11 @@ def source_digest() -> str:
     The version alone changes with a release only, so that results of code that has changed since would be taken for
     those of the present one. All files count, for what a result depends on is not known file by file.
     """
-    root = Path(__file__).parents[1]
+    return digest_of_sources(Path(__file__).parents[1])
+
+
+def digest_of_sources(root: Path) -> str:
+    """Return a digest of the names and contents of all Python files beneath a folder."""
     digest = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
         digest.update(f"{path.relative_to(root).as_posix()}\0".encode())

@@ -4,6 +4,7 @@ The lock is `flock` on a file that stays in the folder, so the system releases i
 too. A second file says for people who holds it; it means nothing while the lock is free.
 """
 
+import errno
 import json
 import os
 from collections.abc import Iterator
@@ -14,10 +15,16 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from avmsf.errors import AvmsfError, FolderInUseError
-from avmsf.files import write_whole
+from avmsf.files import way_out, write_whole
 
 WAIT = 3.0
 """Seconds that a command waits for another writer: longer than a page's change to a capture, shorter than a stage."""
+NO_LIMIT = -1.0
+"""The `wait` that lasts until the lock is free: a program that was killed holds none."""
+_NO_PLACE = (errno.EROFS, errno.ENOENT, errno.ENOTDIR)
+"""Errors of a folder that nobody can write to."""
+_NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
+"""Errors of a disk that has no locks."""
 
 
 @contextmanager
@@ -27,21 +34,23 @@ def write_lock(
     """Let no other process, and no other thread, hold the lock `name` of a folder meanwhile.
 
     The folder is made where it is missing, and with `parents` those that it lies in. The same thread may take the lock
-    again within. A folder that cannot be written to, or a disk without locks, is used without a lock: each write there
-    fails with its own error. `command` is what others are told to wait for.
+    again within. A folder that cannot be written to, where each write fails with its own error, and one on a disk
+    without locks are used without a lock. `command` is what others are told to wait for.
 
-    Raises FolderInUseError where the lock is not free within `wait` seconds; `advice` ends its sentence.
+    Raises FolderInUseError where the lock is not free within `wait` seconds; `advice` ends its sentence. Raises
+    AvmsfError where the folder can be written to and the lock cannot be had.
     """
     folder = folder.resolve()
     path = folder / f"{name}.lock"
     try:
         folder.mkdir(parents=parents, exist_ok=True)
         # One object for each path makes the lock reentrant within a thread.
-        lock = FileLock(path, is_singleton=True)
+        lock = FileLock(path, is_singleton=True, fallback_to_soft=False)
         lock.acquire(timeout=wait)
     except Timeout as error:
         raise FolderInUseError(folder, _read_holder(path), advice) from error
-    except (OSError, NotImplementedError):
+    except OSError as error:
+        _expect_excused(error, path)
         yield
         return
     try:
@@ -56,6 +65,15 @@ def write_lock(
                     _holder_of(path).unlink(missing_ok=True)
     finally:
         lock.release()
+
+
+def _expect_excused(error: OSError, path: Path) -> None:
+    """Raise AvmsfError unless nobody can write to the lock's folder, or its disk has no locks."""
+    denied = error.errno in (errno.EACCES, errno.EPERM)
+    if error.errno in (*_NO_PLACE, *_NO_LOCKS) or (denied and not os.access(path.parent, os.W_OK)):
+        return
+    advice = "delete it when nobody uses the folder" if denied else way_out(error)
+    raise AvmsfError(f"{path}: cannot be locked ({error.strerror or error}): {advice}") from error
 
 
 def _holder_of(path: Path) -> Path:

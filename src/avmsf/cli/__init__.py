@@ -15,6 +15,7 @@ from typing import TextIO
 import tyro
 
 import avmsf
+from avmsf._utils.memory import lacks_memory
 from avmsf._utils.text import printable
 from avmsf.errors import AvmsfError, AvmsfWarning
 
@@ -74,8 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options = verb.parse(words[1:])
             with _compilation_announced():
                 code: int = verb.run(options)
-        except (AvmsfError, MemoryError, RecursionError) as error:
-            told = _MEMORY if isinstance(error, MemoryError) else _DEPTH if isinstance(error, RecursionError) else error
+        except (AvmsfError, RecursionError) as error:
+            told = _DEPTH if isinstance(error, RecursionError) else error
             print(f"avmsf {words[0]}: {printable(' '.join(str(told).split()))}", file=sys.stderr)
             return 2
         except BrokenPipeError:
@@ -85,6 +86,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             print(f"avmsf {words[0]}: interrupted", file=sys.stderr)
             code = INTERRUPTED
+        except Exception as error:
+            if not lacks_memory(error):
+                raise
+            print(f"avmsf {words[0]}: {_MEMORY}", file=sys.stderr)
+            return 2
         return TERMINATED if code == INTERRUPTED and signal.SIGTERM in received else code
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from avmsf._utils.locks import write_lock
 from avmsf.cli.writing import OutputError
 from avmsf.files import way_out
 
@@ -15,6 +16,9 @@ RECORD = "demo.json"
 """File that names all files of a finished demo."""
 UNFINISHED, REPLACED = ".avmsf-demo-unfinished", ".avmsf-demo-replaced"
 """Folders inside the demo's own that hold the new demo until it is complete, and the old one while it is replaced."""
+_LOCK = ".avmsf-demo"
+"""Name of the lock under which a demo is made."""
+_LOCK_FILES = {f"{_LOCK}.lock", f"{_LOCK}.lock.json"}
 _SHOWN = 3
 """Foreign files that an error names."""
 
@@ -24,10 +28,21 @@ def replaced_whole(folder: Path) -> Iterator[Path]:
     """Give an empty folder to fill, inside `folder`; in the end its content takes the place of an earlier demo's.
 
     Whatever is raised meanwhile, Ctrl-C included, leaves `folder` as it was. Raises `OutputError` for a folder with
-    files that no demo wrote, and where nothing can be written.
+    files that no demo wrote, and where nothing can be written, and `FolderInUseError` while another demo fills it.
     """
     known = folder.exists()
     _expect_own(folder)
+    try:
+        with write_lock(folder, _LOCK, command="avmsf demo", advice=", or name another folder", parents=True):
+            yield from _replacing(folder)
+    finally:
+        if not known:
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def _replacing(folder: Path) -> Iterator[Path]:
+    """Yield the folder to fill, under the lock, and leave no file of the lock."""
     begun = folder / UNFINISHED
     try:
         shutil.rmtree(begun, ignore_errors=True)
@@ -41,9 +56,9 @@ def replaced_whole(folder: Path) -> Iterator[Path]:
         ) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
-        if not known:
-            with suppress(OSError):
-                folder.rmdir()
+        # Whoever waits for it looks again when a lock's file is gone.
+        with suppress(OSError):
+            (folder / f"{_LOCK}.lock").unlink()
 
 
 def record(folder: Path) -> dict[str, object]:
@@ -72,7 +87,7 @@ def _expect_own(folder: Path) -> None:
     own = _own_files(folder)
     found = {each.relative_to(folder) for each in folder.rglob("*") if not each.is_dir() or each.is_symlink()}
     # An old demo that was being deleted when its successor was already complete.
-    passed = {UNFINISHED, REPLACED} if own else {UNFINISHED}
+    passed = {UNFINISHED, *_LOCK_FILES, *({REPLACED} if own else ())}
     foreign = sorted(each.as_posix() for each in found if each.as_posix() not in own and each.parts[0] not in passed)
     if foreign:
         shown = ", ".join(foreign[:_SHOWN]) + (", ..." if len(foreign) > _SHOWN else "")

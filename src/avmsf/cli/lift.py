@@ -10,8 +10,9 @@ import tyro
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.scenebar import SceneBar
-from avmsf.cli.scenes import SceneOptions, copy_whole, features_words, stage_line
+from avmsf.cli.scenes import SceneOptions, features_words, stage_line
 from avmsf.cli.writing import expect_writable
+from avmsf.files import copy_whole
 from avmsf.pipeline.features import LiftConfig
 from avmsf.pipeline.scene import SceneConfig, SceneStages
 from avmsf.pipeline.sources import ViewsConfig

@@ -14,12 +14,13 @@ from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scenebar import SceneBar
-from avmsf.cli.scenes import SceneOptions, copy_whole, features_words
+from avmsf.cli.scenes import SceneOptions, features_words
 from avmsf.cli.scores import compare, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import Progress
 from avmsf.field.store import load
+from avmsf.files import copy_whole
 from avmsf.pipeline.choice import Spreading
 from avmsf.pipeline.features import LiftConfig
 from avmsf.pipeline.physics import BodyConfig

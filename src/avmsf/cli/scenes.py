@@ -1,6 +1,5 @@
 """What the verbs that turn a folder's look into features have in common."""
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,6 @@ import tyro
 
 from avmsf.capture import CaptureSettings
 from avmsf.capture.folder import settings_of
-from avmsf.files import write_whole
 from avmsf.pipeline.reconstruct import CACHE
 from avmsf.pipeline.stages import Kept
 from avmsf.scene.symmetry import Symmetries
@@ -35,11 +33,6 @@ class SceneOptions:
     def read_settings(self) -> CaptureSettings:
         """Return the settings of the capture that the folder is, or the defaults."""
         return settings_of(self.folder) if self.settings is None else CaptureSettings.read(self.settings)
-
-
-def copy_whole(made: Path, output: Path) -> None:
-    """Copy a stage's file to where the user wants it, whole or not at all."""
-    write_whole(output, lambda place: shutil.copyfile(made, place))
 
 
 def stage_line(name: str, kept: Kept) -> str:

@@ -10,8 +10,9 @@ import tyro
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.printing import print_text, say
 from avmsf.cli.scenebar import SceneBar
-from avmsf.cli.scenes import SceneOptions, copy_whole, stage_line
+from avmsf.cli.scenes import SceneOptions, stage_line
 from avmsf.cli.writing import expect_writable
+from avmsf.files import copy_whole
 from avmsf.pipeline.scene import SceneConfig, SceneStages
 from avmsf.pipeline.sources import ViewsConfig
 from avmsf.pipeline.stages import StageFolder

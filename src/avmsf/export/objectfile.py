@@ -59,7 +59,7 @@ def read_object(
 
 
 def expect_readable(path: Path) -> None:
-    """Raise `ExportError` where there is no such file, or one too large to be read."""
+    """Raise `ExportError` where there is no such file, or one too large to be read: `load_mesh` bounds meshes alone."""
     if not path.is_file():
         raise ExportError(f"{path}: expected a mesh or a .ply of Gaussians, found no such file: check the name")
     size = path.stat().st_size
@@ -82,8 +82,6 @@ def _shown(scene: trimesh.Scene, points: Float[Tensor, "points 3"], what: str, m
     if not meshes:
         return ObjectFile("points", remarks=(f"{what} has no triangles, so the field's own points are shown",))
     places = np.concatenate([np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes])
-    if not np.isfinite(places).all():
-        raise ExportError(f"{what}: expected finite coordinates, found NaN or infinity: export the mesh again")
     expect_alike(places, points, what)
     if faces <= most:
         return ObjectFile("mesh", "object.glb", _as_glb(scene))

@@ -7,6 +7,7 @@ from importlib.metadata import version
 
 import torch
 
+from avmsf._utils.caching import source_digest
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError
 from avmsf.field.recipes import GainCase, GainRecipe
@@ -41,9 +42,9 @@ def expect_fitting(train: Impacts, modes: Extraction) -> None:
 
 
 def fingerprint(case: GainCase, recipe: GainRecipe) -> str:
-    """Return a digest of all that decides a fit's result, this package's version among it."""
+    """Return a digest of all that decides a fit's result, this package's version and code among it."""
     train, modes = case.train, case.modes
-    words = [version("avmsf"), asdict(case.config), recipe.name, recipe.digest()]
+    words = [version("avmsf"), source_digest(), asdict(case.config), recipe.name, recipe.digest()]
     words += [train.digest(), case.features.digest()]
     digest = hashlib.sha256(json.dumps(words, sort_keys=True).encode())
     tensors = [modes.bank.frequency, modes.bank.damping, modes.residual.magnitude]

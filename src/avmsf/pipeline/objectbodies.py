@@ -4,11 +4,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from avmsf._utils.locks import NO_LIMIT
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.capture.surface import Surface
 from avmsf.errors import SceneError
 from avmsf.field.physics import Physics
-from avmsf.pipeline.objectlooks import WAIT
 from avmsf.pipeline.physics import BodyConfig, physics_of, roughened
 from avmsf.pipeline.scene import SceneConfig, SceneStages
 from avmsf.pipeline.sources import ViewsConfig
@@ -55,5 +55,5 @@ class ObjectBodies:
         stages = SceneStages(
             seen.folder, StageFolder(self.cache / identifier / "all views"), scene, settings=seen.settings
         )
-        with stages.stages.lock("avmsf evaluate", wait=WAIT):
+        with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
             return gaussian_surface(read_splats(stages.cloud.path))

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from avmsf._utils.locks import NO_LIMIT
 from avmsf.bench.task import Look
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.errors import SceneError
@@ -11,8 +12,6 @@ from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features
 
-WAIT = 3600.0
-"""Seconds to wait for another evaluation that makes the features of the same object: they take minutes to an hour."""
 UNALIGNED = "unaligned.safetensors"
 
 
@@ -46,7 +45,7 @@ class ObjectLooks:
             settings=seen.settings,
             name=UNALIGNED if look == "unaligned" else FEATURES,
         )
-        with stages.stages.lock("avmsf evaluate", wait=WAIT):
+        with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
             features = load_features(stages.features.path)
         return FeatureField.from_points(features.points) if look == "positions" else features
 

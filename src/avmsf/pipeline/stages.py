@@ -101,7 +101,8 @@ class StageFolder:
             yield
         except OSError as error:
             raise CaptureError(
-                f"{self.path(name)}: cannot be made again ({error.strerror or error}): {way_out(error)}, as by --cache"
+                f"{self.path(name)}: cannot be read or replaced ({error.strerror or error}): {way_out(error)}, as by "
+                "--cache"
             ) from error
 
 

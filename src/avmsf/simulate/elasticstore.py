@@ -5,6 +5,7 @@
 """
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import asdict
 from importlib.metadata import version
@@ -15,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from avmsf._utils.caching import is_kept, keep_if_possible
+from avmsf._utils.caching import keep_if_possible
 from avmsf._utils.text_files import parse_json
 from avmsf.errors import SimulationError
 from avmsf.files import write_whole
@@ -94,7 +95,8 @@ def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, tell: 
 
     A damaged file is made again, and `tell` hears of it. Raises as `compute`.
     """
-    if path is not None and is_kept(path):
+    # Unlike Path.is_file, this is False where the folder cannot be read.
+    if path is not None and os.path.isfile(path):
         try:
             return load_modes(path)
         except SimulationError as error:

@@ -10,6 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from avmsf._utils.caching import source_digest
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
@@ -189,6 +190,7 @@ class _Maker:
         values = {
             "format": _FORMAT,
             "version": version("avmsf"),
+            "source": source_digest(),
             "surface": self._digest,
             "wall": wall,
             "count": self._count,

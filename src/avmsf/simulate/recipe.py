@@ -8,6 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
+from avmsf._utils.caching import source_digest
 from avmsf.errors import SimulationError
 from avmsf.simulate.hammer import Hammer
 from avmsf.simulate.imperfections import Imperfections
@@ -89,11 +90,10 @@ class ObjectRecipe:
         return json.loads(json.dumps({"version": version("avmsf"), **record}))
 
     def elastic_values(self) -> dict[str, Any]:
-        """Return those of `values` that decide the elastic modes, which take most of the time."""
+        """Return what decides the elastic modes, which take most of the time: some of `values`, and the code."""
         values = self.values()
-        kept = {
-            name: values[name] for name in ("version", "kind", "mesh", "thickness", "material", "seed", "size", "up")
-        }
+        names = ("version", "kind", "mesh", "thickness", "material", "seed", "size", "up")
+        kept = {"source": source_digest(), **{name: values[name] for name in names}}
         imperfect = {name: values["imperfections"][name] for name in ("thickness", "stiffness", "density", "support")}
         return {**kept, "modes": self.modes, "detail": self.detail, "imperfections": imperfect}
 

@@ -8,6 +8,7 @@ breaks, or the server, the page sends it again and nothing is there twice.
 
 import hashlib
 import re
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from threading import RLock
@@ -92,7 +93,7 @@ class StrikeBook:
             known = journal.get(key)
             if known is not None and known["digest"] != digest:
                 raise RefusedError(409, "this key was used for another strike: reload the page and record again")
-            if known is not None and known.get("removed"):
+            if known is not None and self._is_taken_out(known):
                 raise RefusedError(409, f"{known['file']} was taken out again: record it anew to have it back")
             if known is None or not self._rows_of(known["file"]):
                 recording = read_upload(content)
@@ -117,7 +118,7 @@ class StrikeBook:
             journal = self.files.journal()
             if key is not None:
                 _expect_key(key)
-                if key in journal and journal[key]["digest"] == digest and not journal[key].get("removed"):
+                if key in journal and journal[key]["digest"] == digest and not self._is_taken_out(journal[key]):
                     return self._found(journal[key]["file"])
             self._expect_own(file, match)
             recording = read_upload(content)
@@ -174,6 +175,10 @@ class StrikeBook:
 
     def _rows_of(self, file: str) -> list[tuple[int, Row]]:
         return [(number, row) for number, row in enumerate(self.table.rows()) if file_of(row) == file]
+
+    def _is_taken_out(self, known: Mapping[str, Any]) -> bool:
+        """Whether what was written under a key was removed; one whose row is there was not, as after a kill."""
+        return bool(known.get("removed")) and not self._rows_of(known["file"])
 
     def _expect_own(self, file: str, match: str | None) -> None:
         """Raise RefusedError unless one row has this recording, no link leads to it, and it is the one of `match`."""

@@ -2,7 +2,6 @@
 
 import filecmp
 import re
-import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from avmsf.capture.surface import find_surface_file
 from avmsf.capture.table import TABLE
 from avmsf.errors import StudioError
 from avmsf.export.objectfile import holds_gaussians
-from avmsf.files import write_whole
+from avmsf.files import copy_whole
 from avmsf.pipeline.reconstruct import CACHE, FIELD
 from avmsf.pipeline.scene import CLOUD
 from avmsf.pipeline.sources import SPLATS, find_source, find_splats
@@ -128,7 +127,7 @@ def _open_mesh(mesh: Path, object: Path | None, capture: Path | None) -> Opened:
         )
     if not others:
         _copy(_named_by(mesh), folder)
-        _copy_whole(mesh, surface)
+        copy_whole(mesh, surface, raising=StudioError)
     return _open_folder(folder, object)
 
 
@@ -159,11 +158,7 @@ def _copy(files: Iterable[Path], folder: Path) -> None:
                 "or name another folder by --capture"
             )
     for place, path in lacking.items():
-        _copy_whole(path, place)
-
-
-def _copy_whole(path: Path, place: Path) -> None:
-    write_whole(place, lambda temporary: shutil.copyfile(path, temporary), raising=StudioError)
+        copy_whole(path, place, raising=StudioError)
 
 
 def _same(one: Path, other: Path) -> bool:

@@ -13,13 +13,14 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, HTMLResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from avmsf._utils.memory import lacks_memory
 from avmsf.errors import AvmsfError
 from avmsf.export.webpage import MEDIA_TYPES
 from avmsf.studio.guard import contained, nothing_here, read_words
 from avmsf.studio.modules import find_modules, with_local_modules
 from avmsf.studio.place import Place
 from avmsf.studio.policy import policy_of
-from avmsf.studio.refusal import FORESEEN_ERRORS, NUMERIC_ERRORS, Answer, RefusedError, echo, refusal_of, response_to
+from avmsf.studio.refusal import FORESEEN_ERRORS, Answer, RefusedError, echo, refusal_of, response_to
 from avmsf.studio.studio import Studio
 
 PAGE = Path(__file__).parent / "page"
@@ -232,13 +233,12 @@ async def _answer_nobody(request: Request, error: Exception) -> Response:
 
 
 async def _answer_foreseen(request: Request, error: Exception) -> Response:
-    if isinstance(error, NUMERIC_ERRORS):
-        # A check of the values that would name the cause is missing.
-        traceback.print_exception(error)
     return response_to(refusal_of(error))
 
 
 async def _answer_broken(request: Request, error: Exception) -> Response:
+    if lacks_memory(error):
+        return response_to(refusal_of(error))
     # The server's own word on it is hidden with all that it says of ordinary requests.
     traceback.print_exception(error)
     words = f"the server failed at this ({type(error).__name__}): its terminal shows more; reload to see what was done"

@@ -43,13 +43,13 @@ class StrikeFiles:
     def lock(self) -> Iterator[None]:
         """Let no other studio change the table, the recordings or the note of keys meanwhile.
 
-        Raises RefusedError (409) where another one does for long.
+        Raises RefusedError (503), after which the page sends a recording again, where another one does for long.
         """
         with ExitStack() as held:
             try:
                 held.enter_context(write_lock(self.folder / CACHE, "capture", command=COMMAND, wait=_WAIT))
             except FolderInUseError as error:
-                raise RefusedError(409, f"{error}, and try again; nothing was changed") from error
+                raise RefusedError(503, f"{error}, and try again; nothing was changed") from error
             yield
 
     def readable(self, file: str) -> Path:

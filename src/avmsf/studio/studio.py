@@ -2,6 +2,7 @@
 
 import shutil
 import tempfile
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +18,7 @@ from avmsf.studio.jobs import Event, Job, Jobs
 from avmsf.studio.leading import Wish, is_wish, words_model
 from avmsf.studio.locating import read_upload
 from avmsf.studio.opening import Opened, find_object, shows_more
-from avmsf.studio.refusal import RefusedError, echo
+from avmsf.studio.refusal import NUMERIC_ERRORS, RefusedError, echo, refusal_of
 from avmsf.studio.searches import Searches
 from avmsf.studio.session import Revision, Session
 from avmsf.studio.showing import Showcase
@@ -87,7 +88,7 @@ class Studio:
         recording = await self.threads.read(read_upload, content)
         revision = self.session.current
         finder = self.searches.finder_of(revision)
-        blows = await self.threads.compute(finder.locate, recording)
+        blows = await self._compute(finder.locate, recording)
         return {"revision": revision.number, "blows": blows}
 
     async def edit(self, words: dict[str, Any]) -> dict[str, Any]:
@@ -96,7 +97,7 @@ class Studio:
         if is_wish(words):
             return await self._lead(base, Wish.read(words, model=self.model))
         sliders = Sliders.read(words, modes=len(self.session.current.expect_field().bank))
-        return self._changed(await self.threads.compute(self.session.edit, base, sliders))
+        return self._changed(await self._compute(self.session.edit, base, sliders))
 
     async def lead(self, base: int, content: bytes) -> dict[str, Any]:
         """Start to lead the field towards a recording. Raises CaptureError for one that cannot be used."""
@@ -150,7 +151,9 @@ class Studio:
             refuse_few(len(strikes))
         except CaptureError as error:
             raise RefusedError(409, f"{error}: strike more places first") from error
-        task = {"task": "make_field", "folder": str(book.folder), "modes": self.config.modes}
+        # One place is enough: the next job starts when this one's field is open.
+        output = str(self.folder / "reconstructed")
+        task = {"task": "make_field", "folder": str(book.folder), "modes": self.config.modes, "output": output}
         return self.jobs.start("reconstruct", task, self._take_field)
 
     def make_object(self) -> Job:
@@ -172,9 +175,17 @@ class Studio:
             shutil.rmtree(place, ignore_errors=True)
             raise
 
+    async def _compute(self, act: Callable[..., Result], *arguments: Any) -> Result:
+        """Compute with a user's values. Raises RefusedError (422) where they lead to no result."""
+        try:
+            return await self.threads.compute(act, *arguments)
+        except NUMERIC_ERRORS as error:
+            # A check of the values that would name the cause is missing.
+            traceback.print_exception(error)
+            raise refusal_of(error) from error
+
     async def _take_field(self, result: Event) -> Event:
-        path = Path(result["field"])
-        revision = await self.threads.compute(lambda: self.session.open(load(path)))
+        revision = await self.threads.compute(lambda: self.session.open(load(result["output"])))
         return {**result, **self._changed(revision)}
 
     async def _take_object(self, result: Event) -> Event:

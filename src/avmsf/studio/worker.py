@@ -15,12 +15,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
+from avmsf._utils.memory import lacks_memory
 from avmsf.capture import read_capture
 from avmsf.capture.folder import settings_of
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import AvmsfError
 from avmsf.field.fit import Progress
 from avmsf.field.store import load, save
+from avmsf.files import copy_whole
 from avmsf.modal.extract import HighResolution
 from avmsf.pipeline.reconstruct import CACHE, ReconstructConfig, reconstruct
 from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages
@@ -85,7 +87,10 @@ class Voice:
 
 
 def make_field(task: Values, voice: Voice) -> Values:
-    """Reconstruct the capture `folder` and return where its field is, with what its owner should know."""
+    """Reconstruct the capture `folder`, copy its field to `output`, and return what its owner should know.
+
+    The copy is what this reconstruction made, whatever another one puts in the place of `field` meanwhile.
+    """
     folder = Path(task["folder"])
     settings = settings_of(folder)
     voice.tell("capture: reading the recordings")
@@ -102,7 +107,13 @@ def make_field(task: Values, voice: Voice) -> Values:
             listener=voice.listener,
             fitting=voice.fitting,
         )
-    return {"field": str(made.field), "gains": made.gains, "stages": [each.stage for each in made.stages if each.fresh]}
+        copy_whole(made.field, Path(task["output"]))
+    return {
+        "field": str(made.field),
+        "output": task["output"],
+        "gains": made.gains,
+        "stages": [each.stage for each in made.stages if each.fresh],
+    }
 
 
 def make_object(task: Values, voice: Voice) -> Values:
@@ -152,7 +163,9 @@ def main() -> int:
         except AvmsfError as error:
             voice.say({"error": " ".join(str(error).split())})
             return 2
-        except MemoryError:
+        except Exception as error:
+            if not lacks_memory(error):
+                raise
             voice.say({"error": "the memory of this machine does not suffice: close other programs, or use less data"})
             return 2
     return 0
