@@ -1,4 +1,4 @@
-"""How a verb ends that cannot go on: by one sentence and a code that says why, and never on somebody else's terms."""
+"""How a verb ends that cannot go on: by one sentence and an exit code."""
 
 import os
 import signal
@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 import pytest
+import torch
 
 from avmsf.cli import check, main
 from avmsf.cli.printing import console, print_json, print_text, say, table
@@ -48,16 +49,22 @@ def wait() -> None:
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("error", [MemoryError(), RecursionError("maximum recursion depth exceeded")])
-def test_what_no_memory_and_no_stack_can_hold_ends_with_a_sentence(
-    run: Callable[..., int], error: Exception, capsys: Streams
+@pytest.mark.parametrize("act", [lambda: bytearray(1 << 62), lambda: torch.empty(1 << 60, dtype=torch.uint8)])
+def test_missing_memory_ends_a_verb_with_a_sentence(
+    run: Callable[..., int], act: Callable[[], object], capsys: Streams
 ) -> None:
-    def fail() -> None:
-        raise error
-
-    assert run(fail) == 2
+    assert run(act) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert line.startswith("avmsf check: ")
+
+
+@pytest.mark.parametrize("kind", [RecursionError, RuntimeError, OSError, ImportError])
+def test_an_error_of_this_package_shows_where_it_arose(run: Callable[..., int], kind: type[Exception]) -> None:
+    def fail() -> None:
+        raise kind("a bug")
+
+    with pytest.raises(kind):
+        run(fail)
 
 
 def test_sigterm_ends_a_verb_as_ctrl_c_does(run: Callable[..., int], guarded: None, capsys: Streams) -> None:
@@ -67,6 +74,26 @@ def test_sigterm_ends_a_verb_as_ctrl_c_does(run: Callable[..., int], guarded: No
 
     assert run(terminate) == 143
     assert capsys.readouterr().err == "avmsf check: interrupted\n"
+
+
+def test_an_ignored_sigterm_stays_ignored(run: Callable[..., int]) -> None:
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        assert run(lambda: os.kill(os.getpid(), signal.SIGTERM)) == 0
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_a_sigterm_handled_outside_of_python_is_left_to_its_handler(
+    run: Callable[..., int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*arguments: object) -> None:
+        raise AssertionError("such a handler cannot be put back")
+
+    monkeypatch.setattr(signal, "getsignal", lambda number: None)
+    monkeypatch.setattr(signal, "signal", refuse)
+    assert run(lambda: None) == 0
 
 
 def test_ctrl_c_in_a_finalizer_ends_the_verb_all_the_same(run: Callable[..., int], capsys: Streams) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from starlette.responses import JSONResponse
 
+from avmsf._utils.memory import lacks_memory
 from avmsf.errors import AvmsfError, StudioError
 from avmsf.files import way_out
 
@@ -51,16 +52,16 @@ def response_to(error: AvmsfError) -> Answer:
 
 
 def refusal_of(error: Exception) -> RefusedError:
-    """Return the answer to a request that failed by one of `FORESEEN_ERRORS`.
+    """Return the answer to a request that failed by one of `FORESEEN_ERRORS`, or where there is not enough memory.
 
     The page sends a recording again after a status of 500 or more, and not after a lower one.
     """
+    if lacks_memory(error):
+        return RefusedError(503, "there is not enough memory for this: close other programs, or send less")
     if isinstance(error, OSError):
         where = "" if error.filename is None else f"{error.filename}: "
         what = f"{where}cannot be read or written ({error.strerror or error}): {way_out(error)}"
         return RefusedError(507 if error.errno in _FULL else 503, what)
-    if isinstance(error, MemoryError):
-        return RefusedError(503, "there is not enough memory for this: close other programs, or send less")
     if isinstance(error, RecursionError):
         return RefusedError(400, "expected a request of few levels, got one nested too deeply: reload the page")
     return RefusedError(

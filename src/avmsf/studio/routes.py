@@ -13,6 +13,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, HTMLResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from avmsf._utils.memory import lacks_memory
 from avmsf.errors import AvmsfError
 from avmsf.export.webpage import MEDIA_TYPES
 from avmsf.studio.guard import contained, nothing_here, read_words
@@ -239,6 +240,8 @@ async def _answer_foreseen(request: Request, error: Exception) -> Response:
 
 
 async def _answer_broken(request: Request, error: Exception) -> Response:
+    if lacks_memory(error):
+        return response_to(refusal_of(error))
     # The server's own word on it is hidden with all that it says of ordinary requests.
     traceback.print_exception(error)
     words = f"the server failed at this ({type(error).__name__}): its terminal shows more; reload to see what was done"

@@ -1,0 +1,17 @@
+"""Which errors mean that there is not enough memory: libraries do not all raise MemoryError."""
+
+NO_MEMORY = "there is not enough memory: close other programs, or use less data, fewer modes or smaller pictures"
+"""What to tell a user then."""
+
+
+def lacks_memory(error: BaseException) -> bool:
+    """Return whether an error means that the system gave no memory.
+
+    PyTorch's allocators raise RuntimeErrors. Shared libraries that cannot be mapped raise ImportError, or
+    OSError where ctypes opens them.
+    """
+    if isinstance(error, RuntimeError):
+        return any(words in str(error) for words in ("DefaultCPUAllocator", "CUDA out of memory"))
+    if isinstance(error, OSError | ImportError):
+        return any(words in str(error) for words in ("failed to map segment", "annot allocate memory"))
+    return isinstance(error, MemoryError)
