@@ -24,7 +24,7 @@ from avmsf.scene.ply import write_splats
 
 RATE = 8000
 CONTACTS = ((0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.1))
-SURFACES = (".ply", ".obj", ".glb", ".stl")
+SURFACES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 PICTURE = 32
 
 
@@ -64,7 +64,11 @@ def write_capture_folder(folder: Path) -> None:
 
 
 def _exported(mesh: trimesh.Trimesh, kind: str) -> bytes:
-    content = mesh.export(file_type=kind)
+    if kind == "gltf":
+        # Otherwise the buffers are files of their own.
+        (content,) = mesh.export(file_type=kind, embed_buffers=True).values()
+    else:
+        content = mesh.export(file_type=kind)
     return content if isinstance(content, bytes) else str(content).encode()
 
 
