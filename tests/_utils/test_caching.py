@@ -66,14 +66,26 @@ def test_a_loop_is_compiled_where_it_cannot_be_kept(monkeypatch: pytest.MonkeyPa
 
 
 def test_keys_know_every_source_file() -> None:
-    found = caching.source_digest()
-    assert found == caching.source_digest.__wrapped__()
-    probe = Path(caching.__file__).with_name("_probe.py")
-    probe.write_text("")
-    try:
-        assert caching.source_digest.__wrapped__() != found
-    finally:
-        probe.unlink()
+    assert caching.source_digest() == caching.digest_of_sources(Path(caching.__file__).parents[1])
+
+
+def test_a_digest_of_sources_changes_with_their_names_and_contents(tmp_path: Path) -> None:
+    def digest() -> str:
+        return caching.digest_of_sources(tmp_path)
+
+    (tmp_path / "inner").mkdir()
+    (tmp_path / "inner" / "a.py").write_text("x = 1")
+    found = [digest()]
+    assert digest() == found[0]
+    (tmp_path / "inner" / "a.py").write_text("x = 2")
+    found.append(digest())
+    (tmp_path / "inner" / "b.py").touch()
+    found.append(digest())
+    (tmp_path / "inner" / "b.py").rename(tmp_path / "b.py")
+    found.append(digest())
+    assert len(set(found)) == 4
+    (tmp_path / "notes.txt").touch()
+    assert digest() == found[-1]
 
 
 def test_a_file_that_can_be_kept_is_kept_without_a_word(tmp_path: Path) -> None:

@@ -42,7 +42,11 @@ def source_digest() -> str:
     The version alone changes with a release only, so that results of code that has changed since would be taken for
     those of the present one. All files count, for what a result depends on is not known file by file.
     """
-    root = Path(__file__).parents[1]
+    return digest_of_sources(Path(__file__).parents[1])
+
+
+def digest_of_sources(root: Path) -> str:
+    """Return a digest of the names and contents of all Python files below a folder."""
     digest = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
         digest.update(f"{path.relative_to(root).as_posix()}\0".encode())
