@@ -1,4 +1,4 @@
-"""Recordings and tables beyond all use are named by `check` and refused by `read_capture`, whatever they hold."""
+"""Recordings and tables out of bounds are named by `check` and refused by `read_capture`, whatever they hold."""
 
 from pathlib import Path
 
