@@ -5,6 +5,7 @@ import math
 import shutil
 import struct
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -64,11 +65,11 @@ def write_capture_folder(folder: Path) -> None:
 
 
 def _exported(mesh: trimesh.Trimesh, kind: str) -> bytes:
-    if kind == "gltf":
-        # Otherwise the buffers are files of their own.
-        (content,) = mesh.export(file_type=kind, embed_buffers=True).values()
-    else:
-        content = mesh.export(file_type=kind)
+    # The buffers of a glTF are files of their own otherwise.
+    options: dict[str, Any] = {"embed_buffers": True} if kind == "gltf" else {}
+    content = mesh.export(file_type=kind, **options)
+    if isinstance(content, dict):
+        (content,) = content.values()
     return content if isinstance(content, bytes) else str(content).encode()
 
 
