@@ -140,9 +140,11 @@ FAMILIES = {
     "colmap binary": Family(
         tuple(f"colmap_binary/{_MODEL}/{name}.bin" for name in ("cameras", "images", "points3D")), damage_bytes, _views
     ),
-    **{suffix[1:]: Family((f"surface{suffix}",), damage_bytes, _surface) for suffix in SURFACES if suffix != ".obj"},
+    **{suffix[1:]: Family((f"surface{suffix}",), damage_bytes, _surface) for suffix in SURFACES},
     "ply text": Family(("surface_text.ply",), damage_text, _surface),
     "obj": Family(("surface.obj",), damage_text, _surface),
+    "off": Family(("surface.off",), damage_text, _surface),
+    "gltf": Family(("surface.gltf",), _damage_document, _surface),
     "splats": Family(("splats.ply",), damage_bytes, _splats),
     "field": Family(("attention.safetensors", "spline.safetensors"), _damage_field, _field),
 }

@@ -5,6 +5,7 @@ import math
 import shutil
 import struct
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,7 +25,7 @@ from avmsf.scene.ply import write_splats
 
 RATE = 8000
 CONTACTS = ((0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.1))
-SURFACES = (".ply", ".obj", ".glb", ".stl")
+SURFACES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 PICTURE = 32
 
 
@@ -64,7 +65,11 @@ def write_capture_folder(folder: Path) -> None:
 
 
 def _exported(mesh: trimesh.Trimesh, kind: str) -> bytes:
-    content = mesh.export(file_type=kind)
+    # The buffers of a glTF are files of their own otherwise.
+    options: dict[str, Any] = {"embed_buffers": True} if kind == "gltf" else {}
+    content = mesh.export(file_type=kind, **options)
+    if isinstance(content, dict):
+        (content,) = content.values()
     return content if isinstance(content, bytes) else str(content).encode()
 
 

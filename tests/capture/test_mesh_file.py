@@ -9,7 +9,9 @@ import pytest
 import torch
 import trimesh
 
+from avmsf._utils.text_files import MAX_TEXT_BYTES
 from avmsf.capture import read_surface
+from avmsf.capture.mesh_file import MAX_GLTF_BYTES, load_mesh
 from avmsf.capture.texturedmesh import read_textured_mesh
 from avmsf.errors import CaptureError
 
@@ -70,6 +72,12 @@ def test_coordinates_that_are_no_places_are_refused(tmp_path: Path, x: str) -> N
         read_surface(path)
 
 
+def test_vertices_in_a_plane_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "surface.obj").write_text("v 0 0\nv 1 0\nv 0 1\n")
+    with pytest.raises(CaptureError, match="three coordinates"):
+        load_mesh(tmp_path / "surface.obj")
+
+
 def test_a_part_moved_out_of_the_world_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "surface.glb"
     path.write_bytes(triangle())
@@ -85,6 +93,7 @@ def test_a_part_moved_out_of_the_world_is_refused(tmp_path: Path) -> None:
         ("nodes.glb", triangle(nodes=2000), "2,000"),
         ("empty.glb", triangle(count=100_000_000), "100,000,000"),
         ("face.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf " + b"1 2 3 " * 1000, "3,000"),
+        ("materials.obj", b"".join(b"usemtl m%d\nf 1 2 3\n" % number for number in range(1001)), "1,001"),
         ("folded.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf " + b"1 2 \\\n3 " * 1000, "3,0|3,9"),
     ],
 )
@@ -99,6 +108,24 @@ def test_counts_in_the_file_are_bounded_before_anything_is_built(
     monkeypatch.setattr(trimesh, "load_scene", build)
     with pytest.raises(CaptureError, match=found):
         read_surface(tmp_path / name)
+
+
+def test_a_material_may_return_as_often_as_it_likes(tmp_path: Path) -> None:
+    lines = [f"g group {row}\nusemtl {'red' if row % 2 else 'blue'}\nf 1 2 3\n" for row in range(3000)]
+    (tmp_path / "surface.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "".join(lines))
+    assert len(load_mesh(tmp_path / "surface.obj").geometry) == 2
+
+
+def test_buffers_within_a_text_gltf_may_be_larger_than_other_json(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=8, radius=0.25)
+    (content,) = trimesh.exchange.gltf.export_gltf(ball, embed_buffers=True).values()
+    assert len(content) > MAX_TEXT_BYTES
+    (tmp_path / "ball.gltf").write_bytes(content)
+    assert len(read_surface(tmp_path / "ball.gltf").faces) == len(ball.faces)
+    with open(tmp_path / "ball.gltf", "ab") as file:
+        file.truncate(MAX_GLTF_BYTES + 1)
+    with pytest.raises(CaptureError, match=f"{MAX_GLTF_BYTES:,}"):
+        read_surface(tmp_path / "ball.gltf")
 
 
 def test_an_archive_is_no_mesh(tmp_path: Path) -> None:

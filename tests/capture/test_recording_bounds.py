@@ -1,4 +1,4 @@
-"""Recordings and tables beyond all use are named by `check` and refused by `read_capture`, whatever they hold."""
+"""Recordings and tables out of bounds are named by `check` and refused by `read_capture`, whatever they hold."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from avmsf.capture import check, read_capture, read_sound
+from avmsf.capture import audio, check, read_capture, read_sound
 from avmsf.capture.audio import MAX_PEAK, MAX_SAMPLES, MIN_PEAK
 from avmsf.capture.table import MAX_ROWS
 from avmsf.errors import CaptureError
@@ -95,3 +95,11 @@ def test_settings_beyond_reason_are_refused(tmp_path: Path, settings: str) -> No
     report = check(fill(tmp_path, settings=settings))
     assert not report.readable
     assert "capture.toml" in report.problems[0]
+
+
+def test_a_misspelt_name_is_sought_among_the_first_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(audio, "_MAX_NAMES_COMPARED", 1)
+    # A disk may list a folder in any order.
+    monkeypatch.setattr(Path, "iterdir", lambda folder: iter([folder / "z.wav", folder / "hit_on_rim.wav"]))
+    with pytest.raises(CaptureError, match=r"did you mean hit_on_rim\.wav"):
+        audio.read_recording(tmp_path / "hit_on_rin.wav")

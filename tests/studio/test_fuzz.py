@@ -14,7 +14,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks.robustness.studio import Request, fuzz, write_object
 
 
-def test_no_request_breaks_the_studio(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("count", [14, pytest.param(150, marks=pytest.mark.slow)])
+def test_no_request_breaks_the_studio(tmp_path: Path, capfd: pytest.CaptureFixture[str], count: int) -> None:
     path = write_object(tmp_path / "object")
     with served(open_target(path, capture=path.parent), tmp_path / "files") as running:
 
@@ -22,7 +23,7 @@ def test_no_request_breaks_the_studio(tmp_path: Path, capfd: pytest.CaptureFixtu
             answer = running.ask(request.method, request.path, request.body, headers=request.headers)
             return answer.status, answer.content
 
-        found = fuzz(ask, count=150, seed=0)
+        found = fuzz(ask, count=count, seed=0)
         assert running.get("manifest.json").status == 200
     assert (found["server_errors"], found["unanswered"]) == (0, 0)
     assert found["longest_refusal_bytes"] < 1000

@@ -189,8 +189,8 @@ def test_a_recording_belongs_where_it_was_begun_and_ends_by_itself(capturing: An
     page.wait_for_selector("text=blow heard")
     assert page.is_hidden("text=Leave it as it is")
     page.click("text=■ Stop")
-    page.click("text=Put it in place")
-    page.wait_for_function("document.querySelector('#sheet-capture .main').disabled")
+    with page.expect_response("**/capture/strikes/001.wav"):
+        page.click("text=Put it in place")
     assert server.asked == [("PUT", "001.wav", "d1")]
 
 
@@ -389,8 +389,8 @@ def test_what_the_check_refuses_may_still_be_put_in_place_of_what_it_does_not_kn
     told = page.inner_text("#sheet-capture .group:has(> .waveform) .warning")
     assert "cannot be kept" not in told
     assert "in place of 001.wav" in told
-    page.click("text=Put it in place")
-    page.wait_for_function("!document.body.textContent.includes('waits for the server')")
+    with page.expect_response("**/capture/strikes/001.wav"):
+        page.click("text=Put it in place")
     assert server.asked == [("PUT", "001.wav", "d1")]
 
 

@@ -50,6 +50,7 @@ def refused(answer: Answer, *statuses: int) -> str:
         (PermissionError(errno.EACCES, "Permission denied", "x.wav"), 503),
         (OSError("no number"), 503),
         (MemoryError(), 503),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 4 bytes."), 503),
         (RecursionError("maximum recursion depth exceeded"), 400),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes"), 503),
         (ImportError("libtorch.so: failed to map segment from shared object"), 503),

@@ -1,4 +1,4 @@
-"""Pictures and camera files beyond all use are refused by what their headers say, before they take memory or time."""
+"""Pictures and camera files that are too large are refused by what their headers say, before they take time."""
 
 import json
 import struct

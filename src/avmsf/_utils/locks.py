@@ -14,6 +14,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from avmsf._utils.text_files import read_json
 from avmsf.errors import AvmsfError, FolderInUseError
 from avmsf.files import way_out, write_whole
 
@@ -91,7 +92,7 @@ def _write_holder(path: Path, command: str) -> None:
 def _read_holder(path: Path) -> dict[str, object]:
     """Return who holds a lock; nothing where the holder could not say so."""
     try:
-        known = json.loads(_holder_of(path).read_text(encoding="utf-8"))
+        known = read_json(_holder_of(path))
     except (OSError, ValueError):
         return {}
     return known if isinstance(known, dict) else {}

@@ -1,16 +1,20 @@
-"""What errors say of memory that is short."""
+"""Which errors mean that there is not enough memory: libraries do not all raise MemoryError."""
 
-_UNLOADED = ("failed to map segment", "cannot allocate memory")
-"""What the system's loader says, in lower case, of a library that does not fit into the memory."""
+NO_MEMORY = "there is not enough memory: close other programs, or use less data, fewer modes or smaller pictures"
+"""What to tell a user then."""
 
 
 def lacks_memory(error: BaseException) -> bool:
-    """Return whether an error means that the memory does not suffice.
+    """Return whether an error means that the system gave no memory.
 
-    Beside MemoryError these are RuntimeError of torch's allocator, ImportError of a module's library, and OSError of a
-    library that a module opens by itself, as llvmlite does, whose error has the loader's as its context.
+    PyTorch's allocators raise RuntimeErrors. Shared libraries that cannot be mapped raise ImportError, or
+    OSError where ctypes opens them.
     """
-    if isinstance(error, (ImportError, OSError)):
-        said = any(words in str(error).lower() for words in _UNLOADED)
-        return said or (error.__context__ is not None and lacks_memory(error.__context__))
-    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "DefaultCPUAllocator" in str(error))
+    if isinstance(error, RuntimeError):
+        return any(words in str(error) for words in ("DefaultCPUAllocator", "CUDA out of memory"))
+    if isinstance(error, OSError | ImportError):
+        if any(words in str(error) for words in ("failed to map segment", "annot allocate memory")):
+            return True
+        # llvmlite raises another OSError, which names no reason, while it handles this one.
+        return error.__context__ is not None and lacks_memory(error.__context__)
+    return isinstance(error, MemoryError)

@@ -6,5 +6,5 @@ _ESCAPES = {code: chr(code).encode("unicode_escape").decode() for code in _HIDDE
 
 
 def printable(text: str) -> str:
-    """Return text in which control characters, but for line ends and tabs, are written out: a terminal obeys none."""
+    """Return text with control characters, except line feeds and tabs, as escape sequences that a terminal shows."""
     return text.translate(_ESCAPES)

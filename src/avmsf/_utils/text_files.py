@@ -27,19 +27,19 @@ def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
     return io.StringIO(content.decode("utf-8-sig"), newline=None).read()
 
 
-def parse_json(text: str) -> Any:
+def parse_json(text: str, *, max_characters: int = MAX_TEXT_BYTES) -> Any:
     """Return what a JSON text holds."""
-    if len(text) > MAX_TEXT_BYTES:
-        raise ValueError(f"expected at most {MAX_TEXT_BYTES:,} characters of JSON, got {len(text):,}")
+    if len(text) > max_characters:
+        raise ValueError(f"expected at most {max_characters:,} characters of JSON, got {len(text):,}")
     try:
         return json.loads(text)
     except RecursionError as error:
         raise ValueError("lists and objects nested hundreds deep; expected a few levels") from error
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:
     """Return what a JSON file holds."""
-    return parse_json(read_text(path))
+    return parse_json(read_text(path, max_bytes=max_bytes), max_characters=max_bytes)
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64
 
+from avmsf._utils.text_files import read_json
 from avmsf.bench.modefeatures import ModeFeatures, Pitches, features_of
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
@@ -176,7 +177,7 @@ class MaterialSpace:
         """
         path = Path(path)
         try:
-            record = json.loads(path.read_text(encoding="utf-8"))
+            record = read_json(path)
             found = record["format"]
             if found != FORMAT:
                 raise EvaluationError(

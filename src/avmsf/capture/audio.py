@@ -1,9 +1,9 @@
 """Sound files as they lie on disk: every channel, the file's own rate, nothing resampled or scaled."""
 
+import heapq
 import io
 from dataclasses import dataclass
 from difflib import get_close_matches
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -155,7 +155,7 @@ def refuse_rate(rate: float, name: str) -> None:
         )
 
 
-def refuse_faint(sound: Float64[np.ndarray, " frames"], name: str) -> None:
+def refuse_peak(sound: Float64[np.ndarray, " frames"], name: str) -> None:
     """Raise `CaptureError` for a sound whose samples are too large or too small to be computed with in float32."""
     peak = float(np.abs(sound).max())
     if not MIN_PEAK <= peak <= MAX_PEAK:
@@ -208,6 +208,8 @@ def _nearest_name(path: Path) -> str:
     """Return the end of an error about a path that does not exist: a file with a similar name, or what to do."""
     if not path.parent.is_dir():
         return f", nor the folder {path.parent}"
-    names = {other.name.lower(): other.name for other in islice(path.parent.iterdir(), _MAX_NAMES_COMPARED)}
+    # The first by name: the order of a folder differs from disk to disk.
+    listed = heapq.nsmallest(_MAX_NAMES_COMPARED, (other.name for other in path.parent.iterdir()))
+    names = {name.lower(): name for name in listed}
     found = get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)
     return f" (did you mean {names[found[0]]}?)" if found else ": copy it there, or remove its row from impacts.csv"

@@ -18,6 +18,9 @@ from avmsf.errors import AvmsfError, CaptureError
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 MAX_BYTES = 1 << 30
 """Largest mesh file: `MAX_FACES` triangles as text with normals and texture coordinates."""
+MAX_GLTF_BYTES = 64 << 20
+"""Largest text glTF: 1.5 million triangles in buffers that it holds as base64. Text of this length that is nothing but
+JSON takes at most about 2 GB as Python objects; a binary glTF holds its buffers outside of the JSON."""
 MAX_FACES = 5_000_000
 """Triangles of a mesh with all its parts: thirty times what the largest published scans of objects have. They take
 about 1 GB while they are read."""
@@ -29,7 +32,7 @@ MAX_CORNERS = 1_000
 triangles without area."""
 MAX_COORDINATE = 1e9
 """Largest coordinate, in the file's unit: a kilometre in micrometres. Its cube is an ordinary number in float32."""
-MAX_TEXTURE_PIXELS = 200_000_000
+MAX_TEXTURE_PIXELS = 3 * 8192**2
 """Pixels of all textures: three pictures of 8192 x 8192, the largest that graphics cards of all makes take. 0.6 GB."""
 _MAX_VALUES = 12 * MAX_FACES
 """Entries of all accessors of a glb: four vectors (position, normal, color, texture) for each corner."""
@@ -73,18 +76,20 @@ def _expect_small(path: Path) -> None:
     if not path.is_file():
         raise CaptureError("there is no such mesh file")
     if suffix not in MESH_SUFFIXES:
-        raise CaptureError(f"expected a mesh ({', '.join(MESH_SUFFIXES)}), got a file called {path.suffix or 'so'}")
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise CaptureError(f"expected at most {MAX_BYTES >> 20} MiB, got {size >> 20}: reduce the mesh")
+        raise CaptureError(f"expected a mesh ({', '.join(MESH_SUFFIXES)}), got {path.suffix or 'no suffix'}")
+    size, most = path.stat().st_size, MAX_GLTF_BYTES if suffix == ".gltf" else MAX_BYTES
+    if size > most:
+        advice = ", or export it as .glb" if suffix == ".gltf" else ""
+        raise CaptureError(f"expected at most {most:,} bytes, got {size:,}: reduce the mesh{advice}")
     if suffix == ".obj":
         _expect_small_obj(path)
     elif suffix in (".glb", ".gltf"):
-        _expect_small_gltf(read_json(path) if suffix == ".gltf" else _glb_record(path))
+        _expect_small_gltf(read_json(path, max_bytes=MAX_GLTF_BYTES) if suffix == ".gltf" else _glb_record(path))
 
 
 def _expect_small_obj(path: Path) -> None:
-    faces = parts = corners = 0
+    faces = changes = corners = 0
+    materials: set[bytes] = set()
     with open(path, "rb") as file:
         for line in file:
             # A line that ends in a backslash goes on in the next.
@@ -93,10 +98,13 @@ def _expect_small_obj(path: Path) -> None:
                 if not line.rstrip(b"\r\n").endswith(b"\\"):
                     _expect_at_most(MAX_CORNERS, corners, "corners of a face")
                     faces, corners = faces + max(corners - 2, 0), 0
-            elif line.startswith((b"usemtl", b"o ", b"g ")):
-                parts += 1
+            elif line.startswith(b"usemtl"):
+                # Faces of one material become one part, however often the file goes back to it.
+                materials.add(line[6:].strip())
+                changes += 1
+                _expect_at_most(MAX_PARTS, len(materials), "materials")
     _expect_at_most(MAX_FACES, faces, "triangles")
-    _expect_at_most(2 * MAX_PARTS, parts, "objects, groups and changes of the material")
+    _expect_at_most(MAX_FACES, changes, "changes of the material")
 
 
 def _glb_record(path: Path) -> Any:
@@ -140,6 +148,8 @@ def _expect_sound(scene: trimesh.Scene) -> None:
     for geometry in scene.geometry.values():
         vertices = np.asarray(getattr(geometry, "vertices", np.zeros((0, 3))), dtype=np.float64)
         _expect_at_most(3 * MAX_FACES, len(vertices), "vertices")
+        if vertices.shape[1:] != (3,):
+            raise CaptureError(f"expected vertices of three coordinates, got {vertices.shape[1]}: export it again")
         unfit = ~np.isfinite(vertices).all(axis=1)
         if unfit.any():
             row = int(unfit.argmax())

@@ -8,7 +8,7 @@ import scipy.signal
 from jaxtyping import Float64
 from scipy.fft import irfft, next_fast_len, rfft
 
-from avmsf.capture.audio import Recording, refuse_faint, refuse_rate, refuse_silence
+from avmsf.capture.audio import Recording, refuse_peak, refuse_rate, refuse_silence
 from avmsf.capture.onset import Pulse, find_onset, find_pulse
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError
@@ -43,7 +43,7 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
     refuse_rate(recording.sample_rate * settings.playback_speed, recording.name)
     sound = recording.response(settings.response_channel, force_channel=settings.force_channel)
     refuse_silence(sound, recording.name)
-    refuse_faint(sound, recording.name)
+    refuse_peak(sound, recording.name)
     refuse_short(sound, recording)
     sound = remove_rumble(sound, settings.highpass, recording)
     pulse, onset = None, 0
@@ -69,7 +69,7 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
     refuse_short(kept, recording)
     if manner in ("peak", "deconvolve") and newtons is not None:
         kept = kept / newtons
-    refuse_faint(kept, recording.name)
+    refuse_peak(kept, recording.name)
     return Prepared(kept, onset, pulse, None if manner == "none" else newtons)
 
 

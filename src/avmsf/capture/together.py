@@ -51,7 +51,7 @@ def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:
 
 
 def judge_levels(peaks: Sequence[float], names: Sequence[str]) -> list[str]:
-    """Return a remark where a prepared sound is far louder or fainter than the others; all at zero for one of them.
+    """Return a remark where a prepared sound is far louder or fainter than the others, which a single one never is.
 
     Raises `CaptureError` where the loudest is more than `MAX_RANGE_DB` above the faintest.
     """

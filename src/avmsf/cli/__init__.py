@@ -15,7 +15,7 @@ from typing import TextIO
 import tyro
 
 import avmsf
-from avmsf._utils.memory import lacks_memory
+from avmsf._utils.memory import NO_MEMORY, lacks_memory
 from avmsf._utils.text import printable
 from avmsf.errors import AvmsfError, AvmsfWarning
 
@@ -50,8 +50,6 @@ TERMINATED = 143
 """The exit code that shells give a command ended by SIGTERM."""
 _AGAIN = 0.05
 """Seconds after which an interruption that was dropped is raised again: a finalizer ends sooner, or it is repeated."""
-_MEMORY = "the memory does not suffice: end other programs, or use less data, fewer modes or smaller pictures"
-_DEPTH = "a file is nested too deeply to be read, as none of this package is: check the files that were named"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -75,22 +73,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options = verb.parse(words[1:])
             with _compilation_announced():
                 code: int = verb.run(options)
-        except (AvmsfError, RecursionError) as error:
-            told = _DEPTH if isinstance(error, RecursionError) else error
-            print(f"avmsf {words[0]}: {printable(' '.join(str(told).split()))}", file=sys.stderr)
-            return 2
         except BrokenPipeError:
             # Whoever read the output has closed it, as `head` does; Python would complain again when it flushes.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return CLOSED
+        except Exception as error:
+            if not isinstance(error, AvmsfError) and not lacks_memory(error):
+                raise
+            sentence = str(error) if isinstance(error, AvmsfError) else NO_MEMORY
+            print(f"avmsf {words[0]}: {printable(' '.join(sentence.split()))}", file=sys.stderr)
+            return 2
         except KeyboardInterrupt:
             print(f"avmsf {words[0]}: interrupted", file=sys.stderr)
             code = INTERRUPTED
-        except Exception as error:
-            if not lacks_memory(error):
-                raise
-            print(f"avmsf {words[0]}: {_MEMORY}", file=sys.stderr)
-            return 2
         return TERMINATED if code == INTERRUPTED and signal.SIGTERM in received else code
 
 
@@ -100,6 +95,8 @@ def _interrupting() -> Iterator[list[int]]:
 
     Python raises KeyboardInterrupt wherever the main thread is. In a finalizer, or in a function that compiled code
     calls back, it reports the exception and drops it; then the verb would go on, so it is raised once more.
+    A SIGTERM that the parent process has told this one to ignore stays ignored, and one that is handled outside of
+    Python stays handled there.
     """
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():
@@ -114,23 +111,26 @@ def _interrupting() -> Iterator[list[int]]:
         if running:
             _thread.interrupt_main()
 
-    def hear(dropped: "sys.UnraisableHookArgs") -> None:
-        if issubclass(dropped.exc_type, KeyboardInterrupt):
+    def retry(unraisable: "sys.UnraisableHookArgs") -> None:
+        if issubclass(unraisable.exc_type, KeyboardInterrupt):
             # Raised at once, it would be dropped with what this hook raises.
             timer = threading.Timer(_AGAIN, raise_again)
             timer.daemon = True
             timer.start()
         else:
-            report(dropped)
+            report(unraisable)
 
-    report, sys.unraisablehook = sys.unraisablehook, hear
+    report, sys.unraisablehook = sys.unraisablehook, retry
     running = [True]
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = signal.getsignal(signal.SIGTERM)
+    if before not in (None, signal.SIG_IGN):
+        signal.signal(signal.SIGTERM, interrupt)
     try:
         yield received
     finally:
         running.clear()
-        signal.signal(signal.SIGTERM, before)
+        if before is not None:
+            signal.signal(signal.SIGTERM, before)
         sys.unraisablehook = report
 
 

@@ -17,7 +17,7 @@ from avmsf.capture import CaptureSettings, Impacts, check, read_capture
 from avmsf.cli.demofolder import RECORD, record, replaced_whole
 from avmsf.cli.modetable import amplitudes, levels
 from avmsf.cli.overallbar import OverallBar
-from avmsf.cli.printing import console, figure, json_text
+from avmsf.cli.printing import console, figure, json_text, print_text
 from avmsf.cli.scores import compare, score_markdown, score_table, score_values
 from avmsf.cli.writing import Level, write_sound, write_text
 from avmsf.export.webpage import write_webpage
@@ -79,7 +79,7 @@ def run(options: Options) -> int:
     with replaced_whole(options.folder) as begun, OverallBar(STAGES) as bar:
         scores, strikes = _go_all_the_way(begun, bar)
     console(errors=False).print(score_table(_title(*strikes), scores))
-    print(closing_words(options.folder, scores, *strikes))
+    print_text(closing_words(options.folder, scores, *strikes))
     return 0
 
 

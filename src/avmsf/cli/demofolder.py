@@ -1,12 +1,12 @@
 """The folder that `avmsf demo` fills: what was there stays whole until all of the new demo is."""
 
-import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from avmsf._utils.locks import write_lock
+from avmsf._utils.text_files import read_json
 from avmsf.cli.writing import OutputError
 from avmsf.files import way_out
 
@@ -70,7 +70,7 @@ def record(folder: Path) -> dict[str, object]:
 def _own_files(folder: Path) -> set[str]:
     """Return the files of the finished demo in a folder, none where there is no record of one."""
     try:
-        known = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        known = read_json(folder / RECORD)
     except (OSError, ValueError):
         return set()
     if not isinstance(known, dict) or known.get("format") != FORMAT or not isinstance(known.get("files"), list):

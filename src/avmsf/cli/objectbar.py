@@ -4,10 +4,9 @@ import sys
 import time
 from types import TracebackType
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 
-from avmsf.cli.printing import say
+from avmsf.cli.printing import SafeColumn, console, say
 
 
 class ObjectBar:
@@ -17,11 +16,11 @@ class ObjectBar:
         self.live = sys.stderr.isatty()
         self.begun = time.monotonic()
         self.bar = Progress(
-            TextColumn("{task.description}"),
+            SafeColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
-            console=Console(file=sys.stderr, markup=False, highlight=False),
+            console=console(errors=True),
             disable=not self.live,
         )
         self.task = self.bar.add_task("", total=None)

@@ -5,11 +5,10 @@ import time
 from collections.abc import Mapping
 from types import TracebackType
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
-from avmsf.cli.printing import say
+from avmsf.cli.printing import SafeColumn, console, say
 from avmsf.field.fit import Progress as FitProgress
 from avmsf.pipeline.scene import Listener
 from avmsf.scene.lift import LiftProgress
@@ -31,11 +30,11 @@ class OverallBar:
         self._stage = next(iter(stages))
         self._live = sys.stderr.isatty()
         self._bar = Progress(
-            TextColumn("{task.description}"),
+            SafeColumn("{task.description}"),
             BarColumn(),
             TextColumn("{task.percentage:.0f} %"),
             _TimeLeft(self),
-            console=Console(file=sys.stderr, markup=False, highlight=False),
+            console=console(errors=True),
             disable=not self._live,
             transient=True,
         )

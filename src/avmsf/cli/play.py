@@ -15,7 +15,7 @@ import torch
 import tyro
 
 from avmsf.cli.contacts import Contacts, contacts_at, refuse_far
-from avmsf.cli.printing import say
+from avmsf.cli.printing import print_text, say
 from avmsf.cli.render import METRES
 from avmsf.cli.writing import Coding, expect_writable, write_sound
 from avmsf.errors import PlayerError
@@ -162,7 +162,7 @@ def _bounce(player: Player, keyboard: Keyboard, options: Options) -> int:
     sound = bounce(player, blows, samples, block=options.block)
     taken = time.perf_counter() - begun
     write_sound(options.bounce, torch.from_numpy(sound), sample_rate=rate, coding=options.coding)
-    print(
+    print_text(
         f"wrote {options.bounce}: {len(blows)} blows, {samples / rate:.3g} s at {rate:g} Hz, {options.coding}, "
         f"{samples / rate / max(taken, 1e-9):.0f} times as fast as real time"
     )

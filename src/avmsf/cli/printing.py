@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
+from rich.progress import Task, TextColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -24,8 +25,16 @@ class _SafeConsole(Console):
         return super().render_str(printable(text), **settings)
 
 
+class SafeColumn(TextColumn):
+    """A column of a progress bar whose words may hold file names: neither markup nor control characters act in it."""
+
+    def render(self, task: Task) -> Text:
+        """Return the words of a task."""
+        return Text(printable(self.text_format.format(task=task)))
+
+
 def console(*, errors: bool) -> Console:
-    """Return where tables go: the standard output, or with `errors` the standard error, left free by JSON."""
+    """Return where tables and bars go: the standard output, or with `errors` the standard error, left free by JSON."""
     stream = sys.stderr if errors else sys.stdout
     # File names and messages hold square brackets, which would be taken for markup.
     width = None if stream.isatty() else _WIDTH

@@ -3,10 +3,9 @@
 import sys
 from types import TracebackType
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from avmsf.cli.printing import figure, say
+from avmsf.cli.printing import console, figure, say
 from avmsf.field.fit import Progress as FitProgress
 
 
@@ -22,7 +21,7 @@ class FitBar:
             MofNCompleteColumn(),
             TextColumn("loss {task.fields[loss]}"),
             TimeRemainingColumn(),
-            console=Console(file=sys.stderr, markup=False, highlight=False),
+            console=console(errors=True),
             disable=not self.live,
         )
         self.task = self.bar.add_task("", total=None, loss="–", visible=False)

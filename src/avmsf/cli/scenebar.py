@@ -3,10 +3,9 @@
 import sys
 from types import TracebackType
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from avmsf.cli.printing import figure, say
+from avmsf.cli.printing import SafeColumn, console, figure, say
 from avmsf.pipeline.scene import Listener
 from avmsf.scene.lift import LiftProgress
 from avmsf.scene.splat import SplatProgress
@@ -24,9 +23,9 @@ class SceneBar:
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("{task.fields[words]}"),
+            SafeColumn("{task.fields[words]}"),
             TimeRemainingColumn(),
-            console=Console(file=sys.stderr, markup=False, highlight=False),
+            console=console(errors=True),
             disable=not self.live,
         )
         self.tasks: dict[str, TaskID] = {}

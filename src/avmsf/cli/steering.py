@@ -9,10 +9,9 @@ from types import TracebackType
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from avmsf.cli.printing import figure, say
+from avmsf.cli.printing import console, figure, say
 from avmsf.cli.writing import Level, write_sound
 from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
@@ -141,7 +140,7 @@ class SteerBar:
             MofNCompleteColumn(),
             TextColumn("loss {task.fields[loss]}, pitch x {task.fields[pitch]}"),
             TimeRemainingColumn(),
-            console=Console(file=sys.stderr, markup=False, highlight=False),
+            console=console(errors=True),
             disable=not self.live,
         )
         self.task = self.bar.add_task("", total=None, loss="–", pitch="–")

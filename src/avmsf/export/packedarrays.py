@@ -1,6 +1,5 @@
 """Arrays one after another in a binary file, and the JSON manifest that says where each begins: packed, and read."""
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
+from avmsf._utils.text_files import read_json
 from avmsf.errors import ExportError
 from avmsf.export.written import MANIFEST
 
@@ -27,13 +27,13 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """Return the manifest of a folder; raises `ExportError` where it is missing or no JSON object."""
     path = folder / MANIFEST
     try:
-        found = json.loads(path.read_text())
+        found = read_json(path)
     except OSError as error:
         raise ExportError(
             f"{path}: expected the manifest of the paper's demo, found none ({error.strerror or error}): name a folder "
             "that holds one"
         ) from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ExportError(f"{path}: expected JSON, found something else ({error}): export it again") from error
     if not isinstance(found, dict):
         raise ExportError(f"{path}: expected a JSON object, found {type(found).__name__}: export it again")

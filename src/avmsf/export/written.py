@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+from avmsf._utils.text_files import read_json
 from avmsf.errors import ExportError
 from avmsf.files import temporary_path, way_out, write_whole
 
@@ -140,7 +141,7 @@ def _made_here(path: Path) -> bool:
 def _folder_made_here(folder: Path) -> bool:
     """Return whether all that lies in a folder is what one of our manifests lists."""
     try:
-        manifest = json.loads((folder / MANIFEST).read_text())
+        manifest = read_json(folder / MANIFEST)
         listed = set(manifest["files"]) if manifest["generator"].startswith("avmsf ") else set()
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return False

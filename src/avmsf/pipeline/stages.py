@@ -12,6 +12,7 @@ from typing import Any
 import avmsf
 from avmsf._utils.caching import discard, source_digest
 from avmsf._utils.locks import WAIT, write_lock
+from avmsf._utils.text_files import read_json
 from avmsf.errors import CaptureError
 from avmsf.files import way_out, write_whole
 
@@ -132,7 +133,7 @@ def _write(record: Path, values: Mapping[str, Any]) -> None:
 def _read(record: Path) -> dict[str, Any]:
     """Return a record, or an empty one where there is none that can be read: its stage then runs again."""
     try:
-        known = json.loads(record.read_text(encoding="utf-8"))
+        known = read_json(record)
     except (OSError, ValueError):
         return {}
     complete = isinstance(known, dict) and {"recipe", "digest", "seconds"} <= known.keys()

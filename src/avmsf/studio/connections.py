@@ -22,8 +22,13 @@ MAX_CONNECTIONS = 256
 """Open at once: a browser opens six for all tabs of a page."""
 BACKLOG = 16
 """Connections that the system accepts ahead, and that the event loop takes in one step, before it can close others."""
+_LEAST_CONNECTIONS = 16
+"""Kept open whatever the limit of files is: twice the six of a browser, and some for whoever does not know the
+secret."""
 _SPARED_FILES = 64
-"""File descriptors left to the rest of the program, and to `BACKLOG` connections that wait to be counted."""
+"""File descriptors left to the rest of the program, and to `BACKLOG` connections that wait to be counted. Fewer are
+left where the process may open less than `_SPARED_FILES + 2 * _LEAST_CONNECTIONS` (96): no system's default is that
+low."""
 
 
 def max_connections() -> int:
@@ -36,7 +41,7 @@ def max_connections() -> int:
     if files == resource.RLIM_INFINITY:
         return MAX_CONNECTIONS
     # Two for each: a connection may be sending a file.
-    return max(BACKLOG, min(MAX_CONNECTIONS, (files - _SPARED_FILES) // 2))
+    return max(_LEAST_CONNECTIONS, min(MAX_CONNECTIONS, (files - _SPARED_FILES) // 2))
 
 
 def limited(app: Any, **options: Any) -> uvicorn.Config:

@@ -5,7 +5,6 @@ know the token is told nothing; a name that was bent to point here is no loopbac
 where they come from.
 """
 
-import json
 import secrets
 from pathlib import Path
 from urllib.parse import quote
@@ -15,6 +14,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from avmsf._utils.text_files import parse_json
 from avmsf.studio.policy import NOTHING
 from avmsf.studio.refusal import RefusedError, response_to
 
@@ -144,8 +144,8 @@ async def read_words(request: Request, *, largest: int = LARGEST_WORDS) -> dict[
         if len(body) > largest:
             raise too_large(largest)
     try:
-        words = json.loads(bytes(body))
-    except (ValueError, RecursionError) as error:
+        words = parse_json(body.decode())
+    except ValueError as error:
         raise RefusedError(
             400, f"expected a JSON object, found what is none ({str(error)[:100]}): reload the page"
         ) from error

@@ -14,6 +14,7 @@ import traceback
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from typing import Any
 
+from avmsf._utils.text import printable
 from avmsf.errors import AvmsfError
 from avmsf.studio.refusal import RefusedError
 
@@ -137,7 +138,7 @@ class Job:
         if self._cancelled:
             return _STOPPED
         if result is None and status < 0:
-            print(words, end="", file=sys.stderr)
+            print(printable(words), end="", file=sys.stderr)
             return {
                 "error": f"{self.kind}: the work was ended from outside or crashed ({_signal_name(-status)}): try it "
                 "again, and close other programs first where memory is short"

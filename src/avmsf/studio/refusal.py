@@ -52,7 +52,7 @@ def response_to(error: AvmsfError) -> Answer:
 
 
 def refusal_of(error: Exception) -> RefusedError:
-    """Return the answer to a request that failed by `FORESEEN_ERRORS`, `NUMERIC_ERRORS` or for want of memory.
+    """Return the answer to a request that failed by one of `FORESEEN_ERRORS`, or where there is not enough memory.
 
     The page sends a recording again after a status of 500 or more, and not after a lower one.
     """

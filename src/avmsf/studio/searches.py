@@ -5,6 +5,7 @@ import sys
 import traceback
 from collections import defaultdict
 
+from avmsf._utils.text import printable
 from avmsf.errors import AvmsfError
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.locating import Finder, Likeness
@@ -64,5 +65,5 @@ def _report(error: Exception) -> None:
     """Print why tables could not be made. A page that asks to locate on this revision gets the same error."""
     if not isinstance(error, (AvmsfError, *FORESEEN_ERRORS)):
         traceback.print_exception(error)
-    words = " ".join(str(error).split())
+    words = printable(" ".join(str(error).split()))
     print(f"blows cannot be located on this revision ({type(error).__name__}: {words})", file=sys.stderr)

@@ -29,7 +29,7 @@ PORT = 8634
 _HOME = "127.0.0.1"
 _HANGING = 1
 """Seconds that an answer under way may take when the server ends."""
-_LACKING = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+_OUT_OF_RESOURCES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
 class PageServer(uvicorn.Server):
@@ -50,7 +50,7 @@ class PageServer(uvicorn.Server):
     def _handle(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Print what happened outside of any request; of refused connections, the event loop has many a second."""
         error = context.get("exception")
-        if not (isinstance(error, OSError) and error.errno in _LACKING and "socket" in context):
+        if not (isinstance(error, OSError) and error.errno in _OUT_OF_RESOURCES and "socket" in context):
             loop.default_exception_handler(context)
         elif not self._exhausted:
             self._exhausted = True

@@ -15,6 +15,7 @@ import numpy as np
 import soundfile
 
 from avmsf._utils.locks import write_lock
+from avmsf._utils.text_files import read_json
 from avmsf.capture.audio import Recording
 from avmsf.errors import CaptureError, FolderInUseError
 from avmsf.files import write_whole
@@ -116,7 +117,7 @@ class StrikeFiles:
     def journal(self) -> dict[str, dict[str, Any]]:
         """Return what was written under which key; nothing where the note is damaged."""
         try:
-            known = json.loads((self.folder / CACHE / JOURNAL).read_text(encoding="utf-8"))
+            known = read_json(self.folder / CACHE / JOURNAL)
         except (OSError, ValueError):
             return {}
         return known if isinstance(known, dict) else {}

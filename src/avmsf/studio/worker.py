@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
-from avmsf._utils.memory import lacks_memory
+from avmsf._utils.memory import NO_MEMORY, lacks_memory
 from avmsf.capture import read_capture
 from avmsf.capture.folder import settings_of
 from avmsf.capture.warning import CaptureWarning
@@ -166,7 +166,7 @@ def main() -> int:
         except Exception as error:
             if not lacks_memory(error):
                 raise
-            voice.say({"error": "the memory of this machine does not suffice: close other programs, or use less data"})
+            voice.say({"error": NO_MEMORY})
             return 2
     return 0
 

@@ -1,6 +1,5 @@
 """Where the objects of ObjectFolder Real were struck: from a folder of small arrays, or from SonicGauss's lists."""
 
-import json
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from avmsf._utils.text_files import parse_json, read_text
 from avmsf.capture.datasets.arrays import ArrayForm, judge_array, read_array
 from avmsf.errors import DatasetError
 
@@ -130,13 +130,13 @@ def _look_in(folder: Path, *, bare: bool = False) -> Contacts | None:
 def _records(path: Path) -> Iterator[tuple[str, Any]]:
     """Yield a list's records with where they stand: one JSON list, or an object a line."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path)
         if text.lstrip().startswith("["):
-            yield from ((f"record {place}", record) for place, record in enumerate(json.loads(text), start=1))
+            yield from ((f"record {place}", record) for place, record in enumerate(parse_json(text), start=1))
             return
         for number, line in enumerate(text.splitlines(), start=1):
             if line.strip():
-                yield f"line {number}", json.loads(line)
+                yield f"line {number}", parse_json(line)
     except (OSError, ValueError) as error:
         raise DatasetError(f"{path}: not a list of contacts that can be read: {error}") from error
 

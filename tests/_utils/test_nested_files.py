@@ -1,0 +1,73 @@
+"""A file nested far deeper than any reader's own is refused by each reader's own error, or is as good as none."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from avmsf.bench.modespace import MaterialSpace
+from avmsf.bench.results import IDENTITY, ResultsFolder
+from avmsf.capture.datasets.contactlists import LISTS, read_contacts
+from avmsf.cli.demofolder import RECORD, replaced_whole
+from avmsf.errors import AvmsfError, DatasetError, EvaluationError, ExportError
+from avmsf.export.packedarrays import read_manifest
+from avmsf.export.written import MANIFEST, write_folder
+from avmsf.pipeline.reconstruct import CACHE
+from avmsf.pipeline.stages import StageFolder
+from avmsf.studio.strikefiles import JOURNAL, StrikeFiles
+
+NESTED = "[" * 100_000
+
+
+def read_lines(path: Path) -> None:
+    path.write_text(f'{{"a": {NESTED}')
+    read_contacts(path)
+
+
+def write_over(path: Path) -> None:
+    write_folder(path.parent, lambda folder: None, {})
+
+
+@pytest.mark.parametrize(
+    ("name", "read", "kind"),
+    [
+        (LISTS[0], read_contacts, DatasetError),
+        (LISTS[1], read_lines, DatasetError),
+        ("space.json", MaterialSpace.load, EvaluationError),
+        (IDENTITY, lambda path: ResultsFolder(path.parent).identity(), EvaluationError),
+        (MANIFEST, lambda path: read_manifest(path.parent), ExportError),
+        (MANIFEST, write_over, ExportError),
+    ],
+)
+def test_a_nested_file_is_refused(
+    tmp_path: Path, name: str, read: Callable[[Path], object], kind: type[AvmsfError]
+) -> None:
+    (tmp_path / name).write_text(NESTED)
+    with pytest.raises(kind):
+        read(tmp_path / name)
+
+
+def test_a_nested_note_of_keys_is_as_good_as_none(tmp_path: Path) -> None:
+    (tmp_path / CACHE).mkdir()
+    (tmp_path / CACHE / JOURNAL).write_text(NESTED)
+    assert StrikeFiles(tmp_path).journal() == {}
+
+
+def test_a_stage_whose_record_is_nested_runs_again(tmp_path: Path) -> None:
+    made: list[Path] = []
+
+    def make(path: Path) -> None:
+        made.append(path)
+        path.write_text("made")
+
+    for _ in range(2):
+        StageFolder(tmp_path).keep("stage", {}, make)
+        (record,) = tmp_path.glob("*.json")
+        record.write_text(NESTED)
+    assert len(made) == 2
+
+
+def test_a_demo_whose_record_is_nested_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / RECORD).write_text(NESTED)
+    with pytest.raises(AvmsfError), replaced_whole(tmp_path):
+        pass
