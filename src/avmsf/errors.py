@@ -34,6 +34,10 @@ class CaptureError(AvmsfError):
     """A capture folder, its table, its settings or one of its sound files cannot be used."""
 
 
+class RecordingLengthError(CaptureError):
+    """A sound file holds more samples than are read."""
+
+
 class SceneError(AvmsfError):
     """Views, Gaussians, features or symmetries cannot be made or read."""
 

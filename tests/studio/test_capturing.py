@@ -434,7 +434,7 @@ def test_an_unchanged_folder_is_judged_once(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_a_recording_that_is_long_beyond_use_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avmsf.studio.locating.MAX_SAMPLES", 1000)
+    monkeypatch.setattr("avmsf.capture.audio.MAX_SAMPLES", 1000)
     with pytest.raises(RefusedError, match="expected at most 1,000 samples") as refused:
         book(tmp_path).add(blow(), place(0.1), key=key(0))
     assert refused.value.status == 413

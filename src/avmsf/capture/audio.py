@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Float64, Shaped
 from torch import Tensor
 
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, RecordingLengthError
 
 LOWEST_RATE = 100.0
 HIGHEST_RATE = 192_000.0
@@ -195,10 +195,10 @@ def clipped_samples(samples: Shaped[np.ndarray, " frames"]) -> int:
 
 
 def _refuse_long(file: soundfile.SoundFile, name: str) -> None:
-    """Raise `CaptureError` for a file of too many samples, by its header."""
+    """Raise `RecordingLengthError` for a file of too many samples, by its header."""
     samples = file.frames * file.channels
     if samples > MAX_SAMPLES:
-        raise CaptureError(
+        raise RecordingLengthError(
             f"{name}: expected at most {MAX_SAMPLES:,} samples in all channels, got {samples:,} "
             f"({file.frames / file.samplerate / 60:.3g} minutes of {file.channels}): keep the seconds about the blow"
         )

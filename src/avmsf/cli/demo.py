@@ -140,7 +140,8 @@ def _go_all_the_way(folder: Path, bar: OverallBar) -> tuple[dict[str, Scores], t
 
 
 def _title(train: Impacts, test: Impacts) -> str:
-    return f"{len(test)} contacts not trained on, {len(train)} trained on; lower is better"
+    contacts = f"{len(test)} contacts not trained on, {len(train)} trained on"
+    return f"{contacts}; lower is better; the floor has no noise, which L1-log counts"
 
 
 def _write_sounds(folder: Path, field: SoundField, train: Impacts, heard: Impacts) -> None:
@@ -177,8 +178,9 @@ def closing_words(folder: Path, scores: Mapping[str, Scores], train: Impacts, te
     x, y, z = test.contacts[0].tolist()
     command, place = _command(), shlex.quote(str(folder))
     return f"""
-What was done: from photographs of a mug and recordings of {len(train)} strikes, avmsf made a model of its sound.
+What was done: from pictures of a mug and recordings of {len(train)} strikes, avmsf made a model of its sound.
 The model gives the sound of a strike anywhere on the mug, also where it was never struck.
+The mug is simulated: its pictures, its mesh and its recordings, noise included, come from avmsf's simulator.
 
 How good it is:
 {verdict(scores, len(test))}

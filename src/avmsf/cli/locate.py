@@ -76,6 +76,7 @@ def run(options: Options) -> int:
     settings = _settings(options)
     force = None if options.force is None else Force(options.force)
     known = _Known(load(options.field))
+    say("avmsf locate: preparing gains over the surface and their reliability, once a run (seconds to minutes)")
     screen = console(errors=options.json)
     taken, found, failures = set[str](), list[dict[str, Any]](), list[dict[str, str]]()
     for path in options.recordings:

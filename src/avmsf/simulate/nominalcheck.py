@@ -70,8 +70,8 @@ class CheckedSurface:
         held = self.mean_thickness
         if held is not None and wall > _HOLLOW * held:
             raise SimulationError(
-                f"the mesh shows both sides of what is {1000 * held:.2g} mm thick on the mean, so that its wall is "
-                f"known, and ones above {1000 * _HOLLOW * held:.2g} mm are not guessed"
+                f"the mesh shows both sides of what is {1000 * held:.2g} mm thick on average: it is filled, "
+                f"and no wall above {1000 * _HOLLOW * held:.2g} mm is tried"
             )
 
     def sheet(self) -> Skin:

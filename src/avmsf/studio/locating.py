@@ -8,13 +8,13 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-import soundfile
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.capture.audio import MAX_SAMPLES, Recording, SoundBytes, decode_recording
+from avmsf.capture.audio import Recording, SoundBytes, decode_recording
 from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import RecordingLengthError
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.symmetry import Symmetries
 from avmsf.studio.refusal import RefusedError
@@ -100,23 +100,10 @@ def read_upload(content: bytes, *, name: str = "the recording") -> Recording:
     Raises CaptureError for what is no sound file, and RefusedError (413) for one that is long beyond use: a few bytes
     hold hours of silence where it is compressed.
     """
-    _expect_short(content, name)
-    return decode_recording(SoundBytes(content), name)
-
-
-def _expect_short(content: bytes, name: str) -> None:
     try:
-        with soundfile.SoundFile(SoundBytes(content)) as file:
-            samples, seconds = file.frames * file.channels, file.frames / file.samplerate
-    except soundfile.LibsndfileError:
-        # The reader says what is wrong with it.
-        return
-    if samples > MAX_SAMPLES:
-        raise RefusedError(
-            413,
-            f"{name}: expected at most {MAX_SAMPLES:,} samples, minutes of sound, found {samples:,} "
-            f"({seconds / 60:.3g} minutes): send the seconds about the blow",
-        )
+        return decode_recording(SoundBytes(content), name)
+    except RecordingLengthError as error:
+        raise RefusedError(413, str(error)) from error
 
 
 def packed(values: Float[Tensor, " points"]) -> str:
