@@ -44,6 +44,15 @@ def guarded() -> Iterator[None]:
     assert signal.signal(signal.SIGTERM, before) is stray
 
 
+@pytest.fixture
+def own_ctrl_c() -> Iterator[None]:
+    """Let SIGINT raise KeyboardInterrupt, as in a new process: libraries of earlier tests may have changed that."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    if before is not None:
+        signal.signal(signal.SIGINT, before)
+
+
 def wait() -> None:
     for _ in range(200):
         time.sleep(0.01)
@@ -96,7 +105,9 @@ def test_a_sigterm_handled_outside_of_python_is_left_to_its_handler(
     assert run(lambda: None) == 0
 
 
-def test_ctrl_c_in_a_finalizer_ends_the_verb_all_the_same(run: Callable[..., int], capsys: Streams) -> None:
+def test_ctrl_c_in_a_finalizer_ends_the_verb_all_the_same(
+    run: Callable[..., int], own_ctrl_c: None, capsys: Streams
+) -> None:
     class Closing:
         def __del__(self) -> None:
             os.kill(os.getpid(), signal.SIGINT)
