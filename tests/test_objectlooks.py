@@ -56,6 +56,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tmp_path: Path) -> None:
     looks = ObjectLooks(OneObject(seen), tmp_path, CONFIG)
     aligned, bare, unaligned = (looks("slab", look) for look in ("visual", "positions", "unaligned"))

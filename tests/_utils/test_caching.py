@@ -31,6 +31,7 @@ def a_disk_that_is_full(*arguments: object, **named: object) -> None:
     raise OSError(28, "No space left on device")
 
 
+@pytest.mark.slow
 def test_bodies_are_used_where_they_cannot_be_kept_and_the_cause_is_told_once(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
     surface = Surface(torch.from_numpy(ball.vertices).float(), torch.from_numpy(ball.faces).long())
