@@ -12,7 +12,7 @@ from scipy.signal import fftconvolve
 
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.audio import Recording, read_recording
-from avmsf.capture.prepare import prepare
+from avmsf.capture.prepare import prepare, remove_rumble
 from avmsf.errors import CaptureError
 from capture_folder import RATE, ROWS, fill, ring
 
@@ -203,6 +203,14 @@ def test_the_aircraft_s_blows_deconvolved_are_its_measured_impulse_responses(sha
     # Divided by the peak alone the pulse stays in the sound, and with it the delay of its flank.
     peak = read_capture(shared / "aircraft", replace(struck_settings, normalise="peak")).impacts
     assert agreement(spectra(peak.sounds, 512, decay=0.13), truth)[0] > 0.4
+
+
+@pytest.mark.parametrize("highpass", [1e-300, 1e-6, 0.9])
+def test_a_highpass_of_less_than_one_period_is_refused(highpass: float) -> None:
+    recording = Recording("hit.wav", np.random.default_rng(0).standard_normal((1, 8000)), 8000.0, "DOUBLE")
+    with pytest.raises(CaptureError):
+        remove_rumble(recording.channels[0], highpass, recording)
+    assert np.isfinite(remove_rumble(recording.channels[0], 1.0, recording)).all()
 
 
 def test_a_highpass_removes_rumble_and_moves_no_phase(tmp_path: Path) -> None:

@@ -79,10 +79,17 @@ def remove_rumble(
     """Return the sound without what lies below `highpass` Hz: a Butterworth filter of fourth order, run both ways.
 
     Run both ways it moves no phase and is 6 dB down at `highpass`. Raises `CaptureError` for half the sample rate and
-    above, which would leave nothing.
+    above, which would leave nothing, and for a frequency without one whole period in the sound, which cannot be told
+    from its offset.
     """
     if highpass == 0.0:
         return sound
+    lowest = recording.sample_rate / len(sound)
+    if highpass < lowest:
+        raise CaptureError(
+            f"{recording.name}: expected a highpass of 0, or of {lowest:.3g} Hz or more, one period in the recording, "
+            f"got {highpass:g} Hz: change it in capture.toml"
+        )
     if highpass >= recording.sample_rate / 2:
         raise CaptureError(
             f"{recording.name}: highpass is {highpass:g} Hz, and at {recording.sample_rate:g} Hz nothing lies above "
