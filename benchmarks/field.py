@@ -23,8 +23,8 @@ from avmsf.field.fit import fit
 from avmsf.field.physics import Physics
 from avmsf.field.recipes import Attention, GainRecipe, ThinPlate
 from avmsf.field.soundfield import SoundField
-from avmsf.modal.extract import extract
-from avmsf.modal.leastsquares import fit_gains
+from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.nominal import nominal_bodies
 from benchmarks.look import finish, lift_pictures, pictures, slab, speckled

@@ -17,7 +17,7 @@ from avmsf.capture import read_capture, write_capture
 from avmsf.field.config import FitConfig
 from avmsf.field.doubt import coverage
 from avmsf.field.fit import fit
-from avmsf.modal.extract import extract
+from avmsf.modal.extraction.extract import extract
 from avmsf.pipeline.physics import BodyConfig, physics_of
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import simulate_object

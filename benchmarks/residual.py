@@ -12,7 +12,7 @@ from avmsf.capture import Impacts, read_capture
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.recipes import GainRecipe, ThinPlate
-from avmsf.modal.extract import extract
+from avmsf.modal.extraction.extract import extract
 from avmsf.pipeline.physics import physics_of
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.example import EXAMPLE_FOLDER

@@ -13,7 +13,7 @@ from avmsf.field.fit import fit
 from avmsf.field.physics import Physics
 from avmsf.field.soundfield import SoundField
 from avmsf.field.suggest import suggest
-from avmsf.modal.extract import extract
+from avmsf.modal.extraction.extract import extract
 from avmsf.pipeline.physics import BodyConfig, physics_of
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import farthest_points

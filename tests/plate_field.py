@@ -6,8 +6,7 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
-from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction import Extraction
+from avmsf.modal.bank import Extraction, ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike

@@ -7,7 +7,7 @@ import torch
 from avmsf.capture import read_capture
 from avmsf.capture.views import read_views
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.leastsquares import fit_gains
+from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
 from avmsf.simulate.truth import read_truth
 

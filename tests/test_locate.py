@@ -12,7 +12,7 @@ from avmsf.field.gainfield import Gains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.thinplategains import thin_plate_gains
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.leastsquares import fit_gains
+from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise_phased
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike

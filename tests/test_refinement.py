@@ -9,7 +9,7 @@ from avmsf.field.doubt import widening
 from avmsf.field.fit import Progress, fit, gain_case
 from avmsf.field.recipes import SHARED, ThinPlate
 from avmsf.field.refinement import LinearGains, RefinedGains
-from avmsf.modal.extract import extract
+from avmsf.modal.extraction.extract import extract
 from made_fields import BANK, LINEAR, blows, places
 from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
 

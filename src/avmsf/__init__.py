@@ -26,9 +26,8 @@ if TYPE_CHECKING:
     from avmsf.field.soundfield import SoundField
     from avmsf.field.store import load, save
     from avmsf.field.suggest import suggest
-    from avmsf.modal.bank import ModalBank
-    from avmsf.modal.extract import HighResolution, ShortTime, extract
-    from avmsf.modal.extraction import Extraction
+    from avmsf.modal.bank import Extraction, ModalBank
+    from avmsf.modal.extraction.extract import HighResolution, ShortTime, extract
     from avmsf.modal.pulse import ForcePulse
     from avmsf.modal.residual import Residual
     from avmsf.pipeline.physics import BodyConfig, physics_of
@@ -195,9 +194,8 @@ _HOMES = {
     "avmsf.field.soundfield": ("SoundField",),
     "avmsf.field.store": ("load", "save"),
     "avmsf.field.suggest": ("suggest",),
-    "avmsf.modal.bank": ("ModalBank",),
-    "avmsf.modal.extract": ("HighResolution", "ShortTime", "extract"),
-    "avmsf.modal.extraction": ("Extraction",),
+    "avmsf.modal.bank": ("Extraction", "ModalBank"),
+    "avmsf.modal.extraction.extract": ("HighResolution", "ShortTime", "extract"),
     "avmsf.modal.residual": ("Residual",),
     "avmsf.pipeline.physics": ("BodyConfig", "physics_of"),
     "avmsf.tasks.locate": ("locate",),

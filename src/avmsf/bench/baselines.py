@@ -16,7 +16,7 @@ from avmsf.bench.modalbaseline import ModalBaseline
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.leastsquares import fit_gains, fit_sine_gains
+from avmsf.modal.extraction.least_squares import fit_gains, fit_sine_gains
 from avmsf.modal.synthesis import synthesise
 from avmsf.scene.points import nearest_points
 

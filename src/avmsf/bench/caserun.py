@@ -21,8 +21,8 @@ from avmsf.bench.task import Look, Method, Task
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError
 from avmsf.field.physics import Physics
-from avmsf.modal.extraction import Extraction
-from avmsf.modal.keptmodes import extract_once
+from avmsf.modal.bank import Extraction
+from avmsf.modal.extraction.keptmodes import extract_once
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.truth import Truth
 

@@ -11,8 +11,7 @@ from torch import Tensor
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
 from avmsf.field.orientation import orientation_signs
-from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction import Extraction
+from avmsf.modal.bank import Extraction, ModalBank
 from avmsf.modal.residual import shape_noise
 from avmsf.modal.synthesis import synthesise
 

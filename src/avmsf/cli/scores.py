@@ -9,7 +9,7 @@ from avmsf.bench.evaluation import Scores, evaluate, score
 from avmsf.capture import Impacts
 from avmsf.cli.printing import figure, table
 from avmsf.field.soundfield import SoundField
-from avmsf.modal.extraction import Extraction
+from avmsf.modal.bank import Extraction
 
 HEADINGS = {
     "relative_stft": "relative STFT error",

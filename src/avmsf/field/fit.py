@@ -25,9 +25,8 @@ from avmsf.field.recipes import GainCase, GainRecipe, along_phase
 from avmsf.field.refinement import RefinedGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.training import Targets, TrainingRun
-from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction import Extraction
-from avmsf.modal.leastsquares import fit_gains, fit_sine_gains
+from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.extraction.least_squares import fit_gains, fit_sine_gains
 from avmsf.modal.phase import common_phase
 from avmsf.modal.residual import Residual, estimate_residual
 from avmsf.modal.spectra import envelope

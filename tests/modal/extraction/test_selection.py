@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.forward import choose
+from avmsf.modal.extraction.esprit import candidates
+from avmsf.modal.extraction.forward import choose
+from avmsf.modal.extraction.least_squares import NormalEquations
+from avmsf.modal.extraction.selection import Candidates, chance_ratio, merge, prune, select
 from avmsf.modal.innerproducts import gram, poles_of
-from avmsf.modal.leastsquares import NormalEquations
-from avmsf.modal.pencil import candidates
-from avmsf.modal.selection import Candidates, chance_ratio, merge, prune, select
 from avmsf.modal.synthesis import synthesise
 
 RATE = 8000.0

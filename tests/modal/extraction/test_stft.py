@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from avmsf.modal.extract import ShortTime
-from avmsf.modal.shorttime import consensus_modes, narrow_band
+from avmsf.modal.extraction.extract import ShortTime
+from avmsf.modal.extraction.stft import consensus_modes, narrow_band
 
 RATE = 16000.0
 

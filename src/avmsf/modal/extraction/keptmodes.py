@@ -15,9 +15,8 @@ from safetensors.torch import save
 from avmsf._utils.caching import keep_if_possible, source_digest
 from avmsf.capture import Impacts
 from avmsf.files import write_whole
-from avmsf.modal.bank import ModalBank
-from avmsf.modal.extract import ModeFinder, extract, extract_sounds
-from avmsf.modal.extraction import Extraction
+from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.extraction.extract import ModeFinder, extract, extract_sounds
 from avmsf.modal.residual import Residual
 
 _KEY = "avmsf-modes"

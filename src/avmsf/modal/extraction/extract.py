@@ -10,13 +10,12 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError
-from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction import Extraction
-from avmsf.modal.leastsquares import fit_gains, refine
-from avmsf.modal.pencil import SHORTEST, candidates
+from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.extraction.esprit import SHORTEST, candidates
+from avmsf.modal.extraction.least_squares import fit_gains, refine
+from avmsf.modal.extraction.selection import Candidates, chance_ratio, merge, prune, select
+from avmsf.modal.extraction.stft import consensus_modes
 from avmsf.modal.residual import estimate_residual, noise_power
-from avmsf.modal.selection import Candidates, chance_ratio, merge, prune, select
-from avmsf.modal.shorttime import consensus_modes
 from avmsf.modal.synthesis import synthesise
 
 _EMPTY = ModalBank(torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))

@@ -1,0 +1,1 @@
+"""Modes from recordings: candidate poles, selection, least squares and alignment of the recordings."""
