@@ -13,7 +13,8 @@ from avmsf.bench.metrics import default_fft_sizes, relative_stft_error
 from avmsf.capture import Impacts
 from avmsf.errors import ExtractionError
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.extract import HighResolution, ModeFinder, ShortTime, extract, extract_sounds
+from avmsf.modal.extraction.extract import extract, extract_sounds
+from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
 from avmsf.simulate.plate import PlateModes, plate_modes
 from benchmarks.material import IMPULSE, clips_in_place
 from benchmarks.report import Options, Report, Table, tell

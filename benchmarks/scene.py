@@ -15,7 +15,7 @@ from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.capture.views.write import write_views
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load
-from avmsf.modal.extraction.extract import HighResolution
+from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline.features import LiftConfig
 from avmsf.pipeline.reconstruct import ReconstructConfig, reconstruct
 from avmsf.pipeline.scene import Listener, SceneConfig

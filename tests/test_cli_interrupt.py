@@ -64,7 +64,7 @@ def test_the_same_command_goes_on_to_the_same_field(
 def test_an_interruption_before_training_keeps_nothing(
     tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from avmsf.modal import keptmodes as kept
+    from avmsf.modal.extraction import extract as kept
 
     def stop(*arguments: object) -> None:
         raise KeyboardInterrupt
@@ -80,7 +80,7 @@ def test_an_interruption_as_training_begins_keeps_the_modes(
     tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from avmsf.cli import fit as verb
-    from avmsf.modal import keptmodes as kept
+    from avmsf.modal.extraction import extract as kept
 
     def stop(*arguments: object, **named: object) -> None:
         raise KeyboardInterrupt

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from avmsf.field.store import load, save
     from avmsf.field.suggest import suggest
     from avmsf.modal.bank import Extraction, ModalBank
-    from avmsf.modal.extraction.extract import HighResolution, ShortTime, extract
+    from avmsf.modal.extraction.extract import extract
+    from avmsf.modal.extraction.finders import HighResolution, ShortTime
     from avmsf.modal.pulse import ForcePulse
     from avmsf.modal.residual import Residual
     from avmsf.pipeline.physics import BodyConfig, physics_of
@@ -195,7 +196,8 @@ _HOMES = {
     "avmsf.field.store": ("load", "save"),
     "avmsf.field.suggest": ("suggest",),
     "avmsf.modal.bank": ("Extraction", "ModalBank"),
-    "avmsf.modal.extraction.extract": ("HighResolution", "ShortTime", "extract"),
+    "avmsf.modal.extraction.extract": ("extract",),
+    "avmsf.modal.extraction.finders": ("HighResolution", "ShortTime"),
     "avmsf.modal.residual": ("Residual",),
     "avmsf.pipeline.physics": ("BodyConfig", "physics_of"),
     "avmsf.tasks.locate": ("locate",),

@@ -11,7 +11,7 @@ import trimesh
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import main
 from avmsf.errors import FolderInUseError
-from avmsf.modal.extraction.extract import HighResolution
+from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline.reconstruct import CACHE, ReconstructConfig, reconstruct
 from avmsf.pipeline.scene import Listener
 from avmsf.pipeline.stages import StageFolder

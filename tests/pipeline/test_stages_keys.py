@@ -20,7 +20,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import gain_case
 from avmsf.field.physics import Physics
 from avmsf.field.recipes import ThinPlate
-from avmsf.modal.extraction.extract import HighResolution
+from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline import reconstruct as module
 from avmsf.pipeline import stages
 from avmsf.pipeline.scene import Listener

@@ -22,7 +22,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError
 from avmsf.field.physics import Physics
 from avmsf.modal.bank import Extraction
-from avmsf.modal.extraction.keptmodes import extract_once
+from avmsf.modal.extraction.extract import extract_once
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.truth import Truth
 

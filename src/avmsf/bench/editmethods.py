@@ -17,7 +17,8 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import EvaluationError
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.extract import HighResolution, extract_sounds
+from avmsf.modal.extraction.extract import extract_sounds
+from avmsf.modal.extraction.finders import HighResolution
 from avmsf.simulate.material import MATERIALS
 from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, DistillationConfig
 from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, SEARCHED, Parameterisation

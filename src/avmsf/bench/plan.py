@@ -11,7 +11,7 @@ from avmsf.bench.results import ResultsFolder
 from avmsf.bench.task import Look, Method
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.field.physics import Physics
-from avmsf.modal.extraction.extract import HighResolution, ModeFinder
+from avmsf.modal.extraction.finders import HighResolution, ModeFinder
 from avmsf.scene.features import FeatureField
 
 

@@ -24,7 +24,7 @@ from avmsf.export.webpage import write_webpage
 from avmsf.field.config import FitConfig
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
-from avmsf.modal.extraction.extract import HighResolution
+from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline.features import DESCRIPTORS, LiftConfig
 from avmsf.pipeline.reconstruct import CACHE, ReconstructConfig, reconstruct
 from avmsf.pipeline.scene import CLOUD, SceneConfig

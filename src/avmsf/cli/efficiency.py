@@ -20,7 +20,7 @@ from avmsf.cli.evaluate import title_of
 from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.errors import EvaluationError
-from avmsf.modal.extraction.extract import HighResolution
+from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.pipeline.physics import BodyConfig

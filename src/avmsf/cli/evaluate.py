@@ -23,7 +23,7 @@ from avmsf.cli import INTERRUPTED
 from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.printing import console, print_json, say, table
 from avmsf.errors import EvaluationError
-from avmsf.modal.extraction.extract import HighResolution
+from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline.objectbodies import Geometry, ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.pipeline.physics import BodyConfig

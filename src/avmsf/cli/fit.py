@@ -25,7 +25,7 @@ from avmsf.field.physics import Physics
 from avmsf.field.recipes import GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
-from avmsf.modal.extraction.keptmodes import extract_once
+from avmsf.modal.extraction.extract import extract_once
 from avmsf.pipeline.choice import all_recipes, recipe_for
 from avmsf.pipeline.physics import BodyConfig, physics_of
 from avmsf.pipeline.reconstruct import expect_on_object

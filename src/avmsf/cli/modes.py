@@ -11,7 +11,8 @@ from avmsf.bench.pictures import draw_modes, expect_format, save_picture
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.modetable import ModeRow, amplitudes, heard_in, levels, mode_rows
 from avmsf.cli.printing import console, decimals, figure, print_json, say, table
-from avmsf.modal.extraction.extract import HighResolution, ModeFinder, ShortTime, extract
+from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
 
 Method = Literal["high-resolution", "short-time"]
 

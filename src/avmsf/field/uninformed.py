@@ -7,7 +7,7 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError
 from avmsf.modal.bank import Extraction, ModalBank
-from avmsf.modal.extraction.extract import lowest_frequency
+from avmsf.modal.extraction.finders import lowest_frequency
 from avmsf.modal.residual import Residual
 
 _HIGHEST = 0.9

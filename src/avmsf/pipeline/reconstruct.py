@@ -23,8 +23,8 @@ from avmsf.field.physics import Physics
 from avmsf.field.store import save
 from avmsf.files import write_whole
 from avmsf.modal.bank import Extraction
-from avmsf.modal.extraction.extract import ModeFinder
-from avmsf.modal.extraction.keptmodes import extract_once
+from avmsf.modal.extraction.extract import extract_once
+from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.pipeline.choice import Spreading, all_recipes, recipe_for
 from avmsf.pipeline.physics import BodyConfig, physics_of
 from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages

@@ -23,7 +23,7 @@ from avmsf.errors import AvmsfError
 from avmsf.field.fit import Progress
 from avmsf.field.store import load, save
 from avmsf.files import copy_whole
-from avmsf.modal.extraction.extract import HighResolution
+from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline.reconstruct import CACHE, ReconstructConfig, reconstruct
 from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages
 from avmsf.pipeline.stages import StageFolder

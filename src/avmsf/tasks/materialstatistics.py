@@ -14,7 +14,8 @@ from torch import Tensor
 from avmsf.errors import EditError, ExtractionError
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.extract import HighResolution, extract_sounds
+from avmsf.modal.extraction.extract import extract_sounds
+from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.synthesis import synthesise
 from avmsf.simulate.material import Material
 from avmsf.tasks.reference import Reference, read_clip, wav_files

@@ -15,7 +15,8 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.onset import find_onset
 from avmsf.errors import ExtractionError
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.extract import HighResolution, ShortTime, extract, extract_sounds, lowest_frequency
+from avmsf.modal.extraction.extract import extract, extract_sounds
+from avmsf.modal.extraction.finders import HighResolution, ShortTime, lowest_frequency
 from avmsf.modal.synthesis import synthesise
 from avmsf.simulate.plate import Plate, PlateModes, plate_modes, sample_contacts, strike
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from avmsf.modal.extraction.extract import ShortTime
+from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.extraction.stft import consensus_modes, narrow_band
 
 RATE = 16000.0

@@ -1,172 +1,33 @@
-"""Modes, gains and residual from recordings: one verb, two methods."""
+"""Modes, gains and residual from recordings, and a file that keeps them.
 
+Linear algebra rounds differently from one run to the next, so modes that are found again differ in their last digits;
+work that goes on after an interruption needs the very ones it began with.
+"""
+
+import hashlib
+import json
 import math
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from importlib.metadata import version
+from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor
 
+from avmsf._utils.caching import keep_if_possible, source_digest
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError
+from avmsf.files import write_whole
 from avmsf.modal.bank import Extraction, ModalBank
-from avmsf.modal.extraction.esprit import SHORTEST, candidates
-from avmsf.modal.extraction.least_squares import fit_gains, refine
-from avmsf.modal.extraction.selection import Candidates, chance_ratio, merge, prune, select
-from avmsf.modal.extraction.stft import consensus_modes
-from avmsf.modal.residual import estimate_residual, noise_power
+from avmsf.modal.extraction.esprit import SHORTEST
+from avmsf.modal.extraction.finders import HighResolution, ModeFinder, lowest_frequency, noise_bins
+from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.residual import Residual, estimate_residual
 from avmsf.modal.synthesis import synthesise
 
-_EMPTY = ModalBank(torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
-_QUIET = 1e-12
-"""Least power of the noise, of sounds of mean power one: rounding of what is recorded without any."""
-_LEAST_FALL = 0.3
-"""A mode that falls by fewer nepers over the whole sound is not told from hum."""
-_LEAST_TURN = 0.5
-"""Radians by which a mode turns against half the sample rate while it falls to 1/e: with fewer its samples are all but
-nothing in sine phase, and the gain of what is heard would be enormous."""
-_PERIODS = 50
-"""How many periods of the lowest frequency the sounds last: with fewer, a mode is not told from rumble."""
-
-
-@runtime_checkable
-class ModeFinder(Protocol):
-    """Finds the modes that all recordings share."""
-
-    def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:
-        """Return the modes, by frequency; an empty bank when there are none."""
-        ...
-
-
-@dataclass(frozen=True)
-class HighResolution:
-    """Matrix pencils in subbands over all recordings at once, sifted and refined by least squares.
-
-    Tells modes apart that lie closer than the sound's length resolves in a spectrum, as the doublets of nearly round
-    objects do.
-    """
-
-    modes: int = 128
-    """Most modes to keep: those whose absence would lose most energy."""
-    significance: float = 1.5
-    """How many times the most that noise alone would yield anywhere a mode has to explain, in energy."""
-    range_db: float = 60.0
-    """Modes this far below the strongest are left out, decibels of energy."""
-    least_quality: float = 1.0
-    """Least quality factor, pi f / d: below it a thing is a thud, not a tone."""
-    lowest_hertz: float = 0.0
-    """Lowest frequency to look at, Hz; zero for what the length of the sounds allows (about fifty periods)."""
-
-    def __post_init__(self) -> None:
-        expect_modes(self.modes)
-
-    def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:
-        """Return the modes of `sounds`, at most `modes` of them."""
-        level = _level(sounds)
-        sounds = ((sounds - sounds.mean(1, keepdim=True)) / level[:, None])[level > 0]
-        samples = sounds.shape[1]
-        if samples < SHORTEST or len(sounds) == 0:
-            return _EMPTY
-        lowest = max(self.lowest_hertz, lowest_frequency(samples, sample_rate))
-        chance = chance_ratio(len(sounds), trials=samples)
-        noise = noise_power(sounds, bins=_noise_bins(samples)).clamp_min(_QUIET)
-        pairs = candidates(sounds, noise, sample_rate=sample_rate, lowest=lowest, significance=chance)
-        found = merge(*pairs, duration=samples / sample_rate)
-        bank = self._sift(sounds.to(torch.float64), found, noise, sample_rate, lowest)
-        # Hum and thuds are fitted beside the modes, or modes that are not there would stand in for them.
-        toned = math.pi * bank.frequency > self.least_quality * bank.damping
-        turning = math.pi * sample_rate - 2 * math.pi * bank.frequency > _LEAST_TURN * bank.damping
-        return _take(bank, toned & turning & (bank.damping >= _LEAST_FALL * sample_rate / samples))
-
-    def _sift(
-        self,
-        sounds: Float64[Tensor, "contacts samples"],
-        found: ModalBank,
-        noise: Float[Tensor, "contacts bins"],
-        sample_rate: float,
-        lowest: float,
-    ) -> ModalBank:
-        """Return those of `found` that the sounds need, refined.
-
-        The strong ones first, refined until little of them is left over: their remains would pass for weak modes.
-        """
-        samples = sounds.shape[1]
-        significance = self.significance * chance_ratio(len(sounds), trials=samples)
-
-        def weigh(bank: ModalBank) -> Candidates:
-            return Candidates.of(sounds, bank, _beneath(noise, bank, sample_rate), sample_rate=sample_rate)
-
-        def need(bank: ModalBank, range_db: float) -> ModalBank:
-            return prune(
-                sounds,
-                bank,
-                _beneath(noise, bank, sample_rate),
-                sample_rate=sample_rate,
-                significance=significance,
-                range_db=range_db,
-                count=self.modes,
-            )
-
-        weighed, bank = weigh(found), _EMPTY
-        rounds = [*torch.arange(20.0, self.range_db, 20.0).tolist(), self.range_db, self.range_db]
-        for turn, range_db in enumerate(rounds, 1):
-            bank = select(
-                weigh(bank),
-                weighed,
-                samples=samples,
-                sample_rate=sample_rate,
-                significance=significance,
-                range_db=range_db,
-                count=self.modes,
-            )
-            iterations = 20 if turn == len(rounds) else 6
-            bank = refine(sounds, need(bank, range_db), sample_rate=sample_rate, iterations=iterations)
-            bank = need(_take(bank, bank.frequency >= lowest), range_db)
-        return bank
-
-
-@dataclass(frozen=True)
-class ShortTime:
-    """The paper's method: one candidate a bin of a short-time spectrum, log-linear decay, consensus (section 3.4).
-
-    Times are in seconds so that they hold at any sample rate; the defaults are the paper's 2048 and 64 samples at
-    44.1 kHz.
-    """
-
-    modes: int = 128
-    """Most modes to keep: those of the largest mean gain."""
-    fft_seconds: float = 2048 / 44100
-    """Length of the transform, rounded to a power of two in samples."""
-    hop_seconds: float = 64 / 44100
-    """Step between frames, rounded to a power of two in samples."""
-    latest_peak: float = 0.1
-    """A bin whose envelope peaks later than this after the onset holds noise, s."""
-    least_damping: float = 0.5
-    """A bin that decays more slowly than this is hum, 1/s."""
-
-    def __post_init__(self) -> None:
-        expect_modes(self.modes)
-
-    def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:
-        """Return the modes of `sounds`, at most `modes` of them."""
-        fft_size = _power_of_two(self.fft_seconds * sample_rate, least=32)
-        hop = min(_power_of_two(self.hop_seconds * sample_rate, least=1), fft_size // 4)
-        return consensus_modes(
-            sounds,
-            sample_rate=sample_rate,
-            fft_size=fft_size,
-            hop=hop,
-            latest_peak=self.latest_peak,
-            least_damping=self.least_damping,
-            count=self.modes,
-        )
-
-
-def expect_modes(modes: int) -> None:
-    """Raise `ExtractionError` unless at least one mode is asked for."""
-    if modes < 1:
-        raise ExtractionError(f"modes = {modes}: expected 1 or more, the most that are kept")
+_KEY = "avmsf-modes"
 
 
 def extract(impacts: Impacts, method: ModeFinder | None = None) -> Extraction:
@@ -197,41 +58,8 @@ def extract_sounds(
     modes = synthesise(
         gains, bank.frequency, bank.damping, samples=sounds.shape[1], sample_rate=sample_rate, quadrature=quadrature
     )
-    residual = estimate_residual(sounds, modes, bins=_noise_bins(sounds.shape[1]))
+    residual = estimate_residual(sounds, modes, bins=noise_bins(sounds.shape[1]))
     return Extraction(bank, gains, residual, quadrature)
-
-
-def lowest_frequency(samples: int, sample_rate: float) -> float:
-    """Return the lowest frequency (Hz) at which sounds of this length let a mode be told from rumble."""
-    return _PERIODS * sample_rate / samples
-
-
-def _take(bank: ModalBank, kept: Bool[Tensor, " modes"]) -> ModalBank:
-    return ModalBank(bank.frequency[kept], bank.damping[kept])
-
-
-def _level(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, " contacts"]:
-    """Return each sound's root mean square about its mean."""
-    return (sounds - sounds.mean(1, keepdim=True)).square().mean(1).sqrt()
-
-
-def _beneath(
-    noise: Float[Tensor, "contacts bins"], bank: ModalBank, sample_rate: float
-) -> Float64[Tensor, "contacts modes"]:
-    """Return the noise's power at each mode: the most of the three bins there, for its spectrum may be steep."""
-    padded = torch.nn.functional.pad(noise, (1, 1))
-    highest = torch.maximum(torch.maximum(padded[:, :-2], padded[:, 2:]), noise)
-    place = torch.round(bank.frequency * (2 * (noise.shape[1] - 1) / sample_rate)).long()
-    return highest[:, place].to(torch.float64)
-
-
-def _noise_bins(samples: int) -> int:
-    """Return how many noise bands the length allows: of 23 Hz in 3 s at 48 kHz, wider in shorter sounds."""
-    return max(16, 1 << round(math.log2(samples / 64))) // 2 + 1
-
-
-def _power_of_two(value: float, *, least: int) -> int:
-    return max(least, 1 << round(math.log2(max(value, 1.0))))
 
 
 def _why_no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> str:
@@ -265,3 +93,59 @@ def _why_no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) 
             "which lowers its lower end"
         )
     return f"{found}: nothing rings above the noise there. Record at a higher rate, closer, or a less damped object"
+
+
+def extract_once(
+    train: Impacts, method: ModeFinder, path: Path, *, lone: bool = False, needed: bool = False
+) -> Extraction:
+    """Return the modes that `path` keeps of these recordings and this method; find and keep them where it has none.
+
+    With `lone`, one recording is enough. Where the file cannot be written, the modes are found again next time; it is
+    an error if the file is `needed`. Raises as `extract`, and FieldFileError.
+    """
+    digest = _digest(train, method)
+    kept = _read(path, digest)
+    if kept is not None:
+        return kept
+    if lone and len(train) == 1:
+        found = extract_sounds(train.sounds, sample_rate=train.sample_rate, method=method)
+    else:
+        found = extract(train, method)
+    tensors = {
+        "frequency": found.bank.frequency,
+        "damping": found.bank.damping,
+        "gains": found.gains,
+        "quadrature": found.quadrature,
+        "residual": found.residual.magnitude,
+    }
+    content = save({name: tensor.contiguous() for name, tensor in tensors.items()}, {_KEY: digest})
+
+    def write() -> None:
+        write_whole(path, lambda place: place.write_bytes(content))
+
+    if needed:
+        write()
+    else:
+        keep_if_possible(write, path)
+    return found
+
+
+def _read(path: Path, digest: str) -> Extraction | None:
+    try:
+        with safe_open(path, framework="pt") as file:
+            if (file.metadata() or {}).get(_KEY) != digest:
+                return None
+            # Clones, for what the file maps into memory goes with it.
+            read = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError):
+        return None
+    return Extraction(
+        ModalBank(read["frequency"], read["damping"]), read["gains"], Residual(read["residual"]), read["quadrature"]
+    )
+
+
+def _digest(train: Impacts, method: ModeFinder) -> str:
+    words = [version("avmsf"), source_digest(), repr(method), train.names, train.sample_rate]
+    digest = hashlib.sha256(json.dumps(words).encode())
+    digest.update(train.sounds.contiguous().numpy().tobytes())
+    return digest.hexdigest()
