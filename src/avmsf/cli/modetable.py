@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
 
 _HEARD = 4.0
 """An amplitude this many times the standard deviation of one phase under noise: noise reaches it once in 3000
