@@ -86,7 +86,7 @@ def test_recordings_are_the_truth_and_noise_of_the_asked_level(simulation: Simul
     kept = impacts.sounds.shape[1] / simulation.recordings.shape[1]
     level = 20 * math.log10(float(noise.square().mean().sqrt() / (clean.square().mean() / kept).sqrt()))
     # Twelve recordings of .4 s: the rumble's few bins leave an error of some tenths of a decibel.
-    assert level == pytest.approx(-30.0, abs=1.0)
+    assert level == pytest.approx(-30.0, abs=0.6)
     # One room: the noise of each recording is as loud as that of the others.
     each = noise.square().mean(dim=1).sqrt()
     assert float(each.max() / each.min()) < 2.0

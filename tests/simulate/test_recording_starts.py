@@ -10,9 +10,10 @@ import scipy.stats
 import torch
 
 from avmsf.capture import read_capture
+from avmsf.capture.audio import read_sound
 from avmsf.capture.onset import find_onset
 from avmsf.simulate.hammer import Hammer, contact_times, pulse_spectrum
-from avmsf.simulate.imperfections import Imperfections, recording_starts
+from avmsf.simulate.imperfections import Imperfections, recording_starts, stream
 from avmsf.simulate.material import CERAMIC
 from avmsf.simulate.radiation import SOUND_SPEED, travel_time
 from avmsf.simulate.recipe import ObjectRecipe
@@ -60,6 +61,8 @@ def test_starts_have_the_asked_mean_and_spread_and_any_fraction_of_a_sample() ->
     assert float(starts.std()) == pytest.approx(0.002, rel=0.04)
     fractions = (48000.0 * starts % 1.0).numpy()
     assert scipy.stats.kstest(fractions, "uniform").pvalue > 0.01
+    for name in ("speeds", "contact times", "force errors"):
+        assert abs(np.corrcoef(starts.numpy(), stream(2, name).standard_normal(4000))[0, 1]) < 0.06
     still = recording_starts(5, replace(imperfections, jitter=0.0), delay=0.003, sample_rate=48000.0, seed=2)
     assert still.tolist() == pytest.approx([0.0415 * 48000.0] * 5)
 
@@ -107,7 +110,9 @@ def test_the_truth_names_the_impact_in_every_file(simulation: Simulation, tmp_pa
     assert truth.starts is not None
     assert simulation.truth.starts is not None
     assert torch.equal(truth.starts, simulation.truth.starts)
-    onsets = [find_onset(row.double().numpy(), sample_rate=32000.0) for row in simulation.recordings]
+    recordings = [read_sound(tmp_path / "plate" / name)[0] for name in truth.names]
+    assert torch.equal(torch.stack(recordings), simulation.recordings)
+    onsets = [find_onset(row.double().numpy(), sample_rate=32000.0) for row in recordings]
     late = torch.tensor(onsets) - truth.starts
     # The first sample that a threshold finds lies after the impact, by a part of a sample or a few samples.
     assert float(late.min()) >= 0.0
