@@ -107,11 +107,11 @@ def read_strike(folder: Path, strike: Strike, *, settings: CaptureSettings) -> t
 def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float | None = None) -> None:
     """Write a folder that `read_capture` reads back to the same values, bit for bit.
 
-    With `onsets_within`, the sounds are whole recordings that start before their impacts: reading finds the onsets, and
-    keeps this many seconds from each on.
     Sounds become float32 wav files under the recordings' names where these are wav paths inside a folder, else under
     numbers. Everything is written beside the folder first and then renamed into place, so that a folder of this name
-    is whole or absent. Raises `CaptureError` where the folder exists and is not empty, or cannot be written.
+    is whole or absent. With `onsets_within` the sounds are whole recordings that start before their impacts: reading
+    then finds the onsets, and keeps this many seconds from each on. Raises `CaptureError` where the folder exists and
+    is not empty, or cannot be written.
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

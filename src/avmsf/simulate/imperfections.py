@@ -63,7 +63,7 @@ class Imperfections:
     depart from Hertz's law by .11.
     """
     pretrigger: float = 0.05
-    """Time from the start of a recording to the start of the impact's sound, seconds, but for the next two."""
+    """Time that a recording runs before the impact's sound arrives, seconds; the next two add to it."""
     jitter: float = 0.001
     """Variation of that time from recording to recording, seconds, root mean square.
 
