@@ -104,12 +104,14 @@ def read_strike(folder: Path, strike: Strike, *, settings: CaptureSettings) -> t
     return prepared, measure(recording, prepared, settings=settings, line=strike.line)
 
 
-def write_capture(capture: Capture, folder: str | Path) -> None:
+def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float | None = None) -> None:
     """Write a folder that `read_capture` reads back to the same values, bit for bit.
 
     Sounds become float32 wav files under the recordings' names where these are wav paths inside a folder, else under
     numbers. Everything is written beside the folder first and then renamed into place, so that a folder of this name
-    is whole or absent. Raises `CaptureError` where the folder exists and is not empty, or cannot be written.
+    is whole or absent. With `onsets_within` the sounds are whole recordings that start before their impacts: reading
+    then finds the onsets, and keeps this many seconds from each on. Raises `CaptureError` where the folder exists and
+    is not empty, or cannot be written.
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -117,7 +119,7 @@ def write_capture(capture: Capture, folder: str | Path) -> None:
     begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
     try:
         begun.mkdir(parents=True)
-        _write_files(capture, begun)
+        _write_files(capture, begun, onsets_within=onsets_within)
         if folder.exists():
             folder.rmdir()
         os.rename(begun, folder)
@@ -127,7 +129,7 @@ def write_capture(capture: Capture, folder: str | Path) -> None:
         shutil.rmtree(begun, ignore_errors=True)
 
 
-def _write_files(capture: Capture, folder: Path) -> None:
+def _write_files(capture: Capture, folder: Path, *, onsets_within: float | None) -> None:
     impacts = capture.impacts
     names = _file_names(impacts.names)
     rate, speed = _whole_rate(impacts.sample_rate)
@@ -153,12 +155,13 @@ def _write_files(capture: Capture, folder: Path) -> None:
     name = "".join(
         f"\\u{ord(mark):04x}" if mark in '"\\' or ord(mark) in (*range(32), 127) else mark for mark in capture.name
     )
+    seconds = impacts.sounds.shape[1] / rate if onsets_within is None else onsets_within
     (folder / SETTINGS).write_text(
         f'name = "{name}"\n'
-        f"seconds = {impacts.sounds.shape[1] / rate!r}\n"
+        f"seconds = {seconds!r}\n"
         f"playback_speed = {speed!r}\n"
         f'normalise = "{"none" if impacts.forces is None else "done"}"\n'
-        "align = false\n",
+        + ("align = false\n" if onsets_within is None else ""),
         encoding="utf-8",
     )
 
