@@ -1,5 +1,6 @@
 """What one recording is worth: its length, level, noise, clipping, onset and second blows."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,7 +51,8 @@ class RecordingReport:
 def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettings, line: int) -> RecordingReport:
     """Measure one recording that could be read and prepared, and say what about it looks wrong."""
     rate = recording.sample_rate
-    response = recording.response(settings.response_channel, force_channel=settings.force_channel)
+    channel = recording.response_channel(settings.response_channel, force_channel=settings.force_channel)
+    response = recording.channel(channel)
     peak = float(np.abs(response).max())
     noise = _decibels(_noise(response, prepared.onset, rate) / peak)
     clipped, second = clipped_samples(response), None
@@ -61,6 +63,14 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
     else:
         second = find_second_blow(response, prepared.onset, sample_rate=rate, seconds=settings.seconds)
     problems = []
+    others = [each for each in range(1, len(recording.channels) + 1) if each not in (channel, settings.force_channel)]
+    if settings.response_channel is None and any(
+        not np.array_equal(recording.channel(each), response) for each in others
+    ):
+        problems.append(
+            "its channels hold one sound, up to a constant factor and rounding: the loudest is read, channel "
+            f"{channel}; to choose one, write response_channel in capture.toml"
+        )
     if clipped:
         problems.append(f"{counted(clipped, 'clipped sample')}: turn the gain down and record it again")
     if second is not None:
@@ -88,6 +98,25 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         clipped=clipped,
         double_hit_seconds=None if second is None else second / rate,
     )
+
+
+def shared_problems(reports: Sequence[RecordingReport]) -> list[str]:
+    """Return the recordings' problems, each with its file; what several have in common once, with the first names."""
+    places: dict[str, list[str]] = {}
+    for report in reports:
+        for problem in report.problems:
+            places.setdefault(problem.removeprefix(f"{report.file}: "), []).append(report.file)
+    sentences = []
+    for problem, files in places.items():
+        if len(files) > 1:
+            shown = f"{', '.join(files[:3])}{', …' * (len(files) > 3)}"
+            sentences.append(f"{len(files)} recordings ({shown}): {problem}")
+        elif problem.startswith((files[0], "impacts.csv")):
+            # Errors of the capture's reader name the file or the line by themselves.
+            sentences.append(problem)
+        else:
+            sentences.append(f"{files[0]}: {problem}")
+    return sentences
 
 
 def _noise(response: Float64[np.ndarray, " frames"], onset: int, rate: float) -> float:
