@@ -6,7 +6,8 @@ from pathlib import Path
 
 import tyro
 
-from avmsf.capture import CaptureReport, CaptureSettings, RecordingReport, check
+from avmsf.capture import CaptureReport, CaptureSettings, check
+from avmsf.capture.measure import shared_problems
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.wording import counted
 
@@ -53,22 +54,16 @@ def run(options: Options) -> int:
     if not report.readable:
         say(f"avmsf check: {options.capture} cannot be read as it is: mend what is listed and check again")
         return UNREADABLE
-    wrong = sum(bool(row.problems) for row in report.recordings) + len(report.problems)
+    for remark in report.remarks:
+        screen.print(remark, soft_wrap=True)
+    wrong = len(problems)
     screen.print("no problem found" if not wrong else f"readable, with {counted(wrong, 'warning')}", soft_wrap=True)
     return 0
 
 
 def problems_of(report: CaptureReport) -> list[str]:
-    """Return every problem as one sentence: the folder's first, then the recordings' in their order."""
-    return [
-        *report.problems,
-        *(_placed(row, problem) for row in report.recordings for problem in row.problems),
-    ]
-
-
-def _placed(row: RecordingReport, problem: str) -> str:
-    # Errors of the capture's reader name the file or the line by themselves.
-    return problem if problem.startswith((row.file, "impacts.csv")) else f"{row.file}: {problem}"
+    """Return every problem as one sentence: the folder's first, then the recordings', what they share only once."""
+    return [*report.problems, *shared_problems(report.recordings)]
 
 
 def _table(report: CaptureReport, title: str) -> object:
