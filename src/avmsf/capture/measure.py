@@ -54,7 +54,7 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
     channel = recording.response_channel(settings.response_channel, force_channel=settings.force_channel)
     response = recording.channel(channel)
     peak = float(np.abs(response).max())
-    noise = _decibels(_noise(response, prepared.onset, rate) / peak)
+    noise = decibels(noise_level(response, prepared.onset, rate) / peak)
     clipped, second = clipped_samples(response), None
     if prepared.pulse is not None and settings.force_channel is not None:
         force = recording.channel(settings.force_channel)
@@ -81,8 +81,8 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         )
     if recording.subtype in EIGHT_BIT:
         problems.append(f"only 8 bits a sample ({recording.subtype}): its noise hides the decay; record 16 or more")
-    elif recording.subtype.startswith("PCM") and _decibels(peak) < LOWEST_PEAK_DB:
-        problems.append(f"its peak is {-_decibels(peak):.0f} dB below full scale: turn the gain up")
+    elif recording.subtype.startswith("PCM") and decibels(peak) < LOWEST_PEAK_DB:
+        problems.append(f"its peak is {-decibels(peak):.0f} dB below full scale: turn the gain up")
     return RecordingReport(
         file=recording.name,
         line=line,
@@ -92,7 +92,7 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         sample_rate=rate,
         channels=len(recording.channels),
         coding=recording.subtype,
-        peak_db=_decibels(peak),
+        peak_db=decibels(peak),
         noise_db=noise,
         onset_seconds=prepared.onset / rate,
         clipped=clipped,
@@ -119,7 +119,7 @@ def shared_problems(reports: Sequence[RecordingReport]) -> list[str]:
     return sentences
 
 
-def _noise(response: Float64[np.ndarray, " frames"], onset: int, rate: float) -> float:
+def noise_level(response: Float64[np.ndarray, " frames"], onset: int, rate: float) -> float:
     """Return the noise's root mean square: of what lies before the blow, or of the quietest tenth of 10 ms blocks."""
     before = response[: max(0, onset - round(SECONDS_BEFORE * rate))]
     size = max(64, round(0.01 * rate))
@@ -130,6 +130,6 @@ def _noise(response: Float64[np.ndarray, " frames"], onset: int, rate: float) ->
     return float(np.quantile(np.std(blocks, axis=1), 0.1))
 
 
-def _decibels(ratio: float) -> float:
+def decibels(ratio: float) -> float:
     """Return the level of an amplitude ratio; silence is 200 dB down, so that it stays a number."""
     return float(20 * np.log10(max(ratio, 1e-10)))

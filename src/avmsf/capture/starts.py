@@ -14,8 +14,8 @@ from avmsf.capture.together import common_length
 
 START_LEVEL = 10**-2.0
 """Share of the largest mean square in the first 20 ms that a response must have in its first two samples: -20 dB, the
-level (a tenth of the peak) from which `find_onset` counts a swing as the impact's. Impulse responses reach -.1 to -3 dB
-(aircraft, ruler, tree), recordings with 4 samples to 1 s before the impact -25 to -42 dB."""
+level (a tenth of the peak) from which `find_onset` counts a swing as the impact's. Impulse responses reach 0 to -3 dB
+(aircraft, ruler, tree), recordings with 4 samples to 1 s before the impact -25 to -47 dB."""
 
 
 @dataclass(frozen=True, eq=False)
