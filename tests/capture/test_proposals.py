@@ -34,13 +34,15 @@ def folder_of(path: Path, sounds: list[np.ndarray], forces=None, contacts=None) 
     return fill(path, rows=rows, header=header, replace=dict(zip(names, sounds, strict=True)))
 
 
-def rumbling(level: float, frequency: float, *, before: float = 0.4, own: float = 0.0) -> list[np.ndarray]:
+def rumbling(
+    level: float, frequency: float, *, before: float = 0.4, own: float = 0.0, noise: float = 1e-4
+) -> list[np.ndarray]:
     """Return impacts in rumble of a random phase; `own` is a low mode of the object, at the rumble's frequency."""
     generator, sounds = np.random.default_rng(3), []
     for seed in range(6):
         wave = np.sin(2 * np.pi * (frequency * TIME + generator.uniform()))
         mode = np.where(before <= TIME, np.sin(2 * np.pi * frequency * (TIME - before)), 0)
-        sounds.append(ring(SECONDS, before=before, noise=1e-4, seed=seed) + level * wave + own * mode)
+        sounds.append(ring(SECONDS, before=before, noise=noise, seed=seed) + level * wave + own * mode)
     return sounds
 
 
@@ -61,6 +63,11 @@ def test_a_highpass_is_proposed_for_rumble_before_the_impact(
 ) -> None:
     folder = folder_of(tmp_path, rumbling(level, frequency, before=before, own=own))
     assert found(folder).get("highpass") == proposed
+
+
+def test_rumble_60_db_under_the_peak_hides_no_decay(tmp_path: Path) -> None:
+    # Peaks are about .5, so that 2e-4 root mean square is 68 dB under them.
+    assert found(folder_of(tmp_path, rumbling(3e-4, 6.0, noise=1e-6))) == {}
 
 
 def test_a_constant_offset_is_rumble(tmp_path: Path) -> None:
@@ -109,6 +116,14 @@ def test_forces_unrelated_to_the_loudness_are_not_divided_by(tmp_path: Path, rel
 def test_few_recordings_do_not_show_that_forces_are_unrelated(tmp_path: Path) -> None:
     sounds = [ring(0.3, before=0.05, seed=seed) for seed in range(5)]
     assert found(folder_of(tmp_path, sounds, [1, 2, 4, 8, 16])) == {}
+
+
+def test_levels_that_scatter_do_not_show_it_either(tmp_path: Path) -> None:
+    # The level goes with a fifth of the force, and differs by 6 dB among the contacts: two standard errors from a half.
+    forces = 10 ** np.linspace(0, 0.6, 12)
+    scatter = 10 ** (6 / 20 * np.array([1, -1, -1, 1, 1, -1, -1, 1, 1, -1, -1, 1]))
+    sounds = [gain * ring(0.3, before=0.05, seed=1, noise=1e-5) for gain in forces**0.2 * scatter / 10]
+    assert found(folder_of(tmp_path, sounds, forces)) == {}
 
 
 def hammer(newtons: float, *, pushes: int = 1) -> np.ndarray:

@@ -29,7 +29,7 @@ def pre_triggered(*leads: int) -> dict[str, np.ndarray]:
     }
 
 
-def reversed_mode(samples: int) -> np.ndarray:
+def three_responses(samples: int) -> np.ndarray:
     """Return a response that starts with a sine, one that starts with a cosine, and a node's, that grows slowly."""
     time = np.arange(samples) / RATE
     decay = np.exp(-15 * time)
@@ -145,7 +145,7 @@ def test_measured_recordings_with_something_before_the_impact_are_cut(
 
 
 def test_a_displacement_s_and_a_velocity_s_response_start_with_the_impact(tmp_path: Path) -> None:
-    sounds = reversed_mode(4000)
+    sounds = three_responses(4000)
     folder = fill(tmp_path, replace=dict(zip(NAMES, sounds, strict=True)))
     impacts = read_capture(folder).impacts
     assert np.array_equal(impacts.sounds.numpy(), sounds.astype(np.float32))
@@ -155,7 +155,16 @@ def test_a_displacement_s_and_a_velocity_s_response_start_with_the_impact(tmp_pa
     assert [each.onset for each in alone][2] > 0
 
 
-@pytest.mark.parametrize("leads", [(6, 6, 6), (3, 9, 5), (0, 0, 20)])
+def test_a_single_recording_with_a_lead_leaves_all_to_be_cut(tmp_path: Path) -> None:
+    sounds = three_responses(4000)
+    sounds[0] = np.roll(sounds[0], 20)
+    sounds[0, :20] = 0.0
+    report = check(fill(tmp_path, replace=dict(zip(NAMES, sounds, strict=True))))
+    assert report.remarks == ()
+    assert report.recordings[0].onset_seconds == pytest.approx(20 / RATE, abs=2 / RATE)
+
+
+@pytest.mark.parametrize("leads", [(6, 6, 6), (3, 9, 5), (0, 0, 100)])
 def test_with_anything_before_the_impact_each_onset_is_found(tmp_path: Path, leads: tuple[int, ...]) -> None:
     folder = fill(tmp_path, replace=pre_triggered(*leads))
     report = check(folder)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Complex128, Float64
-from scipy.special import stdtr
+from scipy.special import stdtrit
 
 from avmsf._utils.text_files import read_toml
 from avmsf.capture.audio import Recording, read_recording
@@ -227,7 +227,7 @@ class Evidence:
             return None
         slope = float(force @ level) / spread
         error = float(np.sqrt(np.square(level - slope * force).sum() / freedom / spread))
-        if slope >= 0.5 or (error > 0.0 and float(stdtr(freedom, (slope - 0.5) / error)) > SIGNIFICANCE):
+        if slope - error * float(stdtrit(freedom, SIGNIFICANCE)) >= 0.5:
             return None
         return Proposal(
             "normalise",
@@ -316,14 +316,10 @@ def _above_noise(channel: Float64[np.ndarray, " frames"], rate: float) -> float:
 def _low_powers(
     lead: Float64[np.ndarray, " lead"], later: Float64[np.ndarray, " samples"], rate: float
 ) -> Float64[np.ndarray, "kinds candidates"]:
-    """Return mean squares for each candidate: of all before the impact, of that below the candidate, and after it.
-
-    The lead is windowed, so that a constant offset stays at low frequencies. The response is not, for its beginning
-    counts.
-    """
+    """Return mean squares for each candidate: of all before the impact, of that below the candidate, and after it."""
     rows = []
-    for signal, window in ((lead, np.hanning(len(lead))), (later, np.ones(len(later)))):
-        power = np.abs(np.fft.rfft(signal * window)) ** 2 / (len(signal) * np.square(window).sum())
+    for signal in (lead, later):
+        power = np.abs(np.fft.rfft(signal) / len(signal)) ** 2
         power[1:] *= 2.0
         frequencies = np.fft.rfftfreq(len(signal), 1.0 / rate)
         rows.append([power.sum(), *(power[frequencies < cutoff].sum() for cutoff in CANDIDATES_HZ)])
