@@ -14,6 +14,7 @@ from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.datasets.blows import Blow, gather
 from avmsf.capture.prepare import margin_length, prepare
 from avmsf.capture.starts import start_with_impact
+from avmsf.simulate.plate import Plate, sample_contacts, strike
 from capture_folder import RATE, fill, ring
 
 MARGIN = 160
@@ -162,6 +163,25 @@ def test_a_single_recording_with_a_lead_leaves_all_to_be_cut(tmp_path: Path) -> 
     report = check(fill(tmp_path, replace=dict(zip(NAMES, sounds, strict=True))))
     assert report.remarks == ()
     assert report.recordings[0].onset_seconds == pytest.approx(20 / RATE, abs=2 / RATE)
+
+
+@pytest.mark.parametrize("rate", [8000.0, 96_000.0])
+@pytest.mark.parametrize("contact_time", [0.0, 5e-4])
+@pytest.mark.parametrize("lead", [0, 6, 100])
+def test_a_plate_s_responses_start_with_the_impact_at_any_rate(rate: float, contact_time: float, lead: int) -> None:
+    plate, generator = Plate(alpha=40.0), torch.Generator().manual_seed(0)
+    contacts = sample_contacts(plate, 12, generator=generator)
+    sounds = strike(
+        plate, contacts, sample_rate=rate, seconds=0.3, generator=generator, noise_db=-40.0, highest=2500.0,
+        contact_time=contact_time,
+    ).sounds.double().numpy()  # fmt: skip
+    # Before the impact there is noise 40 dB down as well.
+    noise = (
+        1e-2 * np.sqrt(np.mean(sounds**2)) * np.random.default_rng(0).standard_normal((12, round(lead * rate / 8e3)))
+    )
+    files = [Recording("plate", each[None], rate, "FLOAT") for each in np.concatenate([noise, sounds], axis=1)]
+    prepared = [prepare(each, CaptureSettings()) for each in files]
+    assert start_with_impact(prepared, rate=rate) == (lead == 0)
 
 
 @pytest.mark.parametrize("leads", [(6, 6, 6), (3, 9, 5), (0, 0, 100)])

@@ -13,9 +13,12 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.together import common_length
 
 START_LEVEL = 10**-2.0
-"""Share of the largest mean square in the first 20 ms that a response must have in its first two samples: -20 dB, the
+"""Share of the largest mean square in the first 20 ms that a response must have at its start: -20 dB, the
 level (a tenth of the peak) from which `find_onset` counts a swing as the impact's. Impulse responses reach 0 to -3 dB
 (aircraft, ruler, tree), recordings with 4 samples to 1 s before the impact -25 to -47 dB."""
+MAX_START_SECONDS = 0.001
+"""By when `find_onset` must see every recording that starts with the impact. Where modes cancel at first it takes up to
+.3 ms (a plate of 43 modes at 96 kHz) and 5 samples (the aircraft at 400 Hz); delays of 1 ms are found on alignment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,18 +37,24 @@ def start_with_impact(recordings: Sequence[Prepared], *, rate: float) -> bool:
 
     A single recording does not show this: the first samples of an impulse response are small where its modes happen to
     cancel, and the first is zero where it is a displacement. Over all recordings modes cancel nowhere, so the mean
-    square of sounds of equal energy is as large at the first or the second sample as it is later. With anything before
-    the impact it is that of noise. Every single onset has to lie within `MIN_MARGIN` samples as well, by which
-    recordings are aligned later.
+    square of sounds of equal energy is within a sixteenth of a period (and the first two samples) nearly as large as
+    later: a sine reaches -8 dB by then. With anything before the impact it is that of noise. The period is that of the
+    root mean square frequency. Every single onset has to come within `MAX_START_SECONDS` or `MIN_MARGIN` samples as
+    well.
     """
-    if any(each.onset >= MIN_MARGIN or len(each.before) < each.onset for each in recordings):
+    latest = max(MIN_MARGIN, round(MAX_START_SECONDS * rate))
+    if any(each.onset >= latest or len(each.before) < each.onset for each in recordings):
         return False
     size = min(margin_length(rate), *(len(each.before) + len(each.sound) for each in recordings))
     starts = np.stack([np.concatenate([each.before, each.sound[:size]])[:size] for each in recordings])
-    power = starts.astype(np.float64) ** 2
-    energies = power.sum(axis=1, keepdims=True)
-    mean = (power / np.where(energies > 0, energies, 1.0)).mean(axis=0)
-    return bool(mean[:2].max() >= START_LEVEL * mean.max())
+    starts = starts.astype(np.float64)
+    power = starts**2
+    energies = np.maximum(power.sum(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    mean = (power / energies).mean(axis=0)
+    # The squared difference of a sine's samples is its square times (angle between them)^2, on average.
+    angle = np.sqrt((np.diff(starts, axis=1) ** 2 / energies).mean() / mean.mean())
+    first = max(2, 1 + round(2 * np.pi / 16 / max(float(angle), 1.0 / size)))
+    return bool(mean[:first].max() >= START_LEVEL * mean.max())
 
 
 def settle_starts(recordings: Sequence[Prepared], *, rate: float, settings: CaptureSettings) -> list[Prepared]:
