@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
@@ -15,9 +14,9 @@ from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.prepare import prepare
 from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.starts import cut_together, shorten
 from avmsf.capture.surface import Surface
 from avmsf.capture.texturedmesh import TexturedMesh
-from avmsf.capture.together import common_length
 from avmsf.simulate.bodies import Body, make_body, up_of
 from avmsf.simulate.imperfections import damping_matrix, recording_starts, stream
 from avmsf.simulate.radiation import radiated, travel_time
@@ -142,18 +141,20 @@ def _captured(
         normalise="done",
         align=bool((truth.starts != 0.0).any()),
     )
-    sounds = []
+    prepared = []
     for file, force, sound in zip(truth.names, forces.tolist(), recordings, strict=True):
         recording = Recording(file, sound.double().numpy()[None], rate, "FLOAT")
-        sounds.append(prepare(recording, settings, newtons=force).sound.astype(np.float32))
-    length, _ = common_length([len(sound) for sound in sounds], truth.names, rate=rate, settings=settings)
+        prepared.append(shorten(prepare(recording, settings, newtons=force), rate=rate, settings=settings))
+    cut = cut_together(prepared, truth.names, rate=rate, settings=settings)
     impacts = Impacts(
         contacts=strikes.written_places,
-        sounds=torch.from_numpy(np.stack([sound[:length] for sound in sounds])),
+        sounds=cut.sounds,
         sample_rate=rate,
         names=truth.names,
         directions=strikes.written_directions.float(),
         forces=forces,
+        before=cut.before,
+        after=cut.after,
     )
     return Capture(name, impacts, surface, settings)
 
