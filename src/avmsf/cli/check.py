@@ -1,21 +1,27 @@
 """`avmsf check`: what each recording of a capture is worth, and what is wrong."""
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import tyro
 from rich.console import Console
 
-from avmsf.capture import CaptureReport, CaptureSettings, check
+from avmsf.capture import CaptureReport, CaptureSettings, CaptureWarning, Impacts, check, read_capture
 from avmsf.capture.folder import SETTINGS
 from avmsf.capture.measure import shared_problems
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
+from avmsf.cli.alignment import alignment_sentences, alignment_values
 from avmsf.cli.printing import console, decimals, print_json, say, table
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, ExtractionError
+from avmsf.modal.extraction.extract import Extraction, extract
+from avmsf.modal.extraction.finders import HighResolution
 from avmsf.wording import counted
 
 UNREADABLE = 2
+_STRONGEST = 32
+"""Modes that recordings of inverted polarity are looked for by."""
 MAX_PRINTED = 1000
 """Rows, and sentences below them, of the printed report: what a terminal's scrollback holds."""
 
@@ -24,8 +30,8 @@ MAX_PRINTED = 1000
 class Options:
     """Say what each recording of a capture is worth, and what is wrong.
 
-    One row a recording, problems below. The exit code is 0 where the capture can be read, with or without warnings,
-    and 2 where it cannot.
+    One row a recording, problems below. The delay, in samples, is what aligns a recording with the others. The exit
+    code is 0 where the capture can be read, with or without warnings, and 2 where it cannot.
     """
 
     capture: tyro.conf.Positional[Path]
@@ -52,8 +58,10 @@ def run(options: Options) -> int:
     if proposals and options.write_settings:
         _write(options, proposals, screen)
     report = check(options.capture, settings)
+    modes = _modes(options.capture, settings) if report.readable else None
+    aligned = None if modes is None else alignment_values(*modes)
     if report.recordings:
-        screen.print(_table(report, str(options.capture)))
+        screen.print(_table(report, str(options.capture), {} if aligned is None else aligned["delays"]))
     problems = problems_of(report)
     for problem in problems[:MAX_PRINTED]:
         screen.print(problem, soft_wrap=True)
@@ -65,15 +73,30 @@ def run(options: Options) -> int:
         for each in proposals:
             screen.print(f"proposed: {each.line} (--write-settings writes it). {each.reason}", soft_wrap=True)
     if options.json:
-        print_json({**asdict(report), "proposals": [asdict(each) for each in proposals]})
+        print_json({**asdict(report), "proposals": [asdict(each) for each in proposals], "alignment": aligned})
     if not report.readable:
         say(f"avmsf check: {options.capture} cannot be read as it is: mend what is listed and check again")
         return UNREADABLE
     for remark in report.remarks:
         screen.print(remark, soft_wrap=True)
+    if modes is not None and modes[0].alignment is not None and aligned is not None:
+        for sentence in alignment_sentences(modes[0].alignment, aligned["inverted"]):
+            screen.print(sentence, soft_wrap=True)
     wrong = len(problems)
     screen.print("no problem found" if not wrong else f"readable, with {counted(wrong, 'warning')}", soft_wrap=True)
     return 0
+
+
+def _modes(folder: Path, settings: CaptureSettings | None) -> tuple[Extraction, Impacts] | None:
+    """Return the strongest modes and the recordings they are of; None where there is none to align by."""
+    with warnings.catch_warnings():
+        # The report says the same.
+        warnings.simplefilter("ignore", CaptureWarning)
+        impacts = read_capture(folder, settings).impacts
+    try:
+        return extract(impacts, HighResolution(modes=_STRONGEST)), impacts
+    except ExtractionError:
+        return None
 
 
 def _write(options: Options, proposals: Sequence[Proposal], screen: Console) -> None:
@@ -96,8 +119,8 @@ def problems_of(report: CaptureReport) -> list[str]:
     return [*report.problems, *shared_problems(report.recordings)]
 
 
-def _table(report: CaptureReport, title: str) -> object:
-    columns = ("recording", "state", "length s", "rate Hz", "peak dB", "noise dB", "clipped", "onset s", "2nd blow s")
+def _table(report: CaptureReport, title: str, delays: Mapping[str, float]) -> object:
+    columns = ["recording", "state", "length s", "rate Hz", "peak dB", "noise dB", "clipped", "onset s", "2nd blow s"]
     rows = [
         (
             row.file,
@@ -109,7 +132,8 @@ def _table(report: CaptureReport, title: str) -> object:
             decimals(row.clipped, 0),
             decimals(row.onset_seconds, 4),
             decimals(row.double_hit_seconds, 3),
+            *([decimals(delays.get(row.file), 2)] if delays else []),
         )
         for row in report.recordings[:MAX_PRINTED]
     ]
-    return table(title, columns, rows, words=2)
+    return table(title, [*columns, "delay"] if delays else columns, rows, words=2)
