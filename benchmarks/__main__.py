@@ -1,5 +1,4 @@
-"""`python -m benchmarks field`, `extract`, `speed`, `scene`, `proof`, `settings`, `suggest`, `physics`, `residual`,
-`tasks`, `studio` or `robustness`."""
+"""`python -m benchmarks NAME`: the measurements behind the figures in the documentation."""
 
 import argparse
 import sys
@@ -11,6 +10,7 @@ from types import ModuleType
 from avmsf.capture import CaptureWarning
 from avmsf.errors import AvmsfError
 from benchmarks import (
+    align,
     extract,
     field,
     physics,
@@ -28,6 +28,7 @@ from benchmarks.material import MissingDataError
 from benchmarks.report import Options, show
 
 BENCHMARKS: dict[str, ModuleType] = {
+    "align": align,
     "field": field,
     "extract": extract,
     "speed": speed,

@@ -51,6 +51,8 @@ _FIRST_JITTER = 2.0
 _REACH_SECONDS = 0.02
 _REACH_SAMPLES = 16.0
 """Longest delay that is searched, whichever is longer: as far as a capture's reader keeps what lies before an onset."""
+_CLOSE = 1.0
+"""Longest delay of the last search, samples."""
 _RELATIVE = 0.05
 """Error across the phase of any amplitude, over the amplitude: frequencies and dampings are never exact."""
 _STRAY = 0.2
@@ -131,15 +133,19 @@ def align(impacts: Impacts) -> Alignment | None:
     before = coherence(measured.amplitude, bank.damping)
     delays, agrees, phases = _estimate(measured)
     if bool((delays != 0).any()):
-        # Once more, from sounds that start where the first estimate says.
+        # Once more, from sounds that start where the first estimate says; then closely, with the spreads found.
         measured = _Amplitudes.of(impacts.delayed(delays), bank)
         further, agrees, phases = _estimate(measured, earlier=delays)
+        delays = torch.where(agrees, delays + further, 0.0)
+        measured = _Amplitudes.of(impacts.delayed(delays), bank, reach=_CLOSE)
+        further, agrees, phases = _estimate(measured, earlier=delays, agreeing=agrees)
         delays = torch.where(agrees, delays + further, 0.0)
         # The phases are those at the recordings' common start, which moves with the offset.
         offset = _offset(delays, agrees, impacts)
         delays = torch.where(agrees, delays + offset, max(0.0, offset))
         phases = replace(phases, doubled=phases.doubled * torch.exp(1j * offset * measured.turn))
         measured = _Amplitudes.of(impacts.delayed(delays), bank)
+
     after = coherence(measured.amplitude, bank.damping)
     return Alignment(impacts.names, delays, agrees, before, after, phases)
 
@@ -207,7 +213,8 @@ class _Amplitudes:
     """Delays that are searched, samples."""
 
     @classmethod
-    def of(cls, impacts: Impacts, bank: ModalBank) -> "_Amplitudes":
+    def of(cls, impacts: Impacts, bank: ModalBank, *, reach: float = math.inf) -> "_Amplitudes":
+        """Return the amplitudes, to be aligned by delays of at most `reach` samples."""
         rate, samples = impacts.sample_rate, impacts.sounds.shape[1]
         gains, quadrature = fit_gains(impacts.sounds.double(), bank, sample_rate=rate)
         amplitude = torch.complex(quadrature, -gains)
@@ -216,7 +223,7 @@ class _Amplitudes:
         energy = rate * -torch.expm1(-2 * bank.damping * samples / rate) / (4 * bank.damping)
         scale = (amplitude.abs().square() / bank.damping).sum(1, keepdim=True).sqrt()
         scale = scale.clamp_min(torch.finfo(torch.float32).tiny)
-        reach = max(_REACH_SAMPLES, _REACH_SECONDS * rate)
+        reach = min(reach, max(_REACH_SAMPLES, _REACH_SECONDS * rate))
         step = min(0.5, rate / (2 * _GRID_PER_PERIOD * float(bank.frequency.max())))
         steps = math.ceil(reach / step)
         grid = step * torch.arange(-steps, steps + 1, dtype=torch.float64)
@@ -247,16 +254,19 @@ class _Amplitudes:
         return torch.exp(1j * (2 * self.scaled.angle() + self.turn * delays[:, None]))
 
     def spread(
-        self, weights: Float64[Tensor, "contacts modes"], delays: Float64[Tensor, " contacts"]
+        self, weights: Float64[Tensor, "contacts modes"], delays: Float64[Tensor, " contacts"], *, vague: float
     ) -> Float64[Tensor, " modes"]:
-        """Return the spread of each mode's amplitudes about its mean phase, by the median over recordings."""
+        """Return the spread of each mode's amplitudes about its mean phase, by the median over recordings.
+
+        Beside `vague` recordings that have the usual one.
+        """
         turned = self.doubled(delays)
         mean = (weights * turned).sum(0)
         across = self.scaled.abs().square() * (1 - (turned * torch.exp(-1j * mean.angle())).real) / 2
         size = torch.sqrt(self.scaled.abs().square() * self.power).clamp_min(torch.finfo(torch.float64).tiny)
         found = (across / size).median(0).values / _MEDIAN_OF_SQUARE
         count = len(self.scaled)
-        return (count * found + _VAGUE * _USUAL_SPREAD) / (count + _VAGUE)
+        return (count * found + vague * _USUAL_SPREAD) / (count + vague)
 
     def log_likelihood(
         self,
@@ -355,12 +365,16 @@ class _Fit:
 
 
 def _estimate(
-    measured: _Amplitudes, *, earlier: Float64[Tensor, " contacts"] | None = None
+    measured: _Amplitudes,
+    *,
+    earlier: Float64[Tensor, " contacts"] | None = None,
+    agreeing: Bool[Tensor, " contacts"] | None = None,
 ) -> tuple[Float64[Tensor, " contacts"], Bool[Tensor, " contacts"], Phases]:
     """Return the delays, which recordings agree, and the phases at the delayed starts.
 
     `earlier` are the delays that the sounds have been moved by already: the prior is of the sum. Without them, all
-    delays are zero where the recordings are likelier to be aligned as they are.
+    delays are zero where the recordings are likelier to be aligned as they are. With `agreeing`, which recordings agree
+    is known, and the modes' spreads are those found, however few the recordings.
     """
     none = torch.zeros(len(measured.scaled), dtype=torch.float64)
     if earlier is None:
@@ -371,16 +385,16 @@ def _estimate(
         fits += [_climb(measured, prior), _at(measured, none)]
         fit = max(fits, key=lambda each: each.log_posterior)
     else:
-        fit = _climb(measured, _Prior(-earlier, _FIRST_JITTER))
+        fit = _climb(measured, _Prior(-earlier, _FIRST_JITTER), vague=_VAGUE if agreeing is None else 0.0)
     turned = fit.weights * measured.doubled(fit.delays)
     _, odds = measured.search(fit.weights, turned.sum(0) - turned, fit.prior)
     # A capture without common phases may have single recordings that agree by chance.
-    agrees = (odds > 0) & (odds.sum() > 0)
+    agrees = (odds > 0) & (odds.sum() > 0) if agreeing is None else agreeing
     phases = Phases(measured.bank, turned[agrees].sum(0), measured.power, fit.spread, fit.prior.scale)
     return torch.where(agrees, fit.delays, 0.0), agrees, phases
 
 
-def _climb(measured: _Amplitudes, prior: _Prior, *, reference: int | None = None) -> _Fit:
+def _climb(measured: _Amplitudes, prior: _Prior, *, reference: int | None = None, vague: float = _VAGUE) -> _Fit:
     """Return the delays of a highest posterior, climbed from all recordings aligned with one, or as they are."""
     power, spread = measured.power, torch.full_like(measured.power, _FIRST_SPREAD)
     weights = measured.concentration(power, spread)
@@ -394,7 +408,7 @@ def _climb(measured: _Amplitudes, prior: _Prior, *, reference: int | None = None
         if reference is not None:
             found = found - found.median()
         moved = float((found - delays).abs().max())
-        delays, spread = found, measured.spread(weights, found)
+        delays, spread = found, measured.spread(weights, found, vague=vague)
         weights = measured.concentration(power, spread)
         if turn >= _SETTLING:
             scale = float((delays - prior.middle).abs().median())
@@ -412,7 +426,7 @@ def _at(measured: _Amplitudes, delays: Float64[Tensor, " contacts"]) -> _Fit:
     """Return the fit of delays that are known."""
     weights = measured.concentration(measured.power, torch.full_like(measured.power, _FIRST_SPREAD))
     for _ in range(_SETTLING):
-        spread = measured.spread(weights, delays)
+        spread = measured.spread(weights, delays, vague=_VAGUE)
         weights = measured.concentration(measured.power, spread)
     total = (weights * measured.doubled(delays)).sum(0)
     prior = _Prior(delays, _LEAST_JITTER)
