@@ -121,7 +121,9 @@ def _coverage(options: Options) -> Report:
         with tempfile.TemporaryDirectory() as cache:
             recipe = physics_of(made.capture.surface, config, cache=Path(cache))
             steps = FitConfig(steps=2) if options.quick_look else FitConfig()
-            field = fit(train, surface_features(made.capture), extract(train), steps, gains=recipe)
+            modes = extract(train)
+            field = fit(train, surface_features(made.capture), modes, steps, gains=recipe)
+            test = modes.aligned(test)
         held = coverage(field, test.contacts, measured_parts(test, field), directions=test.directions, level=0.9)
         rows.append([name, held.plain, held.by_energy, evaluate(field, test).mean()["relative_stft"]])
         tell(f"physics.coverage: {name}: {held.plain:.3f}, by energy {held.by_energy:.3f}, error {rows[-1][3]:.3f}")

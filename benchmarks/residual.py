@@ -73,10 +73,11 @@ def measure(options: Options) -> Report:
 def _judged(case: _Case, rate: float, options: Options) -> tuple[float, float, float]:
     """Return the tail's level in dB, the relative STFT error and L1-log of one fit."""
     config = replace(QUICK_LOOK if options.quick_look else FitConfig(damping="shared"), noise_rate=rate)
-    field = fit(case.train, case.features, extract(case.train), config, gains=case.recipe)
-    sounds = field.render(case.test.contacts, directions=case.test.directions)
-    levels = [_tail_power(each, case.test.sample_rate) for each in (sounds, case.test.sounds)]
-    means = score(sounds, case.test).mean()
+    modes = extract(case.train)
+    field, test = fit(case.train, case.features, modes, config, gains=case.recipe), modes.aligned(case.test)
+    sounds = field.render(test.contacts, directions=test.directions)
+    levels = [_tail_power(each, test.sample_rate) for each in (sounds, test.sounds)]
+    means = score(sounds, test).mean()
     return float((10 * torch.log10(levels[0] / levels[1])).median()), means["relative_stft"], means["l1_log"]
 
 

@@ -13,6 +13,7 @@ from avmsf.field.fit import fit
 from avmsf.field.physics import Physics
 from avmsf.field.soundfield import SoundField
 from avmsf.field.suggest import suggest
+from avmsf.modal.extraction.alignment import align
 from avmsf.modal.extraction.extract import extract
 from avmsf.pipeline.physics import BodyConfig, physics_of
 from avmsf.scene.features import FeatureField
@@ -72,6 +73,9 @@ def _compare(key: str, captures: dict[str, Capture], wall: float | None, options
         judging = judging[: len(judging) // JUDGING].sort().values
         test = capture.impacts.take(judging.tolist())
         pool = capture.impacts.take(sorted(set(range(len(capture.impacts))) - set(judging.tolist())))
+        alignment = None if pool.before is None else align(pool)
+        if alignment is not None:
+            pool, test = alignment.apply(pool), alignment.apply(test)
         with tempfile.TemporaryDirectory() as cache:
             recipe = physics_of(capture.surface, BodyConfig(wall=wall), cache=Path(cache))
             for number in range(1 if options.quick_look else STARTS):

@@ -105,14 +105,15 @@ class Alignment:
         """Return recordings cut anew at the common start: known ones by their delays, others by their phases.
 
         A recording that was not among those aligned is aligned alone, its phases with theirs; where they do not agree
-        it keeps its own start. Recordings that are final already are returned as they are.
+        it keeps its own start, as all do where those aligned have kept theirs. Recordings that are final already are
+        returned as they are.
         """
         if impacts.before is None:
             return impacts
         known = dict(zip(self.names, self.delays.tolist(), strict=True))
         delays = torch.tensor([known.get(name, 0.0) for name in impacts.names], dtype=torch.float64)
         others = torch.tensor([row for row, name in enumerate(impacts.names) if name not in known], dtype=torch.long)
-        if len(others) and bool(self.agrees.any()):
+        if len(others) and bool((self.delays != 0).any()):
             new = impacts.take(others.tolist())
             delays[others] = _delays_alone(new, self.phases)
             # Once more, from sounds that start where the first estimate says.
