@@ -93,13 +93,13 @@ class HighResolution:
         significance = self.significance * chance_ratio(len(sounds), trials=samples)
 
         def weigh(bank: ModalBank) -> Candidates:
-            return Candidates.of(sounds, bank, _beneath(noise, bank, sample_rate), sample_rate=sample_rate)
+            return Candidates.of(sounds, bank, noise_at(noise, bank, sample_rate), sample_rate=sample_rate)
 
         def need(bank: ModalBank, range_db: float) -> ModalBank:
             return prune(
                 sounds,
                 bank,
-                _beneath(noise, bank, sample_rate),
+                noise_at(noise, bank, sample_rate),
                 sample_rate=sample_rate,
                 significance=significance,
                 range_db=range_db,
@@ -181,7 +181,7 @@ def _level(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, " contact
     return (sounds - sounds.mean(1, keepdim=True)).square().mean(1).sqrt()
 
 
-def _beneath(
+def noise_at(
     noise: Float[Tensor, "contacts bins"], bank: ModalBank, sample_rate: float
 ) -> Float64[Tensor, "contacts modes"]:
     """Return the noise's power at each mode: the most of the three bins there, for its spectrum may be steep."""
