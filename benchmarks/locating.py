@@ -25,8 +25,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.physics import Physics
 from avmsf.field.recipes import Attention, GainRecipe
-from avmsf.modal.bank import Extraction
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import Extraction, extract
 from avmsf.modal.residual import Residual
 from avmsf.pipeline.physics import BodyConfig, physics_of
 from avmsf.scene.features import FeatureField

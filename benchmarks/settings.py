@@ -12,8 +12,7 @@ from avmsf.capture import Impacts
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.recipes import Attention
-from avmsf.modal.bank import Extraction
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import Extraction, extract
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate
 from benchmarks.material import PlateCase, capture_in_place, surface_features

@@ -16,8 +16,7 @@ from avmsf.field.fit import Progress, fit
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.training import Targets, TrainingRun
-from avmsf.modal.bank import Extraction
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import Extraction, extract
 from avmsf.scene.features import FeatureField
 from benchmarks.material import IMPULSE, STRUCK
 from benchmarks.report import Options, Report, Table, tell

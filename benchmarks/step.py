@@ -21,7 +21,8 @@ from avmsf.field.attention import AttentionGains
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.losses import SpectralTarget
 from avmsf.field.training import Targets, TrainingRun, gain_scale
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.residual import Residual, shape_noise
 from avmsf.modal.synthesis import synthesise

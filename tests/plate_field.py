@@ -6,7 +6,8 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import Residual
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike

@@ -15,7 +15,8 @@ from avmsf.field.recipes import SHARED, Attention, GainCase, GainRecipe, ThinPla
 from avmsf.field.refinement import RefinedGains
 from avmsf.field.thinplategains import ThinPlateGains
 from avmsf.field.training import TrainableGains
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise, synthesise_phased
 from avmsf.scene.features import FeatureField

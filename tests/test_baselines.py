@@ -17,7 +17,8 @@ from avmsf.bench.metrics import relative_stft_error
 from avmsf.bench.renderer import Renderer
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise

@@ -14,7 +14,8 @@ from avmsf.bench.spectralmean import MeanSpectra
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, FitError
 from avmsf.field.thinplate import SMOOTHINGS, fit_spline
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import Residual
 from avmsf.simulate.plate import Plate, plate_modes, sample_contacts
 

@@ -94,7 +94,7 @@ def test_a_mono_sound_saved_as_stereo_needs_no_role(tmp_path: Path) -> None:
 
 
 def test_eight_bits_are_read_with_a_warning(tmp_path: Path) -> None:
-    with pytest.warns(CaptureWarning, match=r"a\.wav: only 8 bits a sample .PCM_U8.*avmsf check"):
+    with pytest.warns(CaptureWarning, match="only 8 bits"):
         impacts = read_capture(fill(tmp_path, subtype="PCM_U8"))
     assert len(impacts.impacts) == 3
 

@@ -16,8 +16,6 @@ import avmsf
 from avmsf.capture import read_capture
 from avmsf.cli import VERBS, main
 from avmsf.field.store import load
-from avmsf.modal.extraction.extract import extract
-from avmsf.modal.extraction.finders import HighResolution
 from avmsf.simulate.plate import plate_modes
 from plate_capture import CONTACT_TIME, HIGHEST, PLATE, RATE, TINY, fill_plate
 

@@ -15,7 +15,8 @@ from avmsf.field.losses import spectral_loss
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.training import Targets, TrainingRun
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.synthesis import synthesise_phased
 from avmsf.scene.features import FeatureField

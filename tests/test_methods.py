@@ -24,7 +24,7 @@ from avmsf.field.physics import Physics
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uninformed import uninformed
-from avmsf.modal.bank import Extraction
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.synthesis import synthesise
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.elastic import elastic_modes

@@ -15,7 +15,8 @@ from avmsf.field.fit import fit, gain_case
 from avmsf.field.modalbasis import ModalBasis
 from avmsf.field.physics import Physics, gain_variance
 from avmsf.field.recipes import GainCase, ThinPlate
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise_phased

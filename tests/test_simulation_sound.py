@@ -340,6 +340,10 @@ def test_an_object_stands_on_three_low_places_around_its_middle():
         ({"stiffness": -0.1}, "stiffness = -0.1"),
         ({"support": math.inf}, "support = inf.*finite"),
         ({"thickness": math.nan}, "thickness = nan"),
+        ({"pretrigger": 11.0}, "pretrigger = 11: expected 0 to switch it off, or up to 10"),
+        ({"jitter": -0.001}, r"jitter = -0\.001"),
+        ({"propagation": 1.5}, r"propagation = 1\.5: expected 0 to switch it off, or up to 1"),
+        ({"contact_time": math.nan}, "contact_time = nan"),
     ],
 )
 def test_impossible_imperfections_are_refused(changes, words):

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from avmsf.field.soundfield import SoundField
     from avmsf.field.store import load, save
     from avmsf.field.suggest import suggest
-    from avmsf.modal.bank import Extraction, ModalBank
-    from avmsf.modal.extraction.extract import extract
+    from avmsf.modal.bank import ModalBank
+    from avmsf.modal.extraction.extract import Extraction, extract
     from avmsf.modal.extraction.finders import HighResolution, ShortTime
     from avmsf.modal.pulse import ForcePulse
     from avmsf.modal.residual import Residual
@@ -195,8 +195,8 @@ _HOMES = {
     "avmsf.field.soundfield": ("SoundField",),
     "avmsf.field.store": ("load", "save"),
     "avmsf.field.suggest": ("suggest",),
-    "avmsf.modal.bank": ("Extraction", "ModalBank"),
-    "avmsf.modal.extraction.extract": ("extract",),
+    "avmsf.modal.bank": ("ModalBank",),
+    "avmsf.modal.extraction.extract": ("Extraction", "extract"),
     "avmsf.modal.extraction.finders": ("HighResolution", "ShortTime"),
     "avmsf.modal.residual": ("Residual",),
     "avmsf.pipeline.physics": ("BodyConfig", "physics_of"),

@@ -19,10 +19,9 @@ from avmsf.bench.plan import Evaluation
 from avmsf.bench.results import CaseRecord, Outcome, one_line
 from avmsf.bench.task import Look, Method, Task
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import AvmsfError
+from avmsf.errors import AvmsfError, ExtractionError
 from avmsf.field.physics import Physics
-from avmsf.modal.bank import Extraction
-from avmsf.modal.extraction.extract import extract_once
+from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.truth import Truth
 
@@ -64,6 +63,7 @@ class CaseRun:
         """Return what a method comes to; whatever it raises, but for an interruption, is its failure."""
         begun, shared = time.perf_counter(), self.shared
         try:
+            self._align()
             renderer = method.fit(self._task())
             fit_seconds = time.perf_counter() - begun - (self.shared - shared)
             begun = time.perf_counter()
@@ -113,6 +113,17 @@ class CaseRun:
                 path = self.folder / "modes" / f"{self.place}.safetensors"
                 self.found = extract_once(self.train, self.evaluation.finder, path, lone=True)
             return self.found
+
+    def _align(self) -> None:
+        """Give all recordings the starts that the training ones have in common; without modes they keep their own."""
+        if self.train.before is None:
+            return
+        try:
+            modes = self._modes()
+        except ExtractionError:
+            self.train, self.test = (replace(each, before=None, after=None) for each in (self.train, self.test))
+        else:
+            self.train, self.test = modes.aligned(self.train), modes.aligned(self.test)
 
     def _features(self, look: Look) -> FeatureField:
         with self._sharing():

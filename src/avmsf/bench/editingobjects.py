@@ -25,8 +25,8 @@ from avmsf.field.fit import fit
 from avmsf.field.physics import Physics
 from avmsf.field.recipes import GainRecipe, ThinPlate
 from avmsf.field.soundfield import SoundField
-from avmsf.modal.bank import Extraction, ModalBank
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction, extract
 from avmsf.modal.residual import Residual
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import farthest_points

@@ -13,7 +13,7 @@ from avmsf.field.fit import fit
 from avmsf.field.recipes import Attention, GainRecipe, ThinPlate
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uninformed import uninformed
-from avmsf.modal.bank import Extraction
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.scene.features import FeatureField
 
 QUICK = FitConfig()

@@ -10,7 +10,7 @@ from avmsf.bench.task import Look, Task
 from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
 from avmsf.field.soundfield import SoundField
-from avmsf.modal.bank import Extraction
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.spectra import envelope
 from avmsf.scene.points import farthest_points
 

@@ -63,6 +63,7 @@ class Judging:
     ) -> Judgement:
         """Measure what `renderer` made of the test contacts; `truth`, where known, has the rows of `test`.
 
+        Its time counts from the first sample of the recordings, as the renderer's does (`truth_from_first_sample`).
         `loudest` is the peak of the object's loudest recording, in the unit of the recordings. Raises as `score`, and
         EvaluationError for sounds of another sample rate.
         """

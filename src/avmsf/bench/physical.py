@@ -6,6 +6,10 @@ modes and a method's are matched one to one by frequency alone (`match_modes`); 
 as silence in `gain_error` and as 0 in `mac`, so that no method gains by leaving modes out. Of one contact alone `mac`
 tells nothing: it is 1 for all modes found.
 
+Both count time from the same moment: the caller takes the truth to the first sample of the recordings that the method
+learned from (`bench.knowntruth.truth_from_first_sample`). A common delay by t would turn mode k by 2 pi f_k t, which is
+free, and scale it by exp(-d_k t), which is not.
+
 What nobody hears is free. A mode's phase, one for all contacts, is: the paper's fields have sines only. So is a
 contact's polarity, one sign for all its modes: fields turn the signs of blows from opposite sides to agree. Both are
 chosen so that `gain_error` is least.

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf.bench.caserun import CaseRun
 from avmsf.bench.cases import Case
-from avmsf.bench.knowntruth import truth_at, truth_of
+from avmsf.bench.knowntruth import truth_at, truth_from_first_sample, truth_of
 from avmsf.bench.otherobjects import draw_stranger
 from avmsf.bench.plan import Evaluation
 from avmsf.bench.results import CaseRecord, ObjectRecord, ResultsFolder, one_line
@@ -40,15 +40,15 @@ def run_object(
             facts = evaluation.dataset.facts(identifier)
             truth = truth_of(evaluation.dataset, identifier)
             cases = evaluation.protocol.choosing.cases(impacts)
+            digest = digest_of(impacts, truth)
             if truth is not None:
-                truth_at(truth, impacts.names)
+                truth = truth_from_first_sample(truth_at(truth, impacts.names), impacts)
         except AvmsfError as error:
             results.write(replace(record, failure=one_line(error)))
             return
         except (OSError, ValueError) as error:  # A damaged object must not cost the others their hours.
             results.write(replace(record, failure=f"{type(error).__name__}: {one_line(error)}"))
             return
-        digest = digest_of(impacts, truth)
         if record.digest != digest and all(each.failure is not None for each in record.outcomes):
             # Nothing is mixed where there are no figures yet.
             record = ObjectRecord(identifier)

@@ -10,7 +10,7 @@ from torch import Tensor
 from avmsf.bench.renderer import Renderer
 from avmsf.capture.impacts import Impacts
 from avmsf.field.physics import Physics
-from avmsf.modal.bank import Extraction
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.scene.features import FeatureField
 
 Look = Literal["positions", "visual", "unaligned"]

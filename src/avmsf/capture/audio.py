@@ -24,6 +24,10 @@ MIN_PEAK, MAX_PEAK = 1e-15, 1e15
 Between these the squares of `MAX_SAMPLES` samples and their sum are ordinary numbers in float32."""
 _MAX_NAMES_COMPARED = 1000
 """File names among which a misspelt one is sought: a tenth of a second."""
+MAX_CHANNEL_DIFFERENCE = 0.01
+"""Share of a channel, root mean square, that another channel times a constant may leave of it where both hold one
+sound: 40 dB down, less than the noise of a usable recording (`HIGHEST_NOISE_DB` in measure.py is 20)."""
+_BITS = {"PCM_S8": 8, "PCM_U8": 8, "PCM_16": 16, "PCM_24": 24, "PCM_32": 32}
 EIGHT_BIT = frozenset({"PCM_U8", "PCM_S8", "ULAW", "ALAW", "DPCM_8"})
 
 
@@ -59,25 +63,48 @@ class Recording:
             )
         return self.channels[number - 1]
 
-    def response(
-        self, number: int | None = None, *, force_channel: int | None = None
-    ) -> Float64[np.ndarray, " frames"]:
-        """Return the channel that holds the object's sound: the given one, or the only one it can be.
+    def response_channel(self, number: int | None = None, *, force_channel: int | None = None) -> int:
+        """Return the number of the channel that holds the object's sound: the given one, or the only one it can be.
 
-        Without a number that is a file's one channel, the one that is left beside the force, or the first where all
-        are the same to the bit (a mono sound saved as stereo). `CaptureError` where the choice is open.
+        Without a number that is a file's one channel, the one that is left beside the force, or the loudest where all
+        hold one sound up to a constant factor, rounding and dither. `CaptureError` where the choice is open.
         """
         if number is not None:
-            return self.channel(number)
-        left = [row for index, row in enumerate(self.channels) if index + 1 != force_channel]
+            return number
+        left = [index + 1 for index in range(len(self.channels)) if index + 1 != force_channel]
         if not left:
             raise CaptureError(f"{self.name}: its one channel is the force channel, so there is no sound beside it")
-        if any(not np.array_equal(row, left[0]) for row in left[1:]):
+        if len(left) == 1:
+            return left[0]
+        loudest = max(left, key=lambda each: float(np.std(self.channels[each - 1])))
+        if not all(self._agree(loudest, each) for each in left):
             raise CaptureError(
                 f"{self.name}: it holds {len(self.channels)} different channels and nothing says which one is the "
                 "sound: write response_channel = 1 (or another, counted from 1) in capture.toml, or save it as mono"
             )
-        return left[0]
+        return loudest
+
+    def response(
+        self, number: int | None = None, *, force_channel: int | None = None
+    ) -> Float64[np.ndarray, " frames"]:
+        """Return the channel that holds the object's sound (see `response_channel`)."""
+        return self.channel(self.response_channel(number, force_channel=force_channel))
+
+    def _agree(self, reference: int, other: int) -> bool:
+        """Return whether a channel is the reference times a constant, up to rounding, dither or 1 % of itself.
+
+        What is left of it then lies 40 dB down. Two microphones, or a sample's delay, leave far more.
+        """
+        first, second = (self.channels[number - 1] for number in (reference, other))
+        if np.array_equal(first, second):
+            return True
+        first, second = first - first.mean(), second - second.mean()
+        power = float(first @ first)
+        rest = second - (float(first @ second) / power if power else 0.0) * first
+        bits = _BITS.get(self.subtype)
+        # Rounding with dither has an rms of half a step in each of the two channels.
+        step = 0.0 if bits is None else 2.0 ** (1 - bits)
+        return float(np.std(rest)) <= max(MAX_CHANNEL_DIFFERENCE * float(np.std(second)), step)
 
 
 def read_recording(path: Path, name: str | None = None) -> Recording:

@@ -2,13 +2,14 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from avmsf.capture.folder import read_strike, settings_of
 from avmsf.capture.measure import RecordingReport
-from avmsf.capture.prepare import Prepared
+from avmsf.capture.prepare import Prepared, margin_length
 from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.starts import start_with_impact
 from avmsf.capture.surface import find_surface
 from avmsf.capture.table import TABLE, Row, Strike, read_rows, refuse_repeated_files, understand
 from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_levels, judge_surface, refuse_few
@@ -17,6 +18,7 @@ from avmsf.wording import counted
 
 MAX_SUGGESTIONS = 3
 """Missing files for which a similar name is sought: each search compares up to a thousand names."""
+UNCUT = "all recordings start with the impact, as impulse responses do, and are not cut"
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,21 @@ class CaptureReport:
     """One a row of impacts.csv, in its order."""
     problems: tuple[str, ...]
     """What is wrong with the folder, its table, its surface, or with the recordings side by side."""
+    remarks: tuple[str, ...] = ()
+    """What was found out about the recordings together and is no problem."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Sound:
+    """What the recordings are compared by."""
+
+    file: str
+    samples: int
+    """From the onset to the end."""
+    rate: float
+    peak: float
+    start: Prepared
+    """With no more than the first `margin_length` samples of the sound."""
 
 
 def check(folder: str | Path, settings: CaptureSettings | None = None) -> CaptureReport:
@@ -39,7 +56,7 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
         rows, problems = read_rows(folder)
     except CaptureError as error:
         return CaptureReport(False, (), (str(error),))
-    reports, strikes, sounds = list[RecordingReport](), list[Strike](), list[tuple[str, int, float, float]]()
+    reports, strikes, sounds = list[RecordingReport](), list[Strike](), list[_Sound]()
     missing = list[str]()
     for row in rows:
         strike, prepared, report = _check_row(folder, row, settings=settings, missing=missing)
@@ -47,10 +64,16 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
         if strike is not None:
             strikes.append(strike)
         if prepared is not None:
-            sounds.append((report.file, len(prepared.sound), report.sample_rate or 0.0, prepared.peak))
+            rate = report.sample_rate or 0.0
+            start = replace(prepared, sound=prepared.sound[: margin_length(rate)].copy())
+            sounds.append(_Sound(report.file, len(prepared.sound), rate, prepared.peak, start))
     refused = _check_contacts(folder, strikes, rows, settings=settings, problems=problems)
     if len(missing) > MAX_SUGGESTIONS:
         refused.append(f"{TABLE}: there are no files for {len(missing)} of {len(rows)} rows")
+    uncut = _all_start_with_impact(sounds, settings=settings)
+    if uncut:
+        reports = [each if each.onset_seconds is None else replace(each, onset_seconds=0.0) for each in reports]
+        sounds = [replace(each, samples=each.samples + each.start.onset) for each in sounds]
     refused += _check_sounds(sounds, settings=settings, problems=problems)
     listed = {report.file for report in reports}
     stray = [name for name in _wav_files(folder) if name not in listed]
@@ -58,7 +81,7 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
         lack = f"{counted(len(stray), 'wav file')} {'has' if len(stray) == 1 else 'have'} no row in {TABLE}"
         problems.append(f"{lack}: {', '.join(stray[:5])}{', …' * (len(stray) > 5)}")
     readable = not refused and all(report.readable for report in reports)
-    return CaptureReport(readable, tuple(reports), tuple(refused + problems))
+    return CaptureReport(readable, tuple(reports), tuple(refused + problems), (UNCUT,) if uncut else ())
 
 
 def _wav_files(folder: Path) -> list[str]:
@@ -85,16 +108,22 @@ def _check_row(
     return strike, prepared, report
 
 
-def _check_sounds(
-    sounds: list[tuple[str, int, float, float]], *, settings: CaptureSettings, problems: list[str]
-) -> list[str]:
-    """Add to `problems` what looks wrong about all sounds together, and return what makes the folder unreadable.
+def _all_start_with_impact(sounds: list[_Sound], *, settings: CaptureSettings) -> bool:
+    """Return whether `read_capture` would not cut these recordings (`start_with_impact`)."""
+    if len(sounds) < 2 or len({each.rate for each in sounds}) > 1:
+        return False
+    if not settings.align or settings.force_channel is not None:
+        return False
+    return start_with_impact([each.start for each in sounds], rate=sounds[0].rate)
 
-    Of each sound: its file, samples, sample rate and peak.
-    """
+
+def _check_sounds(sounds: list[_Sound], *, settings: CaptureSettings, problems: list[str]) -> list[str]:
+    """Add to `problems` what looks wrong about all sounds together, and return what makes the folder unreadable."""
     if not sounds:
         return []
-    names, samples, rates, peaks = zip(*sounds, strict=True)
+    names, samples, rates, peaks = zip(
+        *((each.file, each.samples, each.rate, each.peak) for each in sounds), strict=True
+    )
     refused = []
     judges: tuple[Callable[[], list[str]], ...] = (
         lambda: common_length(samples, names, rate=common_rate(rates, names), settings=settings)[1],

@@ -9,15 +9,15 @@ import warnings
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-import numpy as np
 import soundfile
 import torch
 
 from avmsf.capture.audio import read_recording
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.measure import RecordingReport, measure
+from avmsf.capture.measure import RecordingReport, measure, shared_problems
 from avmsf.capture.prepare import Prepared, prepare
 from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.starts import cut_together, shorten
 from avmsf.capture.surface import Surface, find_surface, write_surface
 from avmsf.capture.table import (
     DIRECTION,
@@ -29,7 +29,7 @@ from avmsf.capture.table import (
     refuse_repeated_files,
     understand,
 )
-from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_levels, judge_surface, refuse_few
+from avmsf.capture.together import common_rate, judge_contacts, judge_levels, judge_surface, refuse_few
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
 
@@ -50,10 +50,12 @@ class Capture:
 def read_capture(folder: str | Path, settings: CaptureSettings | None = None) -> Capture:
     """Read a capture folder; `settings`, where given, take the place of the folder's `capture.toml`.
 
-    Every sound starts at its blow, is divided by its force where that is known, and has the length and the sample
-    rate of all others (see `CaptureSettings`); nothing is resampled. Rows keep the order of `impacts.csv`. Raises
-    `CaptureError` at the first thing that cannot be used, and warns with `CaptureWarning` of what can be used but
-    looks wrong; `check` lists everything.
+    Every sound starts at its impact, is divided by its force where that is known, and has the length and the sample
+    rate of all others (see `CaptureSettings`); nothing is resampled. With `align`, what the files hold on either side
+    of the sounds is kept for their alignment with one another (`Impacts.before`, `after`), and recordings that all
+    start with the impact are not cut (`start_with_impact`). Rows keep the order of `impacts.csv`. Raises `CaptureError`
+    at the first thing that cannot be used, and warns with `CaptureWarning` of what can be used but looks wrong; `check`
+    lists everything.
     """
     folder = Path(folder)
     settings = settings or settings_of(folder)
@@ -66,27 +68,29 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
     surface = find_surface(folder, settings)
     if surface is not None:
         remarks += judge_surface(strikes, surface, settings=settings)
-    sounds, forces, reports, peaks = [], [], [], []
+    recordings, reports, peaks = [], [], []
     for strike in strikes:
         prepared, report = read_strike(folder, strike, settings=settings)
-        sounds.append(prepared.sound.astype(np.float32))
-        forces.append(prepared.newtons)
+        recordings.append(shorten(prepared, rate=report.sample_rate or 0.0, settings=settings))
         peaks.append(prepared.peak)
         reports.append(report)
     names = [strike.file for strike in strikes]
     remarks += judge_levels(peaks, names)
     rate = common_rate([report.sample_rate or 0.0 for report in reports], names)
-    length, cut = common_length([len(sound) for sound in sounds], names, rate=rate, settings=settings)
-    for remark in remarks + cut + _summary(reports, folder):
+    cut = cut_together(recordings, names, rate=rate, settings=settings)
+    for remark in remarks + cut.remarks + _summary(reports, folder):
         warnings.warn(remark, CaptureWarning, stacklevel=2)
     directions = [strike.direction for strike in strikes]
+    forces = [each.newtons for each in recordings]
     impacts = Impacts(
         contacts=torch.tensor([strike.contact for strike in strikes], dtype=torch.float64),
-        sounds=torch.from_numpy(np.stack([sound[:length] for sound in sounds])),
+        sounds=cut.sounds,
         sample_rate=rate * settings.playback_speed,
         names=tuple(names),
         directions=None if None in directions else torch.tensor(directions, dtype=torch.float32),
         forces=None if None in forces else torch.tensor(forces, dtype=torch.float32),
+        before=cut.before,
+        after=cut.after,
     )
     return Capture(settings.name or folder.resolve().name, impacts, surface, settings)
 
@@ -104,12 +108,14 @@ def read_strike(folder: Path, strike: Strike, *, settings: CaptureSettings) -> t
     return prepared, measure(recording, prepared, settings=settings, line=strike.line)
 
 
-def write_capture(capture: Capture, folder: str | Path) -> None:
+def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float | None = None) -> None:
     """Write a folder that `read_capture` reads back to the same values, bit for bit.
 
     Sounds become float32 wav files under the recordings' names where these are wav paths inside a folder, else under
     numbers. Everything is written beside the folder first and then renamed into place, so that a folder of this name
-    is whole or absent. Raises `CaptureError` where the folder exists and is not empty, or cannot be written.
+    is whole or absent. With `onsets_within` the sounds are whole recordings that start before their impacts: reading
+    then finds the onsets, and keeps this many seconds from each on. Raises `CaptureError` where the folder exists and
+    is not empty, or cannot be written.
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -117,7 +123,7 @@ def write_capture(capture: Capture, folder: str | Path) -> None:
     begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
     try:
         begun.mkdir(parents=True)
-        _write_files(capture, begun)
+        _write_files(capture, begun, onsets_within=onsets_within)
         if folder.exists():
             folder.rmdir()
         os.rename(begun, folder)
@@ -127,7 +133,7 @@ def write_capture(capture: Capture, folder: str | Path) -> None:
         shutil.rmtree(begun, ignore_errors=True)
 
 
-def _write_files(capture: Capture, folder: Path) -> None:
+def _write_files(capture: Capture, folder: Path, *, onsets_within: float | None) -> None:
     impacts = capture.impacts
     names = _file_names(impacts.names)
     rate, speed = _whole_rate(impacts.sample_rate)
@@ -153,12 +159,13 @@ def _write_files(capture: Capture, folder: Path) -> None:
     name = "".join(
         f"\\u{ord(mark):04x}" if mark in '"\\' or ord(mark) in (*range(32), 127) else mark for mark in capture.name
     )
+    seconds = impacts.sounds.shape[1] / rate if onsets_within is None else onsets_within
     (folder / SETTINGS).write_text(
         f'name = "{name}"\n'
-        f"seconds = {impacts.sounds.shape[1] / rate!r}\n"
+        f"seconds = {seconds!r}\n"
         f"playback_speed = {speed!r}\n"
         f'normalise = "{"none" if impacts.forces is None else "done"}"\n'
-        "align = false\n",
+        + ("align = false\n" if onsets_within is None else ""),
         encoding="utf-8",
     )
 
@@ -201,7 +208,8 @@ def _summary(reports: list[RecordingReport], folder: Path) -> list[str]:
     wrong = [report for report in reports if report.problems]
     if not wrong:
         return []
-    shown = "; ".join(f"{report.file}: {', '.join(report.problems)}" for report in wrong[:5])
-    more = f"; and {len(wrong) - 5} more" if len(wrong) > 5 else ""
+    sentences = shared_problems(wrong)
+    shown = "; ".join(sentences[:5])
+    more = f"; and {len(sentences) - 5} more" if len(sentences) > 5 else ""
     look = "looks" if len(wrong) == 1 else "look"
     return [f"{len(wrong)} of {len(reports)} recordings {look} wrong: {shown}{more}. `avmsf check {folder}` shows all"]

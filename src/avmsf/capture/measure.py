@@ -1,5 +1,6 @@
 """What one recording is worth: its length, level, noise, clipping, onset and second blows."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,9 +51,10 @@ class RecordingReport:
 def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettings, line: int) -> RecordingReport:
     """Measure one recording that could be read and prepared, and say what about it looks wrong."""
     rate = recording.sample_rate
-    response = recording.response(settings.response_channel, force_channel=settings.force_channel)
+    channel = recording.response_channel(settings.response_channel, force_channel=settings.force_channel)
+    response = recording.channel(channel)
     peak = float(np.abs(response).max())
-    noise = _decibels(_noise(response, prepared.onset, rate) / peak)
+    noise = decibels(noise_level(response, prepared.onset, rate) / peak)
     clipped, second = clipped_samples(response), None
     if prepared.pulse is not None and settings.force_channel is not None:
         force = recording.channel(settings.force_channel)
@@ -61,6 +63,14 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
     else:
         second = find_second_blow(response, prepared.onset, sample_rate=rate, seconds=settings.seconds)
     problems = []
+    others = [each for each in range(1, len(recording.channels) + 1) if each not in (channel, settings.force_channel)]
+    if settings.response_channel is None and any(
+        not np.array_equal(recording.channel(each), response) for each in others
+    ):
+        problems.append(
+            "its channels hold one sound, up to a constant factor and rounding: the loudest is read, channel "
+            f"{channel}; to choose one, write response_channel in capture.toml"
+        )
     if clipped:
         problems.append(f"{counted(clipped, 'clipped sample')}: turn the gain down and record it again")
     if second is not None:
@@ -71,8 +81,8 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         )
     if recording.subtype in EIGHT_BIT:
         problems.append(f"only 8 bits a sample ({recording.subtype}): its noise hides the decay; record 16 or more")
-    elif recording.subtype.startswith("PCM") and _decibels(peak) < LOWEST_PEAK_DB:
-        problems.append(f"its peak is {-_decibels(peak):.0f} dB below full scale: turn the gain up")
+    elif recording.subtype.startswith("PCM") and decibels(peak) < LOWEST_PEAK_DB:
+        problems.append(f"its peak is {-decibels(peak):.0f} dB below full scale: turn the gain up")
     return RecordingReport(
         file=recording.name,
         line=line,
@@ -82,7 +92,7 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         sample_rate=rate,
         channels=len(recording.channels),
         coding=recording.subtype,
-        peak_db=_decibels(peak),
+        peak_db=decibels(peak),
         noise_db=noise,
         onset_seconds=prepared.onset / rate,
         clipped=clipped,
@@ -90,7 +100,26 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
     )
 
 
-def _noise(response: Float64[np.ndarray, " frames"], onset: int, rate: float) -> float:
+def shared_problems(reports: Sequence[RecordingReport]) -> list[str]:
+    """Return the recordings' problems, each with its file; what several have in common once, with the first names."""
+    places: dict[str, list[str]] = {}
+    for report in reports:
+        for problem in report.problems:
+            places.setdefault(problem.removeprefix(f"{report.file}: "), []).append(report.file)
+    sentences = []
+    for problem, files in places.items():
+        if len(files) > 1:
+            shown = f"{', '.join(files[:3])}{', …' * (len(files) > 3)}"
+            sentences.append(f"{len(files)} recordings ({shown}): {problem}")
+        elif problem.startswith((files[0], "impacts.csv")):
+            # Errors of the capture's reader name the file or the line by themselves.
+            sentences.append(problem)
+        else:
+            sentences.append(f"{files[0]}: {problem}")
+    return sentences
+
+
+def noise_level(response: Float64[np.ndarray, " frames"], onset: int, rate: float) -> float:
     """Return the noise's root mean square: of what lies before the blow, or of the quietest tenth of 10 ms blocks."""
     before = response[: max(0, onset - round(SECONDS_BEFORE * rate))]
     size = max(64, round(0.01 * rate))
@@ -101,6 +130,6 @@ def _noise(response: Float64[np.ndarray, " frames"], onset: int, rate: float) ->
     return float(np.quantile(np.std(blocks, axis=1), 0.1))
 
 
-def _decibels(ratio: float) -> float:
+def decibels(ratio: float) -> float:
     """Return the level of an amplitude ratio; silence is 200 dB down, so that it stays a number."""
     return float(20 * np.log10(max(ratio, 1e-10)))

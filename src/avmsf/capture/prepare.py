@@ -5,21 +5,27 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.signal
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from scipy.fft import irfft, next_fast_len, rfft
 
 from avmsf.capture.audio import Recording, refuse_peak, refuse_rate, refuse_silence
-from avmsf.capture.onset import Pulse, find_onset, find_pulse
+from avmsf.capture.onset import SECONDS_BEFORE, Pulse, find_onset, find_pulse
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError
+
+MIN_MARGIN = 16
+"""Samples: an onset found by a threshold in the sound is off by one to three samples on measured objects, and the
+filter that interpolates between samples needs some on either side."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """One recording from its onset on, to its end."""
 
-    sound: Float64[np.ndarray, " samples"]
+    sound: Float[np.ndarray, " samples"]
     """Per newton where `newtons` is known, else as recorded."""
+    before: Float[np.ndarray, " lead"]
+    """What the file holds just before `sound`, in the same unit: at most `margin_length` samples."""
     onset: int
     """Sample of the file at which the blow begins, whether or not it was moved to zero."""
     pulse: Pulse | None
@@ -63,14 +69,15 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
             f'{recording.name}: normalise = "peak" needs a force: give force_newtons in impacts.csv, or a force_channel'
         )
     if manner == "deconvolve" and pulse is not None:
-        kept = deconvolve(sound, force, pulse=pulse, regularisation=settings.regularisation)
+        before, kept = deconvolve(sound, force, pulse=pulse, regularisation=settings.regularisation)
     else:
-        kept = sound[onset if settings.align else 0 :]
+        before, kept = np.split(sound, [onset if settings.align else 0])
     refuse_short(kept, recording)
     if manner in ("peak", "deconvolve") and newtons is not None:
-        kept = kept / newtons
+        before, kept = before / newtons, kept / newtons
     refuse_peak(kept, recording.name)
-    return Prepared(kept, onset, pulse, None if manner == "none" else newtons)
+    before = before[max(0, len(before) - margin_length(recording.sample_rate)) :].copy()
+    return Prepared(kept, before, onset, pulse, None if manner == "none" else newtons)
 
 
 def remove_rumble(
@@ -105,6 +112,14 @@ def shortest_allowed(rate: float) -> int:
     return max(64, math.ceil(0.02 * rate))
 
 
+def margin_length(rate: float) -> int:
+    """Return how many samples of each file are kept on either side of a sound, for its alignment with the others.
+
+    20 ms as recorded, as far back as `find_onset` looks for the beginning, and at least 16 samples.
+    """
+    return max(MIN_MARGIN, math.ceil(SECONDS_BEFORE * rate))
+
+
 def refuse_short(kept: Float64[np.ndarray, " samples"], recording: Recording) -> None:
     """Raise `CaptureError` where less than `shortest_allowed` follows the onset."""
     least = shortest_allowed(recording.sample_rate)
@@ -130,8 +145,8 @@ def deconvolve(
     *,
     pulse: Pulse,
     regularisation: float,
-) -> Float64[np.ndarray, " samples"]:
-    """Return the response to a force of one sample's length and of the recorded pulse's height.
+) -> tuple[Float64[np.ndarray, " lead"], Float64[np.ndarray, " samples"]]:
+    """Return the response to a force of one sample's length and of the recorded pulse's height, before and from it on.
 
     With F and X the spectra of force and sound from just before the blow on, zero-padded so that nothing wraps
     round, and e the regularisation, the response has the spectrum
@@ -142,8 +157,9 @@ def deconvolve(
     X / F; where it had none H goes to zero instead of to noise. Of the force only the push counts (`isolate`): what its
     channel holds later is the drift of an amplifier and the object's ringing in the hammer, and dividing by that puts
     it into the response. Divided by the peak force in newtons, the result is in sound per newton for a push of one
-    sample, 1 / sample rate newton seconds; times the sample rate it is per newton second. It starts with the push, so
-    there is no onset to align.
+    sample, 1 / sample rate newton seconds; times the sample rate it is per newton second. It starts with the push.
+    What comes before it, from filters that ring ahead and from a force that is late in its channel, is at negative
+    times, at the end of the transform; no more of it is returned than the sound held before the push.
     """
     begin, isolated = isolate(force, pulse)
     later = sound[begin:]
@@ -152,7 +168,8 @@ def deconvolve(
     power = np.abs(push) ** 2
     whole = irfft(heard * push.conj() / (power + regularisation * power.max()), size)
     # What the last samples hold of the response is the part of the push that came before its peak.
-    return whole[: len(sound) - pulse.peak]
+    # The zeros keep negative times, of which there are at most the window's length, apart from these.
+    return whole[size - (pulse.start - begin) :], whole[: len(sound) - pulse.peak]
 
 
 def isolate(force: Float64[np.ndarray, " frames"], pulse: Pulse) -> tuple[int, Float64[np.ndarray, " window"]]:

@@ -31,7 +31,8 @@ class CaptureSettings:
     surface: str | None = None
     """Surface file in the folder; the first of surface.obj, .ply, .glb, .stl where it is not given."""
     response_channel: int | None = None
-    """Channel of the wav files that holds the sound, counted from 1 as sound editors count. Mono files need none."""
+    """Channel of the wav files that holds the sound, counted from 1 as sound editors count. Mono files need none, nor
+    do files whose channels hold one sound up to a constant factor, rounding and dither."""
     force_channel: int | None = None
     """Channel that holds the hammer's force, counted from 1, where there is one."""
     force_scale: float = 1.0
@@ -51,9 +52,12 @@ class CaptureSettings:
     absent. Larger is quieter and duller."""
     highpass: float = 0.0
     """Remove rumble below this frequency from the sound, Hz as recorded: 20 leaves all that is heard. 0 leaves it
-    as it is, for a large structure may ring as low as that. The hammer's force is never filtered."""
+    as it is, for a large structure may ring as low as that. The hammer's force is never filtered. `check` proposes a
+    value where rumble dominates the noise before the impacts."""
     align: bool = True
-    """Move each onset to sample zero. Set it false for impulse responses, whose first sample is the blow already."""
+    """Find where the impact begins in each file, and align the recordings with one another. Recordings that all start
+    with the impact, as impulse responses do, are recognized and not cut. False takes every file from its first sample
+    as it is: for recordings that have one time zero already."""
 
     def __post_init__(self) -> None:
         for key in ("unit", "surface_unit", "views_unit"):

@@ -5,9 +5,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import tyro
+from rich.console import Console
 
-from avmsf.capture import CaptureReport, CaptureSettings, RecordingReport, check
+from avmsf.capture import CaptureReport, CaptureSettings, check
+from avmsf.capture.folder import SETTINGS
+from avmsf.capture.measure import shared_problems
+from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
 from avmsf.cli.printing import console, decimals, print_json, say, table
+from avmsf.errors import CaptureError
 from avmsf.wording import counted
 
 UNREADABLE = 2
@@ -27,6 +32,9 @@ class Options:
     """Folder with impacts.csv and the wav files it names."""
     settings: Path | None = None
     """A capture.toml to use in place of the folder's own."""
+    write_settings: bool = False
+    """Write the settings that would help, with the reasons, to the folder's capture.toml, and check with them. A
+    capture.toml that exists is left as it is."""
     json: bool = False
     """Print one JSON object on the standard output, all else on the standard error."""
 
@@ -39,8 +47,11 @@ def parse(words: Sequence[str]) -> Options:
 def run(options: Options) -> int:
     """Print the report; return 2 where the capture cannot be read."""
     settings = None if options.settings is None else CaptureSettings.read(options.settings)
-    report = check(options.capture, settings)
     screen = console(errors=options.json)
+    proposals = propose_settings(options.capture, settings)
+    if proposals and options.write_settings:
+        _write(options, proposals, screen)
+    report = check(options.capture, settings)
     if report.recordings:
         screen.print(_table(report, str(options.capture)))
     problems = problems_of(report)
@@ -48,27 +59,41 @@ def run(options: Options) -> int:
         screen.print(problem, soft_wrap=True)
     if len(problems) > MAX_PRINTED:
         screen.print(f"and {len(problems) - MAX_PRINTED} more; --json prints all", soft_wrap=True)
+    if options.write_settings and not proposals:
+        screen.print("no setting other than the present ones would help: nothing was written", soft_wrap=True)
+    if not options.write_settings:
+        for each in proposals:
+            screen.print(f"proposed: {each.line} (--write-settings writes it). {each.reason}", soft_wrap=True)
     if options.json:
-        print_json(asdict(report))
+        print_json({**asdict(report), "proposals": [asdict(each) for each in proposals]})
     if not report.readable:
         say(f"avmsf check: {options.capture} cannot be read as it is: mend what is listed and check again")
         return UNREADABLE
-    wrong = sum(bool(row.problems) for row in report.recordings) + len(report.problems)
+    for remark in report.remarks:
+        screen.print(remark, soft_wrap=True)
+    wrong = len(problems)
     screen.print("no problem found" if not wrong else f"readable, with {counted(wrong, 'warning')}", soft_wrap=True)
     return 0
 
 
+def _write(options: Options, proposals: Sequence[Proposal], screen: Console) -> None:
+    """Write the proposals and say so; print them where they cannot be written, and raise `CaptureError`."""
+    if options.settings is not None:
+        raise CaptureError(
+            f"expected --write-settings without --settings, got both: the new {SETTINGS} would lack what "
+            f"{options.settings} says"
+        )
+    try:
+        path = write_settings(options.capture, proposals)
+    except CaptureError:
+        screen.print(settings_text(proposals), soft_wrap=True)
+        raise
+    screen.print(f"{path}: written, with {', '.join(each.line for each in proposals)}", soft_wrap=True)
+
+
 def problems_of(report: CaptureReport) -> list[str]:
-    """Return every problem as one sentence: the folder's first, then the recordings' in their order."""
-    return [
-        *report.problems,
-        *(_placed(row, problem) for row in report.recordings for problem in row.problems),
-    ]
-
-
-def _placed(row: RecordingReport, problem: str) -> str:
-    # Errors of the capture's reader name the file or the line by themselves.
-    return problem if problem.startswith((row.file, "impacts.csv")) else f"{row.file}: {problem}"
+    """Return every problem as one sentence: the folder's first, then the recordings', what they share only once."""
+    return [*report.problems, *shared_problems(report.recordings)]
 
 
 def _table(report: CaptureReport, title: str) -> object:

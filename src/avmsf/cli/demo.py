@@ -102,6 +102,7 @@ def _go_all_the_way(folder: Path, bar: OverallBar) -> tuple[dict[str, Scores], t
         listener=bar.listener,
         fitting=bar.fitting,
     )
+    train, test = made.modes.aligned(train), made.modes.aligned(test)
     bar.tell("page: a web page, sounds, pictures and scores")
     shutil.move(made.field, folder / FIELD)
     shutil.move(folder / CACHE / CLOUD, folder / GAUSSIANS)

@@ -58,7 +58,7 @@ def run(options: Options) -> int:
     extraction = extract(impacts, finder(options.method, options.modes))
     level = levels(amplitudes(extraction))
     rows = mode_rows(extraction.bank, level)
-    quality = measure_quality(impacts.sounds, extraction, sample_rate=impacts.sample_rate)
+    quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)
     every = list(zip(rows, quality_rows(quality), quality.is_mode.tolist(), strict=True))
     modes, supporting = ([(row, how) for row, how, is_mode in every if is_mode is part] for part in (True, False))
     title = f"{len(modes)} modes of {capture.name}, {len(impacts)} recordings"

@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.quality import ModeQuality
 
 

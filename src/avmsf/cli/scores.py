@@ -9,7 +9,7 @@ from avmsf.bench.evaluation import Scores, evaluate, score
 from avmsf.capture import Impacts
 from avmsf.cli.printing import figure, table
 from avmsf.field.soundfield import SoundField
-from avmsf.modal.bank import Extraction
+from avmsf.modal.extraction.extract import Extraction
 
 HEADINGS = {
     "relative_stft": "relative STFT error",
@@ -21,8 +21,11 @@ HEADINGS = {
 
 
 def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction) -> dict[str, Scores]:
-    """Score the field, the baselines made of the same training impacts, and the floor that the modes set."""
-    count = min(3, len(train))
+    """Score the field, the baselines made of the same training impacts, and the floor that the modes set.
+
+    All by recordings that start where those start that the modes were found in.
+    """
+    train, test, count = modes.aligned(train), modes.aligned(test), min(3, len(train))
     return {
         "field": evaluate(field, test),
         "nearest strike": evaluate(NearestStrike(train), test),

@@ -11,7 +11,7 @@ from avmsf._utils.caching import source_digest
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError
 from avmsf.field.recipes import GainCase, GainRecipe
-from avmsf.modal.bank import Extraction
+from avmsf.modal.extraction.extract import Extraction
 
 
 def expect_fitting(train: Impacts, modes: Extraction) -> None:

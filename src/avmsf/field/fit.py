@@ -25,7 +25,8 @@ from avmsf.field.recipes import GainCase, GainRecipe, along_phase
 from avmsf.field.refinement import RefinedGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.training import Targets, TrainingRun
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains, fit_sine_gains
 from avmsf.modal.phase import common_phase
 from avmsf.modal.residual import Residual, estimate_residual
@@ -80,6 +81,7 @@ def fit(
     """
     config = FitConfig() if config is None else config
     expect_fitting(train, modes)
+    train = modes.aligned(train)
     # Amplitudes are float32 from here on, so that a field is the same whichever its recordings came in.
     train = replace(train, sounds=train.sounds.float())
     modes = replace(modes, residual=Residual(modes.residual.magnitude.float()))
@@ -126,6 +128,7 @@ def _with_measured_residual(field: SoundField, train: Impacts) -> SoundField:
 
 def gain_case(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> GainCase:
     """Return what gain fields are made from: the recordings, with how their modes start and how strong they are."""
+    train = modes.aligned(train)
     phase = torch.zeros_like(modes.bank.frequency)
     if config.phase == "common":
         phase = common_phase(modes.gains, modes.quadrature)

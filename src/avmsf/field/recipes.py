@@ -14,7 +14,7 @@ from avmsf.field.orientation import orientation_signs
 from avmsf.field.refinement import RefinedGains
 from avmsf.field.thinplategains import thin_plate_gains
 from avmsf.field.training import TrainableGains, gain_scale
-from avmsf.modal.bank import Extraction
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.scene.features import FeatureField
 
 SHARED, PER_CONTACT = "shared", "per-contact"

@@ -14,7 +14,8 @@ from avmsf.field.config import FitConfig
 from avmsf.field.descent import Descent, Group
 from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import Residual, shape_noise
 from avmsf.modal.synthesis import synthesise_phased
 

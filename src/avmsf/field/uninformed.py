@@ -6,7 +6,8 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.finders import lowest_frequency
 from avmsf.modal.residual import Residual
 

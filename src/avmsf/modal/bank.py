@@ -1,11 +1,9 @@
-"""The modes of an object, and what an extraction finds in a set of recordings."""
+"""The modes of an object: frequencies and dampings that all contacts share."""
 
 from dataclasses import dataclass
 
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 from torch import Tensor
-
-from avmsf.modal.residual import Residual
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,15 +17,3 @@ class ModalBank:
 
     def __len__(self) -> int:
         return self.frequency.shape[0]
-
-
-@dataclass(frozen=True, eq=False)
-class Extraction:
-    """Modes shared by all recordings, their gains in each, and the noise beneath them."""
-
-    bank: ModalBank
-    gains: Float[Tensor, "contacts modes"]
-    """Signed amplitude of exp(-d t) sin(2 pi f t) in each recording, in the recordings' own unit."""
-    residual: Residual
-    quadrature: Float[Tensor, "contacts modes"]
-    """Amplitude of exp(-d t) cos(2 pi f t) beside it: what of the mode does not start as a sine at the onset."""

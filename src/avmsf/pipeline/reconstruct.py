@@ -22,8 +22,7 @@ from avmsf.field.fit import Progress, fit, gain_case
 from avmsf.field.physics import Physics
 from avmsf.field.store import save
 from avmsf.files import write_whole
-from avmsf.modal.bank import Extraction
-from avmsf.modal.extraction.extract import extract_once
+from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.pipeline.choice import Spreading, all_recipes, recipe_for
 from avmsf.pipeline.physics import BodyConfig, physics_of
@@ -132,6 +131,7 @@ def _reconstruct(
     listener.tell(f"modes: of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path, needed=True))
     modes = extract_once(train, method, found.path)
+    train = modes.aligned(train)
     basis = {**heard, "features": shape.digest, "fit": asdict(config.fit)}
 
     points = next(iter(shape.candidates.values()))

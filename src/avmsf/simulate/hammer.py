@@ -50,7 +50,7 @@ class Hammer:
     pulse: Literal["hertz", "half-sine"] = "hertz"
     """hertz: a round tip; half-sine: a flat one."""
     contact_time: float = 0.0
-    """Seconds that the tip stays on the body; 0 computes it from the above."""
+    """Seconds that the tip stays on the body at `speed`; 0 computes it from the above."""
 
     def __post_init__(self) -> None:
         for name, unit in (("mass", "kg"), ("radius", "m"), ("young", "Pa"), ("speed", "m/s")):
@@ -75,22 +75,30 @@ def contact_times(
 ) -> Float64[Tensor, " contacts"]:
     """Return how long the tip stays on a body of this material and mass, kg, for blows of these speeds, m/s; seconds.
 
+    A round tip stays for a time that goes with the speed to the power -1/5, a flat one equally long at all speeds.
     Raises SimulationError where that is longer than `LONGEST`.
     """
     if hammer.contact_time > 0.0:
-        return torch.full_like(speeds, hammer.contact_time)
-    joint = 1.0 / ((1.0 - hammer.poisson**2) / hammer.young + (1.0 - material.poisson**2) / material.young)
-    moving = moving_mass(hammer, mass)
-    if hammer.pulse == "half-sine":
-        times = torch.full_like(speeds, math.pi * math.sqrt(moving / (2.0 * hammer.radius * joint)))
+        power = 0.0 if hammer.pulse == "half-sine" else -0.2
+        times = hammer.contact_time * (speeds / hammer.speed) ** power
     else:
-        times = _HERTZ_SCALE * (moving**2 / (hammer.radius * joint**2 * speeds)) ** 0.2
+        times = _computed_times(hammer, material, mass=mass, speeds=speeds)
     if float(times.max()) > LONGEST:
         raise SimulationError(
             f"the hammer stays on the body for {float(times.max()):.2g} s; a blow takes less than {LONGEST:g}: take a "
             "lighter hammer, a stiffer tip, or a faster blow"
         )
     return times
+
+
+def _computed_times(
+    hammer: Hammer, material: Material, *, mass: float, speeds: Float64[Tensor, " contacts"]
+) -> Float64[Tensor, " contacts"]:
+    joint = 1.0 / ((1.0 - hammer.poisson**2) / hammer.young + (1.0 - material.poisson**2) / material.young)
+    moving = moving_mass(hammer, mass)
+    if hammer.pulse == "half-sine":
+        return torch.full_like(speeds, math.pi * math.sqrt(moving / (2.0 * hammer.radius * joint)))
+    return _HERTZ_SCALE * (moving**2 / (hammer.radius * joint**2 * speeds)) ** 0.2
 
 
 def peak_forces(

@@ -10,8 +10,8 @@ for a vibration exp(s t) at f Hz, with r from patch to microphone and theta betw
 monopoles with the dipoles that make a patch sound to its front and not to its back. There is no diffraction around the
 body, no reflection from it or from a room. Monopoles alone would be simpler, but the two faces of a thin wall move
 together, one outward and one inward, and would cancel. The time that the sound takes from the nearest patch is left
-out, as aligning recordings at their onset does. Delays of the others turn phases and no more: what has decayed for
-longer was louder, but it starts later too, and a sum of modes has but one start.
+out: `travel_time` gives it, and it only moves the start of a recording. Delays of the others turn phases and no more:
+what has decayed for longer was louder, but it starts later too, and a sum of modes has but one start.
 """
 
 import math
@@ -66,6 +66,12 @@ def radiated(
         sources = torch.complex(kernel.real @ motion, kernel.imag @ motion)
         heard.append(sources @ accelerations)
     return torch.stack(heard)
+
+
+def travel_time(modes: ElasticModes, microphone: Float64[Tensor, " 3"]) -> float:
+    """Return the seconds that sound takes from the nearest patch to the microphone, a place in the object frame, m."""
+    middles = modes.nodes[modes.triangles[:, 3:].reshape(-1)]
+    return float((microphone - middles).norm(dim=1).min()) / SOUND_SPEED
 
 
 def _patches(

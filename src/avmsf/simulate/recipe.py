@@ -45,9 +45,9 @@ class ObjectRecipe:
     sample_rate: int = 48000
     """Hz."""
     seconds: float = 2.0
-    """Length of each recording."""
+    """Length of what is kept of each recording, from its onset on. The files also hold what is before and after it."""
     noise_db: float | None = -30.0
-    """Room noise: its root mean square over that of the noiseless recordings, dB; None for none."""
+    """Room noise: its root mean square over that of the noiseless sounds from their impacts on, dB; None for none."""
     microphone: tuple[float, float, float] = (0.45, -0.35, 0.4)
     """Where it stands, from the middle of the object's bounding box, metres."""
     views: int = 72

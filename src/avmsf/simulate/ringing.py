@@ -10,6 +10,29 @@ _BLOCK = 512
 """Samples between which all phases are computed anew."""
 
 
+def recorded(
+    poles: Complex128[Tensor, " modes"],
+    amplitudes: Complex128[Tensor, "contacts modes"],
+    starts: Float64[Tensor, " contacts"],
+    *,
+    sample_rate: float,
+    samples: int,
+) -> Float64[Tensor, "contacts samples"]:
+    """Return what `ring` gives for recordings whose sounds start at the samples `starts`, and zero before.
+
+    Starts may lie between samples: amplitudes are those at the start, and each sample has the sound's exact value at
+    its time after it. Nothing is interpolated. Of a sound that starts before the recording (negative), the rest is
+    heard.
+    """
+    first = starts.ceil().clamp(min=0.0)
+    late = (first - starts) / sample_rate
+    sounds = ring(poles, amplitudes * torch.exp(poles * late[:, None]), sample_rate=sample_rate, samples=samples)
+    whole = torch.zeros_like(sounds)
+    for row, begin in enumerate(first.long().tolist()):
+        whole[row, begin:] = sounds[row, : samples - begin]
+    return whole
+
+
 def ring(
     poles: Complex128[Tensor, " modes"],
     amplitudes: Complex128[Tensor, "contacts modes"],

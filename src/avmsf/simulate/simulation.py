@@ -6,17 +6,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from torch import Tensor
 
+from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
+from avmsf.capture.prepare import prepare
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.starts import cut_together, shorten
+from avmsf.capture.surface import Surface
 from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.simulate.bodies import Body, make_body, up_of
-from avmsf.simulate.imperfections import damping_matrix, stream
-from avmsf.simulate.radiation import radiated
+from avmsf.simulate.imperfections import damping_matrix, recording_starts, stream
+from avmsf.simulate.radiation import radiated, travel_time
 from avmsf.simulate.recipe import ObjectRecipe
-from avmsf.simulate.ringing import ring
+from avmsf.simulate.ringing import recorded
 from avmsf.simulate.roomnoise import room_noise
 from avmsf.simulate.soundingbody import SoundingBody
 from avmsf.simulate.strikes import Strikes, draw_strikes
@@ -33,7 +38,10 @@ class Simulation:
 
     recipe: ObjectRecipe
     capture: Capture
-    """Recordings in pascals per newton, contacts and directions as they were written down."""
+    """What `read_capture` reads where `write_simulation` wrote this: recordings in pascals per newton, cut at the
+    onsets that it finds; contacts and directions as they were written down."""
+    recordings: Float32[Tensor, "contacts frames"]
+    """The whole recordings, pascals per newton: before each impact there is the room's noise alone."""
     truth: Truth
     mesh: TexturedMesh
     body: SoundingBody
@@ -61,8 +69,9 @@ def simulate_object(
     strikes = draw_strikes(
         body.surface, recipe.contacts, up=up_of(recipe), imperfections=recipe.imperfections, seed=recipe.seed
     )
-    impacts, truth = record(recipe, sounding, strikes)
-    return Simulation(recipe, Capture(name or name_of(recipe), impacts, body.surface), truth, body.mesh, sounding)
+    recordings, forces, truth = record(recipe, sounding, strikes)
+    capture = _captured(recipe, recordings, strikes, forces, truth, name=name or name_of(recipe), surface=body.surface)
+    return Simulation(recipe, capture, recordings, truth, body.mesh, sounding)
 
 
 def name_of(recipe: ObjectRecipe) -> str:
@@ -79,45 +88,90 @@ def sounding_body(recipe: ObjectRecipe, body: Body) -> SoundingBody:
     vertices = body.surface.vertices.double()
     microphone = 0.5 * (vertices.amax(0) + vertices.amin(0)) + torch.tensor(recipe.microphone, dtype=torch.float64)
     heard = radiated(body.elastic, vibration, microphone, retardation=recipe.imperfections.retardation)
-    return SoundingBody(body.elastic, vibration, heard, recipe.hammer)
+    return SoundingBody(body.elastic, vibration, heard, recipe.hammer, travel_time(body.elastic, microphone))
 
 
-def record(recipe: ObjectRecipe, body: SoundingBody, strikes: Strikes) -> tuple[Impacts, Truth]:
-    """Record the blows as a recorder does, and divide each recording by the peak force that was written down."""
-    forces = body.forces(strikes.speeds)
+def record(
+    recipe: ObjectRecipe, body: SoundingBody, strikes: Strikes
+) -> tuple[Float32[Tensor, "contacts frames"], Float32[Tensor, " contacts"], Truth]:
+    """Return the recordings, divided by the peak forces that were written down, these forces, and the truth.
+
+    A recorder runs for `pretrigger` before and after what is asked for, and all recordings are equally long.
+    """
+    imperfections, rate = recipe.imperfections, float(recipe.sample_rate)
+    forces = body.forces(strikes.speeds, strikes.contact_times)
     written = forces * strikes.force_errors
-    amplitudes = body.gains(strikes.places, strikes.directions, speeds=strikes.speeds) / strikes.force_errors[:, None]
-    poles = body.vibration.poles
-    samples = round(recipe.seconds * recipe.sample_rate)
-    sounds = ring(poles, amplitudes, sample_rate=float(recipe.sample_rate), samples=samples)
-    sounds = sounds + _noise(recipe, sounds, written)
-    names = tuple(f"{row + 1:03d}.wav" for row in range(len(sounds)))
-    impacts = Impacts(
-        contacts=strikes.written_places,
-        sounds=sounds.float(),
-        sample_rate=float(recipe.sample_rate),
-        names=names,
-        directions=strikes.written_directions.float(),
-        forces=written.float(),
+    amplitudes = body.gains(
+        strikes.places, strikes.directions, speeds=strikes.speeds, contact_times=strikes.contact_times
     )
+    amplitudes = amplitudes / strikes.force_errors[:, None]
+    starts = recording_starts(len(amplitudes), imperfections, delay=body.delay, sample_rate=rate, seed=recipe.seed)
+    frames = _kept(recipe) + max(0, math.ceil(starts.max())) + round(imperfections.pretrigger * rate)
+    sounds = recorded(body.vibration.poles, amplitudes, starts, sample_rate=rate, samples=frames)
+    sounds = sounds + _noise(recipe, sounds, written)
     truth = Truth(
         frequency=body.vibration.frequency,
         damping=body.vibration.damping,
         gains=-amplitudes.imag,
         quadrature=amplitudes.real.clone(),
-        names=names,
+        names=tuple(f"{row + 1:03d}.wav" for row in range(len(sounds))),
         recipe=recipe.values(),
         contacts=strikes.places,
+        starts=starts,
     )
-    return impacts, truth
+    return sounds.float(), written.float(), truth
+
+
+def _captured(
+    recipe: ObjectRecipe,
+    recordings: Float32[Tensor, "contacts frames"],
+    strikes: Strikes,
+    forces: Float32[Tensor, " contacts"],
+    truth: Truth,
+    *,
+    name: str,
+    surface: Surface,
+) -> Capture:
+    """Return what reading the written recordings gives. Onsets are found, unless all recordings start with theirs."""
+    assert truth.starts is not None
+    rate = float(recipe.sample_rate)
+    settings = CaptureSettings(
+        name=name,
+        seconds=_kept(recipe) / recipe.sample_rate,
+        normalise="done",
+        align=bool((truth.starts != 0.0).any()),
+    )
+    prepared = []
+    for file, force, sound in zip(truth.names, forces.tolist(), recordings, strict=True):
+        recording = Recording(file, sound.double().numpy()[None], rate, "FLOAT")
+        prepared.append(shorten(prepare(recording, settings, newtons=force), rate=rate, settings=settings))
+    cut = cut_together(prepared, truth.names, rate=rate, settings=settings)
+    impacts = Impacts(
+        contacts=strikes.written_places,
+        sounds=cut.sounds,
+        sample_rate=rate,
+        names=truth.names,
+        directions=strikes.written_directions.float(),
+        forces=forces,
+        before=cut.before,
+        after=cut.after,
+    )
+    return Capture(name, impacts, surface, settings)
+
+
+def _kept(recipe: ObjectRecipe) -> int:
+    """Return the samples of each sound that are asked for."""
+    return round(recipe.seconds * recipe.sample_rate)
 
 
 def _noise(
-    recipe: ObjectRecipe, sounds: Float64[Tensor, "contacts samples"], forces: Float64[Tensor, " contacts"]
-) -> Float64[Tensor, "contacts samples"]:
+    recipe: ObjectRecipe, sounds: Float64[Tensor, "contacts frames"], forces: Float64[Tensor, " contacts"]
+) -> Float64[Tensor, "contacts frames"]:
     """Return the room's noise per newton: one level in the room, and so more of it beneath fainter blows."""
     if recipe.noise_db is None:
         return torch.zeros_like(sounds)
-    level = math.sqrt(float((sounds * forces[:, None]).square().mean())) * 10.0 ** (recipe.noise_db / 20.0)
+    # The power over what is asked for, and not over the silence before the impact.
+    power = float((sounds * forces[:, None]).square().mean()) * sounds.shape[1] / _kept(recipe)
+    level = math.sqrt(power) * 10.0 ** (recipe.noise_db / 20.0)
     noise = room_noise(*sounds.shape, sample_rate=float(recipe.sample_rate), generator=stream(recipe.seed, "noise"))
     return level * torch.from_numpy(noise) / forces[:, None]

@@ -39,7 +39,7 @@ def write_simulation(
         raise SimulationError(f"{folder}: exists and is not an empty folder; choose another name or remove it")
     begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
     try:
-        write_capture(replace(simulation.capture, surface=None), begun)
+        _write_recordings(simulation, begun)
         for sound in begun.glob("*.wav"):
             _forget_the_hour(sound)
         write_textured(simulation.mesh, begun)
@@ -52,6 +52,14 @@ def write_simulation(
         raise SimulationError(f"{folder}: the simulated object cannot be written: {error}") from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
+
+
+def _write_recordings(simulation: Simulation, folder: Path) -> None:
+    """Write the whole recordings, and settings by which they are read as the simulation's own capture is."""
+    capture = simulation.capture
+    impacts = replace(capture.impacts, sounds=simulation.recordings, before=None, after=None)
+    seconds = capture.settings.seconds if capture.settings.align else None
+    write_capture(replace(capture, surface=None, impacts=impacts), folder, onsets_within=seconds)
 
 
 def is_written(recipe: ObjectRecipe, folder: str | Path) -> bool:

@@ -34,6 +34,8 @@ class Strikes:
     written_directions: Float64[Tensor, "contacts 3"]
     speeds: Float64[Tensor, " contacts"]
     """Relative to the hammer's."""
+    contact_times: Float64[Tensor, " contacts"]
+    """Relative to those that follow from the speeds."""
     force_errors: Float64[Tensor, " contacts"]
     """What the written peak forces are multiplied by."""
 
@@ -54,6 +56,7 @@ def draw_strikes(
     tilts = _across(normals, math.radians(imperfections.direction), generator=stream(seed, "direction jitter"))
     directions = inward + torch.tan(tilts.norm(dim=1, keepdim=True)) * _unit(tilts)
     speeds = stream(seed, "speeds").standard_normal(count)
+    times = stream(seed, "contact times").standard_normal(count)
     errors = stream(seed, "force errors").standard_normal(count)
     return Strikes(
         places=places,
@@ -61,6 +64,7 @@ def draw_strikes(
         written_places=nearest_on(surface, places + offsets) if imperfections.contact > 0.0 else places,
         written_directions=inward,
         speeds=torch.from_numpy(np.exp(imperfections.speed * speeds)),
+        contact_times=torch.from_numpy(np.exp(imperfections.contact_time * times)),
         # Bounded, for a written force is never negative.
         force_errors=torch.from_numpy(np.exp(imperfections.force * errors)),
     )

@@ -1,11 +1,14 @@
 """What is known of a simulated object and of no recorded one: its modes, and how strongly each blow excited them.
 
 A file `truth.safetensors` holds the tensors under the names of their fields, and in its header one JSON:
-{"format": 1, "version": "0.1.0", "names": ["001.wav", ...], "recipe": {...}}
+{"format": 2, "version": "0.1.0", "names": ["001.wav", ...], "recipe": {...}}
+
+Format 1 is the same without `starts`; it is read too.
 """
 
 import json
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,12 +23,13 @@ from avmsf._utils.text_files import parse_json
 from avmsf.errors import SimulationError
 from avmsf.files import write_whole
 
-FORMAT = 1
+FORMAT = 2
 """Number of this format; it grows with every change that older versions could not read."""
 TRUTH = "truth.safetensors"
 """Its name in a capture folder."""
 _KEY = "avmsf_truth"
-_MODES, _TABLES, _CONTACTS = ("frequency", "damping"), ("gains", "quadrature"), "contacts"
+_MODES, _TABLES = ("frequency", "damping"), ("gains", "quadrature")
+_OPTIONAL = ("contacts", "starts")
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +37,7 @@ class Truth:
     """The modes in a set of simulated recordings, row for row of its `Impacts`.
 
     Recording i is, but for noise, the sum over modes k of exp(-d_k t) (gains[i, k] sin(2 pi f_k t) + quadrature[i, k]
-    cos(2 pi f_k t)), t from the onset.
+    cos(2 pi f_k t)), with t the time since the impact's sound arrived, and silence before.
     """
 
     frequency: Float64[Tensor, " modes"]
@@ -50,11 +54,23 @@ class Truth:
     """All settings that the object was made with, as plain values."""
     contacts: Float64[Tensor, "contacts 3"] | None = None
     """Where the blows fell, metres, which is not quite where the table of impacts has them; None if that is exact."""
+    starts: Float64[Tensor, " contacts"] | None = None
+    """Sample of its file, counted from 0 and between samples too, at which t = 0 of each recording lies: sample n of
+    recording i is at t = (n - starts[i]) / sample_rate. None where all files start with the impact's sound."""
 
     @property
     def amplitudes(self) -> Complex128[Tensor, "contacts modes"]:
         """Amplitudes A: recording i is the real part of the sum of A[i] exp((-d + 2 pi i f) t)."""
         return torch.complex(self.quadrature, -self.gains)
+
+    def after(self, seconds: float) -> "Truth":
+        """Return the same modes with time counted from `seconds` later in all recordings, before where negative.
+
+        Each mode's amplitude is multiplied by exp(pole * seconds). `starts` still name the impacts.
+        """
+        poles = torch.complex(-self.damping, 2 * math.pi * self.frequency)
+        amplitudes = self.amplitudes * torch.exp(poles * seconds)
+        return replace(self, gains=-amplitudes.imag, quadrature=amplitudes.real.clone())
 
 
 def write_truth(truth: Truth, path: str | Path) -> None:
@@ -64,7 +80,7 @@ def write_truth(truth: Truth, path: str | Path) -> None:
     could not be read back.
     """
     path = Path(path)
-    tensors = {name: getattr(truth, name) for name in (*_MODES, *_TABLES, _CONTACTS)}
+    tensors = {name: getattr(truth, name) for name in (*_MODES, *_TABLES, *_OPTIONAL)}
     tensors = {name: tensor.clone().contiguous() for name, tensor in tensors.items() if tensor is not None}
     _expect_tensors(tensors, len(truth.names), path)
     record = {"format": FORMAT, "version": version("avmsf"), "names": list(truth.names), "recipe": truth.recipe}
@@ -122,26 +138,25 @@ def _understand(words: str, path: Path) -> dict[str, Any]:
         record = parse_json(words)
         found, writer, names = record["format"], record["version"], record["names"]
         listed = isinstance(names, list) and all(isinstance(name, str) for name in names)
-        if found == FORMAT and not (listed and isinstance(record["recipe"], dict)):
+        if found in (1, FORMAT) and not (listed and isinstance(record["recipe"], dict)):
             raise ValueError("names or recipe of another type")
     except (ValueError, TypeError, KeyError) as error:
         raise SimulationError(
             f"{path}: expected the header of a simulated object's truth, found a damaged one ({type(error).__name__}: "
             f"{error}): simulate the object again"
         ) from error
-    if found != FORMAT:
+    if found not in (1, FORMAT):
         raise SimulationError(
-            f"{path}: expected a truth of format {FORMAT}, found format {found}, written by avmsf {writer} (this is "
-            f"avmsf {version('avmsf')}): install avmsf {writer} or newer, or simulate the object again"
+            f"{path}: expected a truth of format 1 or {FORMAT}, found format {found}, written by avmsf {writer} (this "
+            f"is avmsf {version('avmsf')}): install avmsf {writer} or newer, or simulate the object again"
         )
     return record
 
 
 def _expect_tensors(tensors: dict[str, Tensor], contacts: int, path: Path) -> None:
     modes = len(tensors["frequency"]) if "frequency" in tensors and tensors["frequency"].ndim == 1 else 0
-    expected = dict.fromkeys(_MODES, (modes,)) | dict.fromkeys(_TABLES, (contacts, modes))
-    if _CONTACTS in tensors:
-        expected |= {_CONTACTS: (contacts, 3)}
+    expected: dict[str, tuple[int, ...]] = dict.fromkeys(_MODES, (modes,)) | dict.fromkeys(_TABLES, (contacts, modes))
+    expected |= {name: size for name, size in (("contacts", (contacts, 3)), ("starts", (contacts,))) if name in tensors}
     found = {name: tuple(tensor.shape) for name, tensor in tensors.items() if tensor.dtype == torch.float64}
     if found != expected or tensors.keys() != expected.keys():
         raise SimulationError(

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.esprit import stable_orders
-from avmsf.modal.extraction.extract import extract_sounds
+from avmsf.modal.extraction.extract import Extraction, extract_sounds
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.extraction.quality import ModeQuality, measure_quality
 from avmsf.modal.residual import Residual

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +13,13 @@ from jaxtyping import Float64
 from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.measure import measure
+from avmsf.capture.measure import measure, shared_problems
 from avmsf.capture.placement import judge_placement, surface_points
 from avmsf.capture.prepare import prepare
 from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.starts import cut_together, shorten
 from avmsf.capture.surface import Surface
-from avmsf.capture.together import common_length, common_rate
+from avmsf.capture.together import common_rate
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError, DatasetError
 
@@ -60,7 +61,7 @@ def gather(
     remain or they do not fit together.
     """
     kept: list[tuple[str, str, float, np.ndarray]] = []
-    sounds, forces, remarks = [], [], list(remarks)
+    recordings, reports, remarks = [], [], list(remarks)
     try:
         for blow in blows:
             try:
@@ -70,25 +71,29 @@ def gather(
                 continue
             if recorded:
                 # Clipping shows only before the amplifier's gain is divided out.
-                report = measure(blow.recording, prepared, settings=settings, line=len(kept) + 1)
-                remarks += [f"{blow.recording.name}: {problem}" for problem in report.problems]
-            sounds.append((prepared.sound * 10 ** (-blow.gain_db / 20)).astype(np.float32))
-            forces.append(prepared.newtons)
+                reports.append(measure(blow.recording, prepared, settings=settings, line=len(kept) + 1))
+            gain = 10 ** (-blow.gain_db / 20)
+            prepared = replace(prepared, sound=prepared.sound * gain, before=prepared.before * gain)
+            recordings.append(shorten(prepared, rate=blow.recording.sample_rate, settings=settings))
             kept.append((blow.name, blow.recording.name, blow.recording.sample_rate, blow.contact))
+        remarks += shared_problems(reports)
         refuse_few(len(kept), origin=origin, reasons=remarks)
         names, files, rates, contacts = zip(*kept, strict=True)
         rate = common_rate(rates, files)
-        length, cut = common_length([len(sound) for sound in sounds], files, rate=rate, settings=settings)
+        cut = cut_together(recordings, files, rate=rate, settings=settings)
     except CaptureError as error:
         raise DatasetError(f"{origin}: {error}") from error
+    forces = [each.newtons for each in recordings]
     impacts = Impacts(
         contacts=torch.from_numpy(np.stack(contacts).astype(np.float64)),
-        sounds=torch.from_numpy(np.stack([sound[:length] for sound in sounds])),
+        sounds=cut.sounds,
         sample_rate=rate * settings.playback_speed,
         names=names,
         forces=None if None in forces else torch.tensor(forces, dtype=torch.float32),
+        before=cut.before,
+        after=cut.after,
     )
-    remarks += cut + _repeated(impacts) + _misplaced(impacts, surface)
+    remarks += cut.remarks + _repeated(impacts) + _misplaced(impacts, surface)
     if remarks:
         warnings.warn(f"{origin}: {listed(remarks)}", CaptureWarning, stacklevel=3)
     return Capture(name, impacts, surface)

@@ -7,6 +7,7 @@ work that goes on after an interruption needs the very ones it began with.
 import hashlib
 import json
 import math
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -20,7 +21,8 @@ from avmsf._utils.caching import keep_if_possible, source_digest
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError
 from avmsf.files import write_whole
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.alignment import Alignment, Phases, align
 from avmsf.modal.extraction.esprit import SHORTEST
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, lowest_frequency, noise_bins
 from avmsf.modal.extraction.least_squares import fit_gains
@@ -30,17 +32,39 @@ from avmsf.modal.synthesis import synthesise
 _KEY = "avmsf-modes"
 
 
+@dataclass(frozen=True, eq=False)
+class Extraction:
+    """Modes shared by all recordings, their gains in each, and the noise beneath them."""
+
+    bank: ModalBank
+    gains: Float[Tensor, "contacts modes"]
+    """Signed amplitude of exp(-d t) sin(2 pi f t) in each recording, in the recordings' own unit."""
+    residual: Residual
+    quadrature: Float[Tensor, "contacts modes"]
+    """Amplitude of exp(-d t) cos(2 pi f t) beside it: what of the mode does not start as a sine at the onset."""
+    alignment: Alignment | None = None
+    """How the recordings were aligned first; None where they were taken as they are."""
+
+    def aligned(self, impacts: Impacts) -> Impacts:
+        """Return recordings, these or others of the object, with the starts that the gains are of."""
+        return impacts if self.alignment is None else self.alignment.apply(impacts)
+
+
 def extract(impacts: Impacts, method: ModeFinder | None = None) -> Extraction:
     """Return the modes that the recordings share, each recording's gains and the noise beneath (paper, section 3.4).
 
-    `method` is `HighResolution()` unless another is given. Gains are the least-squares amplitudes of the modes over
-    the whole of each sound. Raises `ExtractionError` when there are fewer than two recordings or no mode is found.
+    `method` is `HighResolution()` unless another is given. Recordings that are not final (`Impacts.before`) are aligned
+    with one another first. Gains are the least-squares amplitudes of the modes over the whole of each sound. Raises
+    `ExtractionError` when there are fewer than two recordings or no mode is found.
     """
     if len(impacts) < 2:
         raise ExtractionError(
             f"modes are what recordings have in common: expected at least 2 recordings, found {len(impacts)}"
         )
-    return extract_sounds(impacts.sounds, sample_rate=impacts.sample_rate, method=method)
+    alignment = None if impacts.before is None else align(impacts)
+    final = impacts if alignment is None else alignment.apply(impacts)
+    found = extract_sounds(final.sounds, sample_rate=impacts.sample_rate, method=method)
+    return replace(found, alignment=alignment)
 
 
 def extract_sounds(
@@ -104,7 +128,7 @@ def extract_once(
     an error if the file is `needed`. Raises as `extract`, and FieldFileError.
     """
     digest = _digest(train, method)
-    kept = _read(path, digest)
+    kept = _read(path, digest, train.names)
     if kept is not None:
         return kept
     if lone and len(train) == 1:
@@ -118,6 +142,8 @@ def extract_once(
         "quadrature": found.quadrature,
         "residual": found.residual.magnitude,
     }
+    if found.alignment is not None:
+        tensors |= _alignment_tensors(found.alignment)
     content = save({name: tensor.contiguous() for name, tensor in tensors.items()}, {_KEY: digest})
 
     def write() -> None:
@@ -130,7 +156,7 @@ def extract_once(
     return found
 
 
-def _read(path: Path, digest: str) -> Extraction | None:
+def _read(path: Path, digest: str, names: tuple[str, ...]) -> Extraction | None:
     try:
         with safe_open(path, framework="pt") as file:
             if (file.metadata() or {}).get(_KEY) != digest:
@@ -140,12 +166,41 @@ def _read(path: Path, digest: str) -> Extraction | None:
     except (SafetensorError, OSError):
         return None
     return Extraction(
-        ModalBank(read["frequency"], read["damping"]), read["gains"], Residual(read["residual"]), read["quadrature"]
+        ModalBank(read["frequency"], read["damping"]),
+        read["gains"],
+        Residual(read["residual"]),
+        read["quadrature"],
+        _alignment_of(read, names) if "alignment.delays" in read else None,
     )
+
+
+def _alignment_tensors(alignment: Alignment) -> dict[str, Tensor]:
+    phases = alignment.phases
+    numbers = [alignment.coherence_before, alignment.coherence_after, phases.jitter]
+    tensors = {
+        "delays": alignment.delays,
+        "agrees": alignment.agrees,
+        "numbers": torch.tensor(numbers, dtype=torch.float64),
+        "frequency": phases.bank.frequency,
+        "damping": phases.bank.damping,
+        "doubled": torch.view_as_real(phases.doubled),
+        "power": phases.power,
+        "spread": phases.spread,
+    }
+    return {f"alignment.{name}": tensor for name, tensor in tensors.items()}
+
+
+def _alignment_of(read: dict[str, Tensor], names: tuple[str, ...]) -> Alignment:
+    found = {name.removeprefix("alignment."): each for name, each in read.items() if name.startswith("alignment.")}
+    before, after, jitter = found["numbers"].tolist()
+    bank = ModalBank(found["frequency"], found["damping"])
+    phases = Phases(bank, torch.view_as_complex(found["doubled"]), found["power"], found["spread"], jitter)
+    return Alignment(names, found["delays"], found["agrees"], before, after, phases)
 
 
 def _digest(train: Impacts, method: ModeFinder) -> str:
     words = [version("avmsf"), source_digest(), repr(method), train.names, train.sample_rate]
     digest = hashlib.sha256(json.dumps(words).encode())
-    digest.update(train.sounds.contiguous().numpy().tobytes())
+    for sounds in (train.sounds, train.before, train.after):
+        digest.update(b"none" if sounds is None else sounds.contiguous().numpy().tobytes())
     return digest.hexdigest()

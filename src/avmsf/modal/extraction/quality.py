@@ -14,7 +14,8 @@ Fisher, Statistical Methods for Research Workers, 1932, section 21.1).
 Where one mode's pole differs between recordings, extraction finds it twice, nearer to itself than its width: the sum
 of the two follows the pole as it moves. The second one's amplitudes then follow the first one's from contact to
 contact, whereas two modes of a nearly round object have independent shapes. The squared correlation of two independent
-real shapes over n recordings has a beta distribution with parameters 1/2 and (n - 1) / 2.
+real shapes over n recordings has a beta distribution with parameters 1/2 and (n - 1) / 2; where a few recordings
+outweigh the others, n is the number of equal ones of which chance would make as much.
 
 Poles that fail either test stay in the model, for held-out sounds are predicted worse without them
 (docs/decisions/mode-quality.md).
@@ -28,8 +29,9 @@ from jaxtyping import Bool, Complex128, Float, Float64
 from scipy.special import betaincc, gammaincc
 from torch import Tensor
 
-from avmsf.modal.bank import Extraction, ModalBank
+from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.esprit import stable_orders
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.finders import noise_at, noise_bins
 from avmsf.modal.extraction.least_squares import NormalEquations
 from avmsf.modal.innerproducts import poles_of
@@ -64,7 +66,7 @@ class ModeQuality:
 def measure_quality(
     sounds: Float[Tensor, "contacts samples"], extraction: Extraction, *, sample_rate: float
 ) -> ModeQuality:
-    """Return the quality of each pole of an extraction from these sounds (aligned, if the extraction aligned them)."""
+    """Return the quality of each pole, from the sounds that an extraction's gains are of (`Extraction.aligned`)."""
     bank = extraction.bank
     level = (sounds - sounds.mean(1, keepdim=True)).square().mean(1).sqrt()
     heard = level > 0
@@ -74,8 +76,15 @@ def measure_quality(
     moves = _OwnMoves(*system.own_step(sample_rate))
     amplitudes = torch.complex(extraction.gains.double(), extraction.quadrature.double())
     energy = (amplitudes.abs().square() / bank.damping).sum(0)
+    # Loud recordings count no more than others for phases and shapes.
+    amplitudes = amplitudes[heard] / level[heard, None]
     noise = noise_at(noise_power(scaled, bins=noise_bins(sounds.shape[1])), bank, sample_rate)
-    stands_out = _stands_out(explained, moves.misfit(), noise)
+    standing = torch.nonzero(_stands_out(explained, moves.misfit(), noise)).flatten()
+    # A double of what is no mode itself may be the mode that both are of.
+    part = ModalBank(bank.frequency[standing], bank.damping[standing])
+    double = _doubles(part, amplitudes[:, standing], explained[:, standing].sum(0), level=_FALSE_MODES / len(bank))
+    is_mode = torch.zeros(len(bank), dtype=torch.bool)
+    is_mode[standing[~double]] = True
     spread = moves.spread()
     return ModeQuality(
         frequency_spread=spread[:, 0],
@@ -84,7 +93,7 @@ def measure_quality(
         coherence=amplitudes.square().sum(0).abs() / amplitudes.abs().square().sum(0),
         energy_share=energy / energy.sum(),
         explained_left_out=moves.explained_left_out(explained),
-        is_mode=stands_out & ~_doubles(bank, amplitudes, explained.sum(0)),
+        is_mode=is_mode,
     )
 
 
@@ -135,16 +144,24 @@ def _stands_out(
 
 
 def _doubles(
-    bank: ModalBank, amplitudes: Complex128[Tensor, "contacts modes"], explained: Float64[Tensor, " modes"]
+    bank: ModalBank,
+    amplitudes: Complex128[Tensor, "contacts modes"],
+    explained: Float64[Tensor, " modes"],
+    *,
+    level: float,
 ) -> Bool[Tensor, " modes"]:
     """Return which poles only follow one that explains more, within the narrower one's half-power bandwidth."""
     width = torch.minimum(bank.damping[:, None], bank.damping[None, :]) / math.pi
     near = (bank.frequency[:, None] - bank.frequency[None, :]).abs() < width
     near &= explained[:, None] < explained[None, :]
-    norm = torch.linalg.vector_norm(amplitudes, dim=0).clamp_min(torch.finfo(torch.float64).tiny)
-    correlation = ((amplitudes.mH @ amplitudes).abs() / (norm[:, None] * norm[None, :])).square().clamp_max(1.0)
-    chance = torch.from_numpy(betaincc(0.5, max(len(amplitudes) - 1, 1e-9) / 2, correlation.numpy()))
-    return (near & (chance < _FALSE_MODES / max(int(near.sum()), 1))).any(1)
+    power = amplitudes.abs().square()
+    product = (power.sum(0)[:, None] * power.sum(0)[None, :]).clamp_min(torch.finfo(torch.float64).tiny)
+    correlation = ((amplitudes.mH @ amplitudes).abs().square() / product).clamp_max(1.0)
+    # With random signs the squared correlation is one over this in the mean: as of so many recordings of equal weight.
+    effective = product / (power.T @ power).clamp_min(torch.finfo(torch.float64).tiny)
+    freedom = (effective - 1).clamp_min(torch.finfo(torch.float64).eps)
+    chance = torch.from_numpy(betaincc(0.5, freedom.numpy() / 2, correlation.numpy()))
+    return (near & (chance < level)).any(1)
 
 
 def _inverse(matrices: Float64[Tensor, "*batch 2 2"]) -> Float64[Tensor, "*batch 2 2"]:

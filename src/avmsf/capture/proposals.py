@@ -1,0 +1,327 @@
+"""Settings that would help to read a capture folder, found from its recordings, and the `capture.toml` that says so.
+
+A setting is proposed only where the recordings themselves show that it helps. docs/decisions/reading-recordings.md has
+the figures behind the bounds.
+"""
+
+import json
+import textwrap
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Complex128, Float64
+from scipy.special import stdtrit
+
+from avmsf._utils.text_files import read_toml
+from avmsf.capture.audio import Recording, read_recording
+from avmsf.capture.folder import SETTINGS, settings_of
+from avmsf.capture.measure import HIGHEST_NOISE_DB, decibels, noise_level
+from avmsf.capture.onset import SECONDS_BEFORE, find_onset, find_pulse
+from avmsf.capture.prepare import Prepared, prepare
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.starts import shorten, start_with_impact
+from avmsf.capture.table import Strike, read_rows, understand
+from avmsf.errors import CaptureError
+
+MIN_PUSH_SHARE = 0.5
+"""Share of its energy that a hammer's channel has within its push and one width on either side: most of it. The
+aircraft's hammer channel has .92 and more, its accelerometers .24 and less."""
+CANDIDATES_HZ = (20.0, 40.0)
+"""The lower limit of hearing, and an octave above it, where only a large structure rings."""
+MIN_NOISE_RATIO = 10**0.6
+"""Ratio by which a highpass must lower the power of the noise: 6 dB, half its amplitude."""
+MAX_RUMBLE_RISE = 10**0.6
+"""Ratio of power below the highpass after the impact to that before it, above which the object itself rings there:
+6 dB. The power of a few periods of noise scatters by 3."""
+MIN_NOISE_SHARE = 1e-6
+"""Mean square of noise against the squared peak, -60 dB, below which it does not hide the decay over its T60."""
+SHORTEST_LEAD_SECONDS = 0.1
+"""Two periods of the lowest candidate: less than that before an impact does not show rumble."""
+MIN_COHERENCE = 0.9
+"""Coherence of phases from which recordings have one time zero: phases then scatter by .2 rad, and gains err by 2 %.
+Measured impulse responses have .94 to 1.00, and .53 to .92 with a delay of 0 or 1 sample each by chance."""
+SIGNIFICANCE = 1e-3
+"""Probability of forces that are related to the loudness to look as if they were not."""
+MIN_FREEDOM = 5
+"""Degrees of freedom of the regression of level on force; with fewer, repeated impacts do not suffice on their own."""
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """One setting whose proposed value would help: plain values, so that `dataclasses.asdict` gives what JSON holds."""
+
+    key: str
+    """A field of `CaptureSettings`."""
+    value: bool | int | float | str
+    reason: str
+
+    @property
+    def line(self) -> str:
+        """The setting as a line of TOML."""
+        return f"{self.key} = {json.dumps(self.value)}"
+
+
+def propose_settings(folder: str | Path, settings: CaptureSettings | None = None) -> tuple[Proposal, ...]:
+    """Return the settings other than the present ones that would help to read a folder, with the reasons.
+
+    `settings`, where given, take the place of the folder's `capture.toml`. A key that the file holds, or that differs
+    from its default, was chosen and is left alone. Recordings that cannot be read are passed over; raises nothing for
+    bad input.
+    """
+    folder = Path(folder)
+    try:
+        chosen = set(read_toml(folder / SETTINGS)) if settings is None and (folder / SETTINGS).is_file() else set()
+        settings = settings or settings_of(folder)
+        strikes = list(_strikes(folder, settings))
+    except (CaptureError, OSError, ValueError):
+        return ()
+    defaults = vars(CaptureSettings())
+    chosen |= {key for key, value in vars(settings).items() if value != defaults[key]}
+    proposals: list[Proposal] = []
+    if not chosen & {"force_channel", "response_channel"}:
+        proposals += choose_channels([channel_figures(recording) for _, recording in _recordings(folder, strikes)])
+        found: dict[str, Any] = {each.key: each.value for each in proposals}
+        settings = replace(settings, **found)
+    evidence = Evidence(settings)
+    for strike, recording in _recordings(folder, strikes):
+        evidence.add(strike, recording)
+    proposals += [each for each in evidence.proposals() if each.key not in chosen]
+    return tuple(proposals)
+
+
+def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
+    """Write the proposals with their reasons as the folder's `capture.toml` and return its path.
+
+    Raises `CaptureError`, and changes nothing, where the folder has one already or it cannot be written.
+    """
+    path = Path(folder) / SETTINGS
+    try:
+        with open(path, "x", encoding="utf-8") as file:
+            file.write(settings_text(proposals))
+    except FileExistsError as error:
+        raise CaptureError(f"{path}: exists and is left as it is; add the proposed lines to it by hand") from error
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be written: {error.strerror or error}") from error
+    return path
+
+
+def settings_text(proposals: Sequence[Proposal]) -> str:
+    """Return the text of a `capture.toml` with these settings, each below its reason."""
+    head = "# Proposed by `avmsf check --write-settings` from the recordings; change or remove what does not suit.\n"
+    reasons = (textwrap.wrap(each.reason, 100, initial_indent="# ", subsequent_indent="# ") for each in proposals)
+    parts = ("\n".join([*reason, each.line, ""]) for reason, each in zip(reasons, proposals, strict=True))
+    return "\n".join([head, *parts])
+
+
+def choose_channels(figures: Sequence[Float64[np.ndarray, "2 channels"]]) -> list[Proposal]:
+    """Return which channel is the hammer's and which the sound's, from each recording's `channel_figures`.
+
+    A hammer's channel holds one short push in every recording. Of several sounds beside it, the one that stands highest
+    above its noise; without a hammer only where the others hold no clear impact (`HIGHEST_NOISE_DB`), for a
+    channel of several pushes is no sound.
+    """
+    counts = {each.shape[1] for each in figures}
+    if len(counts) != 1 or counts == {1}:
+        return []
+    shares, above = np.stack(figures, axis=1)
+    proposals, sounds = [], list(range(shares.shape[1]))
+    hammers = np.flatnonzero(shares.min(axis=0) >= MIN_PUSH_SHARE)
+    if len(hammers) == 1:
+        hammer = int(hammers[0])
+        sounds.remove(hammer)
+        proposals.append(
+            Proposal(
+                "force_channel",
+                hammer + 1,
+                f"Channel {hammer + 1} is a hammer's: in every recording one short push holds at least "
+                f"{shares[:, hammer].min():.0%} of its energy, in the others at most {shares[:, sounds].max():.0%}. "
+                "Where it is not in newtons, write force_scale as well.",
+            )
+        )
+    levels = np.median(above, axis=0)[sounds]
+    best = int(np.argmax(levels))
+    if len(sounds) > 1 and (proposals or (np.delete(levels, best) < -HIGHEST_NOISE_DB).all()):
+        shown = ", ".join(f"{row + 1}: {level:.0f} dB" for row, level in zip(sounds, levels, strict=True))
+        proposals.append(
+            Proposal(
+                "response_channel",
+                sounds[best] + 1,
+                f"Of the channels that can be the sound, {sounds[best] + 1} stands highest above its noise ({shown}). "
+                "Another one can be chosen.",
+            )
+        )
+    return proposals
+
+
+def channel_figures(recording: Recording) -> Float64[np.ndarray, "2 channels"]:
+    """Return for each channel the share of its energy in its first push, and its peak's level above its noise, dB."""
+    if len(recording.channels) == 1:
+        return np.zeros((2, 1))
+    return np.array([(_push_share(row), _above_noise(row, recording.sample_rate)) for row in recording.channels]).T
+
+
+class Evidence:
+    """What the recordings of a folder show about `normalise`, `highpass` and `align`, added one after the other."""
+
+    def __init__(self, settings: CaptureSettings) -> None:
+        self.settings = settings
+        self._rates: set[float] = set()
+        self._shortest = float("inf")
+        self._starts: list[Prepared] = []
+        self._struck: list[tuple[Strike, float, float]] = []
+        self._noise: list[Float64[np.ndarray, "kinds candidates"]] = []
+        self._squares: Complex128[np.ndarray, " bins"] | float = 0.0
+        self._powers: Float64[np.ndarray, " bins"] | float = 0.0
+
+    def add(self, strike: Strike, recording: Recording) -> None:
+        """Add one recording; one that cannot be prepared is passed over."""
+        settings, rate = self.settings, recording.sample_rate
+        try:
+            prepared = prepare(recording, settings, newtons=strike.newtons)
+        except CaptureError:
+            return
+        self._rates.add(rate)
+        self._shortest = min(self._shortest, recording.duration)
+        self._starts.append(shorten(prepared, rate=rate, settings=replace(settings, seconds=SECONDS_BEFORE)))
+        if prepared.newtons is not None:
+            self._struck.append((strike, prepared.newtons, prepared.peak * prepared.newtons))
+        response = recording.response(settings.response_channel, force_channel=settings.force_channel)
+        kept = round(settings.seconds * rate)
+        lead = response[: max(0, prepared.onset - round(SECONDS_BEFORE * rate))]
+        if len(lead) >= SHORTEST_LEAD_SECONDS * rate:
+            later = response[prepared.onset : prepared.onset + kept]
+            self._noise.append(_low_powers(lead, later, rate) / float(np.abs(response).max()) ** 2)
+        spectrum = np.fft.rfft(np.concatenate([prepared.before, prepared.sound])[:kept], kept)
+        spectrum /= np.linalg.norm(spectrum)
+        self._squares, self._powers = self._squares + spectrum**2, self._powers + np.abs(spectrum) ** 2
+
+    def proposals(self) -> list[Proposal]:
+        """Return what all recordings together show."""
+        if len(self._rates) != 1 or len(self._starts) < 2:
+            return []
+        found = (self._normalise(), self._highpass(), self._align())
+        return [each for each in found if each is not None]
+
+    def _normalise(self) -> Proposal | None:
+        """Propose "none" where dividing by the force makes levels differ more, significantly.
+
+        With b the slope of the level over the force, both in dB, the division leaves less variance where b > .5 and
+        more where b < .5. Levels are compared within repeated impacts where these suffice, else over all contacts,
+        whose own differences are then the noise of the regression.
+        """
+        if self.settings.normalise != "auto" or len(self._struck) != len(self._starts):
+            return None
+        force, level = np.array([(decibels(push), decibels(peak)) for _, push, peak in self._struck]).T
+        places = [(*(round(value, 6) for value in each.contact), each.direction) for each, _, _ in self._struck]
+        groups = np.unique([places.index(each) for each in places], return_inverse=True)[1]
+        freedom = len(groups) - int(groups.max()) - 2
+        if freedom < MIN_FREEDOM:
+            groups, freedom = np.zeros_like(groups), len(groups) - 2
+        sizes = np.bincount(groups)
+        force, level = (each - (np.bincount(groups, each) / sizes)[groups] for each in (force, level))
+        spread = float(force @ force)
+        if freedom < MIN_FREEDOM or spread <= 0.0:
+            return None
+        slope = float(force @ level) / spread
+        error = float(np.sqrt(np.square(level - slope * force).sum() / freedom / spread))
+        if slope - error * float(stdtrit(freedom, SIGNIFICANCE)) >= 0.5:
+            return None
+        return Proposal(
+            "normalise",
+            "none",
+            f"The forces do not go with the loudness: 10 dB more force made the recordings {10 * slope:+.1f} dB louder "
+            f"(standard error {10 * error:.1f} dB), so that dividing by them would make levels differ more.",
+        )
+
+    def _highpass(self) -> Proposal | None:
+        """Propose the lowest candidate that removes most of the noise and nothing of the object's."""
+        if self.settings.highpass > 0.0 or len(self._noise) < len(self._starts) / 2:
+            return None
+        before, below, later = np.mean(self._noise, axis=0)
+        if before[0] < MIN_NOISE_SHARE:
+            return None
+        chosen, left = None, before[0]
+        for cutoff, total, low, after in zip(CANDIDATES_HZ, before, below, later, strict=True):
+            rest = max(total - low, 1e-12 * total)
+            impossible = cutoff * self._shortest < 1.0 or after > MAX_RUMBLE_RISE * low
+            if impossible or left / rest < MIN_NOISE_RATIO:
+                continue
+            chosen, left = cutoff, rest
+        if chosen is None:
+            return None
+        return Proposal(
+            "highpass",
+            chosen,
+            f"Before the impacts, an offset or rumble below {chosen:g} Hz is most of the noise: without it, noise is "
+            f"{10 * np.log10(before[0] / left):.0f} dB lower. The object does not ring there: the power below "
+            f"{chosen:g} Hz does not rise at the impact.",
+        )
+
+    def _align(self) -> Proposal | None:
+        """Propose false where all recordings start with the impact and their phases agree as they are."""
+        settings = self.settings
+        if not settings.align or settings.force_channel is not None:
+            return None
+        if not start_with_impact(self._starts, rate=min(self._rates)):
+            return None
+        coherence = float(np.abs(self._squares).sum() / np.sum(self._powers))
+        if coherence < MIN_COHERENCE:
+            return None
+        return Proposal(
+            "align",
+            False,
+            "All recordings are impulse responses with one time zero: they start with the impact, and their phases "
+            f"agree as they are (coherence {coherence:.2f} of 1). They are not cut in any case; this also leaves out "
+            "the estimation of their delays.",
+        )
+
+
+def _strikes(folder: Path, settings: CaptureSettings) -> Iterator[Strike]:
+    for row in read_rows(folder)[0]:
+        try:
+            yield understand(row, settings)
+        except CaptureError:
+            continue
+
+
+def _recordings(folder: Path, strikes: Sequence[Strike]) -> Iterator[tuple[Strike, Recording]]:
+    for strike in strikes:
+        try:
+            yield strike, read_recording(folder / strike.file, strike.file)
+        except CaptureError:
+            continue
+
+
+def _push_share(channel: Float64[np.ndarray, " frames"]) -> float:
+    """Return the share of a channel's energy that lies within its first push and one width on either side."""
+    if np.ptp(channel) == 0:
+        return 0.0
+    pulse = find_pulse(channel)
+    power = np.square(channel - pulse.rest)
+    width = pulse.stop - pulse.start
+    return float(power[max(0, pulse.start - width) : pulse.stop + width].sum() / power.sum())
+
+
+def _above_noise(channel: Float64[np.ndarray, " frames"], rate: float) -> float:
+    """Return the level of a channel's peak above its noise, dB; 0 for a silent one."""
+    if np.ptp(channel) == 0:
+        return 0.0
+    noise = noise_level(channel, find_onset(channel, sample_rate=rate), rate)
+    return -decibels(noise / float(np.abs(channel).max()))
+
+
+def _low_powers(
+    lead: Float64[np.ndarray, " lead"], later: Float64[np.ndarray, " samples"], rate: float
+) -> Float64[np.ndarray, "kinds candidates"]:
+    """Return mean squares for each candidate: of all before the impact, of that below the candidate, and after it."""
+    rows = []
+    for signal in (lead, later):
+        power = np.abs(np.fft.rfft(signal) / len(signal)) ** 2
+        power[1:] *= 2.0
+        frequencies = np.fft.rfftfreq(len(signal), 1.0 / rate)
+        rows.append([power.sum(), *(power[frequencies < cutoff].sum() for cutoff in CANDIDATES_HZ)])
+    before, after = rows
+    return np.array([[before[0]] * len(CANDIDATES_HZ), before[1:], after[1:]])

@@ -1,0 +1,99 @@
+"""Where the sounds of one capture start in their files: decided for all of its recordings together."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.capture.prepare import MIN_MARGIN, Prepared, margin_length
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.together import common_length
+
+START_LEVEL = 10**-2.0
+"""Share of the largest mean square in the first 20 ms that a response must have at its start: -20 dB, the
+level (a tenth of the peak) from which `find_onset` counts a swing as the impact's. Impulse responses reach 0 to -3 dB
+(aircraft, ruler, tree), recordings with 4 samples to 1 s before the impact -25 to -47 dB."""
+MAX_START_SECONDS = 0.001
+"""By when `find_onset` must see every recording that starts with the impact. Where modes cancel at first it takes up to
+.3 ms (a plate of 43 modes at 96 kHz) and 5 samples (the aircraft at 400 Hz); delays of 1 ms are found on alignment."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sounds:
+    """The sounds of one capture, cut to one length, as `Impacts` holds them."""
+
+    sounds: Float[Tensor, "contacts samples"]
+    before: Float[Tensor, "contacts lead"] | None
+    after: Float[Tensor, "contacts tail"] | None
+    remarks: list[str]
+    """What their common length costs."""
+
+
+def start_with_impact(recordings: Sequence[Prepared], *, rate: float) -> bool:
+    """Return whether all recordings start with the impact, without anything before it, as impulse responses do.
+
+    A single recording does not show this: the first samples of an impulse response are small where its modes happen to
+    cancel, and the first is zero where it is a displacement. Over all recordings modes cancel nowhere, so the mean
+    square of sounds of equal energy is within a sixteenth of a period (and the first two samples) nearly as large as
+    later: a sine reaches -8 dB by then. With anything before the impact it is that of noise. The period is that of the
+    root mean square frequency. Every single onset has to come within `MAX_START_SECONDS` or `MIN_MARGIN` samples as
+    well.
+    """
+    latest = max(MIN_MARGIN, round(MAX_START_SECONDS * rate))
+    if any(each.onset >= latest or len(each.before) < each.onset for each in recordings):
+        return False
+    size = min(margin_length(rate), *(len(each.before) + len(each.sound) for each in recordings))
+    starts = np.stack([np.concatenate([each.before, each.sound[:size]])[:size] for each in recordings])
+    starts = starts.astype(np.float64)
+    power = starts**2
+    energies = np.maximum(power.sum(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    mean = (power / energies).mean(axis=0)
+    # The squared difference of a sine's samples is its square times (angle between them)^2, on average.
+    angle = np.sqrt((np.diff(starts, axis=1) ** 2 / energies).mean() / mean.mean())
+    first = max(2, 1 + round(2 * np.pi / 16 / max(float(angle), 1.0 / size)))
+    return bool(mean[:first].max() >= START_LEVEL * mean.max())
+
+
+def settle_starts(recordings: Sequence[Prepared], *, rate: float, settings: CaptureSettings) -> list[Prepared]:
+    """Return the recordings uncut where all of them start with the impact, else as they are.
+
+    A force channel and `align = false` say where the sounds start; then nothing changes.
+    """
+    if not settings.align or settings.force_channel is not None or not start_with_impact(recordings, rate=rate):
+        return list(recordings)
+    return [
+        replace(each, sound=np.concatenate([each.before, each.sound]), before=each.before[:0], onset=0)
+        for each in recordings
+    ]
+
+
+def shorten(prepared: Prepared, *, rate: float, settings: CaptureSettings) -> Prepared:
+    """Return a recording in float32 with no more of it than `cut_together` can use, so that many fit in memory."""
+    most = round(settings.seconds * rate) + margin_length(rate)
+    sound, before = (part.astype(np.float32) for part in (prepared.sound[:most], prepared.before))
+    return replace(prepared, sound=sound, before=before)
+
+
+def cut_together(
+    recordings: Sequence[Prepared], names: Sequence[str], *, rate: float, settings: CaptureSettings
+) -> Sounds:
+    """Return the sounds from their starts on, cut to one length, and what the files hold on either side of them.
+
+    Without `align` nothing will be moved later, so that both sides are None. Raises `CaptureError` as `common_length`.
+    """
+    settled = settle_starts(recordings, rate=rate, settings=settings)
+    length, remarks = common_length([len(each.sound) for each in settled], names, rate=rate, settings=settings)
+    sounds = torch.from_numpy(np.stack([each.sound[:length] for each in settled]).astype(np.float32))
+    if not settings.align:
+        return Sounds(sounds, None, None, remarks)
+    size = margin_length(rate)
+    before = np.full((len(settled), size), np.nan, dtype=np.float32)
+    after = before.copy()
+    for row, each in enumerate(settled):
+        before[row, size - len(each.before) :] = each.before
+        rest = each.sound[length : length + size]
+        after[row, : len(rest)] = rest
+    return Sounds(sounds, torch.from_numpy(before), torch.from_numpy(after), remarks)
