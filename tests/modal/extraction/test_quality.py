@@ -154,6 +154,13 @@ def test_a_silent_recording_changes_nothing() -> None:
     assert padded.is_mode.tolist() == alone.is_mode.tolist()
 
 
+def test_of_a_single_recording_every_figure_is_finite() -> None:
+    quality = quality_of(record(TRUTH, shapes(1, 3)), TRUTH)
+    for figure in (quality.frequency_spread, quality.damping_spread, quality.coherence, quality.explained_left_out):
+        assert torch.isfinite(figure).all()
+    assert quality.is_mode.all()
+
+
 def test_a_pole_that_is_not_there_is_stable_at_no_order() -> None:
     sounds = record(TRUTH, shapes(4, 3))
     stable = stable_orders(sounds, bank_of((400.0, 8.0), (550.0, 10.0)), sample_rate=RATE)
