@@ -9,12 +9,18 @@ import tyro
 
 from avmsf.bench.pictures import draw_modes, expect_format, save_picture
 from avmsf.capture import CaptureSettings, read_capture
-from avmsf.cli.modetable import ModeRow, amplitudes, heard_in, levels, mode_rows
+from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_rows, quality_rows
 from avmsf.cli.printing import console, decimals, figure, print_json, say, table
 from avmsf.modal.extraction.extract import extract
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
+from avmsf.modal.extraction.quality import measure_quality
 
 Method = Literal["high-resolution", "short-time"]
+
+_EXPLANATION = """\
+±: spread over recordings. energy: share of all. phase: coherence over recordings, 1 if the same in
+all. orders: part of the model orders that find the pole. left out: energy explained in a recording
+that is left out, 50 % by chance."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +58,15 @@ def run(options: Options) -> int:
     extraction = extract(impacts, finder(options.method, options.modes))
     level = levels(amplitudes(extraction))
     rows = mode_rows(extraction.bank, level)
-    heard = heard_in(extraction, sample_rate=impacts.sample_rate, samples=impacts.sounds.shape[1])
-    title = f"{len(rows)} modes of {capture.name}, {len(impacts)} recordings"
-    console(errors=options.json).print(mode_table(title, rows, heard=[f"{count}/{len(impacts)}" for count in heard]))
+    quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)
+    every = list(zip(rows, quality_rows(quality), quality.is_mode.tolist(), strict=True))
+    modes, supporting = ([(row, how) for row, how, is_mode in every if is_mode is part] for part in (True, False))
+    title = f"{len(modes)} modes of {capture.name}, {len(impacts)} recordings"
+    screen = console(errors=options.json)
+    screen.print(quality_table(title, modes))
+    if supporting:
+        screen.print(quality_table(f"{len(supporting)} supporting poles: kept in the model, not modes", supporting))
+    screen.print(_EXPLANATION)
     if options.picture is not None:
         save_picture(draw_modes(extraction.bank, level, title=title), options.picture)
         say(f"wrote {options.picture}")
@@ -66,7 +78,8 @@ def run(options: Options) -> int:
                 "sample_rate": impacts.sample_rate,
                 "seconds": impacts.duration,
                 "method": options.method,
-                "modes": [asdict(row) | {"heard_in": count} for row, count in zip(rows, heard, strict=True)],
+                "modes": [asdict(row) | asdict(how) for row, how in modes],
+                "supporting_poles": [asdict(row) | asdict(how) for row, how in supporting],
             }
         )
     return 0
@@ -77,8 +90,8 @@ def finder(method: Method, modes: int) -> ModeFinder:
     return HighResolution(modes=modes) if method == "high-resolution" else ShortTime(modes=modes)
 
 
-def mode_table(title: str, rows: Sequence[ModeRow], *, heard: Sequence[str] | None = None) -> object:
-    """Return the modes for printing, with the numbers of recordings that `heard` gives."""
+def mode_table(title: str, rows: Sequence[ModeRow]) -> object:
+    """Return the modes for printing."""
     columns = ["", "frequency Hz", "damping 1/s", "T60 s", "level dB"]
     cells = [
         [
@@ -90,7 +103,24 @@ def mode_table(title: str, rows: Sequence[ModeRow], *, heard: Sequence[str] | No
         ]
         for number, row in enumerate(rows, start=1)
     ]
-    if heard is not None:
-        columns.append("heard in")
-        cells = [[*cell, count] for cell, count in zip(cells, heard, strict=True)]
+    return table(title, columns, cells)
+
+
+def quality_table(title: str, rows: Sequence[tuple[ModeRow, QualityRow]]) -> object:
+    """Return modes with their quality for printing."""
+    columns = ["", "frequency Hz", "damping 1/s", "T60 s", "level dB", "energy", "phase", "orders", "left out"]
+    cells = [
+        [
+            str(number),
+            f"{row.frequency_hertz:.2f} ± {figure(how.frequency_spread_hertz, 2)}",
+            f"{figure(row.damping_per_second)} ± {figure(how.damping_spread_per_second, 2)}",
+            figure(row.t60_seconds),
+            decimals(row.level_db, 1),
+            f"{100 * how.energy_share:.2f} %",
+            decimals(how.phase_coherence, 2),
+            f"{100 * how.stable_orders:.0f} %",
+            f"{100 * how.explained_left_out:.0f} %",
+        ]
+        for number, (row, how) in enumerate(rows, start=1)
+    ]
     return table(title, columns, cells)

@@ -9,10 +9,7 @@ from torch import Tensor
 
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
-
-_HEARD = 4.0
-"""An amplitude this many times the standard deviation of one phase under noise: noise reaches it once in 3000
-(exp(-4^2 / 2))."""
+from avmsf.modal.extraction.quality import ModeQuality
 
 
 @dataclass(frozen=True)
@@ -25,6 +22,35 @@ class ModeRow:
     """Time in which it falls by 60 dB, ln(1000) / damping."""
     level_db: float
     """Root mean square of its amplitude over recordings or points, against the strongest mode's."""
+
+
+@dataclass(frozen=True)
+class QualityRow:
+    """How well the recordings support one mode, as plain values."""
+
+    frequency_spread_hertz: float
+    damping_spread_per_second: float
+    stable_orders: float
+    """Part of the model orders that find it again, from 0 to 1."""
+    phase_coherence: float
+    """One if its phase is the same in all recordings, modulo pi."""
+    energy_share: float
+    """Part of the energy of all poles, from 0 to 1."""
+    explained_left_out: float
+    """What of its energy in a recording the other recordings' pole explains, from 0 to 1; .5 by chance."""
+
+
+def quality_rows(quality: ModeQuality) -> list[QualityRow]:
+    """Return the quality of each mode, in the bank's order."""
+    columns = (
+        quality.frequency_spread,
+        quality.damping_spread,
+        quality.stable_orders,
+        quality.coherence,
+        quality.energy_share,
+        quality.explained_left_out,
+    )
+    return [QualityRow(*values) for values in zip(*(column.tolist() for column in columns), strict=True)]
 
 
 def mode_rows(bank: ModalBank, level_db: Float[Tensor, " modes"]) -> list[ModeRow]:
@@ -46,17 +72,3 @@ def levels(amplitudes: Float[Tensor, "contacts modes"]) -> Float[Tensor, " modes
 def amplitudes(extraction: Extraction) -> Float[Tensor, "contacts modes"]:
     """Return the modes' amplitudes in each recording, whatever their phase."""
     return torch.hypot(extraction.gains, extraction.quadrature)
-
-
-def heard_in(extraction: Extraction, *, sample_rate: float, samples: int) -> list[int]:
-    """Return in how many recordings each mode stands clear of the noise.
-
-    A least-squares amplitude of a decaying sine whose samples have the square sum E scatters in white noise of standard
-    deviation s by s / sqrt(E) in phase and in quadrature; E is rate (1 - exp(-2 d T)) / (4 d). Four times that counts
-    as heard, with s the residual's magnitude at the mode.
-    """
-    bank, magnitude = extraction.bank, extraction.residual.magnitude
-    energy = sample_rate * -torch.expm1(-2 * bank.damping * samples / sample_rate) / (4 * bank.damping)
-    place = torch.round(bank.frequency / (sample_rate / 2) * (len(magnitude) - 1)).long()
-    scatter = magnitude.double()[place] / energy.sqrt()
-    return (amplitudes(extraction) > _HEARD * scatter).sum(0).tolist()
