@@ -110,10 +110,10 @@ def clips_in_place(name: str, *, highpass: float = 0.0) -> list[Clip]:
     for path in sorted((shared_data() / name).glob("*.wav")):
         recording = read_recording(path)
         prepared, rate = prepare(recording, settings), recording.sample_rate
-        end = round(settings.seconds * rate)
+        end = round(settings.kept_seconds(rate) * rate)
         if settings.force_channel is not None and prepared.pulse is not None:
             force = recording.channel(settings.force_channel)
-            pushed = find_second_push(force, prepared.pulse, sample_rate=rate, seconds=settings.seconds)
+            pushed = find_second_push(force, prepared.pulse, sample_rate=rate, seconds=settings.kept_seconds(rate))
             if pushed is not None:
                 end = pushed - prepared.onset - round(_BEFORE_NEXT_BLOW * rate)
         clips.append(Clip(path.stem, torch.from_numpy(prepared.sound[:end].copy()).float(), rate))

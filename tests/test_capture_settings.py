@@ -16,7 +16,7 @@ def read(folder: Path, text: str) -> CaptureSettings:
 def test_every_key_is_optional_and_the_paper_keeps_three_seconds(tmp_path: Path) -> None:
     settings = read(tmp_path, "")
     assert settings == CaptureSettings()
-    assert settings.seconds == 3.0
+    assert settings.kept_seconds(48000.0) == 3.0
 
 
 def test_keys_are_read_and_whole_numbers_serve_as_numbers(tmp_path: Path) -> None:
@@ -65,3 +65,10 @@ def test_a_mistake_names_file_and_key(tmp_path: Path, text: str, message: str) -
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=r"nowhere\.toml: there is no such file"):
         CaptureSettings.read(tmp_path / "nowhere.toml")
+
+
+def test_slow_recordings_are_kept_for_as_many_samples() -> None:
+    assert CaptureSettings().kept_seconds(44100.0) == 3.0
+    assert CaptureSettings().kept_seconds(96000.0) == 3.0
+    assert CaptureSettings().kept_seconds(400.0) * 400.0 == pytest.approx(3.0 * 44100.0)
+    assert CaptureSettings(seconds=2.0).kept_seconds(400.0) == 2.0

@@ -59,9 +59,9 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
     if prepared.pulse is not None and settings.force_channel is not None:
         force = recording.channel(settings.force_channel)
         clipped += clipped_samples(force)
-        second = find_second_push(force, prepared.pulse, sample_rate=rate, seconds=settings.seconds)
+        second = find_second_push(force, prepared.pulse, sample_rate=rate, seconds=settings.kept_seconds(rate))
     else:
-        second = find_second_blow(response, prepared.onset, sample_rate=rate, seconds=settings.seconds)
+        second = find_second_blow(response, prepared.onset, sample_rate=rate, seconds=settings.kept_seconds(rate))
     problems = []
     others = [each for each in range(1, len(recording.channels) + 1) if each not in (channel, settings.force_channel)]
     if settings.response_channel is None and any(

@@ -189,7 +189,7 @@ class Evidence:
         if prepared.newtons is not None:
             self._struck.append((strike, prepared.newtons, prepared.peak * prepared.newtons))
         response = recording.response(settings.response_channel, force_channel=settings.force_channel)
-        kept = round(settings.seconds * rate)
+        kept = round(settings.kept_seconds(rate) * rate)
         lead = response[: max(0, prepared.onset - round(SECONDS_BEFORE * rate))]
         if len(lead) >= SHORTEST_LEAD_SECONDS * rate:
             later = response[prepared.onset : prepared.onset + kept]

@@ -13,6 +13,7 @@ from avmsf._utils.text_files import read_toml
 from avmsf.errors import CaptureError
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
+USUAL_SECONDS = 3.0
 NORMALISATIONS = ("auto", "peak", "deconvolve", "none", "done")
 
 
@@ -38,8 +39,9 @@ class CaptureSettings:
     force_scale: float = 1.0
     """Newtons for each unit of the force channel; 1 for float files that hold newtons. Where impacts.csv gives
     force_newtons as well, that is the peak, and the channel gives the shape alone."""
-    seconds: float = 3.0
-    """How much to keep from the onset, in seconds as recorded (before any speed-up)."""
+    seconds: float | None = None
+    """How much to keep from the onset, in seconds as recorded (before any speed-up); `kept_seconds` where it is not
+    given."""
     playback_speed: float = 1.0
     """The capture's sample rate is the files' rate times this; nothing is resampled. Above 1, slow vibrations sound
     as a smaller object would."""
@@ -65,7 +67,7 @@ class CaptureSettings:
                 raise CaptureError(f"{key} is {getattr(self, key)!r}; expected one of {', '.join(METRES)}")
         for key in ("seconds", "playback_speed", "regularisation"):
             value = getattr(self, key)
-            if not (value > 0 and math.isfinite(value)):
+            if value is not None and not (value > 0 and math.isfinite(value)):
                 raise CaptureError(f"{key} is {value!r}; expected a number above 0")
         if not 0 <= self.highpass < math.inf:
             raise CaptureError(f"highpass is {self.highpass!r}; expected a frequency in Hz, or 0 for none")
@@ -81,6 +83,14 @@ class CaptureSettings:
             raise CaptureError(f"normalise is {self.normalise!r}; expected one of {', '.join(NORMALISATIONS)}")
         if self.normalise == "deconvolve" and self.force_channel is None:
             raise CaptureError('normalise = "deconvolve" needs the hammer\'s pulse: say which force_channel holds it')
+
+    def kept_seconds(self, rate: float) -> float:
+        """Return how many seconds are kept from the onset of files of this sample rate, Hz.
+
+        Where `seconds` is not given that is 3 s, and at rates below 44.1 kHz as many samples: what is sampled slowly
+        rings for long (a structure of 19 Hz at 400 Hz still after 6 s).
+        """
+        return max(USUAL_SECONDS, USUAL_SECONDS * 44100.0 / rate) if self.seconds is None else self.seconds
 
     @property
     def metres(self) -> float:

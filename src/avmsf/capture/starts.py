@@ -72,7 +72,7 @@ def settle_starts(recordings: Sequence[Prepared], *, rate: float, settings: Capt
 
 def shorten(prepared: Prepared, *, rate: float, settings: CaptureSettings) -> Prepared:
     """Return a recording in float32 with no more of it than `cut_together` can use, so that many fit in memory."""
-    most = round(settings.seconds * rate) + margin_length(rate)
+    most = round(settings.kept_seconds(rate) * rate) + margin_length(rate)
     sound, before = (part.astype(np.float32) for part in (prepared.sound[:most], prepared.before))
     return replace(prepared, sound=sound, before=before)
 

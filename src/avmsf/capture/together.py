@@ -77,14 +77,14 @@ def common_length(
 ) -> tuple[int, list[str]]:
     """Return how many samples from the onset every sound keeps, and a remark where one short recording costs the rest.
 
-    That is `settings.seconds`, or all of the shortest recording. `CaptureError` where the settings ask for too little.
+    That is `settings.kept_seconds`, or all of the shortest recording. `CaptureError` where the settings ask for too
+    little.
     """
-    asked = round(settings.seconds * rate)
+    seconds = settings.kept_seconds(rate)
+    asked = round(seconds * rate)
     least = shortest_allowed(rate)
     if asked < least:
-        raise CaptureError(
-            f"seconds = {settings.seconds:g} keeps {asked} samples at {rate:g} Hz; at least {least} are needed"
-        )
+        raise CaptureError(f"seconds = {seconds:g} keeps {asked} samples at {rate:g} Hz; at least {least} are needed")
     shortest = min(lengths)
     usual = min(asked, int(np.median(lengths)))
     remarks = []

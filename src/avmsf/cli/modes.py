@@ -9,6 +9,7 @@ import tyro
 
 from avmsf.bench.pictures import draw_modes, expect_format, save_picture
 from avmsf.capture import CaptureSettings, read_capture
+from avmsf.cli.alignment import alignment_sentences, alignment_values
 from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_rows, quality_rows
 from avmsf.cli.printing import console, decimals, figure, print_json, say, table
 from avmsf.modal.extraction.extract import extract
@@ -67,6 +68,10 @@ def run(options: Options) -> int:
     if supporting:
         screen.print(quality_table(f"{len(supporting)} supporting poles: kept in the model, not modes", supporting))
     screen.print(_EXPLANATION)
+    aligned = alignment_values(extraction, impacts)
+    if extraction.alignment is not None and aligned is not None:
+        for sentence in alignment_sentences(extraction.alignment, aligned["inverted"]):
+            screen.print(sentence, soft_wrap=True)
     if options.picture is not None:
         save_picture(draw_modes(extraction.bank, level, title=title), options.picture)
         say(f"wrote {options.picture}")
@@ -78,6 +83,7 @@ def run(options: Options) -> int:
                 "sample_rate": impacts.sample_rate,
                 "seconds": impacts.duration,
                 "method": options.method,
+                "alignment": aligned,
                 "modes": [asdict(row) | asdict(how) for row, how in modes],
                 "supporting_poles": [asdict(row) | asdict(how) for row, how in supporting],
             }
