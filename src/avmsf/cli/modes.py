@@ -68,7 +68,8 @@ def run(options: Options) -> int:
         screen.print(quality_table(f"{len(supporting)} supporting poles: kept in the model, not modes", supporting))
     screen.print(_EXPLANATION)
     if options.picture is not None:
-        save_picture(draw_modes(extraction.bank, level, title=title), options.picture)
+        drawn = f"{len(rows)} poles of {capture.name}, {len(modes)} of them modes"
+        save_picture(draw_modes(extraction.bank, level, title=drawn), options.picture)
         say(f"wrote {options.picture}")
     if options.json:
         print_json(
