@@ -73,7 +73,8 @@ def run(options: Options) -> int:
         for sentence in alignment_sentences(extraction.alignment, aligned["inverted"]):
             screen.print(sentence, soft_wrap=True)
     if options.picture is not None:
-        save_picture(draw_modes(extraction.bank, level, title=title), options.picture)
+        drawn = f"{len(rows)} poles of {capture.name}, {len(modes)} of them modes"
+        save_picture(draw_modes(extraction.bank, level, title=drawn), options.picture)
         say(f"wrote {options.picture}")
     if options.json:
         print_json(
