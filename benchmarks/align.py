@@ -24,6 +24,7 @@ from avmsf.field.physics import Physics
 from avmsf.field.recipes import Attention, GainRecipe, ThinPlate
 from avmsf.modal.extraction.alignment import Alignment, align, coherence
 from avmsf.modal.extraction.extract import Extraction, extract
+from avmsf.modal.extraction.quality import measure_quality
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
 from avmsf.simulate.nominal import nominal_bodies
@@ -31,6 +32,7 @@ from avmsf.simulate.truth import read_truth
 from benchmarks.field import QUICK_LOOK, physics_of
 from benchmarks.look import slab
 from benchmarks.material import STRUCK, shared_data, surface_features
+from benchmarks.modes import AIRCRAFT, LEAST_SHARE, count_modes, tree_frequencies
 from benchmarks.report import Options, Report, Table, tell
 
 STARTS = (0, 18, 37)
@@ -187,6 +189,28 @@ def _jitter(options: Options) -> Report:
             tell(f"{name}, jitter {jitter}: {errors}, rms {rms:.3f}, refused {refused:g}")
     columns = ("object and jitter", "spline", "physics", "worst ratio to jitter 0", "rms", "refused")
     return Report(tables=(Table("held-out error with artificial jitter", columns, rows),), figures=figures)
+
+
+def _modes(options: Options) -> Report:
+    """Count the known modes of measured captures that are found, and the others."""
+    rows: list[list[str | float]] = []
+    figures: Figures = {}
+    for key, name, known, share in (
+        ("aircraft", "aircraft_response", AIRCRAFT, LEAST_SHARE),
+        ("tree", "tree43", tree_frequencies(), 0.0),
+    ):
+        impacts = _read(name).impacts
+        modes = extract(impacts)
+        counted = count_modes(impacts, modes, known, least_share=share)
+        quality = measure_quality(modes.aligned(impacts).sounds, modes, sample_rate=impacts.sample_rate)
+        called = float(quality.is_mode.sum())
+        rows.append(
+            [name, float(len(modes.bank)), called, float(len(known)), float(counted.found), float(counted.extra)]
+        )
+        figures |= {f"modes.{key}_found": float(counted.found), f"modes.{key}_extra": float(counted.extra)}
+    columns = ("capture", "poles", "modes", "known", "found", "extra")
+    title = f"modes; extra ones of the aircraft count from {LEAST_SHARE:.0%} of the energy"
+    return Report(tables=(Table(title, columns, rows),), figures=figures)
 
 
 def _delays(options: Options) -> Report:
@@ -353,4 +377,4 @@ def _error(
     return evaluate(fit(train, features, modes, config, gains=make()), test).mean()["relative_stft"]
 
 
-PARTS = {"captures": _captures, "delays": _delays, "jitter": _jitter, "errors": _errors}
+PARTS = {"captures": _captures, "modes": _modes, "delays": _delays, "jitter": _jitter, "errors": _errors}
