@@ -1,6 +1,7 @@
 """Time alignment: coherence, delays and errors with starts by threshold and aligned, and with known jitter."""
 
 import math
+import tempfile
 import time
 import warnings
 from collections.abc import Callable
@@ -20,15 +21,15 @@ from avmsf.capture.prepare import margin_length, prepare
 from avmsf.capture.table import read_rows, understand
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.physics import Physics
 from avmsf.field.recipes import Attention, GainRecipe, ThinPlate
 from avmsf.modal.extraction.alignment import Alignment, align, coherence
 from avmsf.modal.extraction.extract import Extraction, extract
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.extraction.quality import measure_quality
+from avmsf.pipeline.physics import BodyConfig
+from avmsf.pipeline.physics import physics_of as bodies_of
 from avmsf.scene.features import FeatureField
-from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
-from avmsf.simulate.nominal import nominal_bodies
+from avmsf.simulate.example import EXAMPLE_FOLDER
 from avmsf.simulate.truth import read_truth
 from benchmarks.field import QUICK_LOOK, physics_of
 from benchmarks.look import slab
@@ -155,10 +156,11 @@ def _jitter(options: Options) -> Report:
     plate = STRUCK.strikes(20 if options.quick_look else 40, seconds=1.0)
     # The plate's files: silence before the impact, which begins at their last sample.
     silence = torch.zeros(len(plate), 2 * margin_length(plate.sample_rate))
-    shapes, freedoms = (12, 3000) if options.quick_look else (60, 40_000)
-    walls = nominal_bodies(capture.surface, walls=[EXAMPLE.thickness], count=shapes, freedoms=freedoms)
+    body = BodyConfig(freedoms=3000) if options.quick_look else BodyConfig()
+    with tempfile.TemporaryDirectory() as cache:
+        mug_physics = bodies_of(capture.surface, body, impacts=capture.impacts, cache=Path(cache))
     cases: dict[str, tuple[Impacts, FeatureField, GainRecipe]] = {
-        "mug": (_wide(EXAMPLE_FOLDER, truth.starts), surface_features(capture), Physics(walls)),
+        "mug": (_wide(EXAMPLE_FOLDER, truth.starts), surface_features(capture), mug_physics),
         "plate": (
             replace(plate, before=silence, after=silence),
             STRUCK.features(),
