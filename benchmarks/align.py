@@ -147,6 +147,11 @@ def _errors(options: Options) -> Report:
 
 def _jitter(options: Options) -> Report:
     """Errors with artificial jitter of the starts, on the simulated mug and on the plate."""
+    with tempfile.TemporaryDirectory() as cache:
+        return _jitter_with(options, Path(cache))
+
+
+def _jitter_with(options: Options, cache: Path) -> Report:
     rows: list[list[str | float]] = []
     figures: Figures = {}
     capture = read_capture(EXAMPLE_FOLDER)
@@ -157,8 +162,7 @@ def _jitter(options: Options) -> Report:
     # The plate's files: silence before the impact, which begins at their last sample.
     silence = torch.zeros(len(plate), 2 * margin_length(plate.sample_rate))
     body = BodyConfig(freedoms=3000) if options.quick_look else BodyConfig()
-    with tempfile.TemporaryDirectory() as cache:
-        mug_physics = bodies_of(capture.surface, body, impacts=capture.impacts, cache=Path(cache))
+    mug_physics = bodies_of(capture.surface, body, impacts=capture.impacts, cache=cache)
     cases: dict[str, tuple[Impacts, FeatureField, GainRecipe]] = {
         "mug": (_wide(EXAMPLE_FOLDER, truth.starts), surface_features(capture), mug_physics),
         "plate": (
