@@ -146,6 +146,7 @@ def _crossed(options: Options) -> Report:
     for start in AIRCRAFT_STARTS[:1] if options.quick_look else AIRCRAFT_STARTS:
         train, test = split(capture.impacts, count=CROSSED, start=start)
         modes = extract(train)
+        train, test = modes.aligned(train), modes.aligned(test)
         errors = {
             name: evaluate(fit(train, features, modes, config, gains=recipe), test).mean()["relative_stft"]
             for name, recipe in recipes.items()
@@ -210,6 +211,7 @@ def _visual(options: Options) -> Report:
             "visual_alone_symmetric": finish(lifted, symmetry=True, positions=False).features,
         }
         modes, config = extract(train), QUICK_LOOK if options.quick_look else FitConfig()
+        train, test = modes.aligned(train), modes.aligned(test)
         figures: Figures = {}
         rows: list[list[str | float]] = []
         for name, features in variants.items():
@@ -257,6 +259,7 @@ def _judge(
     config = QUICK_LOOK if options.quick_look else FitConfig()
     begun = time.perf_counter()
     modes = extract(train)
+    train, test = modes.aligned(train), modes.aligned(test)
     extracted = time.perf_counter()
     fitted = fit(train, features, modes, config, gains=Attention())
     done = time.perf_counter()

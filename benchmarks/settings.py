@@ -88,7 +88,8 @@ def _cases(options: Options) -> list[Case]:
     features = surface_features(capture)
     for count, start, part in AIRCRAFT:
         train, test = split(split(capture.impacts, count=count, start=start)[0], count=part)
-        cases.append((train, test, extract(train), features))
+        modes = extract(train)
+        cases.append((modes.aligned(train), modes.aligned(test), modes, features))
     return cases
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from avmsf.capture import CaptureSettings, read_capture
+from avmsf.capture import CaptureSettings, check, read_capture
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
 from avmsf.errors import CaptureError
 from capture_folder import RATE, fill, ring
@@ -206,3 +206,11 @@ def test_what_cannot_be_read_is_passed_over(tmp_path: Path) -> None:
     assert found(folder) == {}
     (folder / "impacts.csv").unlink()
     assert found(folder) == {}
+
+
+def test_different_rates_are_refused_as_a_capture_and_nothing_is_proposed(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    samples, _ = soundfile.read(folder / "b.wav")
+    soundfile.write(folder / "b.wav", samples, 96000)
+    assert propose_settings(folder) == ()
+    assert not check(folder).readable

@@ -28,6 +28,8 @@ MAX_CHANNEL_DIFFERENCE = 0.01
 """Share of a channel, root mean square, that another channel times a constant may leave of it where both hold one
 sound: 40 dB down, less than the noise of a usable recording (`HIGHEST_NOISE_DB` in measure.py is 20)."""
 _BITS = {"PCM_S8": 8, "PCM_U8": 8, "PCM_16": 16, "PCM_24": 24, "PCM_32": 32}
+FAINT_CHANNEL = 0.1
+"""Level of a channel over the loudest one's below which it is not used: a muted or far microphone's, 20 dB down."""
 EIGHT_BIT = frozenset({"PCM_U8", "PCM_S8", "ULAW", "ALAW", "DPCM_8"})
 
 
@@ -66,8 +68,9 @@ class Recording:
     def response_channel(self, number: int | None = None, *, force_channel: int | None = None) -> int:
         """Return the number of the channel that holds the object's sound: the given one, or the only one it can be.
 
-        Without a number that is a file's one channel, the one that is left beside the force, or the loudest where all
-        hold one sound up to a constant factor, rounding and dither. `CaptureError` where the choice is open.
+        Without a number that is a file's one channel, the one that is left beside the force, or, where all hold one
+        sound up to a constant factor, rounding and dither, the first of them that is not faint: the same channel in all
+        files of a recorder, for another might have the opposite sign. `CaptureError` where the choice is open.
         """
         if number is not None:
             return number
@@ -82,7 +85,8 @@ class Recording:
                 f"{self.name}: it holds {len(self.channels)} different channels and nothing says which one is the "
                 "sound: write response_channel = 1 (or another, counted from 1) in capture.toml, or save it as mono"
             )
-        return loudest
+        levels = {each: float(np.std(self.channels[each - 1])) for each in left}
+        return next(each for each in left if levels[each] >= FAINT_CHANNEL * levels[loudest])
 
     def response(
         self, number: int | None = None, *, force_channel: int | None = None

@@ -38,6 +38,10 @@ class Impacts:
     after: Float[Tensor, "contacts tail"] | None = None
     """What each file holds just after `sounds`, likewise; None together with `before`."""
 
+    def __post_init__(self) -> None:
+        if (self.before is None) != (self.after is None):
+            raise ValueError("expected both before and after, or neither, got one of them")
+
     @property
     def duration(self) -> float:
         """Length of every sound, seconds."""

@@ -184,6 +184,8 @@ class Evidence:
         except CaptureError:
             return
         self._rates.add(rate)
+        if len(self._rates) > 1:
+            return  # Refused as a capture; spectra of different rates cannot be added up.
         self._shortest = min(self._shortest, recording.duration)
         self._starts.append(shorten(prepared, rate=rate, settings=replace(settings, seconds=SECONDS_BEFORE)))
         if prepared.newtons is not None:

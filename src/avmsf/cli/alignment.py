@@ -37,13 +37,13 @@ def alignment_sentences(found: Alignment, inverted: list[str]) -> list[str]:
             "recording keeps its own start. Was the sensor or the object moved, or the response channel another?"
         ]
     moved = found.delays[found.agrees]
-    how = "the recordings are aligned as they are"
+    how = "no delays make the modes' phases agree better than they do as read"
     if bool((moved != 0).any()):
         how = f"delays of {float(moved.min()):.2f} to {float(moved.max()):.2f} samples align the recordings"
-    sentences = [
-        f"{how}: coherence of the modes' phases {found.coherence_before:.2f} as read, {found.coherence_after:.2f} then "
-        "(1 is one phase a mode)"
-    ]
+    coherence = f"coherence {found.coherence_before:.2f} as read"
+    if bool((moved != 0).any()):
+        coherence += f", {found.coherence_after:.2f} aligned"
+    sentences = [f"{how}: {coherence} (1 is one phase for each mode)"]
     left = [name for name, agrees in zip(found.names, found.agrees.tolist(), strict=True) if not agrees]
     if left:
         sentences.append(

@@ -82,6 +82,8 @@ def run(options: Options) -> int:
     if modes is not None and modes[0].alignment is not None and aligned is not None:
         for sentence in alignment_sentences(modes[0].alignment, aligned["inverted"]):
             screen.print(sentence, soft_wrap=True)
+    if modes is None:
+        screen.print("no mode was found to align the recordings by: noise, or too short (avmsf modes says more)")
     wrong = len(problems)
     screen.print("no problem found" if not wrong else f"readable, with {counted(wrong, 'warning')}", soft_wrap=True)
     return 0

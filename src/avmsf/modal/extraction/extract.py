@@ -22,7 +22,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError
 from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.alignment import Alignment, Phases, align
+from avmsf.modal.extraction.alignment import Alignment, Phases, align, recording_keys
 from avmsf.modal.extraction.esprit import SHORTEST
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, lowest_frequency, noise_bins
 from avmsf.modal.extraction.least_squares import fit_gains
@@ -128,7 +128,7 @@ def extract_once(
     an error if the file is `needed`. Raises as `extract`, and FieldFileError.
     """
     digest = _digest(train, method)
-    kept = _read(path, digest, train.names)
+    kept = _read(path, digest, train)
     if kept is not None:
         return kept
     if lone and len(train) == 1:
@@ -156,7 +156,7 @@ def extract_once(
     return found
 
 
-def _read(path: Path, digest: str, names: tuple[str, ...]) -> Extraction | None:
+def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
     try:
         with safe_open(path, framework="pt") as file:
             if (file.metadata() or {}).get(_KEY) != digest:
@@ -170,13 +170,13 @@ def _read(path: Path, digest: str, names: tuple[str, ...]) -> Extraction | None:
         read["gains"],
         Residual(read["residual"]),
         read["quadrature"],
-        _alignment_of(read, names) if "alignment.delays" in read else None,
+        _alignment_of(read, train) if "alignment.delays" in read else None,
     )
 
 
 def _alignment_tensors(alignment: Alignment) -> dict[str, Tensor]:
     phases = alignment.phases
-    numbers = [alignment.coherence_before, alignment.coherence_after, phases.jitter]
+    numbers = [alignment.coherence_before, alignment.coherence_after, phases.jitter, phases.start]
     tensors = {
         "delays": alignment.delays,
         "agrees": alignment.agrees,
@@ -190,12 +190,12 @@ def _alignment_tensors(alignment: Alignment) -> dict[str, Tensor]:
     return {f"alignment.{name}": tensor for name, tensor in tensors.items()}
 
 
-def _alignment_of(read: dict[str, Tensor], names: tuple[str, ...]) -> Alignment:
+def _alignment_of(read: dict[str, Tensor], train: Impacts) -> Alignment:
     found = {name.removeprefix("alignment."): each for name, each in read.items() if name.startswith("alignment.")}
-    before, after, jitter = found["numbers"].tolist()
+    before, after, jitter, start = found["numbers"].tolist()
     bank = ModalBank(found["frequency"], found["damping"])
-    phases = Phases(bank, torch.view_as_complex(found["doubled"]), found["power"], found["spread"], jitter)
-    return Alignment(names, found["delays"], found["agrees"], before, after, phases)
+    phases = Phases(bank, torch.view_as_complex(found["doubled"]), found["power"], found["spread"], jitter, start)
+    return Alignment(train.names, found["delays"], found["agrees"], before, after, phases, recording_keys(train))
 
 
 def _digest(train: Impacts, method: ModeFinder) -> str:
