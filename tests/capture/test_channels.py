@@ -89,3 +89,24 @@ def test_what_some_recordings_share_is_said_once_with_their_names(tmp_path: Path
     assert len(shared) == 1
     assert len([each for each in sentences if each.startswith("4.wav: ")]) == 1
     assert len(sentences) == 2
+
+
+def test_a_recording_far_louder_than_all_others_is_named_and_a_fainter_one_is_not(tmp_path: Path) -> None:
+    sounds = {f"{number}.wav": ring(seed=number) for number in range(7)}
+    rows = [f"{name},{number / 10},0,0" for number, name in enumerate(sounds)]
+    fine = fill(tmp_path / "fine", rows=rows, replace=sounds | {"2.wav": 0.1 * sounds["2.wav"]})
+    loud = fill(tmp_path / "loud", rows=rows, replace=sounds | {"2.wav": 10 * sounds["2.wav"]})
+    fine_ones, loud_ones = (
+        [each for each in check(folder).problems if each.startswith("2.wav")] for folder in (fine, loud)
+    )
+    assert fine_ones == []
+    assert len(loud_ones) == 1
+
+
+def test_noise_is_measured_in_what_the_settings_leave(tmp_path: Path) -> None:
+    time = np.arange(8000) / 8000
+    rumble = 0.05 * np.sin(2 * np.pi * 11 * time)
+    sounds = {name: ring(1.0, before=0.4, seed=seed) + rumble for seed, name in enumerate(NAMES)}
+    folder = fill(tmp_path, replace=sounds)
+    plain, filtered = (check(folder, CaptureSettings(highpass=each)).recordings[0] for each in (0.0, 60.0))
+    assert filtered.noise_db < plain.noise_db - 15

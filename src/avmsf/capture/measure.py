@@ -8,7 +8,7 @@ from jaxtyping import Float64
 
 from avmsf.capture.audio import EIGHT_BIT, Recording, clipped_samples
 from avmsf.capture.onset import SECONDS_BEFORE, find_second_blow, find_second_push
-from avmsf.capture.prepare import Prepared
+from avmsf.capture.prepare import Prepared, remove_rumble
 from avmsf.capture.settings import CaptureSettings
 from avmsf.wording import counted
 
@@ -54,7 +54,9 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
     channel = recording.response_channel(settings.response_channel, force_channel=settings.force_channel)
     response = recording.channel(channel)
     peak = float(np.abs(response).max())
-    noise = decibels(noise_level(response, prepared.onset, rate) / peak)
+    # Rumble that the settings remove is not in the sounds.
+    filtered = remove_rumble(response, settings.highpass, recording)
+    noise = decibels(noise_level(filtered, prepared.onset, rate) / float(np.abs(filtered).max()))
     clipped, second = clipped_samples(response), None
     if prepared.pulse is not None and settings.force_channel is not None:
         force = recording.channel(settings.force_channel)

@@ -22,6 +22,9 @@ NARROWEST = 1e-3
 USUAL_RANGE_DB = 80.0
 """Level between a recording and the median beyond which its scale is in doubt: a contact near the nodes of most modes
 takes 40 dB, a soft blow 30."""
+USUAL_GAP_DB = 12.0
+"""Level between the loudest recording and the next beyond which its scale is in doubt, of six recordings or more: 24
+measured and simulated captures have at most 7. One recording at ten times its level outweighs all others in a fit."""
 MAX_RANGE_DB = 140.0
 """Level between the loudest and the faintest recording beyond which the faintest is less than the rounding of the
 loudest in float32 (144 dB), in which they are fitted."""
@@ -67,6 +70,14 @@ def judge_levels(peaks: Sequence[float], names: Sequence[str]) -> list[str]:
             f"{found}; expected at most {MAX_RANGE_DB:g} dB between the loudest and the faintest, got "
             f"{np.ptp(levels):.0f}: export it at the scale of the others, or remove its row"
         )
+    ascending = np.sort(levels)
+    if len(levels) >= 6 and ascending[-1] - ascending[-2] > USUAL_GAP_DB:
+        loudest = int(levels.argmax())
+        above = ascending[-1] - ascending[-2]
+        return [
+            f"{names[loudest]}: its peak, {peaks[loudest]:.3g}, is {above:.0f} dB above that of the next loudest "
+            f"recording; expected at most {USUAL_GAP_DB:g} dB: check its gain, its scale and its force"
+        ]
     if abs(away[worst]) > USUAL_RANGE_DB:
         return [f"{found}; expected at most {USUAL_RANGE_DB:g} dB: check its scale and its force"]
     return []

@@ -3,7 +3,6 @@
 from typing import Any
 
 from avmsf.capture import Impacts
-from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.polarity import inverted_recordings
 
@@ -29,8 +28,15 @@ def alignment_values(modes: Extraction, impacts: Impacts) -> dict[str, Any] | No
     }
 
 
-def alignment_sentences(found: Alignment, inverted: list[str]) -> list[str]:
-    """Say how coherent the modes' phases are, and name what is not aligned or has the opposite sign."""
+def describe_alignment(modes: Extraction, impacts: Impacts) -> list[str]:
+    """Say how coherent the phases of the modes of `impacts` are, and name what is not aligned or has the opposite sign.
+
+    Empty where nothing was aligned.
+    """
+    found = modes.alignment
+    if found is None:
+        return []
+    inverted = list(inverted_recordings(modes, modes.aligned(impacts)))
     if not bool(found.agrees.any()):
         return [
             f"the modes have no common phase (coherence {found.coherence_before:.2f}, 1 is one phase a mode): each "

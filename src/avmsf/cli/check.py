@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 from rich.console import Console
@@ -12,7 +13,7 @@ from avmsf.capture import CaptureReport, CaptureSettings, CaptureWarning, Impact
 from avmsf.capture.folder import SETTINGS
 from avmsf.capture.measure import shared_problems
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
-from avmsf.cli.alignment import alignment_sentences, alignment_values
+from avmsf.cli.alignment import alignment_values, describe_alignment
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.errors import CaptureError, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract
@@ -61,7 +62,7 @@ def run(options: Options) -> int:
     modes = _modes(options.capture, settings) if report.readable else None
     aligned = None if modes is None else alignment_values(*modes)
     if report.recordings:
-        screen.print(_table(report, str(options.capture), {} if aligned is None else aligned["delays"]))
+        screen.print(_table(report, str(options.capture), aligned))
     problems = problems_of(report)
     for problem in problems[:MAX_PRINTED]:
         screen.print(problem, soft_wrap=True)
@@ -77,14 +78,16 @@ def run(options: Options) -> int:
     if not report.readable:
         say(f"avmsf check: {options.capture} cannot be read as it is: mend what is listed and check again")
         return UNREADABLE
-    for remark in report.remarks:
+    for remark in report.remarks if modes is not None else ():
         screen.print(remark, soft_wrap=True)
-    if modes is not None and modes[0].alignment is not None and aligned is not None:
-        for sentence in alignment_sentences(modes[0].alignment, aligned["inverted"]):
+    if modes is not None:
+        for sentence in describe_alignment(*modes):
             screen.print(sentence, soft_wrap=True)
     if modes is None:
         screen.print("no mode was found to align the recordings by: noise, or too short (avmsf modes says more)")
-    wrong = len(problems)
+    wrong = len(problems) + (modes is None)
+    if aligned is not None:
+        wrong += bool(aligned["not_aligned"]) + bool(aligned["inverted"])
     screen.print("no problem found" if not wrong else f"readable, with {counted(wrong, 'warning')}", soft_wrap=True)
     return 0
 
@@ -121,12 +124,15 @@ def problems_of(report: CaptureReport) -> list[str]:
     return [*report.problems, *shared_problems(report.recordings)]
 
 
-def _table(report: CaptureReport, title: str, delays: Mapping[str, float]) -> object:
+def _table(report: CaptureReport, title: str, aligned: Mapping[str, Any] | None) -> object:
+    delays = {} if aligned is None else aligned["delays"]
+    left = [] if aligned is None else aligned["not_aligned"]
+    doubtful = left if aligned is None else [*left, *aligned["inverted"]]
     columns = ["recording", "state", "length s", "rate Hz", "peak dB", "noise dB", "clipped", "onset s", "2nd blow s"]
     rows = [
         (
             row.file,
-            "unreadable" if not row.readable else "look" if row.problems else "good",
+            "unreadable" if not row.readable else "look" if row.problems or row.file in doubtful else "good",
             decimals(row.seconds, 2),
             decimals(row.sample_rate, 0),
             decimals(row.peak_db, 1),
@@ -134,8 +140,8 @@ def _table(report: CaptureReport, title: str, delays: Mapping[str, float]) -> ob
             decimals(row.clipped, 0),
             decimals(row.onset_seconds, 4),
             decimals(row.double_hit_seconds, 3),
-            *([decimals(delays.get(row.file), 2)] if delays else []),
+            *([decimals(None if row.file in left else delays.get(row.file), 2)] if delays else []),
         )
         for row in report.recordings[:MAX_PRINTED]
     ]
-    return table(title, [*columns, "delay"] if delays else columns, rows, words=2)
+    return table(title, [*columns, "delay smp"] if delays else columns, rows, words=2)

@@ -12,6 +12,7 @@ from avmsf._utils.caching import discard
 from avmsf.bench.evaluation import split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.cli import INTERRUPTED
+from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, figure, print_json, say
 from avmsf.cli.progress import FitBar
@@ -121,6 +122,8 @@ def run(options: Options) -> int:
     recipe = _recipe(options, capture, train, features)
     say(f"finding the modes of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     modes = extract_once(train, finder(options.method, options.modes), _beside(options.output, "modes"))
+    for sentence in describe_alignment(modes, train):
+        say(sentence)
     say(f"fitting a field of {len(modes.bank)} modes")
     checkpoint = _beside(options.output, "checkpoint")
     try:

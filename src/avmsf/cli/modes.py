@@ -9,7 +9,7 @@ import tyro
 
 from avmsf.bench.pictures import draw_modes, expect_format, save_picture
 from avmsf.capture import CaptureSettings, read_capture
-from avmsf.cli.alignment import alignment_sentences, alignment_values
+from avmsf.cli.alignment import alignment_values, describe_alignment
 from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_rows, quality_rows
 from avmsf.cli.printing import console, decimals, figure, print_json, say, table
 from avmsf.modal.extraction.extract import extract
@@ -69,9 +69,8 @@ def run(options: Options) -> int:
         screen.print(quality_table(f"{len(supporting)} supporting poles: kept in the model, not modes", supporting))
     screen.print(_EXPLANATION)
     aligned = alignment_values(extraction, impacts)
-    if extraction.alignment is not None and aligned is not None:
-        for sentence in alignment_sentences(extraction.alignment, aligned["inverted"]):
-            screen.print(sentence, soft_wrap=True)
+    for sentence in describe_alignment(extraction, impacts):
+        screen.print(sentence, soft_wrap=True)
     if options.picture is not None:
         drawn = f"{len(rows)} poles of {capture.name}, {len(modes)} of them modes"
         save_picture(draw_modes(extraction.bank, level, title=drawn), options.picture)

@@ -9,6 +9,7 @@ import tyro
 
 from avmsf.capture import read_capture
 from avmsf.cli import INTERRUPTED
+from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.fit import choice_words, part_contacts, recipe_of, summary, suspect_words
 from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, figure, print_json, say, table
@@ -120,6 +121,8 @@ def run(options: Options) -> int:
         return INTERRUPTED
     scores = {} if test is None else compare(fitted, train, test, made.modes)
     screen = console(errors=options.json)
+    for sentence in describe_alignment(made.modes, train):
+        screen.print(sentence, soft_wrap=True)
     if made.report:
         screen.print(features_words(made.report), soft_wrap=True)
     for words in choice_words(made.gains, made.choice):

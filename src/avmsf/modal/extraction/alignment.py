@@ -20,7 +20,6 @@ several starting recordings, each of which the others are first aligned with, th
 """
 
 import hashlib
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -29,9 +28,8 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.finders import HighResolution, noise_at, noise_bins
-from avmsf.modal.extraction.least_squares import fit_gains
-from avmsf.modal.residual import noise_power
+from avmsf.modal.extraction.finders import HighResolution
+from avmsf.modal.extraction.phase_likelihood import DelayPrior, MeasuredPhases, occam_factor
 
 _MODES = 32
 """Modes to align by, the strongest: more cost time and hardly narrow the posterior."""
@@ -41,39 +39,24 @@ _REFERENCES = 6
 """Recordings to start from in turn, the most energetic in their modes first."""
 _ROUNDS = 40
 """Most passes over all recordings."""
-_CANDIDATES = 8
-"""Highest peaks of the density among which a delay is chosen."""
-_NEWTON_STEPS = 8
-"""Of each search, at most one grid step long each."""
-_GRID_PER_PERIOD = 10
-"""Grid points in half a period of the highest mode, after which its doubled phase repeats."""
 _FIRST_JITTER = 2.0
 """Scale of the delays before anything is known of them, samples: what a threshold of a tenth of the peak leaves."""
-_REACH_SECONDS = 0.02
-_REACH_SAMPLES = 16.0
-"""Longest delay that is searched, whichever is longer: as far as a capture's reader keeps what lies before an onset."""
 _CLOSE = 1.0
 """Longest delay of the last search, samples."""
 _EXACT = 3.0
 """Log odds, per recording, of no delays at all where every file starts with its impact, as impulse responses do. The
 aircraft's and the ruler's, whose modes have no exact phases, seem to have delays by up to 2.5 in 4 of 49 splits; files
 of 20 modes that were trimmed 1 to 2 samples apart gain 6 to 25."""
-_RELATIVE = 0.05
-"""Error across the phase of any amplitude, over the amplitude: frequencies and dampings are never exact."""
-_STRAY = 0.2
-"""Part of the phases that lie anywhere: of modes that are hardly excited, or that two close modes are taken for."""
 _FIRST_SPREAD = 0.25
 """The spread of a mode before anything is known of it: half of what phases without a mean would have."""
-_USUAL_SPREAD, _VAGUE = 0.05, 2.0
-"""A spread, and the recordings that it counts for: of few, some modes agree by chance."""
+_VAGUE = 2.0
+"""Recordings of the usual spread that a mode's own is mixed with: of few, some modes agree by chance."""
 _LEAST_JITTER = 0.5
 """Least scale of the delays, samples: an onset that is found at a sample is off by a part of one."""
 _SETTLING = 4
 """Passes before the delays' own scale counts."""
 _CONVERGED = 1e-3
 """Samples by which delays still move when the search ends."""
-_MEDIAN_OF_SQUARE = 0.455
-"""Median of the square of a standard normal number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,15 +125,15 @@ def align(impacts: Impacts) -> Alignment | None:
     bank = HighResolution(modes=_MODES, range_db=_RANGE_DB).find(impacts.sounds, impacts.sample_rate)
     if len(bank) == 0:
         return None
-    measured = _Amplitudes.of(impacts, bank)
+    measured = MeasuredPhases.of(impacts, bank)
     before = coherence(measured.amplitude, bank.damping)
     delays, agrees, phases = _estimate(measured, exact=0.0 if _has_lead(impacts) else _EXACT)
     if bool((delays != 0).any()):
         # Once more, from sounds that start where the first estimate says; then closely, with the spreads found.
-        measured = _Amplitudes.of(impacts.delayed(delays), bank)
+        measured = MeasuredPhases.of(impacts.delayed(delays), bank)
         further, agrees, phases = _estimate(measured, earlier=delays)
         delays = torch.where(agrees, delays + further, 0.0)
-        measured = _Amplitudes.of(impacts.delayed(delays), bank, reach=_CLOSE)
+        measured = MeasuredPhases.of(impacts.delayed(delays), bank, reach=_CLOSE)
         further, agrees, phases = _estimate(measured, earlier=delays, agreeing=agrees)
         delays = torch.where(agrees, delays + further, 0.0)
         # The phases are those at the recordings' common start, which moves with the offset.
@@ -161,7 +144,7 @@ def align(impacts: Impacts) -> Alignment | None:
             start=offset if not _has_lead(impacts) else 0.0,
             doubled=phases.doubled * torch.exp(1j * offset * measured.turn),
         )
-        measured = _Amplitudes.of(impacts.delayed(delays), bank)
+        measured = MeasuredPhases.of(impacts.delayed(delays), bank)
     after = coherence(measured.amplitude, bank.damping)
     return Alignment(impacts.names, delays, agrees, before, after, phases, recording_keys(impacts))
 
@@ -197,188 +180,12 @@ def _has_lead(impacts: Impacts) -> bool:
 
 def _delays_alone(impacts: Impacts, phases: Phases, *, start: float) -> Float64[Tensor, " contacts"]:
     """Return the delays, about `start`, by which recordings agree with known phases, each alone; `start` where none."""
-    measured = _Amplitudes.of(impacts, phases.bank)
+    measured = MeasuredPhases.of(impacts, phases.bank)
     weights = measured.concentration(phases.power, phases.spread)
     doubled = phases.doubled.expand(len(impacts), -1)
-    prior = _Prior(torch.full((len(impacts),), start, dtype=torch.float64), phases.jitter)
+    prior = DelayPrior(torch.full((len(impacts),), start, dtype=torch.float64), phases.jitter)
     delays, odds = measured.search(weights, doubled, prior)
     return torch.where(odds > 0, delays, start)
-
-
-@dataclass(frozen=True, eq=False)
-class _Prior:
-    """Delays have Cauchy distributions about these middles."""
-
-    middle: Float64[Tensor, " contacts"]
-    """Samples."""
-    scale: float
-    """Median distance from it, samples."""
-
-    def log_density(self, delays: Float64[Tensor, "*steps #contacts"]) -> Float64[Tensor, "*steps contacts"]:
-        """Return the logarithm of the density, per sample."""
-        return -torch.log1p(((delays - self.middle) / self.scale).square()) - math.log(math.pi * self.scale)
-
-    def slope(self, delays: Float64[Tensor, " contacts"]) -> Float64[Tensor, " contacts"]:
-        """Return the derivative of the log density."""
-        away = delays - self.middle
-        return -2 * away / (self.scale**2 + away.square())
-
-
-@dataclass(frozen=True, eq=False)
-class _Amplitudes:
-    """The modes' amplitudes in each recording, and what a delay makes of their phases."""
-
-    amplitude: Complex128[Tensor, "contacts modes"]
-    """Of exp((-d + 2 pi i f) t), in the recordings' unit."""
-    scaled: Complex128[Tensor, "contacts modes"]
-    """Each recording scaled to unit energy in the modes, so that loud ones count no more than faint ones."""
-    noise: Float64[Tensor, "contacts modes"]
-    """Variance of `scaled` across its phase that the background noise makes."""
-    bank: ModalBank
-    turn: Float64[Tensor, " modes"]
-    """Radians by which a delay of one sample turns a doubled phase."""
-    grid: Float64[Tensor, " steps"]
-    """Delays that are searched, samples."""
-
-    @classmethod
-    def of(cls, impacts: Impacts, bank: ModalBank, *, reach: float = math.inf) -> "_Amplitudes":
-        """Return the amplitudes, to be aligned by delays of at most `reach` samples."""
-        rate, samples = impacts.sample_rate, impacts.sounds.shape[1]
-        gains, quadrature = fit_gains(impacts.sounds.double(), bank, sample_rate=rate)
-        amplitude = torch.complex(quadrature, -gains)
-        power = noise_at(noise_power(impacts.sounds, bins=noise_bins(samples)), bank, rate)
-        # The squared samples of exp(-d t) cos(2 pi f t) add up to this.
-        energy = rate * -torch.expm1(-2 * bank.damping * samples / rate) / (4 * bank.damping)
-        scale = (amplitude.abs().square() / bank.damping).sum(1, keepdim=True).sqrt()
-        scale = scale.clamp_min(torch.finfo(torch.float32).tiny)
-        if impacts.before is not None:
-            reach = min(reach, float(max(impacts.before.shape[1], 1)))
-        reach = min(reach, max(_REACH_SAMPLES, _REACH_SECONDS * rate))
-        step = min(0.5, rate / (2 * _GRID_PER_PERIOD * float(bank.frequency.max())))
-        steps = math.ceil(reach / step)
-        grid = step * torch.arange(-steps, steps + 1, dtype=torch.float64)
-        turn = 4 * math.pi * bank.frequency / rate
-        return cls(amplitude, amplitude / scale, power / energy / scale.square(), bank, turn, grid)
-
-    @property
-    def power(self) -> Float64[Tensor, " modes"]:
-        """Mean over recordings of the squared `scaled`."""
-        return self.scaled.abs().square().mean(0)
-
-    def variance(
-        self, power: Float64[Tensor, " modes"], spread: Float64[Tensor, " modes"]
-    ) -> Float64[Tensor, "contacts modes"]:
-        """Return the variance across the phase."""
-        own = self.scaled.abs().square()
-        shared = spread * torch.sqrt(own * power)
-        return (self.noise + shared + _RELATIVE**2 * own).clamp_min(torch.finfo(torch.float64).tiny)
-
-    def concentration(
-        self, power: Float64[Tensor, " modes"], spread: Float64[Tensor, " modes"]
-    ) -> Float64[Tensor, "contacts modes"]:
-        """Return the concentrations of the doubled phases."""
-        return self.scaled.abs().square() / (4 * self.variance(power, spread))
-
-    def doubled(self, delays: Float64[Tensor, " contacts"]) -> Complex128[Tensor, "contacts modes"]:
-        """Return exp(2 i phase) with each recording starting later by its delay."""
-        return torch.exp(1j * (2 * self.scaled.angle() + self.turn * delays[:, None]))
-
-    def spread(
-        self, weights: Float64[Tensor, "contacts modes"], delays: Float64[Tensor, " contacts"], *, vague: float
-    ) -> Float64[Tensor, " modes"]:
-        """Return the spread of each mode's amplitudes about its mean phase, by the median over recordings.
-
-        Beside `vague` recordings that have the usual one.
-        """
-        turned = self.doubled(delays)
-        mean = (weights * turned).sum(0)
-        across = self.scaled.abs().square() * (1 - (turned * torch.exp(-1j * mean.angle())).real) / 2
-        size = torch.sqrt(self.scaled.abs().square() * self.power).clamp_min(torch.finfo(torch.float64).tiny)
-        found = (across / size).median(0).values / _MEDIAN_OF_SQUARE
-        count = len(self.scaled)
-        return (count * found + vague * _USUAL_SPREAD) / (count + vague)
-
-    def log_likelihood(
-        self,
-        weights: Float64[Tensor, "contacts modes"],
-        spread: Float64[Tensor, " modes"],
-        doubled: Complex128[Tensor, " modes"],
-    ) -> float:
-        """Return the log likelihood of the amplitudes' parts across their phases, all mean phases alike."""
-        normal = -0.5 * torch.log(self.variance(self.power, spread)) - weights
-        return float(normal.sum() + _log_i0(doubled.abs()).sum())
-
-    def search(
-        self,
-        weights: Float64[Tensor, "contacts modes"],
-        doubled: Complex128[Tensor, "contacts modes"],
-        prior: _Prior,
-    ) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, " contacts"]]:
-        """Return each recording's likeliest delay, and the log odds that its phases agree with `doubled` at all.
-
-        `doubled` is the sum of the others' weights times exp(2 i phase), for each recording. The odds compare phases
-        about these, over all delays of the prior, with phases that are anything.
-        """
-        strength = doubled.abs()
-        # The others' mean phase is not known exactly: two von Mises laws in a row have about the product of the means'
-        # lengths.
-        pull = weights * torch.special.i1e(strength) / torch.special.i0e(strength)
-        toward = pull * torch.exp(1j * (2 * self.scaled.angle() - doubled.angle()))
-        angles = self.turn[:, None] * self.grid
-        parts = torch.cat([toward.real, toward.imag], dim=1).float()
-        score = (parts @ torch.cat([angles.cos(), -angles.sin()]).float()).double()
-        score = score + prior.log_density(self.grid[:, None]).T
-        # Many modes that agree outweigh a strong one that does not, which a product of densities would follow.
-        edge = torch.full_like(score[:, :1], -math.inf)
-        padded = torch.cat([edge, score, edge], dim=1)
-        peaks = torch.where((score >= padded[:, :-2]) & (score >= padded[:, 2:]), score, -math.inf)
-        candidates = self.grid[torch.topk(peaks, min(_CANDIDATES, len(self.grid)), dim=1).indices]
-        turned = toward[:, None] * torch.exp(1j * self.turn * candidates[:, :, None])
-        robust = _agreement(turned, pull[:, None]) + prior.log_density(candidates.T).T
-        delays = candidates.gather(1, robust.argmax(1, keepdim=True))[:, 0]
-        step = float(self.grid[1] - self.grid[0])
-        for _ in range(_NEWTON_STEPS):
-            turned = toward * torch.exp(1j * self.turn * delays[:, None])
-            turned = turned * _belonging(turned, pull)
-            slope = prior.slope(delays) - (self.turn * turned.imag).sum(1)
-            bend = (self.turn.square() * turned.real).sum(1)
-            delays = delays + torch.where(bend > 0, slope / bend, 0.0).clamp(-step, step)
-        turned = toward * torch.exp(1j * self.turn * delays[:, None])
-        bend = (self.turn.square() * (turned * _belonging(turned, pull)).real).sum(1)
-        return delays, _agreement(turned, pull) + _share(prior, delays, bend)
-
-
-def _agreement(
-    toward: Complex128[Tensor, "*delays modes"], pull: Float64[Tensor, "*#delays modes"]
-) -> Float64[Tensor, "*delays"]:
-    """Return the log odds that phases lie about the others' mean with concentrations `pull`, against anywhere.
-
-    `toward` is the concentration times exp(2 i error). A part `_STRAY` of the phases lies anywhere in any case.
-    """
-    return torch.log(_STRAY + (1 - _STRAY) * (toward.real - _log_i0(pull)).exp()).sum(-1)
-
-
-def _belonging(
-    toward: Complex128[Tensor, "contacts modes"], pull: Float64[Tensor, "contacts modes"]
-) -> Float64[Tensor, "contacts modes"]:
-    """Return the probability of each phase to be none of those that lie anywhere."""
-    about = (1 - _STRAY) * (toward.real - _log_i0(pull)).exp()
-    return about / (about + _STRAY)
-
-
-def _share(
-    prior: _Prior, delays: Float64[Tensor, " contacts"], bend: Float64[Tensor, " contacts"]
-) -> Float64[Tensor, " contacts"]:
-    """Return what not knowing the delays costs: their prior density times the width of their posterior (Laplace).
-
-    `bend` is the second derivative of the log likelihood, negated. Nothing is won by delays that are not known at all.
-    """
-    width = 0.5 * torch.log(2 * math.pi / bend.clamp_min(1e-300))
-    return (prior.log_density(delays) + width).clamp_max(0.0)
-
-
-def _log_i0(value: Float64[Tensor, "..."]) -> Float64[Tensor, "..."]:
-    return torch.special.i0e(value).log() + value
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,13 +196,13 @@ class _Fit:
     weights: Float64[Tensor, "contacts modes"]
     """Concentrations of the doubled phases."""
     spread: Float64[Tensor, " modes"]
-    prior: _Prior
+    prior: DelayPrior
     log_posterior: float
     """Up to a constant."""
 
 
 def _estimate(
-    measured: _Amplitudes,
+    measured: MeasuredPhases,
     *,
     earlier: Float64[Tensor, " contacts"] | None = None,
     agreeing: Bool[Tensor, " contacts"] | None = None,
@@ -410,7 +217,7 @@ def _estimate(
     """
     none = torch.zeros(len(measured.scaled), dtype=torch.float64)
     if earlier is None:
-        prior = _Prior(none, _FIRST_JITTER)
+        prior = DelayPrior(none, _FIRST_JITTER)
         energy = measured.scaled.abs().square() / measured.bank.damping
         broadest = torch.argsort((energy / energy.sum(0)).sum(1), descending=True)[:_REFERENCES]
         fits = [_climb(measured, prior, reference=int(row)) for row in broadest]
@@ -418,7 +225,7 @@ def _estimate(
         fits += [_climb(measured, prior), replace(still, log_posterior=still.log_posterior + exact * len(none))]
         fit = max(fits, key=lambda each: each.log_posterior)
     else:
-        fit = _climb(measured, _Prior(-earlier, _FIRST_JITTER), vague=_VAGUE if agreeing is None else 0.0)
+        fit = _climb(measured, DelayPrior(-earlier, _FIRST_JITTER), vague=_VAGUE if agreeing is None else 0.0)
     turned = fit.weights * measured.doubled(fit.delays)
     _, odds = measured.search(fit.weights, turned.sum(0) - turned, fit.prior)
     # A capture without common phases may have single recordings that agree by chance.
@@ -427,7 +234,7 @@ def _estimate(
     return torch.where(agrees, fit.delays, 0.0), agrees, phases
 
 
-def _climb(measured: _Amplitudes, prior: _Prior, *, reference: int | None = None, vague: float = _VAGUE) -> _Fit:
+def _climb(measured: MeasuredPhases, prior: DelayPrior, *, reference: int | None = None, vague: float = _VAGUE) -> _Fit:
     """Return the delays of a highest posterior, climbed from all recordings aligned with one, or as they are."""
     power, spread = measured.power, torch.full_like(measured.power, _FIRST_SPREAD)
     weights = measured.concentration(power, spread)
@@ -451,16 +258,16 @@ def _climb(measured: _Amplitudes, prior: _Prior, *, reference: int | None = None
     turned = weights * measured.doubled(delays)
     total = turned.sum(0)
     bend = (measured.turn.square() * (turned * total.conj()).real / total.abs().clamp_min(1e-300)).sum(1)
-    share = float(_share(prior, delays, bend).sum())
+    share = float(occam_factor(prior, delays, bend).sum())
     return _Fit(delays, weights, spread, prior, measured.log_likelihood(weights, spread, total) + share)
 
 
-def _at(measured: _Amplitudes, delays: Float64[Tensor, " contacts"]) -> _Fit:
+def _at(measured: MeasuredPhases, delays: Float64[Tensor, " contacts"]) -> _Fit:
     """Return the fit of delays that are known."""
     weights = measured.concentration(measured.power, torch.full_like(measured.power, _FIRST_SPREAD))
     for _ in range(_SETTLING):
         spread = measured.spread(weights, delays, vague=_VAGUE)
         weights = measured.concentration(measured.power, spread)
     total = (weights * measured.doubled(delays)).sum(0)
-    prior = _Prior(delays, _LEAST_JITTER)
+    prior = DelayPrior(delays, _LEAST_JITTER)
     return _Fit(delays, weights, spread, prior, measured.log_likelihood(weights, spread, total))

@@ -35,8 +35,13 @@ _NORMAL = 1.4826
 def inverted_recordings(modes: Extraction, impacts: Impacts) -> tuple[str, ...]:
     """Return the names of recordings whose sign is the opposite of the others'; `modes` are those of `impacts`.
 
-    Empty where contacts lie so far apart that neighbors tell nothing of a gain's sign.
+    Empty where contacts lie so far apart that neighbors tell nothing of a gain's sign. Recordings that could not be
+    aligned are not judged.
     """
+    if modes.alignment is not None and not bool(modes.alignment.agrees.all()):
+        rows = torch.nonzero(modes.alignment.agrees).flatten().tolist()
+        impacts = impacts.take(rows)
+        modes = replace(modes, gains=modes.gains[rows], quadrature=modes.quadrature[rows], alignment=None)
     signs, found = torch.ones(len(impacts), 1, dtype=torch.float64), list[int]()
     while len(impacts) >= _FEWEST and len(found) < len(impacts) // 3:
         # One at a time: an inverted recording spoils what is predicted at its neighbors.

@@ -1,0 +1,209 @@
+"""The likelihood of recordings' delays: phases of modes about those of the other recordings (see `alignment`)."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Complex128, Float64
+from torch import Tensor
+
+from avmsf.capture.impacts import Impacts
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.finders import noise_at, noise_bins
+from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.residual import noise_power
+
+_CANDIDATES = 8
+"""Highest peaks of the density among which a delay is chosen."""
+_NEWTON_STEPS = 8
+"""Of each search, at most one grid step long each."""
+_GRID_PER_PERIOD = 10
+"""Grid points in half a period of the highest mode, after which its doubled phase repeats."""
+_REACH_SECONDS = 0.02
+_REACH_SAMPLES = 16.0
+"""Longest delay that is searched, whichever is longer: as far as a capture's reader keeps what lies before an onset."""
+_RELATIVE = 0.05
+"""Error across the phase of any amplitude, over the amplitude: frequencies and dampings are never exact."""
+_STRAY = 0.2
+"""Part of the phases that lie anywhere: of modes that are hardly excited, or that two close modes are taken for."""
+_USUAL_SPREAD = 0.05
+"""Spread of a mode of which little is known: phases to .2 rad."""
+_MEDIAN_OF_SQUARE = 0.455
+"""Median of the square of a standard normal number."""
+
+
+@dataclass(frozen=True, eq=False)
+class DelayPrior:
+    """Delays have Cauchy distributions about these middles."""
+
+    middle: Float64[Tensor, " contacts"]
+    """Samples."""
+    scale: float
+    """Median distance from it, samples."""
+
+    def log_density(self, delays: Float64[Tensor, "*steps #contacts"]) -> Float64[Tensor, "*steps contacts"]:
+        """Return the logarithm of the density, per sample."""
+        return -torch.log1p(((delays - self.middle) / self.scale).square()) - math.log(math.pi * self.scale)
+
+    def slope(self, delays: Float64[Tensor, " contacts"]) -> Float64[Tensor, " contacts"]:
+        """Return the derivative of the log density."""
+        away = delays - self.middle
+        return -2 * away / (self.scale**2 + away.square())
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPhases:
+    """The modes' amplitudes in each recording, and what a delay makes of their phases."""
+
+    amplitude: Complex128[Tensor, "contacts modes"]
+    """Of exp((-d + 2 pi i f) t), in the recordings' unit."""
+    scaled: Complex128[Tensor, "contacts modes"]
+    """Each recording scaled to unit energy in the modes, so that loud ones count no more than faint ones."""
+    noise: Float64[Tensor, "contacts modes"]
+    """Variance of `scaled` across its phase that the background noise makes."""
+    bank: ModalBank
+    turn: Float64[Tensor, " modes"]
+    """Radians by which a delay of one sample turns a doubled phase."""
+    grid: Float64[Tensor, " steps"]
+    """Delays that are searched, samples."""
+
+    @classmethod
+    def of(cls, impacts: Impacts, bank: ModalBank, *, reach: float = math.inf) -> "MeasuredPhases":
+        """Return the amplitudes, to be aligned by delays of at most `reach` samples."""
+        rate, samples = impacts.sample_rate, impacts.sounds.shape[1]
+        gains, quadrature = fit_gains(impacts.sounds.double(), bank, sample_rate=rate)
+        amplitude = torch.complex(quadrature, -gains)
+        power = noise_at(noise_power(impacts.sounds, bins=noise_bins(samples)), bank, rate)
+        # The squared samples of exp(-d t) cos(2 pi f t) add up to this.
+        energy = rate * -torch.expm1(-2 * bank.damping * samples / rate) / (4 * bank.damping)
+        scale = (amplitude.abs().square() / bank.damping).sum(1, keepdim=True).sqrt()
+        scale = scale.clamp_min(torch.finfo(torch.float32).tiny)
+        if impacts.before is not None:
+            reach = min(reach, float(max(impacts.before.shape[1], 1)))
+        reach = min(reach, max(_REACH_SAMPLES, _REACH_SECONDS * rate))
+        step = min(0.5, rate / (2 * _GRID_PER_PERIOD * float(bank.frequency.max())))
+        steps = math.ceil(reach / step)
+        grid = step * torch.arange(-steps, steps + 1, dtype=torch.float64)
+        turn = 4 * math.pi * bank.frequency / rate
+        return cls(amplitude, amplitude / scale, power / energy / scale.square(), bank, turn, grid)
+
+    @property
+    def power(self) -> Float64[Tensor, " modes"]:
+        """Mean over recordings of the squared `scaled`."""
+        return self.scaled.abs().square().mean(0)
+
+    def variance(
+        self, power: Float64[Tensor, " modes"], spread: Float64[Tensor, " modes"]
+    ) -> Float64[Tensor, "contacts modes"]:
+        """Return the variance across the phase."""
+        own = self.scaled.abs().square()
+        shared = spread * torch.sqrt(own * power)
+        return (self.noise + shared + _RELATIVE**2 * own).clamp_min(torch.finfo(torch.float64).tiny)
+
+    def concentration(
+        self, power: Float64[Tensor, " modes"], spread: Float64[Tensor, " modes"]
+    ) -> Float64[Tensor, "contacts modes"]:
+        """Return the concentrations of the doubled phases."""
+        return self.scaled.abs().square() / (4 * self.variance(power, spread))
+
+    def doubled(self, delays: Float64[Tensor, " contacts"]) -> Complex128[Tensor, "contacts modes"]:
+        """Return exp(2 i phase) with each recording starting later by its delay."""
+        return torch.exp(1j * (2 * self.scaled.angle() + self.turn * delays[:, None]))
+
+    def spread(
+        self, weights: Float64[Tensor, "contacts modes"], delays: Float64[Tensor, " contacts"], *, vague: float
+    ) -> Float64[Tensor, " modes"]:
+        """Return the spread of each mode's amplitudes about its mean phase, by the median over recordings.
+
+        Beside `vague` recordings that have the usual one.
+        """
+        turned = self.doubled(delays)
+        mean = (weights * turned).sum(0)
+        across = self.scaled.abs().square() * (1 - (turned * torch.exp(-1j * mean.angle())).real) / 2
+        size = torch.sqrt(self.scaled.abs().square() * self.power).clamp_min(torch.finfo(torch.float64).tiny)
+        found = (across / size).median(0).values / _MEDIAN_OF_SQUARE
+        count = len(self.scaled)
+        return (count * found + vague * _USUAL_SPREAD) / (count + vague)
+
+    def log_likelihood(
+        self,
+        weights: Float64[Tensor, "contacts modes"],
+        spread: Float64[Tensor, " modes"],
+        doubled: Complex128[Tensor, " modes"],
+    ) -> float:
+        """Return the log likelihood of the amplitudes' parts across their phases, all mean phases alike."""
+        normal = -0.5 * torch.log(self.variance(self.power, spread)) - weights
+        return float(normal.sum() + log_i0(doubled.abs()).sum())
+
+    def search(
+        self,
+        weights: Float64[Tensor, "contacts modes"],
+        doubled: Complex128[Tensor, "contacts modes"],
+        prior: DelayPrior,
+    ) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, " contacts"]]:
+        """Return each recording's likeliest delay, and the log odds that its phases agree with `doubled` at all.
+
+        `doubled` is the sum of the others' weights times exp(2 i phase), for each recording. The odds compare phases
+        about these, over all delays of the prior, with phases that are anything.
+        """
+        strength = doubled.abs()
+        # The others' mean phase is not known exactly: two von Mises laws in a row have about the product of the means'
+        # lengths.
+        pull = weights * torch.special.i1e(strength) / torch.special.i0e(strength)
+        toward = pull * torch.exp(1j * (2 * self.scaled.angle() - doubled.angle()))
+        angles = self.turn[:, None] * self.grid
+        parts = torch.cat([toward.real, toward.imag], dim=1).float()
+        score = (parts @ torch.cat([angles.cos(), -angles.sin()]).float()).double()
+        score = score + prior.log_density(self.grid[:, None]).T
+        # Many modes that agree outweigh a strong one that does not, which a product of densities would follow.
+        edge = torch.full_like(score[:, :1], -math.inf)
+        padded = torch.cat([edge, score, edge], dim=1)
+        peaks = torch.where((score >= padded[:, :-2]) & (score >= padded[:, 2:]), score, -math.inf)
+        candidates = self.grid[torch.topk(peaks, min(_CANDIDATES, len(self.grid)), dim=1).indices]
+        turned = toward[:, None] * torch.exp(1j * self.turn * candidates[:, :, None])
+        robust = _agreement(turned, pull[:, None]) + prior.log_density(candidates.T).T
+        delays = candidates.gather(1, robust.argmax(1, keepdim=True))[:, 0]
+        step = float(self.grid[1] - self.grid[0])
+        for _ in range(_NEWTON_STEPS):
+            turned = toward * torch.exp(1j * self.turn * delays[:, None])
+            turned = turned * _inlier_probability(turned, pull)
+            slope = prior.slope(delays) - (self.turn * turned.imag).sum(1)
+            bend = (self.turn.square() * turned.real).sum(1)
+            delays = delays + torch.where(bend > 0, slope / bend, 0.0).clamp(-step, step)
+        turned = toward * torch.exp(1j * self.turn * delays[:, None])
+        bend = (self.turn.square() * (turned * _inlier_probability(turned, pull)).real).sum(1)
+        return delays, _agreement(turned, pull) + occam_factor(prior, delays, bend)
+
+
+def _agreement(
+    toward: Complex128[Tensor, "*delays modes"], pull: Float64[Tensor, "*#delays modes"]
+) -> Float64[Tensor, "*delays"]:
+    """Return the log odds that phases lie about the others' mean with concentrations `pull`, against anywhere.
+
+    `toward` is the concentration times exp(2 i error). A part `_STRAY` of the phases lies anywhere in any case.
+    """
+    return torch.log(_STRAY + (1 - _STRAY) * (toward.real - log_i0(pull)).exp()).sum(-1)
+
+
+def _inlier_probability(
+    toward: Complex128[Tensor, "contacts modes"], pull: Float64[Tensor, "contacts modes"]
+) -> Float64[Tensor, "contacts modes"]:
+    """Return the probability of each phase to be none of those that lie anywhere."""
+    about = (1 - _STRAY) * (toward.real - log_i0(pull)).exp()
+    return about / (about + _STRAY)
+
+
+def occam_factor(
+    prior: DelayPrior, delays: Float64[Tensor, " contacts"], bend: Float64[Tensor, " contacts"]
+) -> Float64[Tensor, " contacts"]:
+    """Return what not knowing the delays costs: their prior density times the width of their posterior (Laplace).
+
+    `bend` is the second derivative of the log likelihood, negated. Nothing is won by delays that are not known at all.
+    """
+    width = 0.5 * torch.log(2 * math.pi / bend.clamp_min(1e-300))
+    return (prior.log_density(delays) + width).clamp_max(0.0)
+
+
+def log_i0(value: Float64[Tensor, "..."]) -> Float64[Tensor, "..."]:
+    """Return the logarithm of the modified Bessel function I0, which itself overflows above 700."""
+    return torch.special.i0e(value).log() + value
