@@ -15,11 +15,11 @@ from avmsf.modal.extraction.quality import measure_quality
 from benchmarks.material import shared_data
 
 AIRCRAFT = (18.85, 40.14, 87.81, 89.63, 97.07, 105.18, 117.99, 125.57, 125.96, 130.0, 135.3, 143.3, 166.23)
-"""The modes of `aircraft_response` between 18.8 and 166 Hz, Hz, by an estimator other than this project's: least
-squares in the frequency domain with a common denominator (p-LSCF) in the bands 10-60, 60-115, 115-140 and 140-175 Hz;
-medians of the poles that are stable to .3 % of frequency and 20 % of damping from order to order, at more than half of
-the orders from 10 to 60. Weaker companions at 39.7, 124.2 and 165.3 Hz are left out, as the published analysis has 13
-modes.
+"""The modes of `aircraft_response` between 18.8 and 166 Hz, Hz. The published analysis gives their number and range
+alone; these frequencies are of an estimator that shares no code with this project: least squares in the frequency
+domain with a common denominator (p-LSCF) in the bands 10-60, 60-115, 115-140 and 140-175 Hz; medians of the poles that
+are stable to .3 % of frequency and 20 % of damping from order to order, at more than half of the orders from 10 to 60.
+Weaker companions at 39.7, 124.2 and 165.3 Hz are left out, as the published analysis has 13 modes.
 """
 NEAR = 0.005
 """Part of its frequency by which a mode may be off and still be taken for it."""

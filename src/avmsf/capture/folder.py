@@ -114,7 +114,8 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
     Sounds become float32 wav files under the recordings' names where these are wav paths inside a folder, else under
     numbers. Everything is written beside the folder first and then renamed into place, so that a folder of this name
     is whole or absent. With `onsets_within` the sounds are whole recordings that start before their impacts: reading
-    then finds the onsets, and keeps this many seconds from each on. Raises `CaptureError` where the folder exists and
+    then finds the onsets, and keeps this many seconds from each on; without it they are final, and are not aligned when
+    they are read. Raises `CaptureError` where the folder exists and
     is not empty, or cannot be written.
     """
     folder = Path(folder)

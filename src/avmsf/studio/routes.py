@@ -114,7 +114,7 @@ class Calls:
         return _file(showcase.object_folder if name.startswith("object.") else showcase.current.folder, request)
 
     async def send_measured(self, request: Request) -> Response:
-        """The sound of a measured strike, as the field was fitted to it."""
+        """The sound of a measured strike, as it is read."""
         return _file(self.studio.showcase.object_folder / "strikes", request)
 
     async def locate(self, request: Request) -> Response:

@@ -156,7 +156,7 @@ class Showcase:
         return 1.0 if self.opened.object is not None else self.opened.settings.surface_metres
 
     def _strikes(self, field: SoundField | None) -> tuple[Impacts | None, tuple[str, ...]]:
-        """Return the capture's strikes as the field was fitted to them, or a word on why they cannot be compared."""
+        """Return the capture's strikes each from its own onset, or a word on why they cannot be compared."""
         if field is None or self.opened.capture is None:
             return None, ()
         try:
