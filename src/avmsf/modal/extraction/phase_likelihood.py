@@ -24,7 +24,7 @@ _REACH_SAMPLES = 16.0
 """Longest delay that is searched, whichever is longer: as far as a capture's reader keeps what lies before an onset."""
 _RELATIVE = 0.05
 """Error across the phase of any amplitude, over the amplitude: frequencies and dampings are never exact."""
-_STRAY = 0.2
+_OUTLIER_SHARE = 0.2
 """Part of the phases that lie anywhere: of modes that are hardly excited, or that two close modes are taken for."""
 _USUAL_SPREAD = 0.05
 """Spread of a mode of which little is known: phases to .2 rad."""
@@ -180,17 +180,17 @@ def _agreement(
 ) -> Float64[Tensor, "*delays"]:
     """Return the log odds that phases lie about the others' mean with concentrations `pull`, against anywhere.
 
-    `toward` is the concentration times exp(2 i error). A part `_STRAY` of the phases lies anywhere in any case.
+    `toward` is the concentration times exp(2 i error). A part `_OUTLIER_SHARE` of the phases lies anywhere in any case.
     """
-    return torch.log(_STRAY + (1 - _STRAY) * (toward.real - log_i0(pull)).exp()).sum(-1)
+    return torch.log(_OUTLIER_SHARE + (1 - _OUTLIER_SHARE) * (toward.real - log_i0(pull)).exp()).sum(-1)
 
 
 def _inlier_probability(
     toward: Complex128[Tensor, "contacts modes"], pull: Float64[Tensor, "contacts modes"]
 ) -> Float64[Tensor, "contacts modes"]:
     """Return the probability of each phase to be none of those that lie anywhere."""
-    about = (1 - _STRAY) * (toward.real - log_i0(pull)).exp()
-    return about / (about + _STRAY)
+    about = (1 - _OUTLIER_SHARE) * (toward.real - log_i0(pull)).exp()
+    return about / (about + _OUTLIER_SHARE)
 
 
 def occam_factor(

@@ -26,7 +26,7 @@ _FALSE_ALARM = 1e-3
 """Probability that an inverted recording is named in a capture that has none, by normal correlations."""
 _TELLING = 0.5
 """Median correlation below which neighbors tell less than a quarter of the gains' energy, and nothing is judged."""
-_FEWEST = 6
+_MIN_RECORDINGS = 6
 """Recordings below which the spread of their correlations is not known."""
 _NORMAL = 1.4826
 """Standard deviation of normal numbers over the median distance from their median."""
@@ -43,7 +43,7 @@ def inverted_recordings(modes: Extraction, impacts: Impacts) -> tuple[str, ...]:
         impacts = impacts.take(rows)
         modes = replace(modes, gains=modes.gains[rows], quadrature=modes.quadrature[rows], alignment=None)
     signs, found = torch.ones(len(impacts), 1, dtype=torch.float64), list[int]()
-    while len(impacts) >= _FEWEST and len(found) < len(impacts) // 3:
+    while len(impacts) >= _MIN_RECORDINGS and len(found) < len(impacts) // 3:
         # One at a time: an inverted recording spoils what is predicted at its neighbors.
         turned = replace(modes, gains=modes.gains * signs, quadrature=modes.quadrature * signs)
         correlation = _predicted(turned, impacts)

@@ -69,15 +69,15 @@ def measure_quality(
     """Return the quality of each pole, from the sounds that an extraction's gains are of (`Extraction.aligned`)."""
     bank = extraction.bank
     level = (sounds - sounds.mean(1, keepdim=True)).square().mean(1).sqrt()
-    heard = level > 0
-    scaled = ((sounds - sounds.mean(1, keepdim=True))[heard] / level[heard, None]).double()
+    audible = level > 0
+    scaled = ((sounds - sounds.mean(1, keepdim=True))[audible] / level[audible, None]).double()
     system = NormalEquations.of(scaled, poles_of(bank, sample_rate), weighted=True)
     explained, _ = system.lost_without()
     moves = _OwnMoves(*system.own_step(sample_rate))
     amplitudes = torch.complex(extraction.gains.double(), extraction.quadrature.double())
     energy = (amplitudes.abs().square() / bank.damping).sum(0)
     # Loud recordings count no more than others for phases and shapes.
-    amplitudes = amplitudes[heard] / level[heard, None]
+    amplitudes = amplitudes[audible] / level[audible, None]
     noise = noise_at(noise_power(scaled, bins=noise_bins(sounds.shape[1])), bank, sample_rate)
     standing = torch.nonzero(_stands_out(explained, moves.misfit(), noise)).flatten()
     # A double of what is no mode itself may be the mode that both are of.
