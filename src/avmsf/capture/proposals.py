@@ -5,6 +5,7 @@ the figures behind the bounds.
 """
 
 import json
+import os
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -291,6 +292,9 @@ def _strikes(folder: Path, settings: CaptureSettings) -> Iterator[Strike]:
 
 def _recordings(folder: Path, strikes: Sequence[Strike]) -> Iterator[tuple[Strike, Recording]]:
     for strike in strikes:
+        # The error would name similar files, for which it compares up to a thousand names.
+        if not os.path.exists(folder / strike.file):
+            continue
         try:
             yield strike, read_recording(folder / strike.file, strike.file)
         except CaptureError:
