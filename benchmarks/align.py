@@ -305,24 +305,26 @@ def jittered(files: Impacts, jitter: str) -> tuple[Impacts, Float64[Tensor, " co
 
 
 def _wide(folder: Path, starts: Float64[Tensor, " contacts"]) -> Impacts:
-    """Return a simulated capture with every sound from its true start on, and twice the usual margins."""
+    """Return a simulated capture with every sound from its true start on, and twice the usual margins.
+
+    Its files are divided by the forces already.
+    """
     impacts = read_capture(folder).impacts
     margin = 2 * margin_length(impacts.sample_rate)
     files = [torch.from_numpy(read_recording(folder / name).response()).float() for name in impacts.names]
-    forces = torch.ones(len(files)) if impacts.forces is None else impacts.forces
     samples = (
         min(len(file) - math.ceil(float(start)) for file, start in zip(files, starts.tolist(), strict=True)) - margin
     )
     rows = [
         Impacts(
             impacts.contacts[:1],
-            torch.nn.functional.pad(file, (margin, 0))[None] / force,
+            torch.nn.functional.pad(file, (margin, 0))[None],
             impacts.sample_rate,
             ("whole",),
         )
         .delayed(torch.tensor([start], dtype=torch.float64))
         .sounds[0, : samples + 2 * margin]
-        for file, force, start in zip(files, forces, starts.tolist(), strict=True)
+        for file, start in zip(files, starts.tolist(), strict=True)
     ]
     whole = torch.stack(rows)
     return replace(
