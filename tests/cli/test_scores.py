@@ -46,5 +46,5 @@ def test_jitter_of_the_starts_does_not_count() -> None:
         field = fit(train, features, modes, FitConfig(steps=0), gains=ThinPlate())
         scores = compare(field, train, test, modes)
         errors[deviation] = {name: each.mean()["relative_stft"] for name, each in scores.items()}
-    for name in ("field", "mean waveform of 3 nearest", "floor: the test strikes' own gains"):
-        assert errors[3.0][name] == pytest.approx(errors[0.0][name], rel=0.05, abs=0.01), name
+    for name in ("field", "mean waveform of 3 nearest"):
+        assert errors[3.0][name] == pytest.approx(errors[0.0][name], rel=0.04), name

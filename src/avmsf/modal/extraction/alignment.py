@@ -117,8 +117,9 @@ class Alignment:
 def align(impacts: Impacts) -> Alignment | None:
     """Return the alignment of recordings with one another; None for fewer than two, or where no mode is found.
 
-    A delay common to all recordings cannot be known: the median of the delays is zero. Where every file begins within
-    the impact the common start is that of the latest, so that no sound begins with silence of its file's making.
+    A delay common to all recordings cannot be known by phases: the common start is where the aligned sounds together
+    leave the noise. Where every file begins within the impact it is that of the latest, so that no sound begins with
+    silence of its file's making.
     """
     if len(impacts) < 2:
         return None
@@ -170,7 +171,25 @@ def _offset(delays: Float64[Tensor, " contacts"], agrees: Bool[Tensor, " contact
     """Return what is added to all delays: the common start is a matter of choice."""
     if not bool(agrees.any()):
         return 0.0
-    return -float(delays[agrees].median() if _has_lead(impacts) else delays[agrees].min())
+    if impacts.before is None:
+        return -float(delays[agrees].median())
+    return _common_onset(impacts, delays, agrees) if _has_lead(impacts) else -float(delays[agrees].min())
+
+
+def _common_onset(impacts: Impacts, delays: Float64[Tensor, " contacts"], agrees: Bool[Tensor, " contacts"]) -> float:
+    """Return how much later than their common start aligned recordings leave the noise, all together, samples.
+
+    That is where the mean power of sounds of equal energy first reaches a hundredth of its maximum, and ten times the
+    noise before. The median of single onsets is off by what these are, over the square root of their number.
+    """
+    assert impacts.before is not None
+    assert impacts.after is not None
+    lead = impacts.before.shape[1]
+    early = replace(impacts, sounds=impacts.sounds[:, : 3 * lead], after=impacts.after[:, :0])
+    power = early.delayed(delays - lead).sounds[agrees, : 2 * lead].double().square()
+    mean = (power / power.sum(1, keepdim=True).clamp_min(1e-300)).mean(0)
+    threshold = max(0.01 * float(mean.max()), 10 * float(mean[: lead // 2].median()))
+    return float((mean >= threshold).nonzero()[0, 0]) - lead
 
 
 def _has_lead(impacts: Impacts) -> bool:
