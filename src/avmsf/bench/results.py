@@ -13,9 +13,9 @@ from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
 
 IDENTITY, OBJECTS = "protocol.json", "objects"
+"""The file that says what the folder's figures are, and the folder of the objects' files."""
 _MAX_BYTES = 64 << 20
 """Largest file of results that is read: three million figures, as of 100 strikes by 10 metrics in 3000 cases."""
-"""The file that says what the folder's figures are, and the folder of the objects' files."""
 
 
 @dataclass(frozen=True)

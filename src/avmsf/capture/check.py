@@ -9,7 +9,7 @@ from avmsf.capture.folder import read_strike, settings_of
 from avmsf.capture.measure import RecordingReport
 from avmsf.capture.prepare import Prepared, margin_length
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.starts import start_with_impact
+from avmsf.capture.starts import stay_uncut
 from avmsf.capture.surface import find_surface
 from avmsf.capture.table import TABLE, Row, Strike, read_rows, refuse_repeated_files, understand
 from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_levels, judge_surface, refuse_few
@@ -70,7 +70,8 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
     refused = _check_contacts(folder, strikes, rows, settings=settings, problems=problems)
     if len(missing) > MAX_SUGGESTIONS:
         refused.append(f"{TABLE}: there are no files for {len(missing)} of {len(rows)} rows")
-    uncut = _all_start_with_impact(sounds, settings=settings)
+    comparable = len(sounds) > 1 and len({each.rate for each in sounds}) == 1
+    uncut = comparable and stay_uncut([each.start for each in sounds], rate=sounds[0].rate, settings=settings)
     if uncut:
         reports = [each if each.onset_seconds is None else replace(each, onset_seconds=0.0) for each in reports]
         sounds = [replace(each, samples=each.samples + each.start.onset) for each in sounds]
@@ -106,15 +107,6 @@ def _check_row(
         file = strike.file if strike is not None else row.cells["file"]
         return strike, None, RecordingReport(file=file, line=row.line, readable=False, problems=(str(error),))
     return strike, prepared, report
-
-
-def _all_start_with_impact(sounds: list[_Sound], *, settings: CaptureSettings) -> bool:
-    """Return whether `read_capture` would not cut these recordings (`start_with_impact`)."""
-    if len(sounds) < 2 or len({each.rate for each in sounds}) > 1:
-        return False
-    if not settings.align or settings.force_channel is not None:
-        return False
-    return start_with_impact([each.start for each in sounds], rate=sounds[0].rate)
 
 
 def _check_sounds(sounds: list[_Sound], *, settings: CaptureSettings, problems: list[str]) -> list[str]:

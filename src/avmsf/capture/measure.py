@@ -70,8 +70,8 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         not np.array_equal(recording.channel(each), response) for each in others
     ):
         problems.append(
-            "its channels hold one sound, up to a constant factor and rounding: the loudest is read, channel "
-            f"{channel}; to choose one, write response_channel in capture.toml"
+            f"its channels hold one sound, up to a constant factor and rounding: channel {channel} is read; to choose "
+            "another, write response_channel in capture.toml"
         )
     if clipped:
         problems.append(f"{counted(clipped, 'clipped sample')}: turn the gain down and record it again")

@@ -57,12 +57,17 @@ def start_with_impact(recordings: Sequence[Prepared], *, rate: float) -> bool:
     return bool(mean[:first].max() >= START_LEVEL * mean.max())
 
 
-def settle_starts(recordings: Sequence[Prepared], *, rate: float, settings: CaptureSettings) -> list[Prepared]:
-    """Return the recordings uncut where all of them start with the impact, else as they are.
+def stay_uncut(recordings: Sequence[Prepared], *, rate: float, settings: CaptureSettings) -> bool:
+    """Return whether the recordings of a capture are taken from their files' first sample on, though `align` is set.
 
-    A force channel and `align = false` say where the sounds start; then nothing changes.
+    A force channel and `align = false` say where the sounds start.
     """
-    if not settings.align or settings.force_channel is not None or not start_with_impact(recordings, rate=rate):
+    return settings.align and settings.force_channel is None and start_with_impact(recordings, rate=rate)
+
+
+def settle_starts(recordings: Sequence[Prepared], *, rate: float, settings: CaptureSettings) -> list[Prepared]:
+    """Return the recordings uncut where all of them start with the impact (`stay_uncut`), else as they are."""
+    if not stay_uncut(recordings, rate=rate, settings=settings):
         return list(recordings)
     return [
         replace(each, sound=np.concatenate([each.before, each.sound]), before=each.before[:0], onset=0)

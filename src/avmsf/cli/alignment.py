@@ -1,6 +1,6 @@
 """How a capture's recordings were aligned with one another, as sentences and as plain values."""
 
-from typing import Any
+from dataclasses import dataclass
 
 from avmsf.capture import Impacts
 from avmsf.modal.extraction.extract import Extraction
@@ -10,57 +10,61 @@ _SHOWN = 8
 """Recordings that a sentence names."""
 
 
-def alignment_values(modes: Extraction, impacts: Impacts) -> dict[str, Any] | None:
-    """Return coherences, delays in samples, and the recordings that are named; None where nothing was aligned.
+@dataclass(frozen=True)
+class AlignmentReport:
+    """How recordings were aligned, as plain values."""
 
-    `modes` are those of `impacts`.
-    """
-    found = modes.alignment
-    if found is None:
-        return None
-    pairs = list(zip(found.names, found.delays.tolist(), found.agrees.tolist(), strict=True))
-    return {
-        "coherence_before": found.coherence_before,
-        "coherence_after": found.coherence_after,
-        "delays": {name: delay for name, delay, _ in pairs},
-        "not_aligned": [name for name, _, agrees in pairs if not agrees],
-        "inverted": list(inverted_recordings(modes, modes.aligned(impacts))),
-    }
+    coherence_before: float
+    coherence_after: float
+    delays: dict[str, float]
+    """Samples by which each recording starts later than it was read."""
+    not_aligned: list[str]
+    inverted: list[str]
+    """Recordings of the opposite sign."""
+
+    @classmethod
+    def of(cls, modes: Extraction, impacts: Impacts) -> "AlignmentReport | None":
+        """Return the report on the recordings that the modes are of; None where nothing was aligned."""
+        found = modes.alignment
+        if found is None:
+            return None
+        left = [name for name, agrees in zip(found.names, found.agrees.tolist(), strict=True) if not agrees]
+        delays = dict(zip(found.names, found.delays.tolist(), strict=True))
+        inverted = list(inverted_recordings(modes, impacts))
+        return cls(found.coherence_before, found.coherence_after, delays, left, inverted)
+
+    def sentences(self) -> list[str]:
+        """Say how coherent the modes' phases are, and name what is not aligned or has the opposite sign."""
+        moved = [delay for name, delay in self.delays.items() if name not in self.not_aligned]
+        if not moved:
+            return [
+                f"the modes have no common phase (coherence {self.coherence_before:.2f}, 1 is one phase for each "
+                "mode): each recording keeps its own start. Was the sensor or the object moved, or the response "
+                "channel another?"
+            ]
+        how = "no delays make the modes' phases agree better than they do as read"
+        coherence = f"coherence {self.coherence_before:.2f} as read"
+        if any(moved):
+            how = f"delays of {min(moved):.2f} to {max(moved):.2f} samples align the recordings"
+            coherence += f", {self.coherence_after:.2f} aligned"
+        sentences = [f"{how}: {coherence} (1 is one phase for each mode)"]
+        if self.not_aligned:
+            sentences.append(
+                f"not aligned: {_listed(self.not_aligned)}; the phases of their modes agree with those of no other "
+                "recording, and they keep their own start"
+            )
+        if self.inverted:
+            sentences.append(
+                f"inverted polarity: {_listed(self.inverted)} have the opposite sign of the recordings near them; "
+                "check the cable and the file, or the direction in impacts.csv"
+            )
+        return sentences
 
 
 def describe_alignment(modes: Extraction, impacts: Impacts) -> list[str]:
-    """Say how coherent the phases of the modes of `impacts` are, and name what is not aligned or has the opposite sign.
-
-    Empty where nothing was aligned.
-    """
-    found = modes.alignment
-    if found is None:
-        return []
-    inverted = list(inverted_recordings(modes, modes.aligned(impacts)))
-    if not bool(found.agrees.any()):
-        return [
-            f"the modes have no common phase (coherence {found.coherence_before:.2f}, 1 is one phase a mode): each "
-            "recording keeps its own start. Was the sensor or the object moved, or the response channel another?"
-        ]
-    moved = found.delays[found.agrees]
-    how = "no delays make the modes' phases agree better than they do as read"
-    if bool((moved != 0).any()):
-        how = f"delays of {float(moved.min()):.2f} to {float(moved.max()):.2f} samples align the recordings"
-    coherence = f"coherence {found.coherence_before:.2f} as read"
-    if bool((moved != 0).any()):
-        coherence += f", {found.coherence_after:.2f} aligned"
-    sentences = [f"{how}: {coherence} (1 is one phase for each mode)"]
-    left = [name for name, agrees in zip(found.names, found.agrees.tolist(), strict=True) if not agrees]
-    if left:
-        sentences.append(
-            f"not aligned, for their modes' phases agree with no others': {_listed(left)}; they keep their own start"
-        )
-    if inverted:
-        sentences.append(
-            f"inverted polarity: {_listed(inverted)} have the opposite sign of the recordings near them; check the "
-            "cable and the file, or the direction in impacts.csv"
-        )
-    return sentences
+    """Return the sentences of the report on the recordings that the modes are of; none where nothing was aligned."""
+    report = AlignmentReport.of(modes, impacts)
+    return [] if report is None else report.sentences()
 
 
 def _listed(names: list[str]) -> str:

@@ -1,10 +1,9 @@
 """`avmsf check`: what each recording of a capture is worth, and what is wrong."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import tyro
 from rich.console import Console
@@ -13,7 +12,7 @@ from avmsf.capture import CaptureReport, CaptureSettings, CaptureWarning, Impact
 from avmsf.capture.folder import SETTINGS
 from avmsf.capture.measure import shared_problems
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
-from avmsf.cli.alignment import alignment_values, describe_alignment
+from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.errors import CaptureError, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract
@@ -60,7 +59,7 @@ def run(options: Options) -> int:
         _write(options, proposals, screen)
     report = check(options.capture, settings)
     modes = _modes(options.capture, settings) if report.readable else None
-    aligned = None if modes is None else alignment_values(*modes)
+    aligned = None if modes is None else AlignmentReport.of(*modes)
     if report.recordings:
         screen.print(_table(report, str(options.capture), aligned))
     problems = problems_of(report)
@@ -74,20 +73,25 @@ def run(options: Options) -> int:
         for each in proposals:
             screen.print(f"proposed: {each.line} (--write-settings writes it). {each.reason}", soft_wrap=True)
     if options.json:
-        print_json({**asdict(report), "proposals": [asdict(each) for each in proposals], "alignment": aligned})
+        print_json(
+            {
+                **asdict(report),
+                "proposals": [asdict(each) for each in proposals],
+                "alignment": None if aligned is None else asdict(aligned),
+            }
+        )
     if not report.readable:
         say(f"avmsf check: {options.capture} cannot be read as it is: mend what is listed and check again")
         return UNREADABLE
     for remark in report.remarks if modes is not None else ():
         screen.print(remark, soft_wrap=True)
-    if modes is not None:
-        for sentence in describe_alignment(*modes):
-            screen.print(sentence, soft_wrap=True)
+    for sentence in [] if aligned is None else aligned.sentences():
+        screen.print(sentence, soft_wrap=True)
     if modes is None:
         screen.print("no mode was found to align the recordings by: noise, or too short (avmsf modes says more)")
     wrong = len(problems) + (modes is None)
     if aligned is not None:
-        wrong += bool(aligned["not_aligned"]) + bool(aligned["inverted"])
+        wrong += bool(aligned.not_aligned) + bool(aligned.inverted)
     screen.print("no problem found" if not wrong else f"readable, with {counted(wrong, 'warning')}", soft_wrap=True)
     return 0
 
@@ -124,10 +128,10 @@ def problems_of(report: CaptureReport) -> list[str]:
     return [*report.problems, *shared_problems(report.recordings)]
 
 
-def _table(report: CaptureReport, title: str, aligned: Mapping[str, Any] | None) -> object:
-    delays = {} if aligned is None else aligned["delays"]
-    left = [] if aligned is None else aligned["not_aligned"]
-    doubtful = left if aligned is None else [*left, *aligned["inverted"]]
+def _table(report: CaptureReport, title: str, aligned: AlignmentReport | None) -> object:
+    delays = {} if aligned is None else aligned.delays
+    left = [] if aligned is None else aligned.not_aligned
+    doubtful = [] if aligned is None else [*left, *aligned.inverted]
     columns = ["recording", "state", "length s", "rate Hz", "peak dB", "noise dB", "clipped", "onset s", "2nd blow s"]
     rows = [
         (

@@ -9,7 +9,7 @@ import tyro
 
 from avmsf.bench.pictures import draw_modes, expect_format, save_picture
 from avmsf.capture import CaptureSettings, read_capture
-from avmsf.cli.alignment import alignment_values, describe_alignment
+from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_rows, quality_rows
 from avmsf.cli.printing import console, decimals, figure, print_json, say, table
 from avmsf.modal.extraction.extract import extract
@@ -68,8 +68,8 @@ def run(options: Options) -> int:
     if supporting:
         screen.print(quality_table(f"{len(supporting)} supporting poles: kept in the model, not modes", supporting))
     screen.print(_EXPLANATION)
-    aligned = alignment_values(extraction, impacts)
-    for sentence in describe_alignment(extraction, impacts):
+    aligned = AlignmentReport.of(extraction, impacts)
+    for sentence in [] if aligned is None else aligned.sentences():
         screen.print(sentence, soft_wrap=True)
     if options.picture is not None:
         drawn = f"{len(rows)} poles of {capture.name}, {len(modes)} of them modes"
@@ -83,7 +83,7 @@ def run(options: Options) -> int:
                 "sample_rate": impacts.sample_rate,
                 "seconds": impacts.duration,
                 "method": options.method,
-                "alignment": aligned,
+                "alignment": None if aligned is None else asdict(aligned),
                 "modes": [asdict(row) | asdict(how) for row, how in modes],
                 "supporting_poles": [asdict(row) | asdict(how) for row, how in supporting],
             }

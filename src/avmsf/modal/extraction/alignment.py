@@ -27,6 +27,7 @@ from jaxtyping import Bool, Complex128, Float64
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
+from avmsf.capture.prepare import margin_length
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.extraction.phase_likelihood import DelayPrior, MeasuredPhases, occam_factor
@@ -73,7 +74,7 @@ class Phases:
     jitter: float
     """Median distance of the delays from `start`, samples."""
     start: float
-    """Delay of a usual recording: zero, but where every file begins within its impact."""
+    """Delay of a usual recording, their median."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +108,11 @@ class Alignment:
         delays = torch.tensor([known.get(key, 0.0) for key in keys], dtype=torch.float64)
         others = torch.tensor([row for row, key in enumerate(keys) if key not in known], dtype=torch.long)
         if len(others) and bool((self.delays != 0).any()):
-            new = impacts.take(others.tolist())
-            delays[others] = _delays_alone(new, self.phases, start=self.phases.start)
+            new, reach = impacts.take(others.tolist()), _reach(impacts)
+            delays[others] = _delays_alone(new, self.phases, usual=self.phases.start, reach=reach)
             # Once more, from sounds that start where the first estimate says.
-            delays[others] += _delays_alone(new.delayed(delays[others]), self.phases, start=0.0)
+            moved = new.delayed(delays[others])
+            delays[others] += _delays_alone(moved, self.phases, usual=0.0, reach=reach)
         return impacts.delayed(delays)
 
 
@@ -126,12 +128,13 @@ def align(impacts: Impacts) -> Alignment | None:
     bank = HighResolution(modes=_MODES, range_db=_RANGE_DB).find(impacts.sounds, impacts.sample_rate)
     if len(bank) == 0:
         return None
-    measured = MeasuredPhases.of(impacts, bank)
+    reach = _reach(impacts)
+    measured = MeasuredPhases.of(impacts, bank, reach=reach)
     before = coherence(measured.amplitude, bank.damping)
     delays, agrees, phases = _estimate(measured, exact=0.0 if _has_lead(impacts) else _EXACT)
     if bool((delays != 0).any()):
         # Once more, from sounds that start where the first estimate says; then closely, with the spreads found.
-        measured = MeasuredPhases.of(impacts.delayed(delays), bank)
+        measured = MeasuredPhases.of(impacts.delayed(delays), bank, reach=reach)
         further, agrees, phases = _estimate(measured, earlier=delays)
         delays = torch.where(agrees, delays + further, 0.0)
         measured = MeasuredPhases.of(impacts.delayed(delays), bank, reach=_CLOSE)
@@ -142,10 +145,10 @@ def align(impacts: Impacts) -> Alignment | None:
         delays = torch.where(agrees, delays + offset, 0.0)
         phases = replace(
             phases,
-            start=offset if not _has_lead(impacts) else 0.0,
+            start=float(delays[agrees].median()) if bool(agrees.any()) else 0.0,
             doubled=phases.doubled * torch.exp(1j * offset * measured.turn),
         )
-        measured = MeasuredPhases.of(impacts.delayed(delays), bank)
+        measured = MeasuredPhases.of(impacts.delayed(delays), bank, reach=reach)
     after = coherence(measured.amplitude, bank.damping)
     return Alignment(impacts.names, delays, agrees, before, after, phases, recording_keys(impacts))
 
@@ -197,14 +200,19 @@ def _has_lead(impacts: Impacts) -> bool:
     return impacts.before is None or bool(torch.isfinite(impacts.before).any())
 
 
-def _delays_alone(impacts: Impacts, phases: Phases, *, start: float) -> Float64[Tensor, " contacts"]:
-    """Return the delays, about `start`, by which recordings agree with known phases, each alone; `start` where none."""
-    measured = MeasuredPhases.of(impacts, phases.bank)
+def _reach(impacts: Impacts) -> float:
+    """Return the longest delay to search, samples: as much as files keep before an onset."""
+    return float(margin_length(impacts.sample_rate) if impacts.before is None else impacts.before.shape[1])
+
+
+def _delays_alone(impacts: Impacts, phases: Phases, *, usual: float, reach: float) -> Float64[Tensor, " contacts"]:
+    """Return the delays, near `usual`, by which recordings agree with known phases; zero for one that does not."""
+    measured = MeasuredPhases.of(impacts, phases.bank, reach=reach)
     weights = measured.concentration(phases.power, phases.spread)
     doubled = phases.doubled.expand(len(impacts), -1)
-    prior = DelayPrior(torch.full((len(impacts),), start, dtype=torch.float64), phases.jitter)
+    prior = DelayPrior(torch.full((len(impacts),), usual, dtype=torch.float64), phases.jitter)
     delays, odds = measured.search(weights, doubled, prior)
-    return torch.where(odds > 0, delays, start)
+    return torch.where(odds > 0, delays, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,8 +239,8 @@ def _estimate(
 
     `earlier` are the delays that the sounds have been moved by already: the prior is of the sum. Without them, all
     delays are zero where the recordings are likelier to be aligned as they are, which `exact` favors, log odds a
-    recording. With `agreeing`, which recordings agree
-    is known, and the modes' spreads are those found, however few the recordings.
+    recording. With `agreeing`, which recordings agree is known, and the modes' spreads are those found, however few the
+    recordings.
     """
     none = torch.zeros(len(measured.scaled), dtype=torch.float64)
     if earlier is None:
@@ -240,7 +248,7 @@ def _estimate(
         energy = measured.scaled.abs().square() / measured.bank.damping
         broadest = torch.argsort((energy / energy.sum(0)).sum(1), descending=True)[:_REFERENCES]
         fits = [_climb(measured, prior, reference=int(row)) for row in broadest]
-        still = _at(measured, none)
+        still = _unmoved(measured)
         fits += [_climb(measured, prior), replace(still, log_posterior=still.log_posterior + exact * len(none))]
         fit = max(fits, key=lambda each: each.log_posterior)
     else:
@@ -281,8 +289,9 @@ def _climb(measured: MeasuredPhases, prior: DelayPrior, *, reference: int | None
     return _Fit(delays, weights, spread, prior, measured.log_likelihood(weights, spread, total) + share)
 
 
-def _at(measured: MeasuredPhases, delays: Float64[Tensor, " contacts"]) -> _Fit:
-    """Return the fit of delays that are known."""
+def _unmoved(measured: MeasuredPhases) -> _Fit:
+    """Return the fit without any delay."""
+    delays = torch.zeros(len(measured.scaled), dtype=torch.float64)
     weights = measured.concentration(measured.power, torch.full_like(measured.power, _FIRST_SPREAD))
     for _ in range(_SETTLING):
         spread = measured.spread(weights, delays, vague=_VAGUE)

@@ -19,9 +19,6 @@ _NEWTON_STEPS = 8
 """Of each search, at most one grid step long each."""
 _GRID_PER_PERIOD = 10
 """Grid points in half a period of the highest mode, after which its doubled phase repeats."""
-_REACH_SECONDS = 0.02
-_REACH_SAMPLES = 16.0
-"""Longest delay that is searched, whichever is longer: as far as a capture's reader keeps what lies before an onset."""
 _RELATIVE = 0.05
 """Error across the phase of any amplitude, over the amplitude: frequencies and dampings are never exact."""
 _OUTLIER_SHARE = 0.2
@@ -68,7 +65,7 @@ class MeasuredPhases:
     """Delays that are searched, samples."""
 
     @classmethod
-    def of(cls, impacts: Impacts, bank: ModalBank, *, reach: float = math.inf) -> "MeasuredPhases":
+    def of(cls, impacts: Impacts, bank: ModalBank, *, reach: float) -> "MeasuredPhases":
         """Return the amplitudes, to be aligned by delays of at most `reach` samples."""
         rate, samples = impacts.sample_rate, impacts.sounds.shape[1]
         gains, quadrature = fit_gains(impacts.sounds.double(), bank, sample_rate=rate)
@@ -78,9 +75,6 @@ class MeasuredPhases:
         energy = rate * -torch.expm1(-2 * bank.damping * samples / rate) / (4 * bank.damping)
         scale = (amplitude.abs().square() / bank.damping).sum(1, keepdim=True).sqrt()
         scale = scale.clamp_min(torch.finfo(torch.float32).tiny)
-        if impacts.before is not None:
-            reach = min(reach, float(max(impacts.before.shape[1], 1)))
-        reach = min(reach, max(_REACH_SAMPLES, _REACH_SECONDS * rate))
         step = min(0.5, rate / (2 * _GRID_PER_PERIOD * float(bank.frequency.max())))
         steps = math.ceil(reach / step)
         grid = step * torch.arange(-steps, steps + 1, dtype=torch.float64)
@@ -115,7 +109,7 @@ class MeasuredPhases:
     ) -> Float64[Tensor, " modes"]:
         """Return the spread of each mode's amplitudes about its mean phase, by the median over recordings.
 
-        Beside `vague` recordings that have the usual one.
+        Averaged with the usual one, which counts as `vague` recordings.
         """
         turned = self.doubled(delays)
         mean = (weights * turned).sum(0)

@@ -24,8 +24,8 @@ _NOISES = (0.01, 0.03, 0.1, 0.3, 1.0)
 """Variances of what neighbors do not predict, over the kernel's."""
 _FALSE_ALARM = 1e-3
 """Probability that an inverted recording is named in a capture that has none, by normal correlations."""
-_TELLING = 0.5
-"""Median correlation below which neighbors tell less than a quarter of the gains' energy, and nothing is judged."""
+_MIN_CORRELATION = 0.5
+"""Median correlation below which neighbors explain less than a quarter of the gains' energy, and nothing is judged."""
 _MIN_RECORDINGS = 6
 """Recordings below which the spread of their correlations is not known."""
 _NORMAL = 1.4826
@@ -35,7 +35,7 @@ _NORMAL = 1.4826
 def inverted_recordings(modes: Extraction, impacts: Impacts) -> tuple[str, ...]:
     """Return the names of recordings whose sign is the opposite of the others'; `modes` are those of `impacts`.
 
-    Empty where contacts lie so far apart that neighbors tell nothing of a gain's sign. Recordings that could not be
+    Empty where contacts lie so far apart that neighbors do not determine a gain's sign. Recordings that could not be
     aligned are not judged.
     """
     if modes.alignment is not None and not bool(modes.alignment.agrees.all()):
@@ -51,7 +51,7 @@ def inverted_recordings(modes: Extraction, impacts: Impacts) -> tuple[str, ...]:
         deviation = max(_NORMAL * float((correlation - usual).abs().median()), 1 / math.sqrt(len(modes.bank)))
         # The log odds of a correlation about -c to one about c, of so many recordings.
         odds = -2 * usual * float(correlation[worst]) / deviation**2
-        if usual < _TELLING or odds < math.log(len(impacts) / _FALSE_ALARM) or worst in found:
+        if usual < _MIN_CORRELATION or odds < math.log(len(impacts) / _FALSE_ALARM) or worst in found:
             break
         found.append(worst)
         signs[worst] = -1.0
