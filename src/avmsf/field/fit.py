@@ -81,11 +81,8 @@ def fit(
     """
     config = FitConfig() if config is None else config
     expect_fitting(train, modes)
-    train = modes.aligned(train)
-    # Amplitudes are float32 from here on, so that a field is the same whichever its recordings came in.
-    train = replace(train, sounds=train.sounds.float())
-    modes = replace(modes, residual=Residual(modes.residual.magnitude.float()))
     case = gain_case(train, features, modes, config)
+    train = case.train
     recipe = Automatic() if gains is None else gains
     told: dict[str, Any] = {}
     if isinstance(recipe, Automatic):
@@ -127,8 +124,12 @@ def _with_measured_residual(field: SoundField, train: Impacts) -> SoundField:
 
 
 def gain_case(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> GainCase:
-    """Return what gain fields are made from: the recordings, with how their modes start and how strong they are."""
+    """Return what gain fields are made from: the aligned recordings, with the phases and strengths of their modes."""
     train = modes.aligned(train)
+    # Amplitudes are float32 from here on, so that a field is the same whichever its recordings came in. The alignment
+    # comes first, as it recognizes recordings by their samples.
+    train = replace(train, sounds=train.sounds.float())
+    modes = replace(modes, residual=Residual(modes.residual.magnitude.float()))
     phase = torch.zeros_like(modes.bank.frequency)
     if config.phase == "common":
         phase = common_phase(modes.gains, modes.quadrature)

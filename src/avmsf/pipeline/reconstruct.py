@@ -131,7 +131,6 @@ def _reconstruct(
     listener.tell(f"modes: of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path, needed=True))
     modes = extract_once(train, method, found.path)
-    train = modes.aligned(train)
     basis = {**heard, "features": shape.digest, "fit": asdict(config.fit)}
 
     points = next(iter(shape.candidates.values()))

@@ -1,0 +1,60 @@
+"""Fields do not depend on the times at which single recordings start."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from avmsf.capture.impacts import Impacts
+from avmsf.field.config import FitConfig
+from avmsf.field.fit import fit, gain_case
+from avmsf.field.recipes import ThinPlate
+from avmsf.field.thinplategains import ThinPlateGains
+from avmsf.modal.extraction.extract import Extraction, extract
+from avmsf.scene.features import FeatureField
+from delayed_plate import ALIGNED, delays, distance, strikes, without_delays
+
+COUNT = 12
+FEATURES = FeatureField.from_contacts(strikes(COUNT).contacts)
+CONFIG = FitConfig(steps=0, damping="shared")
+
+
+@pytest.fixture(scope="module")
+def delayed() -> tuple[Impacts, Extraction]:
+    train = strikes(COUNT, starts=delays(COUNT))
+    return train, extract(train)
+
+
+@pytest.fixture(scope="module")
+def exact(delayed: tuple[Impacts, Extraction]) -> tuple[Impacts, Extraction]:
+    train = without_delays(*delayed, delays(COUNT))
+    return train, extract(train)
+
+
+def test_gains_to_spread_do_not_depend_on_delays(
+    delayed: tuple[Impacts, Extraction], exact: tuple[Impacts, Extraction]
+) -> None:
+    cases = [gain_case(train, FEATURES, modes, CONFIG) for train, modes in (delayed, exact)]
+    assert distance(*(each.train.sounds for each in cases)) < ALIGNED
+    assert distance(*(each.gains for each in cases)) < ALIGNED
+
+
+def test_a_field_and_the_gains_it_is_checked_by_do_not_depend_on_delays(
+    delayed: tuple[Impacts, Extraction], exact: tuple[Impacts, Extraction]
+) -> None:
+    fields = [fit(train, FEATURES, modes, CONFIG, gains=ThinPlate()) for train, modes in (delayed, exact)]
+    assert distance(*(each.gains(FEATURES.points) for each in fields)) < ALIGNED
+    known = [each.gain_field for each in fields]
+    assert all(isinstance(each, ThinPlateGains) for each in known)
+    assert distance(*(each.measured.flatten(1) for each in known if isinstance(each, ThinPlateGains))) < ALIGNED
+
+
+def test_recordings_in_double_precision_are_recognized_by_their_alignment(delayed: tuple[Impacts, Extraction]) -> None:
+    train = delayed[0]
+    assert train.before is not None
+    assert train.after is not None
+    double = replace(train, sounds=train.sounds.double(), before=train.before.double(), after=train.after.double())
+    modes = extract(double)
+    assert modes.alignment is not None
+    aligned = double.delayed(modes.alignment.delays).sounds.float()
+    assert torch.equal(gain_case(double, FEATURES, modes, CONFIG).train.sounds, aligned)
