@@ -1,0 +1,56 @@
+"""Methods learn from, and are compared with, recordings that all start at one time after their impacts."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from avmsf.bench.cases import Case
+from avmsf.bench.caserun import CaseRun
+from avmsf.bench.judging import Judging
+from avmsf.bench.methods import method_named
+from avmsf.bench.plan import Evaluation
+from avmsf.bench.protocols import PROTOCOLS
+from avmsf.capture.datasets import CaptureCollection
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import SimulationError
+from delayed_plate import ALIGNED, delays, distance, strikes, without_delays
+from plate_set import NoBodies, PlateLooks
+
+COUNT, TRAIN = 16, 12
+METHODS = ("nearest", "knn3", "knn-gains")
+
+
+def run_of(impacts: Impacts, folder: Path) -> CaseRun:
+    methods = tuple(map(method_named, METHODS))
+    judging = Judging(level="raw", cdpam=False)
+    looks, bodies = PlateLooks(), NoBodies()
+    protocol, dataset = PROTOCOLS["farthest"], CaptureCollection(folder)
+    return CaseRun(
+        Evaluation(dataset, "plates", protocol, methods, looks, bodies, judging=judging),
+        "a",
+        Case("all", tuple(range(TRAIN)), tuple(range(TRAIN, COUNT))),
+        impacts,
+        None,
+        folder=folder,
+        place="a/01",
+        look=lambda look: looks("a", look),
+        physics=lambda: SimulationError("the plate has no shape here"),
+        stranger=lambda: torch.zeros(impacts.sounds.shape[1]),
+        listened=False,
+    )
+
+
+def test_errors_of_baselines_do_not_depend_on_delays(tmp_path: Path) -> None:
+    starts = delays(COUNT)
+    run = run_of(strikes(COUNT, starts=starts), tmp_path / "delayed")
+    found = [run.outcome(method) for method in run.evaluation.methods]
+    same = without_delays(run.impacts, run._modes(), starts)
+    other = run_of(same, tmp_path / "exact")
+    expected = [other.outcome(method) for method in run.evaluation.methods]
+    assert distance(run.train.sounds, other.train.sounds) < ALIGNED
+    assert distance(run.test.sounds, other.test.sounds) < ALIGNED
+    for one, other_one in zip(found, expected, strict=True):
+        assert one.failure is None
+        for metric in ("relative_stft", "l1", "envelope"):
+            assert one.values[metric] == pytest.approx(other_one.values[metric], rel=2 * ALIGNED), (one.method, metric)
