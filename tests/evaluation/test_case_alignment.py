@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from avmsf.bench.cases import Case
 from avmsf.bench.caserun import CaseRun
+from avmsf.bench.cases import Case
 from avmsf.bench.judging import Judging
 from avmsf.bench.methods import method_named
 from avmsf.bench.plan import Evaluation
