@@ -50,9 +50,10 @@ def strikes(count: int, *, starts: Tensor | None = None) -> Impacts:
 def without_delays(impacts: Impacts, modes: Extraction, starts: Tensor) -> Impacts:
     """Return delayed recordings as they were before, but for what their alignment moved all of them by."""
     assert modes.alignment is not None
-    common = (modes.alignment.delays - starts[: len(modes.alignment.delays)]).median()
-    exact = strikes(len(starts)).delayed(common.expand(len(starts)))
-    return exact.take([exact.names.index(name) for name in impacts.names])
+    names = strikes(len(starts)).names
+    aligned, asked = ([names.index(name) for name in each.names] for each in (modes.alignment, impacts))
+    common = (modes.alignment.delays - starts[aligned]).median()
+    return strikes(len(starts)).delayed(common.expand(len(starts))).take(asked)
 
 
 def distance(found: Tensor, expected: Tensor) -> float:

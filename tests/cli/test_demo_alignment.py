@@ -1,0 +1,62 @@
+"""The demo's page and its sounds to compare hold recordings that start where those start that its field is of."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import soundfile
+import torch
+from torch import Tensor
+
+from avmsf.bench.baselines import MeanWaveform
+from avmsf.bench.evaluation import split
+from avmsf.capture import Impacts, read_capture
+from avmsf.cli import demo
+from avmsf.cli.overallbar import OverallBar
+from avmsf.field.config import FitConfig
+from avmsf.field.fit import fit
+from avmsf.field.recipes import ThinPlate
+from avmsf.field.store import save
+from avmsf.modal.extraction.extract import extract
+from avmsf.pipeline.reconstruct import Reconstruction
+from avmsf.pipeline.scene import CLOUD
+from avmsf.scene.features import FeatureField
+from avmsf.scene.points import farthest_points
+from delayed_plate import ALIGNED, delays, distance, strikes, without_delays
+
+COUNT = 16
+
+
+def sounds_of(folder: Path, kind: str) -> Tensor:
+    """Return the demo's sounds of a kind, each of unit norm."""
+    files = sorted((folder / "sounds").glob(f"*-{kind}.wav"))
+    sounds = torch.stack([torch.from_numpy(soundfile.read(each, dtype="float32")[0]) for each in files])
+    return torch.nn.functional.normalize(sounds)
+
+
+def test_the_demos_page_and_sounds_do_not_depend_on_delays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    delayed = strikes(COUNT, starts=delays(COUNT))
+    train, test = split(delayed, count=demo.TRAIN)
+    modes = extract(train)
+    config = FitConfig(steps=0, residual=False)
+    field = fit(train, FeatureField.from_contacts(delayed.contacts), modes, config, gains=ThinPlate())
+    shown: list[Impacts] = []
+
+    def reconstruct(*arguments: object, cache: Path, **named: object) -> Reconstruction:
+        cache.mkdir()
+        (cache / CLOUD).touch()
+        save(field, cache / "field.safetensors")
+        return Reconstruction(cache / "field.safetensors", (), {}, modes, "spline", {})
+
+    monkeypatch.setattr(demo, "read_capture", lambda folder: replace(read_capture(folder), impacts=delayed))
+    monkeypatch.setattr(demo, "reconstruct", reconstruct)
+    monkeypatch.setattr(demo, "write_webpage", lambda *arguments, strikes, **named: shown.append(strikes))
+    monkeypatch.setattr(demo, "save_picture", lambda picture, path: None)
+    with OverallBar(demo.STAGES) as bar:
+        demo._go_all_the_way(tmp_path, bar)
+    exact_train, exact_test = (without_delays(each, modes, delays(COUNT)) for each in (train, test))
+    assert distance(shown[0].sounds, exact_test.sounds) < ALIGNED
+    heard = exact_test.take(farthest_points(test.contacts, 2).tolist())
+    mean = MeanWaveform(exact_train).render(heard.contacts)
+    for kind, expected in (("1-recorded", heard.sounds), ("3-mean-of-nearest", mean)):
+        assert distance(sounds_of(tmp_path, kind), torch.nn.functional.normalize(expected)) < 2 * ALIGNED
