@@ -58,3 +58,9 @@ def test_recordings_in_double_precision_are_recognized_by_their_alignment(delaye
     assert modes.alignment is not None
     aligned = double.delayed(modes.alignment.delays).sounds.float()
     assert torch.equal(gain_case(double, FEATURES, modes, CONFIG).train.sounds, aligned)
+
+
+def test_aligned_recordings_are_not_delayed_again(delayed: tuple[Impacts, Extraction]) -> None:
+    train, modes = delayed
+    aligned = modes.aligned(train)
+    assert torch.equal(gain_case(aligned, FEATURES, modes, CONFIG).train.sounds, aligned.sounds)
