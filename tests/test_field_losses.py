@@ -106,8 +106,8 @@ def test_a_match_costs_nothing_and_silence_costs_one_a_resolution():
     target = spectral_target(recorded, fft_sizes=SIZES, hops=HOPS)
     # Rounding alone: the target's magnitudes are made by torch.
     assert float(spectral_loss(recorded, target)) == pytest.approx(0, abs=1e-14)
-    # A magnitude of zero counts as 1e-6 of the window's norm.
-    assert float(spectral_loss(torch.zeros_like(recorded), target)) == pytest.approx(len(SIZES), abs=1e-5)
+    # A magnitude of zero counts as 1e-6 of the window's norm times the largest sample.
+    assert float(spectral_loss(torch.zeros_like(recorded), target)) == pytest.approx(len(SIZES), abs=3e-5)
 
 
 def test_the_loss_is_relative():
@@ -187,3 +187,16 @@ def test_sounds_that_are_not_the_targets_are_refused():
 def test_an_odd_transform_is_refused():
     with pytest.raises(ValueError, match="expected even FFT sizes, found 63"):
         spectral_target(sounds(), fft_sizes=(64, 63), hops=(16, 16))
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3])
+def test_the_loss_does_not_depend_on_the_unit_of_the_sounds(scale: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    truth, other = torch.randn(2, 3, 4096, generator=generator)
+    losses = [
+        float(spectral_loss(size * other, spectral_target(size * truth, fft_sizes=(512, 128), hops=(128, 32))))
+        for size in (1.0, scale)
+    ]
+    assert losses[1] == pytest.approx(losses[0], rel=1e-4)
+    silence = spectral_loss(torch.zeros_like(truth), spectral_target(scale * truth, fft_sizes=(512,), hops=(128,)))
+    assert float(silence) == pytest.approx(1.0, rel=1e-4)

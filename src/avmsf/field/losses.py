@@ -18,7 +18,8 @@ from avmsf.field.comparison import compare, magnitude
 _CHUNK = 1 << 19
 """Samples of windowed frames held at once: they stay near the processor's cache."""
 _SILENT = 1e-12
-"""Power below which a magnitude counts as zero, relative to the window's energy: its slope is taken as finite there."""
+"""Power below which a magnitude counts as zero, over that of the target's largest sample times the window's energy: its
+slope is taken as finite there. Recordings divided by their forces have samples of 1e-5, so the floor has to scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +57,9 @@ def spectral_target(
         raise ValueError(f"expected even FFT sizes, found {odd[0]}: half a window lies before a frame's centre")
     cut = sounds[:, :samples]
     windows = [torch.hann_window(size, dtype=cut.dtype, device=cut.device) for size in fft_sizes]
-    floors = [_SILENT * float(window.square().sum()) for window in windows]
+    tiny = torch.finfo(cut.dtype).tiny
+    peak = float(cut.abs().max()) if cut.numel() else 0.0
+    floors = [max(_SILENT * peak**2 * float(window.square().sum()), tiny) for window in windows]
     magnitudes = []
     for fft_size, hop, window, floor in zip(fft_sizes, hops, windows, floors, strict=True):
         frames = _padded(cut, fft_size).unfold(1, fft_size, hop)
