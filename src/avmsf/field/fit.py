@@ -22,6 +22,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField
 from avmsf.field.losses import spectral_loss
 from avmsf.field.recipes import GainCase, GainRecipe, along_phase
+from avmsf.field.gains.refinement import RefinedGains as MixtureRefinement
 from avmsf.field.refinement import RefinedGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.training import Targets, TrainingRun
@@ -99,6 +100,10 @@ def fit(
     if isinstance(run.network, RefinedGains):
         parts = fit_gains(train.sounds, bank, sample_rate=train.sample_rate)
         finished = run.network.judged(order, along_phase(*parts, case.phase[order]))
+    elif isinstance(run.network, MixtureRefinement):
+        parts = fit_gains(train.sounds, bank, sample_rate=train.sample_rate)
+        along = along_phase(*parts, case.phase[order])
+        finished = run.network.judged(order, torch.view_as_complex(along.contiguous()))
     else:
         finished = run.network.finished(order)
     field = SoundField(

@@ -1,0 +1,154 @@
+"""The elastic family: a measured mode's shape is a mixture of mode shapes of a nominal body that are near in frequency.
+
+The object's body is not the nominal one: its thickness, material and supports differ. To first order a perturbation of
+stiffness and mass mixes shape j into shape k in proportion to 1 / (lambda_k - lambda_j), lambda being squared angular
+frequencies (Fox and Kapoor, AIAA Journal 6, 1968). So if a mode is shape k, perturbed by a relative amount tau,
+
+    K = (1 - p) sum_j g_kj phi_j phi_j' + p R,   g_kj = 1 / (1 + (2 log(f_k / f_j) / tau)^2),
+
+where phi_j is the component of shape j along the impacts, R a smooth kernel for what no shape of the basis has, and p
+its share. Shapes nearer in frequency than the perturbation mix freely. Where shapes cannot be told one from another, a
+broader profile serves, g_kj = exp(-log(f_k / f_j)^2 / 2 w^2) + 1/1000: whatever lies near in frequency.
+
+Which shape a mode is follows from its gains and from its frequency f: given shape k and a factor c on all nominal
+frequencies (the body's material and scale are not known), log f is normal about log(c f_k) with one of several standard
+deviations; under all other families it is uniform over the measured range.
+"""
+
+import math
+from dataclasses import replace
+from functools import cached_property
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float64, Int
+from torch import Tensor
+
+from avmsf.field.gains.family import KernelFamily, Sites, scaled, squared_exponential
+from avmsf.simulate.elastic import ElasticModes
+
+PERTURBATIONS = (0.003, 0.01, 0.03, 0.1, 0.3)
+"""Relative perturbations tau of stiffness and mass."""
+WIDTHS = (0.05, 0.1, 0.2, 0.4)
+"""Standard deviations w of the broad profiles, in log frequency."""
+REMAINDERS = (0.03, 0.1, 0.3, 0.6)
+"""Shares p of what no shape has."""
+REACH = 0.15
+"""Length of the remainder's kernel over the object's size."""
+_FAR = 1e-3
+"""Least weight of a shape in a broad profile."""
+_FREQUENCY_ERRORS = (0.01, 0.03, 0.08, 0.2)
+"""Standard deviations of log frequency about the nominal one, equally probable."""
+_MEMORY = 4_000_000
+"""Numbers of a basis held at once."""
+_MARGIN = 0.1
+"""Log frequency by which the range of measured modes is widened at both ends."""
+FACTORS = torch.exp(torch.arange(-60, 61, dtype=torch.float64) * 0.05)
+"""Factors on the nominal frequencies that are considered."""
+_FACTOR_PRIOR = ((0.5, 0.0, 0.05), (0.15, -0.29, 0.1), (0.15, -1.4, 0.15), (0.2, 0.0, 0.8))
+"""Probability, mean and standard deviation of the log factor, relative to aluminum. The square root of Young's modulus
+over density lies within 4 % for glass, ceramics, iron, steel and aluminum, at .75 of it for wood, at .22 to .29 of it
+for plastics; the last one is for a mesh of another scale."""
+
+
+class Elastic(KernelFamily):
+    """Mixtures of the mode shapes of one nominal body, interpolated in its elements."""
+
+    kind: ClassVar[str] = "elastic"
+
+    def __init__(self, reference: Sites, size: float, modes: ElasticModes) -> None:
+        super().__init__(reference, size)
+        # As a file keeps them, so that a field that was read renders what the saved one does.
+        self.modes = replace(modes, shapes=modes.shapes.float().double())
+        self.factor_weights = torch.softmax(factor_log_prior(), dim=0)
+        """Probability of each of `FACTORS`."""
+        self._reach = torch.tensor([REACH * size], dtype=torch.float64)
+        apart = torch.log(modes.frequency[:, None] / modes.frequency)
+        profiles = [1.0 / (1.0 + (2.0 * apart / tau).square()) for tau in PERTURBATIONS]
+        profiles += [torch.exp(-0.5 * (apart / width).square()) + _FAR for width in WIDTHS]
+        elastic = scaled(torch.stack(profiles).flatten(0, 1), self._known.square().T)
+        share = torch.tensor(REMAINDERS, dtype=torch.float64)[None, :, None]
+        both = [(1.0 - share) * elastic[:, None], share.expand(len(elastic), -1, 1)]
+        self.shares = torch.cat(both, dim=2).flatten(0, 1)
+
+    def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
+        """Return the product of both impacts' components of each shape, and the remainder's kernel."""
+        one, other = self._along(sites), self._along(others)
+        return torch.cat([one.T[:, :, None] * other.T[:, None], self._remainder(sites, others)[None]])
+
+    def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
+        """Return the squared components of each shape, and ones."""
+        return torch.cat([self._along(sites).square().T, torch.ones(1, len(sites), dtype=torch.float64)])
+
+    def between(self, sites: Sites, others: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept sites others"]:
+        """Return some kernels between two sets of impacts."""
+        one, other = self._along(sites), self._along(others)
+        shares, size = self.shares[kept], len(sites) * len(others)
+        found = self._remainder(sites, others) * shares[:, -1, None, None]
+        # As one product where few impacts make it small, else kernel by kernel: the basis would be far larger.
+        if size * one.shape[1] <= _MEMORY:
+            pairs = (one.T[:, :, None] * other.T[:, None]).flatten(1)
+            return found + (shares[:, :-1] @ pairs).reshape(len(kept), len(sites), len(others))
+        for row, share in enumerate(shares[:, :-1]):
+            found[row] += (one * share) @ other.T
+        return found
+
+    def mean(
+        self, sites: Sites, known: Sites, coefficients: Float64[Tensor, "basis contacts series"]
+    ) -> Float64[Tensor, "sites series"]:
+        """Return the family's part of the means: the sum over the known impacts comes before the places."""
+        weights = torch.einsum("cj,jcs->js", self._along(known), coefficients[:-1])
+        return self._along(sites) @ weights + self._remainder(sites, known) @ coefficients[-1]
+
+    def categories(self) -> Int[Tensor, " kernels"]:
+        """Return one category for each profile and remainder: the shape that is its center has a prior of its own."""
+        profiles, shapes = len(PERTURBATIONS) + len(WIDTHS), len(self.modes)
+        one = torch.arange(profiles * len(REMAINDERS)).reshape(profiles, 1, len(REMAINDERS))
+        return one.expand(-1, shapes, -1).flatten()
+
+    def log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "kernels modes"]:
+        """Return the log probability that each shape is the mode's, times the density of its frequency if it is.
+
+        Over the density of a frequency of which nothing is known; averaged over the factors.
+        """
+        each = self.match(log_frequency) + self.factor_weights.log()[:, None, None]
+        profiles = len(PERTURBATIONS) + len(WIDTHS)
+        shared = torch.logsumexp(each, dim=0)[None, :, None].expand(profiles, -1, len(REMAINDERS), -1)
+        return shared.flatten(0, 2)
+
+    def shape_evidence(self, evidence: Float64[Tensor, "kernels noises series"]) -> Float64[Tensor, "shapes series"]:
+        """Return the log evidence of each shape as center; profiles, remainders and noise shares are equally probable."""
+        shape = (len(PERTURBATIONS) + len(WIDTHS), len(self.modes), len(REMAINDERS) * evidence.shape[1], -1)
+        each = evidence.reshape(shape).transpose(0, 1).flatten(1, 2)
+        return torch.logsumexp(each, dim=1) - math.log(each.shape[1])
+
+    def match(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "factors shapes modes"]:
+        """Return the same for each factor on the nominal frequencies."""
+        low, high = float(log_frequency.min()) - _MARGIN, float(log_frequency.max()) + _MARGIN
+        nominal = torch.log(FACTORS[:, None] * self.modes.frequency)
+        inside = ((nominal > low) & (nominal < high)).sum(1).clamp_min(1).double()
+        error = torch.tensor(_FREQUENCY_ERRORS, dtype=torch.float64)
+        apart = (log_frequency - nominal[..., None])[..., None]
+        normal = torch.exp(-0.5 * (apart / error).square()) / (error * math.sqrt(2.0 * math.pi))
+        density = normal.mean(-1).clamp_min(torch.finfo(torch.float64).tiny)
+        return density.log() - inside.log()[:, None, None] + math.log(high - low)
+
+    @cached_property
+    def _known(self) -> Float64[Tensor, "contacts shapes"]:
+        """Components of the shapes along the reference impacts."""
+        return self.modes.gains(self.reference.points, self.reference.directions)
+
+    def _along(self, sites: Sites) -> Float64[Tensor, "sites shapes"]:
+        return self._known if sites is self.reference else self.modes.gains(sites.points, sites.directions)
+
+    def _remainder(self, sites: Sites, others: Sites) -> Float64[Tensor, "sites others"]:
+        return squared_exponential(sites.points, others.points, self._reach)[0] * sites.cosine(others)
+
+
+def factor_log_prior() -> Float64[Tensor, " factors"]:
+    """Return the log density of each log factor before anything is measured."""
+    terms = [
+        math.log(weight / deviation) - 0.5 * ((torch.log(FACTORS) - mean) / deviation).square()
+        for weight, mean, deviation in _FACTOR_PRIOR
+    ]
+    return torch.logsumexp(torch.stack(terms), dim=0)

@@ -1,0 +1,117 @@
+"""What every kernel family is: kernels that are weighted sums of a basis, among contacts and to other places."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float64, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Sites:
+    """Impacts: where, and along which direction."""
+
+    points: Float64[Tensor, "sites 3"]
+    """Object frame, metres."""
+    directions: Float64[Tensor, "sites 3"]
+    """Unit vectors along which the hammer moves; the same for all where nothing is known of them."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def take(self, rows: Int[Tensor, " rows"]) -> "Sites":
+        """Return some of the impacts."""
+        return Sites(self.points[rows], self.directions[rows])
+
+    def cosine(self, other: "Sites") -> Float64[Tensor, "sites others"]:
+        """Return the cosines between directions.
+
+        A force along n sets a mode in motion by n . u, where u is the mode's displacement. If the components of u are
+        independent of each other and alike, the covariance of two gains is that of a component times the cosine:
+        perpendicular impacts say nothing of each other, and an opposite one changes the gain's sign.
+        """
+        return self.directions @ other.directions.T
+
+
+class KernelFamily(ABC):
+    """Kernels of one assumption about how gains vary over an object.
+
+    Kernel h between two impacts is sum_b shares[h, b] basis_b, scaled so that its mean over the reference impacts is
+    one on the diagonal.
+    """
+
+    kind: ClassVar[str]
+    """Its name in files, reports and settings."""
+    prior: ClassVar[float] = 1.0
+    """Probability of all kernels of the family together, over another family's."""
+
+    reference: Sites
+    """The impacts that scales and regressions are defined by: those of the fit."""
+    size: float
+    """Diagonal of the box around the object, metres."""
+    shares: Float64[Tensor, "kernels basis"]
+    """Scaled."""
+
+    def __init__(self, reference: Sites, size: float) -> None:
+        self.reference, self.size = reference, size
+
+    @abstractmethod
+    def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
+        """Return the basis between two sets of impacts."""
+
+    @abstractmethod
+    def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
+        """Return the basis of each impact with itself."""
+
+    def categories(self) -> Int[Tensor, " kernels"]:
+        """Return the category of each kernel, from 0 on; each kernel is one, unless a family says otherwise."""
+        return torch.arange(len(self.shares))
+
+    def log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "kernels modes"]:
+        """Return the log probability of each kernel within its category for modes of these log frequencies (Hz).
+
+        It may be relative to the density of a measured log frequency under families that know nothing of it.
+        """
+        return torch.zeros(len(self.shares), len(log_frequency), dtype=torch.float64)
+
+    def kernels(self) -> Float64[Tensor, "kernels contacts contacts"]:
+        """Return all kernels among the reference impacts."""
+        return self.between(self.reference, self.reference, torch.arange(len(self.shares)))
+
+    def between(self, sites: Sites, others: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept sites others"]:
+        """Return some kernels between two sets of impacts."""
+        return torch.einsum("hb,bso->hso", self.shares[kept], self.basis(sites, others))
+
+    def own(self, sites: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept sites"]:
+        """Return some kernels of each impact with itself."""
+        return self.shares[kept] @ self.diagonal(sites)
+
+    def coefficients(
+        self, kept: Int[Tensor, " kept"], solved: Float64[Tensor, "kept contacts series"]
+    ) -> Float64[Tensor, "basis contacts series"]:
+        """Return the coefficients of the basis in the means, from those of the kernels (`KernelMixture.solve`)."""
+        return torch.einsum("hb,hcs->bcs", self.shares[kept], solved)
+
+    def mean(
+        self, sites: Sites, known: Sites, coefficients: Float64[Tensor, "basis contacts series"]
+    ) -> Float64[Tensor, "sites series"]:
+        """Return the family's part of the means at impacts, whose coefficients are those of the known impacts."""
+        return torch.einsum("bpc,bcs->ps", self.basis(sites, known), coefficients)
+
+
+def scaled(
+    shares: Float64[Tensor, "kernels basis"], diagonal: Float64[Tensor, "basis contacts"]
+) -> Float64[Tensor, "kernels basis"]:
+    """Return the shares over the kernels' mean on the diagonal, `diagonal` being the basis's there; zero stays."""
+    size = shares @ diagonal.mean(1)
+    return shares / torch.where(size > torch.finfo(torch.float64).tiny, size, 1.0)[:, None]
+
+
+def squared_exponential(
+    points: Float64[Tensor, "sites dim"], others: Float64[Tensor, "others dim"], lengths: Float64[Tensor, " lengths"]
+) -> Float64[Tensor, "lengths sites others"]:
+    """Return exp(-distance^2 / 2 length^2) for each length, in the points' unit."""
+    squares = (points[:, None] - others).square().sum(2)
+    return torch.exp(-0.5 * squares / lengths[:, None, None].square())

@@ -1,0 +1,98 @@
+"""From measured gains to the gain model: the weights of all kernels, and of the factors on nominal frequencies."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Complex128, Float32, Float64
+from torch import Tensor
+
+from avmsf.field.gains.elastic import Elastic, factor_log_prior
+from avmsf.field.gains.family import KernelFamily
+from avmsf.field.gains.mixture import Hypotheses, KernelMixture, active_series, log_evidence, posterior_weights
+from avmsf.field.gains.model import MixtureGains, series_of
+
+_STRONGEST = 16
+"""Modes of the most energy, which decide on the factor on nominal frequencies: many weak ones are not the body's."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredGains:
+    """Gains at the training contacts, and what is known of their modes."""
+
+    values: Complex128[Tensor, "contacts modes"]
+    """Turned by each mode's common phase: the real part starts with it, the imaginary one a quarter period ahead."""
+    variance: Float64[Tensor, " modes"]
+    """That the background noise gives each part of each gain."""
+    frequency: Float64[Tensor, " modes"]
+    """Hz."""
+    damping: Float64[Tensor, " modes"]
+    """1/s."""
+
+    @property
+    def energy(self) -> Float64[Tensor, " modes"]:
+        """Of each mode's sound, up to a constant."""
+        return self.values.abs().square().sum(0) / self.damping
+
+    @property
+    def floor(self) -> Float64[Tensor, " series"]:
+        """The variance over the mean square of a part."""
+        size = self.values.abs().square().mean(0) / 2.0
+        return (self.variance / size.clamp_min(torch.finfo(torch.float64).tiny)).repeat(2)
+
+
+def fit_mixture(
+    families: Sequence[KernelFamily],
+    measured: MeasuredGains,
+    points: Float32[Tensor, "points 3"],
+    *,
+    directional: bool,
+) -> MixtureGains:
+    """Return the gain model of some families, all of the same reference impacts, by evidence."""
+    values, floor = series_of(measured.values), measured.floor
+    kernels = [family.kernels() for family in families]
+    evidence = [log_evidence(each, values, floor) for each in kernels]
+    pairs = list(zip(families, evidence, strict=True))
+    weigh_factors(pairs, measured)
+    kinds = [family.kind for family in families]
+    category, prior, first = [], [], 0
+    for family in families:
+        own = family.categories() + first
+        count = int(own.max()) + 1 - first
+        category.append(own)
+        prior.append(torch.full((count,), family.prior / kinds.count(family.kind) / count, dtype=torch.float64))
+        first += count
+    log_frequency = torch.log(measured.frequency)
+    log_prior = torch.cat([family.log_prior(log_frequency) for family in families]).repeat(1, 2)
+    hypotheses = Hypotheses(torch.cat(kernels), torch.cat(category), torch.cat(prior), log_prior)
+    weights = posterior_weights(torch.cat(evidence), hypotheses, active_series(values))
+    used = torch.nonzero(weights.sum((1, 2)) > 0).flatten()
+    ends = torch.tensor([len(family.shares) for family in families]).cumsum(0).tolist()
+    starts = [0, *ends[:-1]]
+    rows = [used[(used >= start) & (used < end)] - start for start, end in zip(starts, ends, strict=True)]
+    some = [(family, each) for family, each in zip(families, rows, strict=True) if len(each)]
+    mixture = KernelMixture(hypotheses.kernels[used], values, floor, weights[used])
+    kept_families, kept = zip(*some, strict=True)
+    return MixtureGains(points, families[0].reference, kept_families, kept, mixture, directional)
+
+
+def weigh_factors(families: Sequence[tuple[KernelFamily, Tensor]], measured: MeasuredGains) -> None:
+    """Give each elastic family the probabilities of the factors on its frequencies, from the strongest modes.
+
+    A mode is a perturbed shape of the body with some frequency, or no shape of it; both parts of its gains share the
+    shape. Given a factor the modes are independent of each other.
+    """
+    others = [(family, each) for family, each in families if not isinstance(family, Elastic)]
+    total = sum(family.prior for family, _ in others)
+    none = torch.cat(
+        [each.flatten(0, 1) + math.log(family.prior / total / each[:, :, 0].numel()) for family, each in others]
+    )
+    unknown = torch.logsumexp(none, dim=0).reshape(2, -1).sum(0)
+    rows = torch.topk(measured.energy, min(_STRONGEST, len(measured.energy))).indices
+    for family, each in families:
+        if isinstance(family, Elastic):
+            known = family.shape_evidence(each).reshape(len(family.modes), 2, -1).sum(1)
+            single = torch.logsumexp(family.match(torch.log(measured.frequency)) + known, dim=1)
+            both = torch.logaddexp(single, unknown)[:, rows]
+            family.factor_weights = torch.softmax(both.sum(1) + factor_log_prior(), dim=0)

@@ -1,0 +1,336 @@
+"""The gain model: kernel families weighed by evidence, and their predictions anywhere on the object."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Complex128, Float, Float32, Float64, Int
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avmsf.field.gainfield import Gains
+from avmsf.field.gains.elastic import Elastic
+from avmsf.field.gains.family import KernelFamily, Sites
+from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from avmsf.field.records import count_of, like
+from avmsf.simulate.elastic import ElasticModes
+from avmsf.simulate.nominal import NOMINAL
+
+SAME_PLACE = 0.01
+"""Distance between contacts over the diagonal of the box around all, up to which they are one place: hammers do not hit
+more exactly."""
+_BATCH = 512
+"""Places whose covariances with the contacts are held at once."""
+_POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceCovariance:
+    """What is not known of one mode's gains at some places."""
+
+    covariance: Float64[Tensor, "places places"]
+    """Between the gains at places, summed over their two parts."""
+    noise: float
+    """Variance that one more measured gain has of its own, likewise."""
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureGains:
+    """Gains as a Gaussian process over several kernel families, each kernel weighed by its evidence."""
+
+    points: Float32[Tensor, "points 3"]
+    """Points of the object's surface, object frame, metres."""
+    training: Sites
+    """The impacts that the gains are known at."""
+    families: tuple[KernelFamily, ...]
+    """At least one."""
+    kept: tuple[Int[Tensor, " _kept"], ...]
+    """Rows of each family's kernels that have a weight."""
+    mixture: KernelMixture
+    """Of the kept kernels in this order; its series are the real parts of all modes' gains, then the imaginary ones."""
+    directional: bool
+    """Whether directions of impacts are known, or a body says which way its surface faces."""
+    measured: Complex128[Tensor, "contacts modes"] | None = None
+    """The gains of the field's own modes in the recordings, by which the model judges itself; None for `values`."""
+    report: dict[str, Any] = field(default_factory=dict)
+    """What the fit found, as plain values; not saved."""
+
+    kind: ClassVar[str] = "mixture"
+
+    @property
+    def contacts(self) -> Float64[Tensor, "contacts 3"]:
+        """Their places, metres."""
+        return self.training.points
+
+    @property
+    def values(self) -> Complex128[Tensor, "contacts modes"]:
+        """The gains there."""
+        return _complex(self.mixture.values)
+
+    @property
+    def places(self) -> Int[Tensor, " contacts"]:
+        """Number of each contact's place, from 0 on."""
+        return places_of(self.contacts)
+
+    def sites(
+        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Sites:
+        """Return impacts; without a direction, or with one of length zero, they go straight into the body.
+
+        Where there is no body they go as the nearest training impact does. Where the model knows nothing of directions,
+        all are alike.
+        """
+        points = contacts.double()
+        given = torch.zeros_like(points) if directions is None or not self.directional else directions.double()
+        length = given.norm(dim=1, keepdim=True)
+        unknown = length[:, 0] == 0
+        used = given / length.clamp_min(torch.finfo(torch.float64).tiny)
+        if bool(unknown.any()):
+            body = next((each for each in self.families if isinstance(each, Elastic)), None)
+            if body is not None and self.directional:
+                used[unknown] = -body.modes.normals(points[unknown])
+            else:
+                near = cKDTree(self.contacts.numpy()).query(points[unknown].numpy())[1]
+                used[unknown] = self.training.directions[torch.from_numpy(near)]
+        return Sites(points, used)
+
+    def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
+        """Return the mean gains of impacts at contacts (metres) along unit vectors, see `sites`."""
+        sites = self.sites(contacts, directions)
+        series = torch.zeros(len(sites), self.mixture.values.shape[1], dtype=torch.float64)
+        for family, coefficients in zip(self.families, self._coefficients, strict=True):
+            series += family.mean(sites, self.training, coefficients)
+        mean = _complex(series)
+        return Gains(mean.real.float(), mean.imag.float())
+
+    def deviation(
+        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts modes 2"]:
+        """Return the posterior standard deviation of both parts of the gains, without the noise of a measurement."""
+        sites = self.sites(contacts, directions)
+        found = [self._spread(sites.take(rows)) for rows in torch.split(torch.arange(len(sites)), _BATCH)]
+        return _parts(torch.cat(found)).float()
+
+    def noise(self) -> Float64[Tensor, "modes 2"]:
+        """Return the standard deviation of the noise in both parts of a measured gain."""
+        return _parts(self.mixture.standard_error()[None])[0]
+
+    def smoother(self) -> Float64[Tensor, "modes 2 contacts contacts"]:
+        """Return the matrices by which the mean at the contacts is linear in the gains there."""
+        found = self.mixture.smoother()
+        return found.reshape(2, -1, *found.shape[1:]).transpose(0, 1)
+
+    def leave_one_out(self) -> Complex128[Tensor, "contacts modes"]:
+        """Return the gains at each contact as the contacts at all other places predict them."""
+        return _complex(self._left_out[0])
+
+    def standardized_errors(self) -> Float64[Tensor, "contacts modes 2"]:
+        """Return the leave-one-place-out errors of the measured gains over their predicted standard deviations.
+
+        NaN for parts of modes without any gains.
+        """
+        mean, deviation = self._left_out
+        measured = self.values if self.measured is None else self.measured
+        scores = (series_of(measured) - mean) / deviation
+        power = self.mixture.values.square().sum(0)
+        return _parts(torch.where(power > 0, scores, torch.nan))
+
+    def covariances(
+        self, contacts: Float64[Tensor, "places 3"], directions: Float64[Tensor, "places 3"] | None
+    ) -> Iterator[PlaceCovariance]:
+        """Yield what is not known of each mode's gains at places, by the mode's most probable hypothesis."""
+        sites, count = self.sites(contacts, directions), len(self.contacts)
+        modes = self.mixture.values.shape[1] // 2
+        energy = self.mixture.values.square().sum(0)
+        both = (self.mixture.weights * energy).reshape(*self.mixture.weights.shape[:2], 2, modes).sum(2)
+        best = both.flatten(0, 1).argmax(0)
+        scale = self.mixture.quadratic.reshape(*self.mixture.weights.shape[:2], 2, modes).sum(2) / count
+        for mode in range(modes):
+            row, share = divmod(int(best[mode]), len(NOISE_SHARES))
+            family, kernel = self._family_of(row)
+            cross = family.between(sites, self.training, kernel)[0]
+            own = family.between(sites, sites, kernel)[0]
+            noise = float(self.mixture.noise_variance[share, mode])
+            known = self.mixture.kernels[row] + noise * torch.eye(count, dtype=torch.float64)
+            half = torch.linalg.solve_triangular(torch.linalg.cholesky(known), cross.T, upper=False)
+            size = float(scale[row, share, mode])
+            yield PlaceCovariance(size * (own - half.T @ half), size * noise)
+
+    def with_values(self, values: Complex128[Tensor, "contacts modes"]) -> "MixtureGains":
+        """Return the model of other gains at the same contacts, its hypotheses weighed as before."""
+        return replace(self, mixture=self.mixture.with_values(series_of(values)))
+
+    def judged_by(self, measured: Complex128[Tensor, "contacts modes"]) -> "MixtureGains":
+        """Return the same model, which judges itself by these gains."""
+        return replace(self, measured=measured)
+
+    def take(self, modes: Int[Tensor, " modes"]) -> "MixtureGains":
+        """Return the model of some modes, in the given order."""
+        series = torch.cat([modes, modes + self.mixture.values.shape[1] // 2])
+        measured = None if self.measured is None else self.measured[:, modes]
+        return replace(self, mixture=self.mixture.take(series), measured=measured)
+
+    def without(self, contacts: Bool[Tensor, " contacts"]) -> "MixtureGains":
+        """Return the model without some contacts, its hypotheses weighed as before."""
+        kept = torch.nonzero(~contacts).flatten()
+        measured = None if self.measured is None else self.measured[kept]
+        training, mixture = self.training.take(kept), self.mixture.at_contacts(kept)
+        return replace(self, training=training, mixture=mixture, measured=measured)
+
+    def shares(self) -> Float64[Tensor, "families modes"]:
+        """Return the posterior probability of each family, mean over both parts of each mode's gains."""
+        rows = torch.split(self.mixture.weights.sum(1), [len(each) for each in self.kept])
+        return torch.stack([each.sum(0).reshape(2, -1).mean(0) for each in rows])
+
+    def record(self) -> dict[str, Any]:
+        """Return the sizes and the families' names."""
+        contacts, modes = self.values.shape
+        return {
+            "points": len(self.points),
+            "contacts": contacts,
+            "modes": modes,
+            "directional": self.directional,
+            "families": [family.kind for family in self.families],
+            "kept": [len(each) for each in self.kept],
+            "bodies": [
+                {
+                    "nodes": len(family.modes.nodes),
+                    "triangles": len(family.modes.triangles),
+                    "shapes": len(family.modes),
+                }
+                for family in self.families
+                if isinstance(family, Elastic)
+            ],
+        }
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the contacts, the gains there, the weights, and each body's mode shapes."""
+        named = {
+            "points": self.points,
+            "contacts": self.training.points,
+            "directions": self.training.directions,
+            "scale": torch.tensor([family.size for family in self.families], dtype=torch.float64),
+            "values": torch.view_as_real(self.values),
+            "measured": torch.view_as_real(self.values if self.measured is None else self.measured),
+            "floor": self.mixture.floor,
+            "kept": torch.cat(self.kept),
+            "weights": self.mixture.weights,
+        }
+        bodies = [family.modes for family in self.families if isinstance(family, Elastic)]
+        for row, body in enumerate(bodies):
+            named |= {
+                f"bodies.{row}.frequency": body.frequency,
+                f"bodies.{row}.nodes": body.nodes,
+                f"bodies.{row}.triangles": body.triangles,
+                f"bodies.{row}.shapes": body.shapes.float(),
+            }
+        return named
+
+    @classmethod
+    def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return tensors like those of a model of these sizes."""
+        points, contacts, modes = (count_of(record[name], name) for name in ("points", "contacts", "modes"))
+        families, kept = record["families"], [count_of(each, "kept") for each in record["kept"]]
+        unknown = sorted(set(families) - {*_POSITIONAL, Elastic.kind})
+        if unknown or len(families) != len(kept) or len(record["bodies"]) != families.count(Elastic.kind):
+            raise ValueError(f"families are {families}, with {len(kept)} numbers and {len(record['bodies'])} bodies")
+        like(record["directional"], True, "directional")
+        sizes: dict[str, tuple[int, ...]] = {
+            "contacts": (contacts, 3),
+            "directions": (contacts, 3),
+            "scale": (len(families),),
+            "values": (contacts, modes, 2),
+            "measured": (contacts, modes, 2),
+            "floor": (2 * modes,),
+            "weights": (sum(kept), len(NOISE_SHARES), 2 * modes),
+        }
+        for row, body in enumerate(record["bodies"]):
+            nodes, shapes = count_of(body["nodes"], "nodes"), count_of(body["shapes"], "shapes")
+            sizes |= {f"bodies.{row}.frequency": (shapes,), f"bodies.{row}.nodes": (nodes, 3)}
+        named = {name: torch.empty(size, dtype=torch.float64, device="meta") for name, size in sizes.items()}
+        named |= {"points": torch.empty(points, 3, device="meta")}
+        named |= {"kept": torch.empty(sum(kept), dtype=torch.int64, device="meta")}
+        for row, body in enumerate(record["bodies"]):
+            triangles = count_of(body["triangles"], "triangles")
+            named[f"bodies.{row}.triangles"] = torch.empty(triangles, 6, dtype=torch.int64, device="meta")
+            named[f"bodies.{row}.shapes"] = torch.empty(body["nodes"], body["shapes"], 3, device="meta")
+        return named
+
+    @classmethod
+    def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "MixtureGains":
+        """Return the model."""
+        training = Sites(tensors["contacts"], tensors["directions"])
+        bodies = iter(
+            ElasticModes(
+                **{name: tensors[f"bodies.{row}.{name}"] for name in ("frequency", "nodes", "triangles")},
+                shapes=tensors[f"bodies.{row}.shapes"].double(),
+                material=NOMINAL,
+                mass=0.0,
+            )
+            for row in range(len(record["bodies"]))
+        )
+        families = tuple(
+            Elastic(training, size, next(bodies)) if kind == Elastic.kind else _POSITIONAL[kind](training, size)
+            for kind, size in zip(record["families"], tensors["scale"].tolist(), strict=True)
+        )
+        kept = torch.split(tensors["kept"], record["kept"])
+        kernels = torch.cat([family.kernels()[rows] for family, rows in zip(families, kept, strict=True)])
+        values, measured = (torch.view_as_complex(tensors[name].contiguous()) for name in ("values", "measured"))
+        mixture = KernelMixture(kernels, series_of(values), tensors["floor"], tensors["weights"])
+        return cls(tensors["points"], training, families, tuple(kept), mixture, record["directional"], measured)
+
+    @cached_property
+    def _coefficients(self) -> list[Float64[Tensor, "_basis contacts series"]]:
+        solved = torch.split(self.mixture.solve(), [len(each) for each in self.kept])
+        rows = zip(self.families, self.kept, solved, strict=True)
+        return [family.coefficients(kept, each) for family, kept, each in rows]
+
+    @cached_property
+    def _left_out(self) -> tuple[Float64[Tensor, "contacts series"], Float64[Tensor, "contacts series"]]:
+        return self.mixture.leave_out(self.places)
+
+    def _spread(self, sites: Sites) -> Float64[Tensor, "sites series"]:
+        pairs = list(zip(self.families, self.kept, strict=True))
+        cross = torch.cat([family.between(sites, self.training, kept) for family, kept in pairs])
+        return self.mixture.spread(cross, torch.cat([family.own(sites, kept) for family, kept in pairs]))
+
+    def _family_of(self, row: int) -> tuple[KernelFamily, Int[Tensor, " one"]]:
+        """Return the family of a kept kernel, and its row there."""
+        for family, kept in zip(self.families, self.kept, strict=True):
+            if row < len(kept):
+                return family, kept[row : row + 1]
+            row -= len(kept)
+        raise AssertionError(row)
+
+
+def places_of(contacts: Float64[Tensor, "contacts 3"]) -> Int[Tensor, " contacts"]:
+    """Return the number of each contact's place, from 0 on; no two of one are farther apart than `SAME_PLACE`."""
+    places, owner = torch.unique(contacts, dim=0, return_inverse=True)
+    distance = SAME_PLACE * float((places.amax(0) - places.amin(0)).norm())
+    near = np.unique(cKDTree(places.numpy()).query_pairs(distance, output_type="ndarray"))
+    if not len(near):
+        return owner
+    # Complete linkage: along a row of contacts each near to the next, places would else grow without end.
+    groups = fcluster(linkage(places[near].numpy(), "complete"), distance, criterion="distance")
+    first = np.arange(len(places))
+    first[near] = near[np.unique(groups, return_index=True)[1][groups - 1]]
+    return torch.unique(torch.from_numpy(first), return_inverse=True)[1][owner]
+
+
+def series_of(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, "contacts series"]:
+    """Return the series of complex gains: the real parts of all modes, then the imaginary parts."""
+    return torch.cat([values.real, values.imag], dim=1)
+
+
+def _complex(series: Float64[Tensor, "contacts series"]) -> Complex128[Tensor, "contacts modes"]:
+    real, imaginary = series.chunk(2, dim=1)
+    return torch.complex(real, imaginary)
+
+
+def _parts(series: Float64[Tensor, "contacts series"]) -> Float64[Tensor, "contacts modes 2"]:
+    return torch.stack(series.chunk(2, dim=1), dim=2)

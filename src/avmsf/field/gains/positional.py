@@ -1,0 +1,150 @@
+"""Kernel families that know positions and directions alone: unstructured, smooth, thin plate."""
+
+from functools import cached_property
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from avmsf.field.gains.family import KernelFamily, Sites, scaled, squared_exponential
+
+LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
+"""Lengths of the smooth kernels over the object's size, the diagonal of the box around it."""
+AFFINE_SHARES = (0.5, 0.9)
+"""Shares of an affine function of the position beside a smooth one."""
+DRIFT_SHARES = (0.3, 0.7, 0.95)
+"""Shares of the thin plate's affine part."""
+_FLAT = 1e-3
+"""Extent over the longest below which contacts do not differ along an axis."""
+
+
+class Unstructured(KernelFamily):
+    """Gains that have nothing to do with the place, and gains that are the same everywhere.
+
+    With the first, predictions shrink towards silence; without it a mode that is noise alone would be interpolated.
+    """
+
+    kind: ClassVar[str] = "unstructured"
+    prior: ClassVar[float] = 0.05
+
+    def __init__(self, reference: Sites, size: float) -> None:
+        super().__init__(reference, size)
+        self.shares = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
+
+    def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
+        """Return a constant."""
+        return sites.cosine(others)[None]
+
+    def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
+        """Return ones."""
+        return torch.ones(1, len(sites), dtype=torch.float64)
+
+
+class Smooth(KernelFamily):
+    """Squared exponential kernels of several lengths, by themselves and added to an affine function of the position."""
+
+    kind: ClassVar[str] = "smooth"
+
+    def __init__(self, reference: Sites, size: float) -> None:
+        super().__init__(reference, size)
+        self._lengths = size * torch.tensor(LENGTHS, dtype=torch.float64)
+        alone = torch.eye(len(LENGTHS), dtype=torch.float64)
+        affine = torch.tensor(AFFINE_SHARES, dtype=torch.float64)
+        # The shortest is left out there: what is not affine would be noise.
+        added = (1.0 - affine)[:, None, None] * alone[1:]
+        both = torch.cat([added, affine[:, None, None].expand(*added.shape[:2], 1)], dim=2).flatten(0, 1)
+        shares = torch.cat([torch.nn.functional.pad(alone, (0, 1)), both])
+        self.shares = scaled(shares, self.diagonal(reference))
+
+    @cached_property
+    def _axes(self) -> "Axes":
+        return Axes(self.reference.points)
+
+    def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
+        """Return the squared exponentials and the affine kernel (1 + x . x') / (1 + dim), x standardized."""
+        smooth = squared_exponential(sites.points, others.points, self._lengths)
+        one, other = (self._axes.standardized(each.points) for each in (sites, others))
+        affine = (1.0 + one @ other.T) / (1.0 + one.shape[1])
+        return torch.cat([smooth, affine[None]]) * sites.cosine(others)
+
+    def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
+        """Return ones, and the affine kernel's."""
+        along = self._axes.standardized(sites.points)
+        affine = (1.0 + along.square().sum(1)) / (1.0 + along.shape[1])
+        return torch.cat([torch.ones(len(LENGTHS), len(sites), dtype=torch.float64), affine[None]])
+
+
+class ThinPlate(KernelFamily):
+    """The thin-plate spline as a Gaussian process: a function of least bending added to an affine one.
+
+    The kernel k = r^2 log r is positive definite but for affine functions. With H(x) = p(x) P^+, p = (1, x) and P its
+    rows at the contacts, K = k - k H' - H k + H k H' is the covariance of what k has beyond its affine regression on
+    the contacts (kriging with a drift; Wahba, Spline Models for Observational Data, 1990, section 2.4), and H H' that
+    of the affine part. With fewer contacts than twice the number of coefficients of an affine function it is the
+    distance kernel -r and a constant, which do not run away beyond the contacts.
+    """
+
+    kind: ClassVar[str] = "thin-plate"
+
+    def __init__(self, reference: Sites, size: float) -> None:
+        super().__init__(reference, size)
+        self._axes = Axes(reference.points)
+        along = self._axes.along(reference.points)
+        places = len(torch.unique(reference.points, dim=0))
+        self._bending = places >= 2 * (along.shape[1] + 1)
+        self._inverse = torch.linalg.pinv(self._drift(along))
+        self._among = self._kernel(along, along)
+        drift = torch.tensor(DRIFT_SHARES, dtype=torch.float64)
+        # Each part is of mean one on the diagonal before the shares are taken.
+        size_of = self.diagonal(reference).mean(1).clamp_min(torch.finfo(torch.float64).tiny)
+        self.shares = torch.stack([1.0 - drift, drift], dim=1) / size_of
+
+    def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
+        """Return the kernel of what bends, and that of the affine part."""
+        one, other, known = (self._axes.along(each.points) for each in (sites, others, self.reference))
+        left, right = self._drift(one) @ self._inverse, self._drift(other) @ self._inverse
+        bent = self._kernel(one, other) - left @ self._kernel(known, other) - self._kernel(one, known) @ right.T
+        return torch.stack([bent + left @ self._among @ right.T, left @ right.T]) * sites.cosine(others)
+
+    def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
+        """Return both of each impact with itself; the kernel k is zero there."""
+        along = self._axes.along(sites.points)
+        left = self._drift(along) @ self._inverse
+        bent = ((left @ self._among) * left).sum(1)
+        bent = bent - 2.0 * (left * self._kernel(along, self._axes.along(self.reference.points))).sum(1)
+        return torch.stack([bent.clamp_min(0.0), left.square().sum(1)])
+
+    def _kernel(
+        self, along: Float64[Tensor, "sites dim"], others: Float64[Tensor, "others dim"]
+    ) -> Float64[Tensor, "sites others"]:
+        # Not cdist, whose shortcut through products loses half the digits of short distances.
+        distance = (along[:, None] - others).square().sum(2).sqrt()
+        return torch.special.xlogy(distance.square(), distance) if self._bending else -distance
+
+    def _drift(self, along: Float64[Tensor, "sites dim"]) -> Float64[Tensor, "sites terms"]:
+        constant = torch.ones(len(along), 1, dtype=torch.float64)
+        return torch.cat([constant, along], dim=1) if self._bending else constant
+
+
+class Axes:
+    """Principal axes of contacts, those along which they differ."""
+
+    def __init__(self, points: Float64[Tensor, "contacts 3"]) -> None:
+        self._middle = points.mean(0)
+        centered = points - self._middle
+        _, _, rows = torch.linalg.svd(centered, full_matrices=False)
+        along = centered @ rows.T
+        extent = along.amax(0) - along.amin(0)
+        longest = float(extent.max()) or 1.0
+        kept = extent > _FLAT * longest
+        self._directions = rows[kept].T / longest
+        self._deviation = along[:, kept].square().mean(0).sqrt() / longest
+
+    def along(self, points: Float64[Tensor, "sites 3"]) -> Float64[Tensor, "sites dim"]:
+        """Return points along the axes, over the contacts' longest extent."""
+        return (points - self._middle) @ self._directions
+
+    def standardized(self, points: Float64[Tensor, "sites 3"]) -> Float64[Tensor, "sites dim"]:
+        """Return points along the axes, of mean square one over the contacts along each."""
+        return self.along(points) / self._deviation

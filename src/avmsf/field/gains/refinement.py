@@ -1,0 +1,87 @@
+"""The gains at the training contacts, refined end to end through the gain model's smoother."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Complex128, Float, Float32, Float64, Int
+from torch import Tensor, nn
+
+from avmsf.field.gainfield import Gains
+from avmsf.field.gains.model import MixtureGains
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.phase import turned_like
+
+_STEP = 200.0
+"""Standard errors that a parameter of one stands for: a learning rate made for networks then moves gains in time."""
+_STRENGTH = 0.1
+"""Spectral loss that gains are worth which are off by one standard error each: about what it measures of them."""
+
+
+class RefinedGains(nn.Module):
+    """A gain model whose measured gains may move, each as far as its standard error allows.
+
+    With the hypotheses' weights kept, the mean gains are linear in the measured ones. So the gain model is the prior of
+    the refinement too: gains move where the spectra of all recordings ask for it and the kernels allow it.
+    """
+
+    smoother: Float32[Tensor, "modes 2 contacts contacts"]
+    start: Float32[Tensor, "contacts modes 2"]
+    noise: Float32[Tensor, "modes 2"]
+    share: Float32[Tensor, " modes"]
+    position: Int[Tensor, " training"]
+
+    def __init__(self, model: MixtureGains, bank: ModalBank, *, used: Int[Tensor, " contacts"], training: int) -> None:
+        """Start from the model of the modes of `bank`, whose energies say how much a gain matters.
+
+        `used` are the rows, among `training` recordings, of the model's contacts.
+        """
+        super().__init__()
+        self.model, self.used = model, used
+        position = torch.full((training,), -1)
+        position[used] = torch.arange(len(used))
+        smoother, values = model.smoother(), torch.view_as_real(model.values)
+        self.register_buffer("position", position)
+        self.register_buffer("smoother", smoother.float())
+        self.register_buffer("start", _applied(smoother, values).float())
+        self.register_buffer("noise", model.noise().float())
+        energy = values.square().sum((0, 2)) / bank.damping
+        self.register_buffer("share", (energy / energy.sum().clamp_min(torch.finfo(torch.float64).tiny)).float())
+        self.shift = nn.Parameter(torch.zeros_like(self.start))
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What the model's fit found."""
+        return self.model.report
+
+    def heeded(self, contacts: int) -> list[int]:
+        """Return the rows of the recordings that the model uses."""
+        return self.used.tolist()
+
+    def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
+        """Return the gains at the contacts of these recordings."""
+        parts = (self.start + _applied(self.smoother, self.noise * _STEP * self.shift))[self.position[rows]]
+        return Gains(parts[..., 0], parts[..., 1])
+
+    def penalty(self) -> Float[Tensor, ""]:
+        """Return the squared shifts over the squared standard errors, each mode by its part of the energy."""
+        squares = (_STEP * self.shift).square().mean((0, 2))
+        return 0.5 * _STRENGTH * (squares * self.share).sum()
+
+    def finished(self, order: Int[Tensor, " modes"]) -> MixtureGains:
+        """Return the model of the gains as they stand, with its modes in the given order."""
+        moved = (self.noise * _STEP * self.shift).detach().double()
+        return self.model.with_values(self.model.values + torch.view_as_complex(moved.contiguous())).take(order)
+
+    def judged(self, order: Int[Tensor, " modes"], measured: Complex128[Tensor, "contacts modes"]) -> MixtureGains:
+        """Return the finished model, judging itself by the gains that its modes, in order, have in the recordings.
+
+        Frequencies that moved end to end have turned their modes, which says nothing of the gains.
+        """
+        finished = self.finished(order)
+        turned = turned_like(*(torch.view_as_real(each) for each in (measured[self.used], finished.values)))
+        return finished.judged_by(torch.view_as_complex(turned.contiguous()))
+
+
+def _applied(smoother: Tensor, values: Float64[Tensor, "contacts modes 2"] | Tensor) -> Tensor:
+    """Return the smoothed values, part by part and mode by mode; both values are [contacts, modes, 2]."""
+    return (smoother @ values.permute(1, 2, 0)[..., None]).squeeze(-1).permute(2, 0, 1)
