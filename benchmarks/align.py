@@ -21,17 +21,17 @@ from avmsf.capture.prepare import margin_length, prepare
 from avmsf.capture.table import read_rows, understand
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.recipes import Attention, GainRecipe, ThinPlate
+from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.modal.extraction.alignment import Alignment, align, coherence
 from avmsf.modal.extraction.extract import Extraction, extract
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.extraction.quality import measure_quality
-from avmsf.pipeline.physics import BodyConfig
-from avmsf.pipeline.physics import physics_of as bodies_of
+from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.example import EXAMPLE_FOLDER
 from avmsf.simulate.truth import read_truth
-from benchmarks.field import QUICK_LOOK, physics_of
+from benchmarks.field import QUICK_LOOK, filled_estimator
 from benchmarks.look import slab
 from benchmarks.material import STRUCK, shared_data, surface_features
 from benchmarks.modes import AIRCRAFT, LEAST_SHARE, count_modes, tree_frequencies
@@ -117,7 +117,7 @@ def _captures(options: Options) -> Report:
 
 
 def _errors(options: Options) -> Report:
-    """Held-out errors of splines, elastic shapes and the network, before and after."""
+    """Held-out errors of gain models without and with a body, and of the network, before and after."""
     rows: list[list[str | float]] = []
     figures: Figures = {}
     for name, counts in COUNTS.items():
@@ -140,7 +140,7 @@ def _errors(options: Options) -> Report:
             ]
             figures |= {f"align.{name}.{count}.{method}.{when}": error for (when, method), error in errors.items()}
             if name == "aircraft_response":
-                figures[f"align.aircraft_{count}"] = errors["after", "physics"]
+                figures[f"align.aircraft_{count}"] = errors["after", "auto"]
     table = Table("held-out error, starts by threshold and aligned", ("capture and method", "before", "after"), rows)
     return Report(tables=(table,), figures=figures)
 
@@ -162,17 +162,17 @@ def _jitter_with(options: Options, cache: Path) -> Report:
     # The plate's files: silence before the impact, which begins at their last sample.
     silence = torch.zeros(len(plate), 2 * margin_length(plate.sample_rate))
     body = BodyConfig(freedoms=3000) if options.quick_look else BodyConfig()
-    mug_physics = bodies_of(capture.surface, body, impacts=capture.impacts, cache=cache)
+    mug = MixtureEstimator(bodies=candidate_bodies(capture.surface, body, impacts=capture.impacts, cache=cache))
     cases: dict[str, tuple[Impacts, FeatureField, GainRecipe]] = {
-        "mug": (_wide(EXAMPLE_FOLDER, truth.starts), surface_features(capture), mug_physics),
+        "mug": (_wide(EXAMPLE_FOLDER, truth.starts), surface_features(capture), mug),
         "plate": (
             replace(plate, before=silence, after=silence),
             STRUCK.features(),
-            physics_of(slab(STRUCK.plate), options),
+            filled_estimator(slab(STRUCK.plate), options),
         ),
     }
     config = QUICK_LOOK if options.quick_look else FitConfig()
-    for name, (files, features, physics) in cases.items():
+    for name, (files, features, estimator) in cases.items():
         base: tuple[Figures, Float64[Tensor, " contacts"]] | None = None
         for jitter in JITTERS:
             moved, starts = jittered(files, jitter)
@@ -180,7 +180,7 @@ def _jitter_with(options: Options, cache: Path) -> Report:
             modes, found = extract(train), align(moved)
             assert found is not None
             train, test = modes.aligned(train), modes.aligned(test)
-            recipes: dict[str, GainRecipe] = {"spline": ThinPlate(), "physics": physics}
+            recipes: dict[str, GainRecipe] = {"no_body": MixtureEstimator(), "auto": estimator}
             errors = {
                 method: evaluate(fit(train, features, modes, config, gains=recipe), test).mean()["relative_stft"]
                 for method, recipe in recipes.items()
@@ -194,7 +194,7 @@ def _jitter_with(options: Options, cache: Path) -> Report:
             figures |= {f"{key}.{method}": error for method, error in errors.items()}
             figures |= {f"{key}.rms": rms, f"{key}.ratio": worst}
             tell(f"{name}, jitter {jitter}: {errors}, rms {rms:.3f}, refused {refused:g}")
-    columns = ("object and jitter", "spline", "physics", "worst ratio to jitter 0", "rms", "refused")
+    columns = ("object and jitter", "no_body", "auto", "worst ratio to jitter 0", "rms", "refused")
     return Report(tables=(Table("held-out error with artificial jitter", columns, rows),), figures=figures)
 
 
@@ -372,10 +372,10 @@ def _bowl(name: str) -> tuple[Impacts, Impacts]:
 
 
 def _methods(capture: Capture, options: Options) -> dict[str, Callable[[], GainRecipe]]:
-    made: dict[str, Callable[[], GainRecipe]] = {"spline": ThinPlate}
+    made: dict[str, Callable[[], GainRecipe]] = {"no_body": MixtureEstimator}
     if capture.surface is not None:
-        physics = physics_of(capture.surface, options)
-        made["physics"] = lambda: physics
+        estimator = filled_estimator(capture.surface, options)
+        made["auto"] = lambda: estimator
     return made | {"network": Attention}
 
 

@@ -16,12 +16,12 @@ from avmsf.bench.evaluation import Scores, evaluate, score, split
 from avmsf.bench.renderer import Renderer
 from avmsf.capture import Impacts, Surface
 from avmsf.capture.texturedmesh import TexturedMesh
-from avmsf.field.automatic import Automatic
 from avmsf.field.config import FitConfig
 from avmsf.field.doubt import coverage
 from avmsf.field.fit import fit
-from avmsf.field.physics import Physics
-from avmsf.field.recipes import Attention, GainRecipe, ThinPlate
+from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import extract
 from avmsf.modal.extraction.least_squares import fit_gains
@@ -38,8 +38,7 @@ METHODS = (
     "knn3_gains",
     "warmup",
     "field",
-    "thin_plate",
-    "physics",
+    "no_body",
     "auto",
     "floor",
     "sine_floor",
@@ -57,12 +56,13 @@ CONVENTIONS = (
     "quarter.",
     f"l1, l1_log, envelope: convention '{PAPER.name}' of avmsf.bench.conventions, mean over held-out contacts.",
     "knn3: of the 3 nearest contacts. warmup: the network after its warm-up alone. field: the network after training, "
-    "quick recipe; thin_plate, physics: the same with splines, with elastic shapes; auto: whichever of these two "
-    "predicts training contacts better that are left out.",
-    "physics_thin, physics_thick: plates of half and of twice the nominal thickness. physics_mislabelled: the labels "
-    "of 3 recordings, drawn with the start as seed, have changed places; named: part of these that the fit names.",
-    "coverage90: part of the held-out sounds' own gains, all alike, in the 90 % interval of physics; by_energy: by "
-    "their energy.",
+    "quick recipe; auto: the same with the Gaussian process over all kernel families, no_body: without elastic mode "
+    "shapes.",
+    "thin, thick: plates of half and of twice the nominal thickness. mislabelled: the labels of 3 recordings, drawn "
+    "with the start as seed, have changed places; mislabelled_named, others_named: part of these, and number of "
+    "others, that the fit names as outliers.",
+    "coverage90: part of the held-out sounds' own gains, all alike, in the 90 % interval of auto; by_energy: by their "
+    "energy.",
     "floor: held-out sounds' own gains, in phase and in quadrature, with the training modes; sine_floor: in phase "
     "alone.",
 )
@@ -70,10 +70,11 @@ CONVENTIONS = (
 Figures = dict[str, float]
 
 
-def physics_of(surface: Surface, options: Options) -> Physics:
-    """Return the recipe for an object with this surface: a filled body, coarse for a quick look."""
+def filled_estimator(surface: Surface, options: Options) -> MixtureEstimator:
+    """Return the gain models' estimator for an object with this surface: a filled body, coarse for a quick look."""
     shapes, freedoms = (12, 3000) if options.quick_look else (60, 40_000)
-    return Physics(nominal_bodies(surface, walls=[None], count=shapes, freedoms=freedoms))
+    bodies = nominal_bodies(surface, walls=[None], count=shapes, freedoms=freedoms)
+    return MixtureEstimator(bodies=CandidateBodies(bodies))
 
 
 def measure(options: Options) -> Report:
@@ -95,7 +96,7 @@ def _plate_impulse(options: Options) -> Report:
 def _of_plate(key: str, title: str, case: PlateCase, seconds: float, options: Options) -> Report:
     count, seconds = (20, 0.25) if options.quick_look else (100, seconds)
     train, test = split(case.strikes(count, seconds=seconds), fraction=0.2)
-    figures = _judge(key, train, test, case.features(), physics_of(slab(case.plate), options), options)
+    figures = _judge(key, train, test, case.features(), filled_estimator(slab(case.plate), options), options)
     title = f"{key}: {title}; {count} contacts, {len(train)} to train on, {seconds:g} s at 44.1 kHz, noise 40 dB down"
     return Report(tables=(_table(title, figures),), figures=_prefixed(key, figures))
 
@@ -104,7 +105,7 @@ def _aircraft(options: Options) -> Report:
     capture = capture_in_place("aircraft_response")
     features = surface_features(capture)
     assert capture.surface is not None
-    physics = physics_of(capture.surface, options)
+    estimator = filled_estimator(capture.surface, options)
     counts, starts = (
         (AIRCRAFT_COUNTS[:1], AIRCRAFT_STARTS[:1])
         if options.quick_look
@@ -119,42 +120,42 @@ def _aircraft(options: Options) -> Report:
         runs = []
         for start in starts:
             train, test = split(capture.impacts, count=count, start=start)
-            runs.append(_judge(f"{key}, start {start}", train, test, features, physics, options))
+            runs.append(_judge(f"{key}, start {start}", train, test, features, estimator, options))
         figures = {name: sum(run[name] for run in runs) / len(runs) for name in runs[0]}
         title = (
             f"{key}: aircraft_response, {count} of {len(capture.impacts)} contacts to train on, farthest points from "
             f"contact {', '.join(map(str, starts))}, mean"
         )
         report += Report(tables=(_table(title, figures),), figures=_prefixed(key, figures))
-    held = [report.figures[f"aircraft.{count}.physics.coverage90"] for count in counts]
+    held = [report.figures[f"aircraft.{count}.auto.coverage90"] for count in counts]
     return report + Report(figures={"aircraft.coverage90": sum(held) / len(held)})
 
 
 def _crossed(options: Options) -> Report:
-    """Fit with physics where the plates' thickness, or some labels, are wrong."""
+    """Fit where the plates' thickness, or some labels, are wrong."""
     capture = capture_in_place("aircraft_response")
     features = surface_features(capture)
     assert capture.surface is not None
     config = QUICK_LOOK if options.quick_look else FitConfig()
     bodies = {
-        "physics": capture.surface,
-        "physics_thin": thickened(capture.surface, 0.5),
-        "physics_thick": thickened(capture.surface, 2.0),
+        "auto": capture.surface,
+        "thin": thickened(capture.surface, 0.5),
+        "thick": thickened(capture.surface, 2.0),
     }
-    recipes = {name: physics_of(surface, options) for name, surface in bodies.items()}
+    estimators = {name: filled_estimator(surface, options) for name, surface in bodies.items()}
     runs: list[Figures] = []
     for start in AIRCRAFT_STARTS[:1] if options.quick_look else AIRCRAFT_STARTS:
         train, test = split(capture.impacts, count=CROSSED, start=start)
         modes = extract(train)
         train, test = modes.aligned(train), modes.aligned(test)
         errors = {
-            name: evaluate(fit(train, features, modes, config, gains=recipe), test).mean()["relative_stft"]
-            for name, recipe in recipes.items()
+            name: evaluate(fit(train, features, modes, config, gains=estimator), test).mean()["relative_stft"]
+            for name, estimator in estimators.items()
         }
         wrong, moved = mislabelled(train, MISLABELLED, seed=start)
-        fitted = fit(moved, features, modes, config, gains=recipes["physics"])
-        named = fitted.origin.report["suspects"]
-        errors["physics_mislabelled"] = evaluate(fitted, test).mean()["relative_stft"]
+        fitted = fit(moved, features, modes, config, gains=estimators["auto"])
+        named = fitted.origin.report.get("outliers", {})
+        errors["mislabelled"] = evaluate(fitted, test).mean()["relative_stft"]
         errors["mislabelled_named"] = sum(name in named for name in wrong) / len(wrong)
         errors["others_named"] = float(sum(name not in wrong for name in named))
         tell(f"start {start}: {errors}; wrong {', '.join(wrong)}; named {'; '.join(named.values())}")
@@ -162,7 +163,7 @@ def _crossed(options: Options) -> Report:
     means = {name: sum(run[name] for run in runs) / len(runs) for name in runs[0]}
     title = f"aircraft.{CROSSED}: what is known of the object is wrong; mean of starts"
     rows: list[list[str | float]] = [[name, value] for name, value in means.items()]
-    figures = {f"aircraft.{CROSSED}.{name}": value for name, value in means.items() if name != "physics"}
+    figures = {f"aircraft.{CROSSED}.{name}": value for name, value in means.items() if name != "auto"}
     return Report(tables=(Table(title, ("what", "error or part"), rows),), figures=figures)
 
 
@@ -253,7 +254,7 @@ PARTS: dict[str, Callable[[Options], Report]] = {
 
 
 def _judge(
-    name: str, train: Impacts, test: Impacts, features: FeatureField, physics: Physics, options: Options
+    name: str, train: Impacts, test: Impacts, features: FeatureField, estimator: MixtureEstimator, options: Options
 ) -> Figures:
     """Return METHOD and METHOD.METRIC for all methods, on one extraction that they share."""
     config = QUICK_LOOK if options.quick_look else FitConfig()
@@ -263,11 +264,7 @@ def _judge(
     extracted = time.perf_counter()
     fitted = fit(train, features, modes, config, gains=Attention())
     done = time.perf_counter()
-    others: dict[str, GainRecipe | Automatic] = {
-        "thin_plate": ThinPlate(),
-        "physics": physics,
-        "auto": Automatic((physics, ThinPlate())),
-    }
+    others = {"no_body": MixtureEstimator(), "auto": estimator}
     fields = {method: fit(train, features, modes, config, gains=gains) for method, gains in others.items()}
     renderers: dict[str, Renderer] = {
         "white_noise": WhiteNoise(train),
@@ -285,16 +282,15 @@ def _judge(
     figures = {"modes": float(len(modes.bank))}
     for method in METHODS:
         figures |= _of_method(method, scores[method])
-    known = fields["physics"]
+    known = fields["auto"]
     heard = measured_parts(test, known)
     held = coverage(known, test.contacts, heard, directions=test.directions, level=0.9)
-    figures |= {"physics.coverage90": held.plain, "physics.coverage90_by_energy": held.by_energy}
+    figures |= {"auto.coverage90": held.plain, "auto.coverage90_by_energy": held.by_energy}
     figures |= {"extract_seconds": extracted - begun, "fit_seconds": done - extracted}
     tell(
         f"{name}: {len(modes.bank)} modes in {extracted - begun:.1f} s, fit in {done - extracted:.1f} s, "
-        f"{fitted.origin.report.get('damping')} damping, error {figures['field']:.3f} (thin_plate "
-        f"{figures['thin_plate']:.3f}, physics {figures['physics']:.3f}, auto {figures['auto']:.3f} by "
-        f"{fields['auto'].origin.report['gains']}, floor {figures['floor']:.3f})"
+        f"{fitted.origin.report.get('damping')} damping, error {figures['field']:.3f} (no_body "
+        f"{figures['no_body']:.3f}, auto {figures['auto']:.3f}, floor {figures['floor']:.3f})"
     )
     return figures
 

@@ -23,11 +23,11 @@ from avmsf.capture import Capture, Surface, read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.physics import Physics
+from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.modal.extraction.extract import Extraction, extract
 from avmsf.modal.residual import Residual
-from avmsf.pipeline.physics import BodyConfig, physics_of
+from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate, plate_surface_points
 from avmsf.simulate.shapes import make_shape
@@ -51,7 +51,7 @@ CONVENTIONS = (
     "rmed: distance between found and true contact over the diagonal of the box around the object's points, mean over "
     "held-out strikes; modulo: to the nearest image of the truth under the object's symmetries. random: expectation "
     "over all points.",
-    "fields: physics without end-to-end steps, fitted to a fifth of the strikes (aircraft: 15 of 74, three starts), "
+    "fields: all kernel families, without end-to-end steps, fitted to a fifth of the strikes (aircraft: 15 of 74, three starts), "
     "spread as far apart as they go. network: the paper's, quick recipe. no_residual: fitted and located as if there "
     "were no noise.",
     "coverage90: part of the strikes that were located whose true contact lies in the 90 % region of the posterior, "
@@ -87,7 +87,7 @@ class LocatingOptions:
     every: bool = False
     """All twenty objects in place of some."""
     network: bool = False
-    """The paper's network beside physics."""
+    """The paper's network as well."""
     output: Path | None = None
     """Folder for every strike's rows as JSON."""
     cache: Path | None = None
@@ -121,7 +121,7 @@ def measure_locating(options: LocatingOptions) -> Report:
 def _plate(options: LocatingOptions) -> Report:
     count, seconds = (20, 0.25) if options.quick_look else (100, 1.5)
     train, test = split(STRUCK.strikes(count, seconds=seconds), fraction=0.2)
-    recipe = _physics(slab(STRUCK.plate), 0.0, "plate", options)
+    recipe = _estimator(slab(STRUCK.plate), 0.0, "plate", options)
     case = LocatingCase("plate", train, test, STRUCK.features(), recipe, plate_images(STRUCK.plate))
     return _table("plate", {"plate": [case]}, options)
 
@@ -129,7 +129,7 @@ def _plate(options: LocatingOptions) -> Report:
 def _aircraft(options: LocatingOptions) -> Report:
     capture = capture_in_place("aircraft_response")
     assert capture.surface is not None
-    recipe = _physics(capture.surface, 0.0, "aircraft", options)
+    recipe = _estimator(capture.surface, 0.0, "aircraft", options)
     features, cases = surface_features(capture), []
     for start in AIRCRAFT_STARTS[: 1 if options.quick_look else None]:
         train, test = split(capture.impacts, count=AIRCRAFT_COUNT, start=start)
@@ -159,7 +159,7 @@ def _sim20_case(name: str, options: LocatingOptions) -> LocatingCase:
         train,
         test,
         surface_features(capture),
-        _physics(capture.surface, None, name, options),
+        _estimator(capture.surface, None, name, options),
         Images.of(symmetries_of(shape.symmetry)),
         None if truth.contacts is None else truth.contacts[rows],
     )
@@ -175,11 +175,11 @@ def _simulated(name: str, options: LocatingOptions) -> tuple[Capture, Truth]:
     return made.capture, made.truth
 
 
-def _physics(surface: Surface, wall: float | None, name: str, options: LocatingOptions) -> Physics:
+def _estimator(surface: Surface, wall: float | None, name: str, options: LocatingOptions) -> MixtureEstimator:
     config = BodyConfig(wall=wall, shapes=12, freedoms=3000) if options.quick_look else BodyConfig(wall=wall)
     assert options.cache is not None
     tell(f"locate.{name}: elastic bodies")
-    return physics_of(surface, config, cache=options.cache / name)
+    return MixtureEstimator(bodies=candidate_bodies(surface, config, cache=options.cache / name))
 
 
 def plate_images(plate: Plate) -> Images:
@@ -218,7 +218,7 @@ def _table(key: str, groups: dict[str, list[LocatingCase]], options: LocatingOpt
 
 
 def _judged(case: LocatingCase, options: LocatingOptions, seconds: list[float]) -> dict[str, LocatingScores]:
-    """Return a case's scores: by physics under the empty name, then without residual and by the network."""
+    """Return a case's scores: with bodies under the empty name, then without residual and by the network."""
     modes = extract(case.train)
     silent = replace(modes, residual=Residual(torch.zeros_like(modes.residual.magnitude)))
     plain = FitConfig(steps=0)
@@ -249,7 +249,7 @@ def _judged(case: LocatingCase, options: LocatingOptions, seconds: list[float]) 
             settings=settings | {"trained_on": list(case.train.names)},
         )
         means = {method: round(scores[kind].figures(method)["rmed_modulo"], 4) for method in METHODS}
-        tell(f"locate: {case.name} {kind or 'physics'}: {json.dumps(means)}")
+        tell(f"locate: {case.name} {kind or 'all families'}: {json.dumps(means)}")
         if options.output is not None:
             scores[kind].write(options.output / f"{case.name}{'-' + kind if kind else ''}.json")
     return scores
@@ -268,7 +268,7 @@ def _stream(options: LocatingOptions) -> Report:
     train, test = split(STRUCK.strikes(40, seconds=seconds), fraction=0.5)
     features = FeatureField.from_points(plate_surface_points(STRUCK.plate, STREAM_POINTS))
     field = fit(
-        train, features, extract(train), FitConfig(steps=0), gains=_physics(slab(STRUCK.plate), 0.0, "plate", options)
+        train, features, extract(train), FitConfig(steps=0), gains=_estimator(slab(STRUCK.plate), 0.0, "plate", options)
     )
     begun = time.process_time()
     listener = Listener(Locator.of(field))
@@ -336,7 +336,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=["sim20"], help="by itself sim20")
     parser.add_argument("--sim20", type=Path, help="the set as `avmsf simulate sim-20` makes it; made anew without it")
     parser.add_argument("--every", action="store_true", help="all twenty objects of the set in place of five")
-    parser.add_argument("--network", action="store_true", help="the paper's network beside physics")
+    parser.add_argument("--network", action="store_true", help="the paper's network as well")
     parser.add_argument("--output", type=Path, help="folder for every strike's rows as JSON")
     parser.add_argument("--cache", type=Path, help="folder that keeps elastic modes")
     chosen = parser.parse_args(arguments)

@@ -1,4 +1,4 @@
-"""What a field with physics costs in time and memory, and how often its intervals hold gains whose truth is known."""
+"""What a field with elastic mode shapes costs in time and memory, and how often its intervals hold gains whose truth is known."""
 
 import json
 import subprocess
@@ -17,8 +17,9 @@ from avmsf.capture import read_capture, write_capture
 from avmsf.field.config import FitConfig
 from avmsf.field.doubt import coverage
 from avmsf.field.fit import fit
+from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.modal.extraction.extract import extract
-from avmsf.pipeline.physics import BodyConfig, physics_of
+from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.field import measured_parts
@@ -32,11 +33,11 @@ COSTED_SIZE, COSTED_MODES = 0.5, 170
 COVERED = ("mug-ceramic", "bowl-glass", "bracket-steel", "pot-steel", "dish-ceramic", "spoon-wood")
 CONVENTIONS = (
     f"physics.seconds: of sim-20's {COSTED}, {COSTED_SIZE:g} m long, 8 recordings of it, from a mesh of unknown wall "
-    "to a field: bodies of several walls, the chosen one with 40,000 degrees of freedom, modes, fit end to end, in a "
+    "to a field: bodies of several walls, the most probable one with 40,000 degrees of freedom, modes, fit end to end, in a "
     "process of its own; seconds_cached: again, with the elastic shapes kept; filled: the same where it is told that "
     "the mesh encloses the material whole, which it does. gigabytes: peak memory of that process. render_ms: of one "
     "sound, after the first.",
-    "coverage90: part of the held-out recordings' own gains in the 90 % interval of physics, of 32 blows with each of "
+    "coverage90: part of the held-out recordings' own gains in the 90 % interval, of 32 blows with each of "
     "six objects of sim-20 where 8 were learnt from; by_energy: by their energy; error: relative STFT error there.",
 )
 
@@ -91,10 +92,11 @@ def _fitted(folder: Path, cache: Path, wall: str, freedoms: int) -> dict[str, fl
     assert capture.surface is not None
     begun = time.perf_counter()
     config = BodyConfig(wall=None if wall == "unknown" else float(wall), freedoms=freedoms)
-    recipe = physics_of(capture.surface, config, impacts=capture.impacts, cache=cache)
+    bodies = candidate_bodies(capture.surface, config, impacts=capture.impacts, cache=cache)
     solved = time.perf_counter()
     modes = extract(capture.impacts)
-    field = fit(capture.impacts, surface_features(capture), modes, FitConfig(), gains=recipe)
+    estimator = MixtureEstimator(bodies=bodies)
+    field = fit(capture.impacts, surface_features(capture), modes, FitConfig(), gains=estimator)
     done = time.perf_counter()
     field.render(capture.impacts.contacts[:1])
     warm = time.perf_counter()
@@ -119,10 +121,10 @@ def _coverage(options: Options) -> Report:
         train, test = split(made.capture.impacts, fraction=0.2)
         config = BodyConfig(freedoms=3000) if options.quick_look else BodyConfig()
         with tempfile.TemporaryDirectory() as cache:
-            recipe = physics_of(made.capture.surface, config, cache=Path(cache))
+            estimator = MixtureEstimator(bodies=candidate_bodies(made.capture.surface, config, cache=Path(cache)))
             steps = FitConfig(steps=2) if options.quick_look else FitConfig()
             modes = extract(train)
-            field = fit(train, surface_features(made.capture), modes, steps, gains=recipe)
+            field = fit(train, surface_features(made.capture), modes, steps, gains=estimator)
             test = modes.aligned(test)
         held = coverage(field, test.contacts, measured_parts(test, field), directions=test.directions, level=0.9)
         rows.append([name, held.plain, held.by_energy, evaluate(field, test).mean()["relative_stft"]])

@@ -12,9 +12,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
+from avmsf.field.gains.model import MixtureGains, series_of
+from avmsf.field.gains.positional import Smooth
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import save
-from avmsf.field.thinplategains import ThinPlateGains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
@@ -100,17 +103,16 @@ def _megabytes(field: SoundField) -> float:
 
 
 def _solved(solid: Solid, material: Material, size: float, count: int) -> tuple[SoundField, float]:
-    """Return the field of a fresh solve of the scaled solid, exact at some corners of its surface, and its seconds."""
+    """Return the field of a fresh solve of the scaled solid, through gains at some corners, and its seconds."""
     begun = time.perf_counter()
     body = elastic_modes(Solid.build(size * solid.points, solid.cells), material, count=count)
     seconds = time.perf_counter() - begun
     places = size * _places(solid)
-    values = torch.stack([_response(body, material, places), torch.zeros(len(places), count).double()], dim=2)
     damping = rayleigh(body.frequency, material) / 2
     frequency = torch.sqrt(body.frequency.square() - (damping / (2 * math.pi)).square())
     field = SoundField(
         ModalBank(frequency, damping),
-        ThinPlateGains(places.float(), places, values, 0.0),
+        _gain_model(places, _response(body, material, places)),
         torch.zeros_like(frequency),
         Residual(torch.zeros(9)),
         192e3,
@@ -118,6 +120,17 @@ def _solved(solid: Solid, material: Material, size: float, count: int) -> tuple[
         Origin("bowl"),
     )
     return field, seconds
+
+
+def _gain_model(places: Tensor, values: Tensor) -> MixtureGains:
+    """Return gains of one kernel: linear in the values alike for all modes, so that the model adds no error."""
+    sites = Sites(places, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(len(places), 3))
+    smooth = Smooth(sites, float((places.amax(0) - places.amin(0)).norm()))
+    series = series_of(values.to(torch.complex128))
+    weights = torch.zeros(1, len(NOISE_SHARES), series.shape[1], dtype=torch.float64)
+    weights[:, 0] = 1.0
+    mixture = KernelMixture(smooth.kernels()[:1], series, torch.zeros(series.shape[1], dtype=torch.float64), weights)
+    return MixtureGains(places.float(), sites, (smooth,), (torch.tensor([0]),), mixture, directional=False)
 
 
 def _response(body: ElasticModes, material: Material, places: Tensor) -> Tensor:

@@ -11,15 +11,14 @@ from avmsf.bench.evaluation import score, split
 from avmsf.capture import Impacts, read_capture
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.recipes import GainRecipe, ThinPlate
+from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.modal.extraction.extract import extract
-from avmsf.pipeline.physics import physics_of
+from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.example import EXAMPLE_FOLDER
 from avmsf.simulate.sim20 import SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
-from benchmarks.field import QUICK_LOOK
-from benchmarks.field import physics_of as filled_body_of
+from benchmarks.field import QUICK_LOOK, filled_estimator
 from benchmarks.material import STRUCK, capture_in_place, surface_features
 from benchmarks.report import Options, Report, Table, tell
 
@@ -35,7 +34,7 @@ CONVENTIONS = (
     "error: relative STFT error; l1_log: log-mel distance, nepers; means over held-out contacts, then objects. "
     "Dampings are shared; seed 0. mug: the built-in example, 12 of 16 contacts to train on; plate: 4 mm, 20 of 100; "
     "aircraft: aircraft_response, 15 of 74, first contact 0; sim20: the 20 simulated objects, 8 of 40 each, sounds "
-    "scaled so that the loudest of an object peaks at one. Gains: elastic mode shapes; on the plate a spline.",
+    "scaled so that the loudest of an object peaks at one. Gains: all kernel families; on the plate no elastic one.",
 )
 
 
@@ -92,21 +91,21 @@ def _mug(options: Options) -> Iterator[_Case]:
     capture = read_capture(EXAMPLE_FOLDER)
     assert capture.surface is not None
     train, test = split(capture.impacts, count=12)
-    recipe = ThinPlate() if options.quick_look else physics_of(capture.surface)
-    yield _Case("mug", train, test, surface_features(capture), recipe)
+    bodies = None if options.quick_look else candidate_bodies(capture.surface)
+    yield _Case("mug", train, test, surface_features(capture), MixtureEstimator(bodies=bodies))
 
 
 def _plate(options: Options) -> Iterator[_Case]:
     count, seconds = (20, 0.25) if options.quick_look else (100, 3.0)
     train, test = split(STRUCK.strikes(count, seconds=seconds), fraction=0.2)
-    yield _Case("plate", train, test, STRUCK.features(), ThinPlate())
+    yield _Case("plate", train, test, STRUCK.features(), MixtureEstimator())
 
 
 def _aircraft(options: Options) -> Iterator[_Case]:
     capture = capture_in_place("aircraft_response")
     assert capture.surface is not None
     train, test = split(capture.impacts, count=15)
-    recipe = ThinPlate() if options.quick_look else filled_body_of(capture.surface, options)
+    recipe = MixtureEstimator() if options.quick_look else filled_estimator(capture.surface, options)
     yield _Case("aircraft", train, test, surface_features(capture), recipe)
 
 
@@ -119,8 +118,8 @@ def _sim20(options: Options) -> Iterator[_Case]:
         assert capture.surface is not None
         full_scale = capture.impacts.sounds / capture.impacts.sounds.abs().max()
         train, test = split(replace(capture.impacts, sounds=full_scale), count=8)
-        recipe = ThinPlate() if options.quick_look else physics_of(capture.surface, impacts=train)
-        yield _Case(name, train, test, surface_features(capture), recipe)
+        bodies = None if options.quick_look else candidate_bodies(capture.surface, impacts=train)
+        yield _Case(name, train, test, surface_features(capture), MixtureEstimator(bodies=bodies))
 
 
 PARTS: dict[str, Callable[[Options], Iterator[_Case]]] = {

@@ -117,7 +117,7 @@ def draw_screenshots(folder: Path) -> tuple[Path, ...]:
         capture = Path(scratch) / "example"
         shutil.copytree(example, capture)
         field = Path(scratch) / "example.safetensors"
-        _avmsf("fit", str(capture), "--gains", "spline", "--output", str(field))
+        _avmsf("fit", str(capture), "--gain-model", "smooth", "--output", str(field))
         with _studio(str(field), "--capture", str(capture)) as address:
             written = _draw_field(browser, address, capture, folder)
         empty = Path(scratch) / "new object"

@@ -10,12 +10,12 @@ from avmsf.bench.evaluation import evaluate
 from avmsf.capture import Capture, Impacts
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.physics import Physics
+from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.soundfield import SoundField
 from avmsf.field.suggest import suggest
 from avmsf.modal.extraction.alignment import align
 from avmsf.modal.extraction.extract import extract
-from avmsf.pipeline.physics import BodyConfig, physics_of
+from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import farthest_points
 from avmsf.simulate.sim20 import sim20_recipe
@@ -35,7 +35,7 @@ WAYS = ("suggested", "farthest", "random")
 SIM20_OBJECTS = ("plate-ceramic", "mug-ceramic", "bracket-steel", "blob-polycarbonate")
 CONVENTIONS = (
     f"error: relative STFT error, mean over one of {JUDGING} recordings, drawn with seed 0, of which no way learns; "
-    "physics, no steps end to end, modes extracted and the field fitted anew for every number of strikes.",
+    "all kernel families, no steps end to end, modes extracted and the field fitted anew for every number of strikes.",
     f"all ways begin with the same {FIRST} strikes, spread as far apart as they go; then some more at a time, of those "
     "recorded: those that suggest names, the farthest from all others, or any (seed: the start's number).",
     "ratio: mean error of suggested strikes over that of farthest ones, all numbers and starts together.",
@@ -77,9 +77,10 @@ def _compare(key: str, captures: dict[str, Capture], wall: float | None, options
         if alignment is not None:
             pool, test = alignment.apply(pool), alignment.apply(test)
         with tempfile.TemporaryDirectory() as cache:
-            recipe = physics_of(capture.surface, BodyConfig(wall=wall), cache=Path(cache))
+            bodies = candidate_bodies(capture.surface, BodyConfig(wall=wall), cache=Path(cache))
+            estimator = MixtureEstimator(bodies=bodies)
             for number in range(1 if options.quick_look else STARTS):
-                for count, errors in _paths(pool, test, features, recipe, number, options):
+                for count, errors in _paths(pool, test, features, estimator, number, options):
                     rows.append([f"{name}, start {number}", count, *errors])
                     found.append(errors)
                     words = ", ".join(f"{way} {error:.3f}" for way, error in zip(WAYS, errors, strict=True))
@@ -94,7 +95,7 @@ def _compare(key: str, captures: dict[str, Capture], wall: float | None, options
 
 
 def _paths(
-    pool: Impacts, test: Impacts, features: FeatureField, recipe: Physics, number: int, options: Options
+    pool: Impacts, test: Impacts, features: FeatureField, estimator: MixtureEstimator, number: int, options: Options
 ) -> list[tuple[int, tuple[float, ...]]]:
     """Return the numbers of strikes with the errors of each way."""
     rounds = [count for count in ROUNDS[: 1 if options.quick_look else None] if count <= len(pool)]
@@ -102,20 +103,20 @@ def _paths(
     drawn = torch.randperm(len(pool), generator=torch.Generator().manual_seed(number)).tolist()
     anywhere = farthest[:FIRST] + [row for row in drawn if row not in farthest[:FIRST]]
     rows, found = farthest[:FIRST], []
-    suggested = _fitted(pool, rows, features, recipe)
+    suggested = _fitted(pool, rows, features, estimator)
     for count in rounds:
         following = suggest(suggested, count - len(rows), candidates=pool.contacts, directions=pool.directions)
         rows = [*rows, *following.rows.tolist()]
-        suggested = _fitted(pool, rows, features, recipe)
-        others = (_fitted(pool, each[:count], features, recipe) for each in (farthest, anywhere))
+        suggested = _fitted(pool, rows, features, estimator)
+        others = (_fitted(pool, each[:count], features, estimator) for each in (farthest, anywhere))
         errors = tuple(evaluate(each, test).mean()["relative_stft"] for each in (suggested, *others))
         found.append((count, errors))
     return found
 
 
-def _fitted(impacts: Impacts, rows: list[int], features: FeatureField, recipe: Physics) -> SoundField:
+def _fitted(impacts: Impacts, rows: list[int], features: FeatureField, estimator: MixtureEstimator) -> SoundField:
     train = impacts.take(rows)
-    return fit(train, features, extract(train), FitConfig(steps=0), gains=recipe)
+    return fit(train, features, extract(train), FitConfig(steps=0), gains=estimator)
 
 
 PARTS: dict[str, Callable[[Options], Report]] = {"aircraft": _aircraft, "sim20": _sim20}

@@ -1,4 +1,4 @@
-"""A made dome: walls to choose from, what is true of it, and blows on it."""
+"""A made dome: walls to choose from, and what is true of it."""
 
 from dataclasses import replace
 from functools import cache
@@ -7,7 +7,6 @@ import numpy as np
 import torch
 
 from avmsf.capture.surface import Surface
-from avmsf.field.bodychoice import MeasuredGains
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.nominal import NOMINAL, NominalBody
@@ -49,23 +48,3 @@ def truth(wall: float) -> ElasticModes:
 @cache
 def points() -> torch.Tensor:
     return FeatureField.from_mesh(dome(), generator=torch.Generator().manual_seed(0), count=1500).points
-
-
-def struck(wall: float, count: int, *, seed: int = 0, noise: float = 0.03) -> MeasuredGains:
-    """Return the gains of blows straight into a made dome, with noise over each mode's size."""
-    generator = torch.Generator().manual_seed(seed)
-    contacts = points()[torch.randperm(len(points()), generator=generator)[:count]]
-    elastic = truth(wall)
-    directions = -elastic.normals(contacts)
-    gains = elastic.gains(contacts, directions)
-    values = torch.stack([gains, 0.2 * gains], dim=2)
-    size = values.square().mean(0, keepdim=True).sqrt()
-    return MeasuredGains(
-        contacts,
-        directions.float(),
-        values + noise * size * torch.randn(values.shape, dtype=torch.float64, generator=generator),
-        elastic.frequency,
-        torch.full_like(elastic.frequency, 10.0),
-        torch.zeros(count, len(elastic), dtype=torch.float64),
-        torch.ones(count, dtype=torch.float64),
-    )

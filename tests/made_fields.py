@@ -1,4 +1,4 @@
-"""One gain field of every kind, for a plate whose shapes are known in closed form, made in a moment."""
+"""One gain field of every kind, for a plate whose mode shapes are known in closed form, made in a moment."""
 
 from collections.abc import Callable
 from functools import cache
@@ -6,16 +6,19 @@ from functools import cache
 import torch
 
 from avmsf.field.attention import AttentionGains, AttentionShape
-from avmsf.field.elasticpoints import ElasticPoints
 from avmsf.field.gainfield import GainField
-from avmsf.field.modalbasis import ModalBasis, fit_modal_basis
-from avmsf.field.thinplategains import ThinPlateGains, thin_plate_gains
+from avmsf.field.gains.elastic import Elastic
+from avmsf.field.gains.family import KernelFamily, Sites
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.modal.bank import ModalBank
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.elastic import ElasticModes
 from made_modes import sliding_plate
 
 SIDES = (0.24, 0.17, 0.004)
+DIAGONAL = sum(side**2 for side in SIDES) ** 0.5
 BANK = ModalBank(
     torch.tensor([390.0, 850.0, 1300.0, 1360.0, 2300.0], dtype=torch.float64),
     torch.tensor([12.0, 15.0, 30.0, 22.0, 60.0], dtype=torch.float64),
@@ -47,13 +50,14 @@ def blows(contacts: torch.Tensor, *, seed: int) -> torch.Tensor:
     return askew / askew.norm(dim=1, keepdim=True)
 
 
-def struck(count: int, *, noise: float = 0.05) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return contacts, directions, and gains that are nearly those of the plate's first modes, in two parts."""
+def struck(count: int, *, noise: float = 0.05) -> tuple[Sites, torch.Tensor]:
+    """Return impacts and their complex gains, which are nearly those of the plate's first modes."""
     contacts = places(count, seed=1)
     directions = blows(contacts, seed=2)
     shapes = plate().gains(contacts, directions)[:, : len(BANK)]
     parts = torch.stack([shapes, 0.3 * shapes.roll(1, dims=1)], dim=2) * torch.linspace(2.0, 0.5, len(BANK))[:, None]
-    return contacts, directions, parts + noise * parts.std() * draw(*parts.shape, seed=3)
+    parts += noise * parts.std() * draw(*parts.shape, seed=3)
+    return Sites(contacts, directions), torch.view_as_complex(parts)
 
 
 def attention(*, spatial_damping: bool = False) -> AttentionGains:
@@ -72,40 +76,41 @@ def attention(*, spatial_damping: bool = False) -> AttentionGains:
     return network.eval().requires_grad_(False)
 
 
-def spline(count: int = 20, *, noise: float = 0.05) -> ThinPlateGains:
-    contacts, directions, values = struck(count, noise=noise)
-    side = -directions[:, 2].sign()
-    return thin_plate_gains(
-        contacts, values * side[:, None, None], importance=1 / BANK.damping, points=places(150, seed=0)
-    )
+def mixture(sites: Sites, values: torch.Tensor, *more: KernelFamily, directional: bool) -> MixtureGains:
+    """Return a model of the positional families and some more."""
+    families = [each(sites, DIAGONAL) for each in (Unstructured, Smooth, ThinPlate)]
+    variance = torch.full((len(BANK),), 1e-4, dtype=torch.float64)
+    measured = MeasuredGains(values, variance, BANK.frequency, BANK.damping)
+    return fit_mixture([*families, *more], measured, places(150, seed=0).float(), directional=directional)
 
 
-def physics(count: int = 9) -> ModalBasis:
-    contacts, directions, values = struck(count)
-    doubt = torch.ones(count, dtype=torch.float64)
-    doubt[4] = 10.0
-    return fit_modal_basis(
-        ElasticPoints.of(plate(), places(150, seed=0)),
-        plate().frequency,
-        contacts,
-        directions,
-        values,
-        frequency=BANK.frequency,
-        floor=torch.full((count, len(BANK)), 1e-4, dtype=torch.float64),
-        doubt=doubt,
-    )
+def positional(count: int = 20, *, noise: float = 0.05) -> MixtureGains:
+    """Return a model that knows no directions: all impacts are as from one side."""
+    impacts, values = struck(count, noise=noise)
+    alike = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(count, 3)
+    side = -impacts.directions[:, 2:].sign()
+    return mixture(Sites(impacts.points, alike), side * values, directional=False)
 
 
-LINEAR: dict[str, Callable[[], ThinPlateGains | ModalBasis]] = {
-    "spline": cache(spline),
-    "smoothed spline": cache(lambda: spline(30, noise=3.0)),
-    "spline of few": cache(lambda: spline(4)),
-    "physics": cache(physics),
-}
-"""Fields whose mean gains are weighted sums of those at the contacts."""
+def directional() -> MixtureGains:
+    """Return a model that knows directions, and no body."""
+    return mixture(*struck(20), directional=True)
+
+
+def elastic() -> MixtureGains:
+    """Return a model with the plate's own mode shapes, fitted to gains a little off the measured ones."""
+    impacts, values = struck(9)
+    body = Elastic(impacts, DIAGONAL, plate())
+    return mixture(impacts, 1.1 * values, body, directional=True).judged_by(values)
+
+
 FIELDS: dict[str, Callable[[], GainField]] = {
     "attention": cache(attention),
     "attention with dampings": cache(lambda: attention(spatial_damping=True)),
-    **LINEAR,
+    "positional": cache(positional),
+    "positional, noisy": cache(lambda: positional(30, noise=3.0)),
+    "positional, few contacts": cache(lambda: positional(4)),
+    "directional": cache(directional),
+    "elastic": cache(elastic),
 }
 """All there are, by what tests call them; the same object at every call."""

@@ -8,7 +8,7 @@ import torch
 from avmsf.bench.task import Look
 from avmsf.capture import Capture, Surface, write_capture
 from avmsf.errors import SceneError, SimulationError
-from avmsf.field.physics import Physics
+from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 from avmsf.simulate.truth import TRUTH, Truth, write_truth
@@ -66,6 +66,6 @@ class PlateLooks:
 class NoBodies:
     """Knows no object's shape."""
 
-    def __call__(self, identifier: str) -> Physics:
+    def __call__(self, identifier: str) -> CandidateBodies:
         """Raise SimulationError."""
         raise SimulationError(f"{identifier} has no shape here")

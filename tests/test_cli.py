@@ -40,8 +40,8 @@ def field(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "5",
         "--start",
         "1",
-        "--gains",
-        "spline",
+        "--gain-model",
+        "smooth",
         *TINY,
     ]
     assert main(words) == 0
@@ -227,8 +227,8 @@ def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys
         "--start",
         "2",
         "--json",
-        "--gains",
-        "attention",
+        "--gain-model",
+        "network",
         *TINY,
     ]
     assert main([*words, "--seed", "3"]) == 0
@@ -261,46 +261,29 @@ def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys
 SHEET = ("--body.wall", "0.004", "--body.shapes", "8", "--body.freedoms", "1000")
 
 
-def strike_one_place(folder: Path) -> None:
-    header, *rows = [line.split(",") for line in (folder / "impacts.csv").read_text().splitlines()]
-    assert header[:4] == ["file", "x", "y", "z"]
-    rows = [[row[0], *rows[0][1:4], *row[4:]] for row in rows]
-    (folder / "impacts.csv").write_text("\n".join(",".join(row) for row in [header, *rows]))
-
-
-def test_fit_says_why_physics_took_no_part(capture: Path, tmp_path: Path, capsys: Streams) -> None:
-    fields = tmp_path / "fields"
-    assert main(["fit", str(capture), "--output", str(fields / "two"), "--train-count", "2", *SHEET, *TINY]) == 0
-    told, beside = capsys.readouterr()
-    assert "2 recordings tell little of how loud modes are between contacts" in beside
-    # Counted before anything is computed.
-    assert "tetrahedra" not in beside
-    assert "not by physics: physics needs 3 strikes or more" in told
-    assert "gains by spline" in told
-    folder = fill_plate(tmp_path / "plate")
-    strike_one_place(folder)
-    assert main(["fit", str(folder), "--output", str(fields / "one"), "--json", *SHEET, *TINY]) == 0
+def test_fit_says_why_elastic_mode_shapes_took_no_part(tmp_path: Path, capsys: Streams) -> None:
+    folder, fields = fill_plate(tmp_path / "plate", surface=False), tmp_path / "fields"
+    assert main(["fit", str(folder), "--output", str(fields / "all"), "--json", "--train-count", "2", *TINY]) == 0
     out, err = capsys.readouterr()
-    missing = json.loads(out)["report"]["choice"]["missing"]
-    assert f"not by physics: {missing['physics']}" in err
-    assert "strikes lie within 0 m on an object of" in missing["physics"]
-    # Told to spread them by splines, it tried nothing else.
-    assert main(["fit", str(capture), "--output", str(fields / "told"), "--gains", "spline", *TINY]) == 0
-    assert "not by" not in capsys.readouterr().out
+    assert "2 recordings tell little of how loud modes are between contacts" in err
+    report = json.loads(out)["report"]
+    assert report["bodies"] == []
+    assert "no mesh" in report["missing"]["elastic"]
+    assert f"no elastic mode shapes: {report['missing']['elastic']}" in err
+    # Told to do without them, it does not look for any.
+    assert main(["fit", str(folder), "--output", str(fields / "one"), "--gain-model", "smooth", *TINY]) == 0
+    assert "elastic" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("wrong", ["two strikes, seen before the modes", "strikes in one place, seen after them"])
+@pytest.mark.parametrize("wrong", ["no mesh, seen before the modes", "a rate that diverges, seen after them"])
 def test_a_refused_fit_leaves_nothing_behind(tmp_path: Path, capsys: Streams, wrong: str) -> None:
-    folder, output = fill_plate(tmp_path / "plate"), tmp_path / "fields" / "plate"
-    words = ["--gains", "physics", *SHEET, *TINY]
-    if wrong.startswith("two"):
-        words += ["--train-count", "2"]
-    else:
-        strike_one_place(folder)
+    early = wrong.endswith("before the modes")
+    folder, output = fill_plate(tmp_path / "plate", surface=not early), tmp_path / "fields" / "plate"
+    words = ["--gain-model", "elastic", *SHEET, *TINY, *(() if early else ("--learning-rate", "1e30"))]
     assert main(["fit", str(folder), "--output", str(output), *words]) == 2
     error = capsys.readouterr().err
-    assert ("needs 3 strikes or more" in error) == wrong.startswith("two")
-    assert ("finding the modes" in error) == wrong.endswith("after them")
+    assert ("no mesh" in error) == early
+    assert ("finding the modes" in error) == (not early)
     assert [each.name for each in output.parent.glob("*") if each.suffix != ".bodies"] == []
 
 
@@ -308,7 +291,7 @@ def test_a_surface_in_another_unit_is_noted_once(tmp_path: Path, capsys: Streams
     folder = fill_plate(tmp_path / "plate")
     (surface,) = folder.glob("surface.*")
     trimesh.load(surface, process=False).apply_scale(1000.0).export(surface)
-    assert main(["fit", str(folder), "--output", str(tmp_path / "field"), "--gains", "spline", *TINY]) == 0
+    assert main(["fit", str(folder), "--output", str(tmp_path / "field"), "--gain-model", "smooth", *TINY]) == 0
     notes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: ")]
     assert len(notes) == 1
     assert "is the surface's unit mm?" in notes[0]
@@ -327,7 +310,7 @@ def test_a_recipes_settings_hold_where_the_options_say_nothing() -> None:
 def test_without_a_surface_the_contacts_box_stands_for_the_object(tmp_path: Path, capsys: Streams) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
     path = tmp_path / "plate.safetensors"
-    assert main(["fit", str(folder), "--output", str(path), "--gains", "attention", *TINY]) == 0
+    assert main(["fit", str(folder), "--output", str(path), "--gain-model", "network", *TINY]) == 0
     assert "has no surface" in capsys.readouterr().err
     points = load(path).gain_field.points
     contacts = read_capture(folder).impacts.contacts

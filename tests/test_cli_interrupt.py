@@ -11,7 +11,7 @@ from avmsf.field.fit import Progress
 from avmsf.field.store import load
 from plate_capture import TINY, fill_plate
 
-NETWORK = ("--gains", "attention", *TINY)
+NETWORK = ("--gain-model", "network", *TINY)
 
 Streams = pytest.CaptureFixture[str]
 

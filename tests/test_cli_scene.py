@@ -26,7 +26,7 @@ LIFT = ("--lift.encoder", "descriptors", "--lift.points", "600")
 RENDERED = ("--views.rendered", "48", "--views.count", "18")
 MODES = ("--modes", "12")
 FIT = tuple(f"--fit.{word[2:]}" if word.startswith("--") else word for word in TINY[: -len(MODES)])
-SMALL = (*SMALL_SPLAT, *LIFT, *FIT, *MODES, "--gains", "visual")
+SMALL = (*SMALL_SPLAT, *LIFT, *FIT, *MODES, "--gain-model", "network")
 
 
 def photograph(folder: Path) -> Path:

@@ -1,4 +1,4 @@
-"""Doubt: against fields refitted without a contact, draws whose truth is known, and the sounds themselves."""
+"""How sure a field is: against fits without a contact, draws whose truth is known, and the sounds themselves."""
 
 import math
 from dataclasses import replace
@@ -6,17 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 from matplotlib.figure import Figure
-from torch import Tensor
 
 from avmsf.bench.doubtpictures import draw_band, draw_doubt
 from avmsf.errors import FitError
-from avmsf.field.belief import beliefs, deviation_of, knows_doubt, left_out, struck_at
 from avmsf.field.doubt import coverage, gain_doubt, spectrum_band, widening
-from avmsf.field.evidence import Regression
-from avmsf.field.hypotheses import row_of
-from avmsf.field.modalbasis import ModalBasis, sites_of
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.posterior import fitted_mixture, has_posterior, std_of, training_contacts, unedited_mixture
 from avmsf.field.scaledgains import ScaledGains
-from avmsf.field.suggest import suggest
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.tasks.locator import Locator
@@ -24,82 +20,43 @@ from avmsf.tasks.retune import retune
 from believing_field import (
     BANK,
     DOWN,
-    FIRST,
     LENGTH,
     bar_contacts,
     bar_points,
     drawn_gains,
-    physics_field,
+    elastic_field,
+    one_hypothesis,
+    positional_field,
     sound_field,
-    spline_field,
 )
 
-
-def test_leaving_contacts_out_at_once_agrees_with_leaving_each_out_by_itself() -> None:
-    contacts = bar_contacts(6)
-    values = drawn_gains(contacts, seed=1)
-    gains = physics_field(contacts, values, only=FIRST)
-    missed, spread = gains.regression.left_out
-    whole = gains.regression.hypotheses.covariance(torch.arange(4), torch.tensor([row_of(*FIRST)]))[0]
-    for row in range(6):
-        kept = [each for each in range(6) if each != row]
-        for mode in range(4):
-            inverse = torch.linalg.inv(whole[mode][kept][:, kept])
-            cross = whole[mode][row, kept]
-            mean = cross @ inverse @ values[kept, mode]
-            scale = torch.einsum("cd,ce,ed->d", values[kept, mode], inverse, values[kept, mode]) / 5
-            variance = scale * (whole[mode][row, row] - cross @ inverse @ cross)
-            assert torch.allclose(missed[row, mode], values[row, mode] - mean)
-            assert torch.allclose(spread[row, mode], variance.sqrt())
+both_models = pytest.mark.parametrize("made", [elastic_field, positional_field])
 
 
-def test_hypotheses_are_weighed_without_the_gain_that_is_left_out() -> None:
-    contacts = bar_contacts(6)
-    values = drawn_gains(contacts, seed=2)
-    gains = physics_field(contacts, values)
-    known = gains.regression
-    # Shapes are scaled by all contacts; only what the evidence says of the others' gains is asked for.
-    single = known.hypotheses.likelihood(torch.arange(4))
-    before = torch.log(known.weights) - single
-    for row in (0, 4):
-        kept = torch.tensor([each for each in range(6) if each != row])
-        total = torch.zeros(4, 2, dtype=torch.float64)
-        mass = torch.zeros(4, 2, dtype=torch.float64)
-        for hypothesis in range(len(known.weights)):
-            whole = known.hypotheses.covariance(torch.arange(4), torch.tensor([hypothesis]))[0]
-            others = whole[:, kept][:, :, kept]
-            inverse, rest = torch.linalg.inv(others), values[kept].transpose(0, 1)
-            squares = (rest * (inverse @ rest)).sum(1)
-            evidence = -0.5 * (5 * torch.log(squares) + torch.logdet(others)[:, None])
-            weight = torch.exp(before[hypothesis] + evidence)
-            total += weight * (whole[:, row, kept][:, None] @ inverse @ rest)[:, 0]
-            mass += weight
-        assert torch.allclose(known.left_out[0][row], values[row] - total / mass, atol=1e-9)
+def test_a_place_is_left_out_as_in_a_model_without_its_contacts() -> None:
+    contacts = bar_contacts(6)[[0, 1, 2, 3, 4, 5, 0]]
+    values = drawn_gains(bar_contacts(6), seed=1)[[0, 1, 2, 3, 4, 5, 0]]
+    values[6] += 0.1
+    gains = one_hypothesis(contacts, values)
+    assert gains.place_count == 6
+    scores = gains.standardized_errors()
+    for row in range(7):
+        rest = gains.without((contacts == contacts[row]).all(1))
+        assert len(rest.contacts) == (5 if row in (0, 6) else 6)
+        known = rest.at(contacts[row : row + 1])
+        mean = torch.stack([known.mean[0], known.quadrature[0]], dim=1).double()  # type: ignore[index]
+        torch.testing.assert_close(torch.view_as_real(gains.leave_one_out()[row]), mean, rtol=1e-5, atol=1e-6)
+        # Of a measured gain, whose noise counts as well.
+        variance = rest.deviation(contacts[row : row + 1])[0].double().square() + rest.noise().square()
+        torch.testing.assert_close(scores[row], (values[row] - mean) / variance.sqrt(), rtol=1e-4, atol=1e-5)
 
 
-def test_splines_foretell_contacts_left_out_as_splines_without_them() -> None:
-    contacts = bar_contacts(9)
-    values = drawn_gains(contacts, seed=3)
-    scores = left_out(sound_field(spline_field(contacts, values)))
-    # The scale is told by the errors themselves, so that their mean square is one.
-    assert torch.allclose(scores.square().mean(0), torch.ones(4, 2, dtype=torch.float64))
-    # Contacts are in the order of `unique` there, and without one the unit of length differs, which scales all alike.
-    places, owner = torch.unique(contacts, dim=0, return_inverse=True)
-    order = torch.argsort(owner)
-    for site in (2, 5):
-        kept = order[[each for each in range(9) if each != site]]
-        there = spline_field(contacts[kept], values[kept]).at(places[site : site + 1])
-        missed = values[order[site]] - torch.stack([there.mean[0], there.quadrature[0]], dim=1).double()  # type: ignore[index]
-        ratio = scores[site] / missed
-        assert bool((ratio > 0).all())
-
-
-def test_what_is_drawn_from_the_belief_needs_no_widening_and_is_covered() -> None:
+def test_what_is_drawn_from_the_model_needs_no_widening_and_is_covered() -> None:
     everywhere = bar_contacts(100, seed=11)
     rates, widths = [], []
     for seed in range(6):
         values = drawn_gains(everywhere, seed=seed)
-        field = sound_field(physics_field(everywhere[:16], values[:16]))
+        field = sound_field(elastic_field(everywhere[:16], values[:16]))
         found = coverage(field, everywhere[16:], values[16:])
         rates.append((found.plain, found.by_energy))
         widths.append(widening(field))
@@ -110,14 +67,14 @@ def test_what_is_drawn_from_the_belief_needs_no_widening_and_is_covered() -> Non
     assert sum(widths) / 6 == pytest.approx(1.645, abs=0.25)
 
 
-def test_noise_that_is_not_believed_in_widens_until_it_is_covered() -> None:
+def test_noise_that_the_model_does_not_expect_widens_until_it_is_covered() -> None:
     everywhere = bar_contacts(100, seed=12)
     values = drawn_gains(everywhere, seed=1, noise=0.5)
-    # The one hypothesis has a tenth of the noise's deviation, and shapes to explain the rest by.
-    field = sound_field(physics_field(everywhere[:30], values[:30], only=(3, 0, 0)))
+    # The one hypothesis has a tenth of the noise's deviation, and takes the rest for gains.
+    gains = one_hypothesis(everywhere[:30], values[:30], noise=0.003)
+    field = sound_field(gains)
     widened = coverage(field, everywhere[30:], values[30:]).plain
-    spread = field.gain_field.deviation(everywhere[30:]).double().square()  # type: ignore[union-attr]
-    spread = (spread + field.gain_field.noise[0].square()).sqrt()  # type: ignore[attr-defined]
+    spread = (gains.deviation(everywhere[30:]).double().square() + gains.noise().square()).sqrt()
     known = field.known(everywhere[30:])
     missed = values[30:] - torch.stack([known.mean, known.quadrature], dim=2).double()  # type: ignore[list-item]
     assert float((missed.abs() <= 1.645 * spread).double().mean()) < widened - 0.03
@@ -129,65 +86,41 @@ def test_a_wider_interval_covers_more() -> None:
     rates = []
     for seed in range(4):
         values = drawn_gains(everywhere, seed=seed)
-        field = sound_field(spline_field(everywhere[:20], values[:20]))
+        field = sound_field(positional_field(everywhere[:20], values[:20]))
         rates.append([coverage(field, everywhere[20:], values[20:], level=each).plain for each in (0.3, 0.6, 0.9)])
     low, middle, high = torch.tensor(rates).mean(0).tolist()
     assert low < middle < high
     assert high == pytest.approx(0.9, abs=0.08)
 
 
-def test_splines_are_not_asked_from_which_side_a_blow_came() -> None:
+def test_an_impact_from_below_has_the_opposite_gain_where_directions_are_known() -> None:
     everywhere = bar_contacts(60, seed=13)
     values = drawn_gains(everywhere, seed=0)
-    turned = torch.where(torch.arange(40)[:, None, None] % 2 == 0, -values[20:], values[20:])
-    splines = sound_field(spline_field(everywhere[:20], values[:20]))
-    assert coverage(splines, everywhere[20:], turned).plain == coverage(splines, everywhere[20:], values[20:]).plain
-    # Physics is told the directions, and a gain of the wrong sign is missed.
-    physics = sound_field(physics_field(everywhere[:20], values[:20]))
-    straight = coverage(physics, everywhere[20:], values[20:]).plain
-    assert coverage(physics, everywhere[20:], turned).plain < straight - 0.1
+    side = torch.where(torch.arange(40) % 2 == 0, -1.0, 1.0).double()[:, None]
+    turned = side[:, :, None] * values[20:]
+    field = sound_field(elastic_field(everywhere[:20], values[:20]))
+    straight = coverage(field, everywhere[20:], values[20:]).plain
+    assert coverage(field, everywhere[20:], turned, directions=side * DOWN).plain == straight
+    assert coverage(field, everywhere[20:], turned).plain < straight - 0.1
 
 
-@pytest.mark.parametrize("made", [physics_field, spline_field])
+@both_models
 def test_fields_judge_themselves_by_the_gains_that_were_measured(made) -> None:
     contacts = bar_contacts(12, seed=4)
     values = drawn_gains(contacts, seed=4)
     gains = made(contacts, values)
     moved = torch.randn(values.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    scores = left_out(sound_field(gains))
-    judged = gains.judged_by(values + moved)
-    if made is physics_field:
-        _, spread = gains.regression.left_out
-    else:
-        spread = gains.sites.left_out(values.flatten(1)).reshape(-1, *values.shape[1:]) / scores
-    # What foretells a contact is as it was: the error grows by what the measured gain lies off the field's own.
-    off = moved if made is physics_field else gains.sites.means(moved.flatten(1)).reshape(spread.shape)
-    assert torch.allclose(left_out(sound_field(judged)), scores + off / spread, rtol=1e-9)
+    judged = gains.judged_by(torch.view_as_complex(values + moved))
+    # What predicts a contact is as it was: the error grows by what the measured gain lies off the model's own.
+    scores, missed = gains.standardized_errors(), values - torch.view_as_real(gains.leave_one_out())
+    torch.testing.assert_close(judged.standardized_errors(), scores * (missed + moved) / missed)
     assert torch.equal(judged.at(contacts).mean, gains.at(contacts).mean)
-    restored = type(gains).restore(judged.record(), judged.tensors())
-    assert torch.equal(left_out(sound_field(restored)), left_out(sound_field(judged)))
     taken = judged.take(torch.tensor([2, 0]))
-    assert torch.equal(taken.tensors()["measured"], (values + moved)[:, [2, 0]])
+    torch.testing.assert_close(taken.standardized_errors(), judged.standardized_errors()[:, [2, 0]])
 
 
-def test_strikes_that_are_doubted_do_not_widen_the_others_intervals() -> None:
-    contacts = bar_contacts(12)
-    values = drawn_gains(contacts, seed=5)
-    wrong = values.clone()
-    wrong[3] *= -20.0
-    doubt = torch.ones(12, dtype=torch.float64)
-    doubt[3] = 1e6
-    surface = physics_field(contacts, values).surface
-    sites, _ = sites_of(surface, contacts, DOWN.expand(12, 3))
-    known = physics_field(contacts, values).regression
-    regression = Regression.of(sites, known.prior, wrong, floor=known.floor, doubt=doubt)
-    gains = ModalBasis(surface, contacts, DOWN.expand(12, 3), regression)
-    assert left_out(sound_field(gains)).shape == (11, 4, 2)
-    assert widening(sound_field(gains)) < 4.0
-
-
-@pytest.mark.parametrize("made", [physics_field, spline_field])
-def test_doubt_grows_away_from_contacts_and_knows_no_unit(made: type) -> None:
+@both_models
+def test_doubt_grows_away_from_contacts_and_has_no_unit(made: type) -> None:
     contacts = bar_contacts(80)
     contacts = contacts[contacts[:, 0] < 0.4 * LENGTH]
     values = drawn_gains(contacts, seed=6)
@@ -199,10 +132,11 @@ def test_doubt_grows_away_from_contacts_and_knows_no_unit(made: type) -> None:
     assert torch.allclose(louder, doubt, rtol=1e-4, atol=1e-6)
 
 
-def test_a_sound_without_doubt_has_its_own_spectrum() -> None:
+def test_a_sound_without_doubt_has_its_own_spectrum(monkeypatch: pytest.MonkeyPatch) -> None:
     contacts = bar_contacts(6)
-    gains = physics_field(contacts, drawn_gains(contacts, seed=7))
-    field = replace(sound_field(Certain(gains)), residual=Residual(torch.zeros(9)))
+    gains = elastic_field(contacts, drawn_gains(contacts, seed=7))
+    field = replace(sound_field(gains), residual=Residual(torch.zeros(9)))
+    monkeypatch.setattr(MixtureGains, "deviation", lambda known, sites, ways=None: torch.zeros(len(sites), 4, 2))
     band = spectrum_band(field, contacts[2])
     power = torch.fft.rfft(field.render(contacts[2:3])[0].double()).abs().square()
     assert torch.allclose(band.lower_db, band.upper_db)
@@ -217,7 +151,7 @@ def test_a_sound_without_doubt_has_its_own_spectrum() -> None:
 
 def test_bands_hold_what_the_gains_intervals_hold() -> None:
     contacts = bar_contacts(10)
-    gains = physics_field(contacts, drawn_gains(contacts, seed=15))
+    gains = elastic_field(contacts, drawn_gains(contacts, seed=15))
     field = replace(sound_field(gains), residual=Residual(torch.zeros(9)))
     # One mode alone, whose energy is the square of its gains: two parts of means and deviations that are known.
     lone = ModalBank(BANK.frequency[:1], BANK.damping[:1])
@@ -239,14 +173,14 @@ def test_bands_hold_what_the_gains_intervals_hold() -> None:
     assert float(band.upper_db[peak] - band.lower_db[peak]) == pytest.approx(float(expected), rel=0.25)
 
 
-@pytest.mark.parametrize("made", [physics_field, spline_field])
+@both_models
 def test_an_edited_field_is_as_sure_of_itself_as_before(made: type) -> None:
     contacts, others = bar_contacts(30)[:12], bar_contacts(30)[12:]
     values = drawn_gains(bar_contacts(30), seed=16)
     field = sound_field(made(contacts, values[:12]))
     points, same = bar_points()[::5], retune(field)
-    assert knows_doubt(same)
-    assert torch.equal(left_out(same).nan_to_num(), left_out(field).nan_to_num())
+    assert has_posterior(same)
+    assert fitted_mixture(same) is field.gain_field
     assert torch.equal(gain_doubt(same, points), gain_doubt(field, points))
     assert torch.equal(spectrum_band(same, others[0]).upper_db, spectrum_band(field, others[0]).upper_db)
     maps = [Locator.of(each, points=points).locate(field.render(others[:1])[0]) for each in (field, same)]
@@ -255,9 +189,9 @@ def test_an_edited_field_is_as_sure_of_itself_as_before(made: type) -> None:
     factor = torch.tensor([2.0, 0.5, 8.0, 1.0], dtype=torch.float64)
     louder = replace(field, gain_field=ScaledGains(field.gain_field, factor, 2.0))
     assert widening(louder) == widening(field)
-    assert torch.equal(struck_at(louder), 2.0 * struck_at(field))
-    known = deviation_of(field, others) * factor[:, None]
-    torch.testing.assert_close(deviation_of(louder, 2.0 * others), known, rtol=1e-6, atol=0)
+    assert torch.equal(training_contacts(louder), 2.0 * training_contacts(field))
+    known = std_of(field, others) * factor[:, None]
+    torch.testing.assert_close(std_of(louder, 2.0 * others), known, rtol=1e-6, atol=0)
     heard = coverage(louder, 2.0 * others, values[12:] * factor[:, None])
     assert heard.plain == coverage(field, others, values[12:]).plain
     weights = ModalBank(BANK.frequency, BANK.damping / factor**2)
@@ -266,7 +200,7 @@ def test_an_edited_field_is_as_sure_of_itself_as_before(made: type) -> None:
 
 def test_modes_that_an_edit_has_silenced_are_in_no_doubt() -> None:
     contacts = bar_contacts(12)
-    gains = physics_field(contacts, drawn_gains(contacts, seed=17))
+    gains = elastic_field(contacts, drawn_gains(contacts, seed=17))
     field = replace(sound_field(gains), residual=Residual(torch.zeros(9)))
     above = retune(field, pitch=[1.0, 1.0, 4.0, 4.0])
     mute = retune(field, gains_db=[0.0, 0.0, -math.inf, -math.inf])
@@ -280,7 +214,7 @@ def test_modes_that_an_edit_has_silenced_are_in_no_doubt() -> None:
 def test_bands_are_the_same_every_time_and_wider_where_less_is_known() -> None:
     contacts = bar_contacts(80)
     contacts = contacts[contacts[:, 0] < 0.4 * LENGTH]
-    field = sound_field(physics_field(contacts, drawn_gains(contacts, seed=8)))
+    field = sound_field(elastic_field(contacts, drawn_gains(contacts, seed=8)))
     struck, far = contacts[0], torch.tensor([0.95 * LENGTH, 0.05, 0.0])
     near, off, again = (spectrum_band(field, each) for each in (struck, far, far))
     assert torch.equal(off.upper_db, again.upper_db)
@@ -290,7 +224,7 @@ def test_bands_are_the_same_every_time_and_wider_where_less_is_known() -> None:
 
 def test_pictures_are_drawn_of_solids_and_of_sheets() -> None:
     contacts = bar_contacts(8)
-    field = sound_field(physics_field(contacts, drawn_gains(contacts, seed=9)))
+    field = sound_field(elastic_field(contacts, drawn_gains(contacts, seed=9)))
     points = bar_points()
     doubt = gain_doubt(field, points)
     sheet = draw_doubt(points, doubt, title="bar", struck=contacts, suggested=contacts[:2])
@@ -327,22 +261,10 @@ def _numbers(picture: Figure) -> list[list[str]]:
 def test_what_cannot_be_said_is_refused() -> None:
     contacts = bar_contacts(6)
     values = drawn_gains(contacts, seed=10)
-    field = sound_field(physics_field(contacts, values))
+    field = sound_field(elastic_field(contacts, values))
     with pytest.raises(FitError, match=r"level = 1: expected a probability between 0 and 1"):
         spectrum_band(field, contacts[0], level=1.0)
-    with pytest.raises(FitError, match="was edited, and no blow tells more of what nobody can strike"):
-        suggest(retune(field), 1)
-    with pytest.raises(FitError, match="was edited, and no blow"):
-        next(beliefs(retune(field), contacts, None))
+    with pytest.raises(FitError, match="expected a fitted field, got an edited one"):
+        unedited_mixture(retune(field))
     with pytest.raises(FitError, match=r"gains are of shape \(6, 3, 2\): expected 6 contacts, the field's 4 modes"):
         coverage(field, contacts, values[:, :3])
-
-
-class Certain(ModalBasis):
-    """The same means, without doubt."""
-
-    def __init__(self, known: ModalBasis) -> None:
-        super().__init__(known.surface, known.contacts, known.directions, known.regression)
-
-    def deviation(self, contacts: Tensor, directions: Tensor | None = None) -> Tensor:
-        return torch.zeros(len(contacts), 4, 2)

@@ -25,6 +25,7 @@ from safetensors.torch import save as to_bytes
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FieldFileError
 from avmsf.field.fit import fit
+from avmsf.field.header import FORMAT
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
@@ -81,7 +82,7 @@ def test_a_file_names_its_tensors_and_itself(tmp_path):
     assert {name.removeprefix("gain_field.") for name in names if name.startswith("gain_field.")} == set(
         field().gain_field.state_dict()
     )
-    assert record["format"] == 6
+    assert record["format"] == FORMAT
     assert record["version"] == "0.1.0"
     assert record["sample_rate"] == 8000.0
     assert record["origin"]["capture"] == "a plate"
@@ -274,9 +275,9 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path):
 
 def test_a_newer_format_is_refused_by_name(tmp_path):
     def change(_: dict, record: dict) -> None:
-        record.update(format=7, version="3.1.4", something="new")
+        record.update(format=FORMAT + 1, version="3.1.4", something="new")
 
-    with pytest.raises(FieldFileError, match=r"of format 6, found format 7, written by avmsf 3\.1\.4") as caught:
+    with pytest.raises(FieldFileError, match=rf"found format {FORMAT + 1}, written by avmsf 3\.1\.4") as caught:
         load(changed(tmp_path, change))
     assert "install a newer avmsf" in str(caught.value)
 
@@ -369,12 +370,12 @@ def test_nothing_that_a_record_lacks_is_made_up(tmp_path, keys):
         load(changed(tmp_path, change))
 
 
-@pytest.mark.parametrize("words", ["", "[]", "{", '"avmsf"', '{"format": 6}'])
+@pytest.mark.parametrize("words", ["", "[]", "{", '"avmsf"', f'{{"format": {FORMAT}}}'])
 def test_a_record_that_is_none_is_refused(tmp_path, words):
     path = tmp_path / "plate.safetensors"
     save(field(), path)
     path.write_bytes(to_bytes(from_bytes(path.read_bytes()), {"avmsf": words}))
-    with pytest.raises(FieldFileError, match="expected the header of a sound field of format 6, found another"):
+    with pytest.raises(FieldFileError, match=f"expected the header of a sound field of format {FORMAT}, found another"):
         load(path)
 
 

@@ -9,8 +9,10 @@ import torch
 
 from avmsf.errors import LocationError
 from avmsf.field.gainfield import Gains
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.soundfield import Origin, SoundField
-from avmsf.field.thinplategains import thin_plate_gains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual
@@ -22,7 +24,7 @@ from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
 from avmsf.tasks.retune import retune
 from avmsf.tasks.slack import contacts_of
-from believing_field import bar_contacts, drawn_gains, physics_field, sound_field
+from believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from unsaved_gains import Unsaved
 
 PLATE = Plate()
@@ -81,9 +83,12 @@ def struck(count: int, *, seed: int, noise_db: float = -40.0, plate: Plate = PLA
 @cache
 def fitted_field(taps: int) -> SoundField:
     impacts = struck(taps, seed=5)
-    parts = torch.stack(fit_gains(impacts.sounds, bank(), sample_rate=RATE), 2).double()
-    points = plate_surface_points(PLATE, 1500)
-    return field_of(thin_plate_gains(impacts.contacts, parts, importance=1 / bank().damping, points=points))
+    values = torch.complex(*(each.double() for each in fit_gains(impacts.sounds, bank(), sample_rate=RATE)))
+    sites = Sites(impacts.contacts, torch.tensor([0.0, 0.0, 1.0]).double().expand_as(impacts.contacts))
+    families = [each(sites, DIAGONAL) for each in (Unstructured, Smooth, ThinPlate)]
+    measured = MeasuredGains(values, torch.zeros_like(bank().damping), bank().frequency, bank().damping)
+    points = plate_surface_points(PLATE, 1500).float()
+    return field_of(fit_mixture(families, measured, points, directional=False))
 
 
 def mirrored(contact: torch.Tensor) -> torch.Tensor:
@@ -302,9 +307,9 @@ def test_fields_that_were_edited_and_know_no_contacts_are_located_on_too():
     assert missed(found, found.most_probable, impacts.contacts[0]) < 0.05
 
 
-def test_contacts_that_say_nothing_are_not_counted():
+def test_contacts_that_a_field_does_not_use_are_not_counted():
     contacts = bar_contacts(8)
-    gains = physics_field(contacts, drawn_gains(contacts, seed=1))
+    gains = elastic_field(contacts, drawn_gains(contacts, seed=1))
     assert contacts_of(sound_field(gains)) == 8
     assert contacts_of(sound_field(gains.without(torch.arange(8) < 3))) == 5
     assert contacts_of(retune(sound_field(gains.without(torch.arange(8) < 3)), pitch=1.1)) == 5

@@ -11,7 +11,7 @@ import soundfile
 import torch
 
 from avmsf.bench.evaluation import split
-from avmsf.bench.fieldmethods import AutomaticField, FieldMethod, PhysicsField, SplineField, UninformedField
+from avmsf.bench.fieldmethods import FieldMethod, MixtureField, UninformedField
 from avmsf.bench.gridfield import PAPER_GRID, Grid, GridField
 from avmsf.bench.methods import METHODS, RecordedMethod, method_named, report_of
 from avmsf.bench.renderer import Renderer
@@ -20,7 +20,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import Surface
 from avmsf.errors import EvaluationError, FitError, SceneError
 from avmsf.field.fit import fit
-from avmsf.field.physics import Physics
+from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uninformed import uninformed
@@ -45,7 +45,7 @@ def tiny(method: Method) -> Method:
     """Return a method of the same kind that is fitted in a moment."""
     if isinstance(method, GridField):
         return replace(method, base=TINY, grid=Grid((4, 8), (1e-2,), (2,), (1.0,), ("shared",)))
-    if isinstance(method, SplineField | PhysicsField | AutomaticField):
+    if isinstance(method, MixtureField):
         return replace(method, config=TINY)
     if isinstance(method, FieldMethod | UninformedField):
         kept = {name: getattr(method.config, name) for name in ("residual", "feature_scale", "bands")}
@@ -54,15 +54,15 @@ def tiny(method: Method) -> Method:
 
 
 @cache
-def plate_physics() -> Physics:
-    """Return the recipe for a sheet of the plate's size, of a few hundred elements: enough to be computed with."""
+def plate_bodies() -> CandidateBodies:
+    """Return a sheet of the plate's size, of a few hundred elements: enough to be computed with."""
     x, y = torch.meshgrid(torch.linspace(0, PLATE.length, 5), torch.linspace(0, PLATE.width, 5), indexing="ij")
     corners = torch.arange(25).reshape(5, 5)
     a, b, c, d = (part.flatten() for part in (corners[:-1, :-1], corners[1:, :-1], corners[1:, 1:], corners[:-1, 1:]))
     faces = torch.cat([torch.stack([a, b, c], dim=1), torch.stack([a, c, d], dim=1)])
     sheet = Surface(torch.stack([x.flatten(), y.flatten(), torch.zeros(25)], dim=1), faces)
     solid = shell(sheet, thickness=PLATE.thickness, detail=0.15)
-    return Physics(NominalBodies((NominalBody(PLATE.thickness, elastic_modes(solid, NOMINAL, count=12)),), {}))
+    return CandidateBodies(NominalBodies((NominalBody(PLATE.thickness, elastic_modes(solid, NOMINAL, count=12)),), {}))
 
 
 def plate_task(train: Impacts, *, impacts: Impacts | None = None, seed: int = 0) -> Task:
@@ -75,7 +75,7 @@ def plate_task(train: Impacts, *, impacts: Impacts | None = None, seed: int = 0)
         seed=seed,
         modes=lambda: plate_extraction(train),
         features=lambda look: plate_features(200),
-        physics=plate_physics,
+        bodies=plate_bodies,
         stranger=lambda: torch.linspace(-1, 1, SAMPLES),
     )
 
@@ -126,10 +126,6 @@ def test_a_seed_decides_all_chance(name):
 @every_method
 def test_one_or_two_shots_are_enough(name):
     impacts = struck()
-    if name == "field-physics":
-        with pytest.raises(FitError, match=r"physics needs 3 strikes or more .*found 2"):
-            tiny(METHODS[name]).fit(plate_task(impacts.take(range(2))))
-        return
     for count in (1, 2):
         train = impacts.take(range(count))
         renderer = tiny(METHODS[name]).fit(plate_task(train))
@@ -349,7 +345,6 @@ def test_reports_say_what_was_used():
         "kernel": "thin plate",
         "directions": 2,
         "sites": TRAIN,
-        "smoothing": 0.0,
     }
     assert report_of(made("field-positions"))["damping"] in ("shared", "per-contact")
 

@@ -16,7 +16,7 @@ from avmsf.tasks.modaledit import ModalEdit, Struck
 RATE = 8000.0
 
 
-def made_field(kind: str = "physics") -> SoundField:
+def made_field(kind: str = "elastic") -> SoundField:
     bank = made_fields.BANK
     phase = torch.linspace(-1.0, 1.0, len(bank), dtype=torch.float64)
     return SoundField(

@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from avmsf.errors import EditError, SimulationError
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.positional import Smooth
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
-from avmsf.field.thinplategains import ThinPlateGains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.simulate.block import block
@@ -45,12 +47,18 @@ def plate_of(material: Material, *, size: float = 1.0) -> Plate:
 
 
 def field_of(frequency: torch.Tensor, damping: torch.Tensor, gains: torch.Tensor, contacts: torch.Tensor) -> SoundField:
-    """Return a field that has these gains at these contacts, and splines between them."""
-    values = torch.stack([gains, 0.5 * gains.roll(1, dims=1)], dim=2)
-    splines = ThinPlateGains(contacts.float(), contacts.double(), values, 0.0)
+    """Return a field that has these gains at these contacts, and smooth ones between them."""
+    values = torch.complex(gains, 0.5 * gains.roll(1, dims=1))
+    sites = Sites(contacts, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(contacts))
+    size = float((contacts.amax(0) - contacts.amin(0)).norm())
+    measured = MeasuredGains(values, torch.zeros_like(frequency), frequency, damping)
+    model = fit_mixture([Smooth(sites, size)], measured, contacts.float(), directional=False)
+    # The mean at the contacts is linear in the gains measured there: these have it pass through the given ones.
+    passed = torch.linalg.solve(model.smoother(), torch.view_as_real(values).permute(1, 2, 0))
+    model = model.with_values(torch.view_as_complex(passed.permute(2, 0, 1).contiguous()))
     phase = torch.zeros_like(frequency)
     return SoundField(
-        ModalBank(frequency, damping), splines, phase, Residual(torch.full((9,), 1e-9)), RATE, 2000, Origin("plate")
+        ModalBank(frequency, damping), model, phase, Residual(torch.full((9,), 1e-9)), RATE, 2000, Origin("plate")
     )
 
 

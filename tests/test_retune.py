@@ -17,7 +17,7 @@ PLACES = places(7, seed=8)
 RATE = 8000.0
 
 
-def field(name: str = "spline") -> SoundField:
+def field(name: str = "positional") -> SoundField:
     phase = torch.tensor([0.0, 0.4, -1.2, 3.0, 1.6], dtype=torch.float64)
     return SoundField(BANK, FIELDS[name](), phase, Residual(torch.full((9,), 1e-9)), RATE, 600, Origin("plate"))
 
@@ -42,7 +42,7 @@ def test_without_values_nothing_changes():
     assert torch.equal(after.render(PLACES), before.render(PLACES))
 
 
-@pytest.mark.parametrize("name", ["spline", "attention with dampings", "physics"])
+@pytest.mark.parametrize("name", ["positional", "attention with dampings", "elastic"])
 def test_pitch_moves_frequencies_and_decay_the_ring_times(name):
     before, factors = field(name), torch.linspace(0.5, 1.5, 5, dtype=torch.float64)
     after = retune(before, pitch=1.2, decay=factors)

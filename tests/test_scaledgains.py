@@ -15,8 +15,8 @@ PLACES = places(7, seed=8)
 BLOWS = blows(PLACES, seed=9)
 
 
-@pytest.mark.parametrize("name", ["attention with dampings", "spline", "physics"])
-def test_gains_and_doubt_are_the_inner_fields_times_the_factors(name):
+@pytest.mark.parametrize("name", ["attention with dampings", "positional", "elastic"])
+def test_gains_and_deviations_are_the_inner_fields_times_the_factors(name):
     inner = FIELDS[name]()
     scaled = ScaledGains(inner, FACTORS)
     before, after = (each.at(PLACES, BLOWS) for each in (inner, scaled))
@@ -26,25 +26,25 @@ def test_gains_and_doubt_are_the_inner_fields_times_the_factors(name):
         torch.testing.assert_close(after.quadrature.double(), before.quadrature.double() * FACTORS, rtol=1e-7, atol=0)
     assert before.damping is None or torch.equal(before.damping, after.damping)
     assert (before.damping is None) == (after.damping is None)
-    doubts = [each.deviation(PLACES, BLOWS) for each in (inner, scaled)]
-    assert doubts[0] is None or torch.allclose(doubts[1], doubts[0] * FACTORS.abs().float()[:, None], rtol=1e-6)
+    deviations = [each.deviation(PLACES, BLOWS) for each in (inner, scaled)]
+    assert deviations[0] is None or torch.allclose(deviations[1], deviations[0] * FACTORS.abs().float()[:, None], rtol=1e-6)
     assert torch.equal(scaled.points, inner.points)
 
 
-@pytest.mark.parametrize("name", ["attention", "spline", "physics"])
+@pytest.mark.parametrize("name", ["attention", "positional", "elastic"])
 def test_on_a_larger_object_places_are_where_they_would_be_on_the_small_one(name):
     inner = FIELDS[name]()
     large = ScaledGains(inner, torch.ones(5, dtype=torch.float64), 4.0)
     # Four is a power of two: lengths are not rounded.
     assert torch.equal(large.points, 4 * inner.points)
     assert torch.equal(large.at(4 * PLACES, BLOWS).mean, inner.at(PLACES, BLOWS).mean)
-    doubts = large.deviation(4 * PLACES, BLOWS), inner.deviation(PLACES, BLOWS)
-    assert doubts == (None, None) or torch.equal(*doubts)
+    deviations = large.deviation(4 * PLACES, BLOWS), inner.deviation(PLACES, BLOWS)
+    assert deviations == (None, None) or torch.equal(*deviations)
     assert not torch.equal(large.at(PLACES, BLOWS).mean, inner.at(PLACES, BLOWS).mean)
 
 
 def test_of_scaled_gains_the_factors_multiply_and_nothing_nests(tmp_path):
-    inner = FIELDS["spline"]()
+    inner = FIELDS["positional"]()
     twice = ScaledGains(ScaledGains(inner, FACTORS, 0.5), 3 * FACTORS, 3.0)
     assert twice.field is inner
     assert torch.equal(twice.scale, 3 * FACTORS**2)
@@ -57,17 +57,17 @@ def test_of_scaled_gains_the_factors_multiply_and_nothing_nests(tmp_path):
 
 
 def test_lengths_and_inner_fields_that_cannot_be_are_refused():
-    inner = FIELDS["spline"]()
+    inner = FIELDS["positional"]()
     for length in (0.0, -1.0, float("inf"), float("nan")):
         with pytest.raises(ValueError, match="length is"):
             ScaledGains(inner, FACTORS, length)
     record = ScaledGains(inner, FACTORS).record()
-    with pytest.raises(ValueError, match="inner is 'scaled', not attention, spline, physics"):
+    with pytest.raises(ValueError, match="inner is 'scaled', not attention, mixture"):
         ScaledGains.skeleton(record | {"inner": "scaled"})
 
 
 def test_a_file_whose_factors_are_no_numbers_is_refused(tmp_path):
-    broken = ScaledGains(FIELDS["spline"](), FACTORS * torch.nan)
+    broken = ScaledGains(FIELDS["positional"](), FACTORS * torch.nan)
     field = SoundField(BANK, broken, torch.zeros(5).double(), Residual(torch.zeros(9)), 8e3, 9, Origin())
     with pytest.raises(FieldFileError, match=r"expected gain_field\.scale to be finite throughout"):
         save(field, tmp_path / "one")

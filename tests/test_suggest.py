@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from avmsf.errors import FitError
-from avmsf.field.belief import beliefs
 from avmsf.field.doubt import gain_doubt, widening
 from avmsf.field.fit import gain_case
-from avmsf.field.hypotheses import NOISES, REMAINDERS, WIDTHS
+from avmsf.field.gains.elastic import REACH
+from avmsf.field.gains.model import MixtureGains
 from avmsf.field.recipes import SHARED, Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.suggest import suggest
@@ -19,46 +19,48 @@ from believing_field import (
     BANK,
     DOWN,
     ELASTIC,
-    FIRST,
     LENGTH,
+    NOISE,
+    PERTURBATION,
+    REMAINDER,
+    SIZE,
     bar_contacts,
     bar_points,
+    cosines,
     drawn_gains,
-    physics_field,
+    elastic_field,
+    one_hypothesis,
+    positional_field,
     sound_field,
-    spline_field,
 )
 from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
+
+both_models = pytest.mark.parametrize("made", [elastic_field, positional_field])
 
 
 def of_one_hypothesis(count: int = 5) -> SoundField:
     contacts = bar_contacts(count)
-    return sound_field(physics_field(contacts, drawn_gains(contacts, seed=1), only=FIRST))
+    return sound_field(one_hypothesis(contacts, drawn_gains(contacts, seed=1)))
 
 
 def open_variance(field: SoundField, extra: Tensor, points: Tensor) -> Tensor:
     """Return the energy that is not known at points with `extra` struck too, by the textbook's formula."""
     gains = field.gain_field
-    contacts, values = gains.contacts, gains.values  # type: ignore[attr-defined]
+    assert isinstance(gains, MixtureGains)
+    contacts, values = gains.contacts, torch.view_as_real(gains.values)
     struck = torch.cat([contacts, extra])
     total = torch.zeros(len(points), dtype=torch.float64)
-
-    def shapes(places: Tensor) -> Tensor:
-        return 2**0.5 * torch.cos(torch.pi * torch.arange(1, 7) * places[:, :1] / LENGTH)
-
-    reach = 0.15 * float((bar_points().amax(0) - bar_points().amin(0)).norm())
-    width, part, noise = WIDTHS[FIRST[0]], REMAINDERS[FIRST[1]], NOISES[FIRST[2]]
     for mode in range(len(BANK)):
-        prior = torch.exp(-0.5 * (torch.log(BANK.frequency[mode] / ELASTIC) / width) ** 2) + 1e-3
-        prior = prior / (shapes(contacts).square() @ prior).mean()
+        shares = 1.0 / (1.0 + (2.0 * torch.log(ELASTIC[mode] / ELASTIC) / PERTURBATION) ** 2)
+        shares = shares / (cosines(contacts).square() @ shares).mean()
 
-        def kernel(one: Tensor, two: Tensor, prior: Tensor = prior) -> Tensor:
-            smooth = torch.exp(-0.5 * (one[:, None] - two).square().sum(2) / reach**2)
-            return (1 - part) * shapes(one) @ torch.diag(prior) @ shapes(two).T + part * smooth
+        def kernel(one: Tensor, two: Tensor, shares: Tensor = shares) -> Tensor:
+            smooth = torch.exp(-0.5 * (one[:, None] - two).square().sum(2) / (REACH * SIZE) ** 2)
+            return (1 - REMAINDER) * cosines(one) @ torch.diag(shares) @ cosines(two).T + REMAINDER * smooth
 
-        known = kernel(contacts, contacts) + noise * torch.eye(len(contacts))
-        scale = torch.einsum("cd,ce,ed->d", values[:, mode], torch.linalg.inv(known), values[:, mode]).sum()
-        all_of = kernel(struck, struck) + noise * torch.eye(len(struck))
+        known = kernel(contacts, contacts) + NOISE * torch.eye(len(contacts))
+        scale = torch.einsum("cd,ce,ed->", values[:, mode], torch.linalg.inv(known), values[:, mode])
+        all_of = kernel(struck, struck) + NOISE * torch.eye(len(struck))
         left = kernel(points, points) - kernel(points, struck) @ torch.linalg.inv(all_of) @ kernel(struck, points)
         total += scale / len(contacts) * torch.diagonal(left) / (4 * BANK.damping[mode])
     return total
@@ -98,12 +100,12 @@ def test_each_contact_is_the_best_of_all_candidates() -> None:
 def test_a_field_that_was_struck_on_one_side_is_to_be_struck_on_the_other() -> None:
     contacts = bar_contacts(60)
     contacts = contacts[contacts[:, 0] < 0.3 * LENGTH]
-    for gains in (physics_field, spline_field):
+    for gains in (elastic_field, positional_field):
         field = sound_field(gains(contacts, drawn_gains(contacts, seed=2)))
         assert float(suggest(field, 1).contacts[0, 0]) > 0.6 * LENGTH
 
 
-@pytest.mark.parametrize("made", [physics_field, spline_field])
+@both_models
 def test_contacts_differ_lie_on_the_object_and_lower_the_error_each(made: type) -> None:
     contacts = bar_contacts(6)
     found = suggest(sound_field(made(contacts, drawn_gains(contacts, seed=3))), 8)
@@ -113,41 +115,38 @@ def test_contacts_differ_lie_on_the_object_and_lower_the_error_each(made: type) 
     both = torch.cat([contacts, found.contacts])
     assert len(torch.unique(both, dim=0)) == 14
     assert float((found.contacts[:, None] - bar_points().double()).norm(dim=2).amin(1).max()) < 1e-9
-    assert (found.directions is None) == (made is spline_field)
+    assert (found.directions is None) == (made is positional_field)
     if found.directions is not None:
         assert torch.allclose(found.directions, DOWN.expand(8, 3))
 
 
-@pytest.mark.parametrize("count", [3, 5, 20])
-def test_what_splines_believe_of_two_places_agrees_with_what_they_believe_of_each(count: int) -> None:
+@both_models
+@pytest.mark.parametrize("count", [3, 20])
+def test_what_is_not_known_of_places_has_no_negative_variance(made: type, count: int) -> None:
     contacts = bar_contacts(count)
-    contacts = torch.cat([contacts, contacts[:1]])
-    gains = spline_field(contacts, drawn_gains(contacts[:-1], seed=4)[[*range(count), 0]])
-    places = bar_contacts(40, seed=9)
-    (belief,) = beliefs(sound_field(gains), places, None)
-    single = gains.deviation(places)
-    assert single is not None
-    energy = (single.double().square().sum(2) / (4 * BANK.damping)).sum(1)
-    assert torch.allclose(torch.diagonal(belief.covariance), energy, rtol=1e-4, atol=1e-6 * float(energy.max()))
-    assert float(torch.linalg.eigvalsh(belief.covariance).min()) > -1e-9 * float(energy.max())
+    rows = [*range(count), 0]
+    known = made(contacts[rows], drawn_gains(contacts, seed=4)[rows]).covariances(bar_contacts(40, seed=9), None)
+    for each in known:
+        size = float(torch.diagonal(each.covariance).max())
+        assert each.noise > 0
+        assert torch.allclose(each.covariance, each.covariance.T, atol=1e-9 * size)
+        assert float(torch.linalg.eigvalsh(each.covariance).min()) > -1e-9 * size
 
 
-def test_physics_of_one_hypothesis_believes_what_its_deviation_says() -> None:
-    field = of_one_hypothesis(8)
+def test_of_one_hypothesis_the_covariances_are_those_of_the_deviation() -> None:
+    gains = of_one_hypothesis(8).gain_field
+    assert isinstance(gains, MixtureGains)
     places = bar_contacts(30, seed=5)
-    total = sum(torch.diagonal(each.covariance) for each in beliefs(field, places, None))
-    single = field.gain_field.deviation(places)
-    assert single is not None
-    assert isinstance(total, Tensor)
-    assert torch.allclose(total, (single.double().square().sum(2) / (4 * BANK.damping)).sum(1), rtol=1e-4)
+    variances = torch.stack([torch.diagonal(each.covariance) for each in gains.covariances(places, None)], dim=1)
+    torch.testing.assert_close(variances, gains.deviation(places).double().square().sum(2), rtol=1e-4, atol=1e-9)
 
 
-def test_gains_without_doubt_are_refused_with_those_that_have_it() -> None:
+def test_gains_of_unknown_uncertainty_are_refused() -> None:
     impacts = plate_impacts()
     modes = plate_extraction(impacts)
     network = Attention().start(gain_case(impacts, plate_features(), modes, QUICK), SHARED)
     field = replace(sound_field(network.finished(torch.arange(len(modes.bank)))), bank=modes.bank)
-    with pytest.raises(FitError, match=r"'attention' do not know how sure they are; spline and physics do"):
+    with pytest.raises(FitError, match=r"gains of the kind 'mixture', got 'attention'"):
         suggest(field)
 
 
@@ -187,16 +186,16 @@ def test_what_cannot_be_suggested_is_said(message: str) -> None:
         suggest(of_one_hypothesis(), **WRONG[message])  # type: ignore[arg-type]
 
 
-def test_the_place_of_a_wrong_label_may_be_struck_again() -> None:
+def test_a_place_that_was_struck_is_not_suggested_again() -> None:
     contacts = bar_contacts(6)
-    field = sound_field(physics_field(contacts, drawn_gains(contacts, seed=3)))
-    with pytest.raises(FitError, match="1 contacts are asked for and 0 of the 6 candidates have not been struck"):
-        suggest(field, 1, candidates=contacts)
-    doubted = replace(field, gain_field=field.gain_field.without(torch.arange(6) == 4))
-    assert suggest(doubted, 1, candidates=contacts).rows.tolist() == [4]
+    gains = elastic_field(contacts, drawn_gains(contacts, seed=3))
+    with pytest.raises(FitError, match="0 of the 6 candidates"):
+        suggest(sound_field(gains), 1, candidates=contacts)
+    without = sound_field(gains.without(torch.arange(6) == 4))
+    assert suggest(without, 1, candidates=contacts).rows.tolist() == [4]
 
 
-@pytest.mark.parametrize("made", [physics_field, spline_field])
+@both_models
 def test_of_very_many_candidates_some_that_are_far_apart_are_weighed(
     made: type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,13 +203,13 @@ def test_of_very_many_candidates_some_that_are_far_apart_are_weighed(
     field = sound_field(made(contacts, drawn_gains(contacts, seed=3)))
     candidates = bar_contacts(120, seed=4)
     whole = suggest(field, 3, candidates=candidates)
-    asked = []
+    asked, covariances = [], MixtureGains.covariances
 
-    def counted(field: SoundField, places: Tensor, ways: Tensor | None) -> object:
+    def counted(gains: MixtureGains, places: Tensor, ways: Tensor | None) -> object:
         asked.append(len(places))
-        return beliefs(field, places, ways)
+        return covariances(gains, places, ways)
 
-    monkeypatch.setattr("avmsf.field.suggest.beliefs", counted)
+    monkeypatch.setattr(MixtureGains, "covariances", counted)
     monkeypatch.setattr("avmsf.field.suggest.MOST", 30)
     fewer = suggest(field, 3, candidates=candidates, directions=DOWN.expand(120, 3))
     assert asked == [len(whole.points) + 30]
@@ -222,11 +221,11 @@ def test_of_very_many_candidates_some_that_are_far_apart_are_weighed(
     assert len(suggest(field, 40, candidates=candidates).rows) == 40
 
 
-def test_one_place_says_nothing_of_doubt() -> None:
+def test_one_place_says_nothing_of_how_gains_vary() -> None:
     contacts = bar_contacts(1).expand(3, 3)
     values = drawn_gains(bar_contacts(1), seed=6).expand(3, 4, 2)
-    with pytest.raises(FitError, match="strike a second place"):
-        suggest(sound_field(spline_field(contacts, values)))
+    with pytest.raises(FitError, match="2 places or more, got 1"):
+        suggest(sound_field(positional_field(contacts, values)))
 
 
 def test_errors_are_calibrated_as_the_map_of_doubt_is() -> None:

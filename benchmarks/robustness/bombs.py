@@ -155,7 +155,7 @@ def _field(name: str, value: float) -> Bomb:
     """Return a field whose header says another value."""
 
     def put(folder: Path) -> tuple[str, Path]:
-        path = folder / "spline.safetensors"
+        path = folder / "mixture.safetensors"
         content = path.read_bytes()
         metadata = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
         record, tensors = json.loads(metadata["avmsf"]) | {name: value}, from_bytes(content)

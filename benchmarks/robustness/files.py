@@ -146,7 +146,7 @@ FAMILIES = {
     "off": Family(("surface.off",), damage_text, _surface),
     "gltf": Family(("surface.gltf",), _damage_document, _surface),
     "splats": Family(("splats.ply",), damage_bytes, _splats),
-    "field": Family(("attention.safetensors", "spline.safetensors"), _damage_field, _field),
+    "field": Family(("attention.safetensors", "mixture.safetensors"), _damage_field, _field),
 }
 
 

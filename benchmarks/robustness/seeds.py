@@ -12,16 +12,25 @@ import numpy as np
 import soundfile
 import torch
 import trimesh
+from torch import Tensor
 
+from avmsf.capture import Surface
 from avmsf.field.attention import AttentionGains, AttentionShape
+from avmsf.field.gains.elastic import Elastic
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import save
-from avmsf.field.thinplategains import thin_plate_gains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.scene.features import FeatureField
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import write_splats
+from avmsf.simulate.elastic import elastic_modes
+from avmsf.simulate.nominal import NOMINAL
+from avmsf.simulate.shell import shell
 
 RATE = 8000
 CONTACTS = ((0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.1))
@@ -130,11 +139,24 @@ def _write_fields(folder: Path) -> None:
     network = AttentionGains(
         FeatureField.from_points(points), gain_scale=torch.ones(3), shape=shape, generator=generator
     )
-    spline = thin_plate_gains(
-        points[:12], torch.rand(12, 3, 2, dtype=torch.float64, generator=generator), importance=1 / bank.damping,
-        points=points,
-    )  # fmt: skip
-    for name, gains in (("attention", network.eval().requires_grad_(False)), ("spline", spline)):
+    mixture = mixture_gains(points[:12], bank, points.float())
+    for name, gains in (("attention", network.eval().requires_grad_(False)), ("mixture", mixture)):
         residual = Residual(torch.full((17,), 1e-3))
         phase = torch.zeros(3, dtype=torch.float64)
         save(SoundField(bank, gains, phase, residual, 8000.0, 800, Origin("ball")), folder / f"{name}.safetensors")
+
+
+def mixture_gains(contacts: Tensor, bank: ModalBank, points: Tensor) -> MixtureGains:
+    """Return a gain model of every family, for drawn gains and a sheet of 0.2 m as the body."""
+    size = float((points.amax(0) - points.amin(0)).norm())
+    sites = Sites(contacts, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(len(contacts), 3))
+    corners = 0.2 * torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    sheet = shell(Surface(corners, torch.tensor([[0, 1, 2], [0, 2, 3]])), thickness=0.004, detail=0.5)
+    families = [
+        *(each(sites, size) for each in (Unstructured, Smooth, ThinPlate)),
+        Elastic(sites, size, elastic_modes(sheet, NOMINAL, count=4)),
+    ]
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(len(contacts), len(bank), dtype=torch.complex128, generator=generator)
+    variance = torch.full((len(bank),), 1e-4, dtype=torch.float64)
+    return fit_mixture(families, MeasuredGains(values, variance, bank.frequency, bank.damping), points, directional=True)

@@ -22,9 +22,9 @@ import torch
 
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import save
-from avmsf.field.thinplategains import thin_plate_gains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
+from benchmarks.robustness.seeds import mixture_gains
 
 RATE = 8000
 INPUTS = 3000
@@ -248,8 +248,7 @@ def write_object(folder: Path) -> Path:
     frequency = torch.tensor([390.0, 850.0, 1300.0, 1360.0, 2300.0], dtype=torch.float64)
     bank = ModalBank(frequency, 0.02 * frequency)
     contacts = points[:12].double()
-    parts = torch.rand(12, len(bank), 2, generator=generator, dtype=torch.float64) - 0.5
-    gains = thin_plate_gains(contacts, parts, importance=1.0 / bank.damping, points=points)
+    gains = mixture_gains(contacts, bank, points)
     noise = Residual(torch.full((9,), 1e-6))
     made = SoundField(bank, gains, torch.zeros_like(frequency), noise, float(RATE), 2400, Origin("plate"))
     rows = ["file,x,y,z"]

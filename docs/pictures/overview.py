@@ -1,6 +1,6 @@
 """Draw overview.png: `python docs/pictures/overview.py mug.safetensors src/avmsf/example`.
 
-The field is that of `avmsf fit src/avmsf/example --gains physics --train-fraction 0.75 --output mug.safetensors`. The
+The field is that of `avmsf fit src/avmsf/example --train-fraction 0.75 --output mug.safetensors`. The
 object at the left is cut from studio/modes.png.
 """
 

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from avmsf.export.universal import write_universal
     from avmsf.export.wavgrid import write_grid
     from avmsf.export.webpage import write_webpage
-    from avmsf.field.automatic import Automatic
     from avmsf.field.config import PAPER, FitConfig
     from avmsf.field.fit import fit
-    from avmsf.field.physics import Physics
-    from avmsf.field.recipes import Attention, ThinPlate
+    from avmsf.field.gains.bodies import CandidateBodies
+    from avmsf.field.gains.estimator import MixtureEstimator
+    from avmsf.field.recipes import Attention
     from avmsf.field.soundfield import SoundField
     from avmsf.field.store import load, save
     from avmsf.field.suggest import suggest
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from avmsf.modal.extraction.finders import HighResolution, ShortTime
     from avmsf.modal.pulse import ForcePulse
     from avmsf.modal.residual import Residual
-    from avmsf.pipeline.physics import BodyConfig, physics_of
+    from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
     from avmsf.scene.descriptors import ImageDescriptors
     from avmsf.scene.dino import DinoEncoder
     from avmsf.scene.features import FeatureField
@@ -64,9 +64,9 @@ __all__ = [
     "MATERIALS",
     "PAPER",
     "Attention",
-    "Automatic",
     "BodyConfig",
     "Camera",
+    "CandidateBodies",
     "Capture",
     "CaptureSettings",
     "DecoderDistillation",
@@ -84,8 +84,8 @@ __all__ = [
     "Locator",
     "Material",
     "MaterialStatistics",
+    "MixtureEstimator",
     "ModalBank",
-    "Physics",
     "Player",
     "Reference",
     "Residual",
@@ -97,8 +97,8 @@ __all__ = [
     "SteerConfig",
     "Surface",
     "Symmetries",
-    "ThinPlate",
     "View",
+    "candidate_bodies",
     "check",
     "evaluate",
     "extract",
@@ -110,7 +110,6 @@ __all__ = [
     "load_features",
     "locate",
     "locate_blows",
-    "physics_of",
     "read_capture",
     "read_demo",
     "read_splats",
@@ -188,10 +187,10 @@ _HOMES = {
     "avmsf.bench.evaluation": ("evaluate", "split"),
     "avmsf.capture": ("Capture", "CaptureSettings", "Impacts", "Surface", "check", "read_capture", "write_capture"),
     "avmsf.field.config": ("PAPER", "FitConfig"),
-    "avmsf.field.automatic": ("Automatic",),
     "avmsf.field.fit": ("fit",),
-    "avmsf.field.physics": ("Physics",),
-    "avmsf.field.recipes": ("Attention", "ThinPlate"),
+    "avmsf.field.gains.bodies": ("CandidateBodies",),
+    "avmsf.field.gains.estimator": ("MixtureEstimator",),
+    "avmsf.field.recipes": ("Attention",),
     "avmsf.field.soundfield": ("SoundField",),
     "avmsf.field.store": ("load", "save"),
     "avmsf.field.suggest": ("suggest",),
@@ -199,7 +198,7 @@ _HOMES = {
     "avmsf.modal.extraction.extract": ("Extraction", "extract"),
     "avmsf.modal.extraction.finders": ("HighResolution", "ShortTime"),
     "avmsf.modal.residual": ("Residual",),
-    "avmsf.pipeline.physics": ("BodyConfig", "physics_of"),
+    "avmsf.pipeline.bodies": ("BodyConfig", "candidate_bodies"),
     "avmsf.tasks.locate": ("locate",),
     "avmsf.tasks.locator": ("Locator",),
     "avmsf.tasks.severalblows": ("locate_blows",),

@@ -16,7 +16,7 @@ from avmsf.compiled import compiled
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.store import load
 from avmsf.files import write_whole
-from avmsf.pipeline.physics import BodyConfig, physics_of
+from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from plate_capture import TINY, fill_plate
 
 Streams = pytest.CaptureFixture[str]
@@ -37,10 +37,10 @@ def test_bodies_are_used_where_they_cannot_be_kept_and_the_cause_is_told_once(tm
     surface = Surface(torch.from_numpy(ball.vertices).float(), torch.from_numpy(ball.faces).long())
     blocked = a_file(tmp_path / "bodies")
     with pytest.warns(AvmsfWarning, match=f"{blocked}.*File exists"):
-        [body] = physics_of(surface, BodyConfig(wall=0.0, shapes=6, freedoms=1200), cache=blocked).bodies.bodies
+        [body] = candidate_bodies(surface, BodyConfig(wall=0.0, shapes=6, freedoms=1200), cache=blocked).bodies.bodies
     assert len(body.elastic) == 6
     # A second warning would be an error here.
-    physics_of(surface, BodyConfig(wall=0.0, shapes=6, freedoms=1600), cache=blocked)
+    candidate_bodies(surface, BodyConfig(wall=0.0, shapes=6, freedoms=1600), cache=blocked)
 
 
 def test_what_is_wrong_with_the_work_itself_is_no_matter_of_the_disk(tmp_path: Path) -> None:
@@ -54,7 +54,7 @@ def test_what_is_wrong_with_the_work_itself_is_no_matter_of_the_disk(tmp_path: P
 def test_a_fit_does_without_the_files_that_it_goes_on_from(tmp_path: Path, capsys: Streams) -> None:
     folder, output = fill_plate(tmp_path / "plate"), tmp_path / "field.safetensors"
     (tmp_path / "field.safetensors.modes").mkdir()
-    assert main(["fit", str(folder), "--output", str(output), "--gains", "spline", *TINY]) == 0
+    assert main(["fit", str(folder), "--output", str(output), "--gain-model", "smooth", *TINY]) == 0
     assert "Is a directory" in capsys.readouterr().err
     assert len(load(output).bank)
 

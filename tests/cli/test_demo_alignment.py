@@ -15,7 +15,7 @@ from avmsf.cli import demo
 from avmsf.cli.overallbar import OverallBar
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.recipes import ThinPlate
+from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.store import save
 from avmsf.modal.extraction.extract import extract
 from avmsf.pipeline.reconstruct import Reconstruction
@@ -39,14 +39,16 @@ def test_the_demos_page_and_sounds_do_not_depend_on_delays(tmp_path: Path, monke
     train, test = split(delayed, count=demo.TRAIN)
     modes = extract(train)
     config = FitConfig(steps=0, residual=False)
-    field = fit(train, FeatureField.from_contacts(delayed.contacts), modes, config, gains=ThinPlate())
+    field = fit(
+        train, FeatureField.from_contacts(delayed.contacts), modes, config, gains=MixtureEstimator(("thin-plate",))
+    )
     shown: list[Impacts] = []
 
     def reconstruct(*arguments: object, cache: Path, **named: object) -> Reconstruction:
         cache.mkdir()
         (cache / CLOUD).touch()
         save(field, cache / "field.safetensors")
-        return Reconstruction(cache / "field.safetensors", (), {}, modes, "spline", {})
+        return Reconstruction(cache / "field.safetensors", (), {}, modes)
 
     monkeypatch.setattr(demo, "read_capture", lambda folder: replace(read_capture(folder), impacts=delayed))
     monkeypatch.setattr(demo, "reconstruct", reconstruct)

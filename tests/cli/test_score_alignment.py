@@ -6,7 +6,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.cli.scores import compare
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.recipes import ThinPlate
+from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.modal.extraction.extract import extract
 from avmsf.scene.features import FeatureField
 from delayed_plate import ALIGNED, delays, strikes, without_delays
@@ -18,7 +18,7 @@ def errors_of(impacts: Impacts) -> dict[str, list[float]]:
     """Return each method's relative STFT errors at the last contacts; all but the floor know the first alone."""
     train, test = impacts.take(range(TRAIN)), impacts.take(range(TRAIN, COUNT))
     modes, features = extract(train), FeatureField.from_contacts(impacts.contacts)
-    field = fit(train, features, modes, FitConfig(steps=0, residual=False), gains=ThinPlate())
+    field = fit(train, features, modes, FitConfig(steps=0, residual=False), gains=MixtureEstimator(("thin-plate",)))
     scores = compare(field, train, test, modes)
     return {method: each.values["relative_stft"].tolist() for method, each in scores.items()}
 

@@ -10,7 +10,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.cli.scores import compare
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.recipes import ThinPlate
+from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.modal.extraction.extract import extract
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate, sample_contacts, strike
@@ -43,7 +43,7 @@ def test_jitter_of_the_starts_does_not_count() -> None:
         train, test = split(shaken(exact, deviation), count=14)
         modes = extract(train)
         features = FeatureField.from_contacts(exact.contacts)
-        field = fit(train, features, modes, FitConfig(steps=0), gains=ThinPlate())
+        field = fit(train, features, modes, FitConfig(steps=0), gains=MixtureEstimator(("thin-plate",)))
         scores = compare(field, train, test, modes)
         errors[deviation] = {name: each.mean()["relative_stft"] for name, each in scores.items()}
     for name in ("field", "mean waveform of 3 nearest"):

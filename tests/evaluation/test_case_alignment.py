@@ -35,7 +35,7 @@ def run_of(impacts: Impacts, folder: Path) -> CaseRun:
         folder=folder,
         place="a/01",
         look=lambda look: looks("a", look),
-        physics=lambda: SimulationError("the plate has no shape here"),
+        bodies=lambda: SimulationError("the plate has no shape here"),
         stranger=lambda: torch.zeros(impacts.sounds.shape[1]),
         listened=False,
     )

@@ -13,7 +13,7 @@ from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.pulse import ForcePulse
 from avmsf.modal.residual import Residual
-from made_fields import BANK, FIELDS, physics, places, spline
+from made_fields import BANK, FIELDS, elastic, places, plate, positional
 
 RATE, SAMPLES = 8000.0, 3000
 
@@ -60,7 +60,7 @@ def test_the_formula_holds_in_plain_sums():
 
 
 def test_modes_above_half_the_rate_are_left_out():
-    sound_field = replace(sounding("spline"), sample_rate=2700.0)
+    sound_field = replace(sounding("positional"), sample_rate=2700.0)
     table = SampledField.of(sound_field)
     assert table.frequency.tolist() == BANK.frequency[:3].tolist()
     expected = sound_field.render(table.points[:3])
@@ -68,15 +68,15 @@ def test_modes_above_half_the_rate_are_left_out():
 
 
 @pytest.mark.parametrize("scaled", [False, True])
-def test_normals_of_physics_are_its_own(scaled):
-    table = SampledField.of(sounding("physics", scaled=scaled))
-    torch.testing.assert_close(table.normals, -physics().surface.inward)
+def test_normals_of_an_elastic_model_are_its_bodys(scaled):
+    table = SampledField.of(sounding("elastic", scaled=scaled))
+    torch.testing.assert_close(table.normals, plate().normals(elastic().points).float())
 
 
 def test_given_points_and_normals_are_kept():
     chosen = places(5, seed=9)
     normals = torch.tensor([[0.0, 0.0, 2.0]]).expand(5, 3)
-    table = SampledField.of(sounding("spline"), chosen, normals)
+    table = SampledField.of(sounding("positional"), chosen, normals)
     assert torch.equal(table.points, chosen)
     torch.testing.assert_close(table.normals, normals / 2)
     assert table.name == "plate"
@@ -85,8 +85,8 @@ def test_given_points_and_normals_are_kept():
 
 
 def test_fewer_points_are_spread_out_and_are_the_fields_own():
-    table = SampledField.of(sounding("spline"), limit=12)
-    own = spline().points
+    table = SampledField.of(sounding("positional"), limit=12)
+    own = positional().points
     assert len(table) == 12
     assert bool((table.points[:, None] == own).all(2).any(1).all())
     # Of 150 points, twelve at random lie closer: a plate of .24 x .17 m holds twelve about 6 cm apart.
@@ -129,14 +129,14 @@ def test_two_points_have_normals_away_from_their_middle():
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.tensor([[0.0, 0.0, torch.nan]])])
 def test_points_that_are_none_are_refused(points):
     with pytest.raises(ExportError, match="expected points of the object's surface"):
-        SampledField.of(sounding("spline"), points)
+        SampledField.of(sounding("positional"), points)
 
 
 def test_normals_of_other_points_are_refused():
     with pytest.raises(ExportError, match="a normal for each of 5 points, found 4"):
-        SampledField.of(sounding("spline"), places(5, seed=9), torch.ones(4, 3))
+        SampledField.of(sounding("positional"), places(5, seed=9), torch.ones(4, 3))
 
 
 def test_a_limit_of_none_is_refused():
     with pytest.raises(ExportError, match="limit of 0"):
-        SampledField.of(sounding("spline"), limit=0)
+        SampledField.of(sounding("positional"), limit=0)

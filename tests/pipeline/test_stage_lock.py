@@ -67,7 +67,7 @@ def test_reconstruct_is_refused_before_it_reads_what_another_one_writes(tmp_path
             tmp_path / "plate",
             capture,
             capture.impacts,
-            ReconstructConfig("spline"),
+            ReconstructConfig("smooth"),
             method=HighResolution(modes=4),
             cache=tmp_path / "cache",
             settings=CaptureSettings(),

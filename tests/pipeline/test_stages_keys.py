@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -15,14 +15,15 @@ from avmsf.capture.surface import Surface
 from avmsf.errors import CaptureError, SimulationError
 from avmsf.field import arguments
 from avmsf.field.arguments import fingerprint
-from avmsf.field.automatic import Choice
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import gain_case
-from avmsf.field.physics import Physics
-from avmsf.field.recipes import ThinPlate
+from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.store import load
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline import reconstruct as module
 from avmsf.pipeline import stages
+from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.pipeline.scene import Listener
 from avmsf.pipeline.stages import StageFolder
 from avmsf.simulate import nominal, recipe
@@ -66,7 +67,8 @@ def body_key() -> Path | None:
 
 def fit_key() -> str:
     impacts = plate_impacts(6, seconds=0.1)
-    return fingerprint(gain_case(impacts, plate_features(60), plate_extraction(impacts), FitConfig()), ThinPlate())
+    case = gain_case(impacts, plate_features(60), plate_extraction(impacts), FitConfig())
+    return fingerprint(case, MixtureEstimator())
 
 
 def edit_key() -> dict[str, str]:
@@ -93,57 +95,51 @@ def test_other_code_has_another_key(
     assert key() != before
 
 
-def test_the_choice_does_not_depend_on_free_memory_and_is_made_again_once_there_is_physics(
+def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are_bodies(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     capture = read_capture(fill_plate(tmp_path / "plate"))
     asked: list[str] = []
-    answers: list[Exception | None] = []
+    failures: list[Exception | None] = []
 
-    def physics_of(*arguments: Any, **named: Any) -> object:
-        asked.append("physics")
-        if answers[0] is not None:
-            raise answers[0]
-        return object.__new__(Physics)
+    def bodies(*arguments: Any, **named: Any) -> CandidateBodies:
+        asked.append("bodies")
+        if failures[0] is not None:
+            raise failures[0]
+        return candidate_bodies(*arguments, **named)
 
-    def all_recipes(physics: Any, *, tell: object) -> object:
-        missing = {}
-        try:
-            physics()
-        except SimulationError as error:
-            missing["physics"] = str(error)
-        report = {"choice": {"errors": {}, "missing": missing}}
-        return SimpleNamespace(unavailable=missing, choose=lambda case: Choice(ThinPlate(), report))
+    monkeypatch.setattr(module, "candidate_bodies", bodies)
 
-    monkeypatch.setattr(module, "physics_of", physics_of)
-    monkeypatch.setattr(module, "all_recipes", all_recipes)
-
-    def run() -> dict[str, bool]:
+    def run() -> bool:
+        """Return whether the field was made now."""
         made = module.reconstruct(
             tmp_path / "plate",
             capture,
             capture.impacts,
-            module.ReconstructConfig(fit=FitConfig(clusters=8, warmup_steps=2, steps=2, fft_sizes=(1024, 256))),
+            module.ReconstructConfig(
+                body=BodyConfig(wall=0.004, shapes=8, freedoms=1000),
+                fit=FitConfig(steps=2, fft_sizes=(1024, 256)),
+            ),
             method=HighResolution(modes=6),
             cache=tmp_path / "cache",
             settings=CaptureSettings(),
             listener=Listener(),
         )
-        assert set(made.choice) == {"errors", "missing"}
-        return {each.stage: each.fresh for each in made.stages}
+        return {each.stage: each.fresh for each in made.stages}["fit"]
 
     # The plate has a surface, of which features are made by pictures: not what is tested.
     monkeypatch.setattr(module, "SceneStages", NoScene)
-    answers[:] = [SimulationError("3.1 GB are free")]
-    assert run()["choice"]
-    answers[:] = [SimulationError("2.9 GB are free")]
-    assert not run()["choice"]
-    answers[:] = [None]
-    assert run()["choice"]
+    failures[:] = [SimulationError("3.1 GB are free")]
+    assert run()
+    failures[:] = [SimulationError("2.9 GB are free")]
+    assert not run()
+    failures[:] = [None]
+    assert run()
+    assert load(tmp_path / "cache" / "field.safetensors").origin.report["missing"] == {}
     asked.clear()
-    assert not run()["choice"]
+    assert not run()
     assert asked == []
-    recipe = json.loads((tmp_path / "cache" / "choice.json.stage.json").read_text())["recipe"]
+    recipe = json.loads((tmp_path / "cache" / "field.safetensors.stage.json").read_text())["recipe"]
     assert "GB" not in json.dumps(recipe)
 
 

@@ -18,12 +18,12 @@ from made_fields import BANK, FIELDS
 RATE = 8000
 
 
-def plate_field(kind: str = "spline") -> SoundField:
+def plate_field(kind: str = "positional") -> SoundField:
     phase = torch.zeros(len(BANK), dtype=torch.float64)
     return SoundField(BANK, FIELDS[kind](), phase, Residual(torch.full((9,), 1e-6)), float(RATE), 2400, Origin("plate"))
 
 
-def open_plate(home: Path, kind: str = "spline") -> Opened:
+def open_plate(home: Path, kind: str = "positional") -> Opened:
     home.mkdir(parents=True, exist_ok=True)
     path = home / "plate.safetensors"
     save(plate_field(kind), path)

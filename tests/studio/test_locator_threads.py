@@ -17,7 +17,7 @@ LENGTHS = (400, 480, 560, 640)
 
 
 def test_threads_share_what_is_cached(monkeypatch: pytest.MonkeyPatch) -> None:
-    locator = Locator.of(plate_field("physics"))
+    locator = Locator.of(plate_field("elastic"))
     made: Counter[Any] = Counter()
     together = threading.Barrier(THREADS)
     of, heed_of = _Length.of, module.heed_of

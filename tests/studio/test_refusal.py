@@ -26,7 +26,7 @@ PLACE = "capture/strikes?x=0.01&y=0.02&z=0"
 
 @pytest.fixture
 def plate(tmp_path: Path) -> Iterator[Served]:
-    with served(open_plate(tmp_path / "opened", "physics"), tmp_path / "files") as running:
+    with served(open_plate(tmp_path / "opened", "elastic"), tmp_path / "files") as running:
         yield running
 
 

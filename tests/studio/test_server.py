@@ -56,7 +56,7 @@ from served import Served, served
 
 @pytest.fixture
 def plate(tmp_path: Path) -> Iterator[Served]:
-    with served(open_plate(tmp_path / "opened", "physics"), tmp_path / "files") as running:
+    with served(open_plate(tmp_path / "opened", "elastic"), tmp_path / "files") as running:
         yield running
 
 
@@ -85,7 +85,7 @@ def test_the_page_gets_the_field_that_is_open(plate: Served) -> None:
     assert manifest["live"]["rows"] == [0, 1, 2, 3, 4]
     assert {"locate", "edit", "save"} <= set(manifest["live"]["abilities"])
     assert "capture" not in manifest["live"]["abilities"]
-    field = plate_field("physics")
+    field = plate_field("elastic")
     assert np.array_equal(tensor(plate, manifest, "frequency"), field.bank.frequency.numpy())
     points = torch.from_numpy(tensor(plate, manifest, "points").copy())
     time_axis = torch.arange(200) / RATE
@@ -101,7 +101,7 @@ def test_the_page_gets_the_field_that_is_open(plate: Served) -> None:
 def test_a_recorded_blow_is_located_as_the_task_does(plate: Served) -> None:
     manifest = plate.manifest()
     points = torch.from_numpy(tensor(plate, manifest, "points").copy())
-    field = plate_field("physics")
+    field = plate_field("elastic")
     for row in (5, 80):
         sound = torch.cat([torch.zeros(200), field.render(points[row : row + 1])[0]])
         answer = plate.ask("POST", "locate", wav(sound.numpy()))
@@ -132,7 +132,7 @@ def test_an_edit_is_heard_undone_and_saved(plate: Served) -> None:
     assert told["revision"] == 2
     assert "Poisson's ratio" in told["remarks"][0]
     after = plate.manifest()
-    expected = recast(plate_field("physics"), CERAMIC, WOOD, size=2.0)
+    expected = recast(plate_field("elastic"), CERAMIC, WOOD, size=2.0)
     assert np.allclose(tensor(plate, after, "frequency"), expected.bank.frequency, rtol=1e-12)
     # The page shows the object as it was; where a place sounds is on the object as it is now.
     points = torch.from_numpy(tensor(plate, before, "points").copy())
@@ -142,7 +142,7 @@ def test_an_edit_is_heard_undone_and_saved(plate: Served) -> None:
     assert after["live"]["undo"]
     assert after["live"]["sliders"]["size"] == 2.0
     # Who still reads the revision before gets its own numbers.
-    assert np.array_equal(tensor(plate, before, "frequency"), plate_field("physics").bank.frequency)
+    assert np.array_equal(tensor(plate, before, "frequency"), plate_field("elastic").bank.frequency)
 
     saved = plate.ask("POST", "save", {"base": 2, "name": "wooden"})
     assert saved.status == 201
@@ -152,7 +152,7 @@ def test_an_edit_is_heard_undone_and_saved(plate: Served) -> None:
     assert "stays" in again.words["error"]
     undone = plate.ask("POST", "undo", {"base": 3}).words
     assert undone["revision"] == 4
-    assert np.array_equal(tensor(plate, plate.manifest(), "frequency"), plate_field("physics").bank.frequency)
+    assert np.array_equal(tensor(plate, plate.manifest(), "frequency"), plate_field("elastic").bank.frequency)
 
 
 def test_a_blow_on_an_edited_object_is_located_in_the_pages_frame(plate: Served) -> None:
@@ -180,7 +180,7 @@ def test_only_the_last_revisions_are_kept_and_all_can_be_undone(plate: Served) -
     assert len(list(plate.studio.folder.glob("revision-*"))) <= 5
     for number in range(8, 15):
         assert plate.ask("POST", "undo", {"base": number}).status == 200
-    assert np.array_equal(tensor(plate, plate.manifest(), "frequency"), plate_field("physics").bank.frequency)
+    assert np.array_equal(tensor(plate, plate.manifest(), "frequency"), plate_field("elastic").bank.frequency)
 
 
 def test_an_edit_that_silences_everything_is_refused(plate: Served) -> None:
@@ -213,7 +213,7 @@ def test_a_descent_that_another_tab_has_overtaken_is_kept(
     wait = (
         "import os, time\nwhile not os.path.exists(sys.argv[2]): time.sleep(0.01)\nprint(json.dumps({'result': task}))"
     )
-    led = retune(plate_field("physics"), pitch=1.25)
+    led = retune(plate_field("elastic"), pitch=1.25)
     save(led, tmp_path / "led")
     worker = (sys.executable, "-c", script + wait, str(tmp_path / "led"), str(tmp_path / "go"))
     start = plate.studio.jobs.start
@@ -401,7 +401,7 @@ def test_a_worker_copies_its_field_before_another_process_may_replace_it(
 
     def stand_in(*arguments: object, **named: object) -> object:
         field.write_text("made")
-        return SimpleNamespace(field=field, gains="spline", stages=[])
+        return SimpleNamespace(field=field, stages=[])
 
     def copy(source: Path, path: Path) -> None:
         locked.append(FileLock(folder / CACHE / "stages.lock", is_singleton=True, fallback_to_soft=False).is_locked)

@@ -20,7 +20,7 @@ from avmsf.bench.results import CaseRecord, Outcome, one_line
 from avmsf.bench.task import Look, Method, Task
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, ExtractionError
-from avmsf.field.physics import Physics
+from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.truth import Truth
@@ -45,7 +45,7 @@ class CaseRun:
         folder: Path,
         place: str,
         look: Callable[[Look], FeatureField],
-        physics: Callable[[], Physics | AvmsfError],
+        bodies: Callable[[], CandidateBodies | AvmsfError],
         stranger: Callable[[], Float[Tensor, " samples"]],
         listened: bool,
     ) -> None:
@@ -54,7 +54,7 @@ class CaseRun:
         self.train, self.test = impacts.take(case.train), impacts.take(case.test)
         self.truth = None if truth is None else truth_at(truth, self.test.names)
         self.folder, self.place, self.look, self.stranger = folder, place, look, stranger
-        self.physics = physics
+        self.bodies = bodies
         self.listened = spread(len(case.test), LISTENED) if listened else []
         self.shared = 0.0
         self.found: Extraction | None = None
@@ -103,7 +103,7 @@ class CaseRun:
             seed=self.evaluation.seed,
             modes=self._modes,
             features=self._features,
-            physics=self._physics,
+            bodies=self._bodies,
             stranger=self._stranger,
         )
 
@@ -129,9 +129,9 @@ class CaseRun:
         with self._sharing():
             return self.look(look)
 
-    def _physics(self) -> Physics:
+    def _bodies(self) -> CandidateBodies:
         with self._sharing():
-            found = self.physics()
+            found = self.bodies()
         if isinstance(found, AvmsfError):
             raise found
         return found

@@ -22,8 +22,9 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.physics import Physics
-from avmsf.field.recipes import GainRecipe, ThinPlate
+from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.recipes import GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction, extract
@@ -85,7 +86,7 @@ class KnownObject:
     impacts: Impacts
     modes: Extraction
     """True or extracted, row for row of the impacts."""
-    recipe: GainRecipe = field(default_factory=ThinPlate)
+    recipe: GainRecipe = field(default_factory=MixtureEstimator)
     """How its field spreads the gains."""
     points: Float[Tensor, "points 3"] | None = None
     """Of its surface, metres; the contacts alone where nothing else is known."""
@@ -193,7 +194,8 @@ class SolvedShape:
         # Regression over shapes needs some doubt: as much as noise 60 dB below the sounds would give.
         level = torch.full((17,), 1e-3 * float(sounds.square().mean().sqrt()))
         modes = Extraction(bank, -amplitudes.imag.float(), Residual(level), amplitudes.real.float())
-        recipe = Physics(NominalBodies((NominalBody(None, elastic),), {}))
+        bodies = NominalBodies((NominalBody(None, elastic),), {})
+        recipe = MixtureEstimator(bodies=CandidateBodies(bodies))
         return KnownObject(name, material.name, impacts, modes, recipe, elastic.nodes[self._spread])
 
     @cached_property

@@ -6,11 +6,10 @@ import torch
 
 from avmsf.bench.task import Look, Task
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import AvmsfError
-from avmsf.field.automatic import Automatic
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.recipes import Attention, GainRecipe, ThinPlate
+from avmsf.field.gains.estimator import GainModel, estimator_for
+from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uninformed import uninformed
 from avmsf.modal.extraction.extract import Extraction
@@ -37,53 +36,20 @@ class FieldMethod:
 
 
 @dataclass(frozen=True)
-class SplineField:
-    """A field whose gains are thin-plate splines, trained end to end."""
+class MixtureField:
+    """A field whose gains are a Gaussian process over kernel families."""
 
     name: str
     """What tables call it."""
+    model: GainModel = "auto"
+    """All families, or one."""
     config: FitConfig = QUICK
     """Settings of the fit, but for the seed, which is the task's."""
 
     def fit(self, task: Task) -> SoundField:
-        """Fit the field. Raises AvmsfError where modes or field cannot be made."""
-        return fit_field(task, task.train, task.features("positions"), task.modes(), self.config, gains=ThinPlate())
-
-
-@dataclass(frozen=True)
-class PhysicsField:
-    """A field whose gains are made of the object's elastic mode shapes."""
-
-    name: str
-    """What tables call it."""
-    config: FitConfig = QUICK
-    """Settings of the fit, but for the seed, which is the task's."""
-
-    def fit(self, task: Task) -> SoundField:
-        """Fit the field. Raises AvmsfError where the object's shape, modes or field cannot be had."""
-        return fit_field(task, task.train, task.features("positions"), task.modes(), self.config, gains=task.physics())
-
-
-@dataclass(frozen=True)
-class AutomaticField:
-    """A field of elastic mode shapes or splines, whichever predicts training contacts better that are left out."""
-
-    name: str
-    """What tables call it."""
-    config: FitConfig = QUICK
-    """Settings of the fit, but for the seed, which is the task's."""
-
-    def fit(self, task: Task) -> SoundField:
-        """Fit the field. Raises AvmsfError where modes or field cannot be made."""
-        positions = task.features("positions")
-        missing: dict[str, str] = {}
-        candidates: list[GainRecipe] = []
-        try:
-            candidates.append(task.physics())
-        except AvmsfError as error:
-            missing["physics"] = str(error)
-        gains = Automatic((*candidates, ThinPlate()), missing)
-        return fit_field(task, task.train, positions, task.modes(), self.config, gains=gains)
+        """Fit the field. Raises AvmsfError where modes or field cannot be made, or the one family cannot be had."""
+        gains = estimator_for(self.model, task.bodies)
+        return fit_field(task, task.train, task.features("positions"), task.modes(), self.config, gains=gains)
 
 
 @dataclass(frozen=True)
@@ -125,7 +91,7 @@ def fit_field(
     modes: Extraction,
     config: FitConfig,
     *,
-    gains: GainRecipe | Automatic | None = None,
+    gains: GainRecipe | None = None,
 ) -> SoundField:
     """Fit a field to some of a task's blows, in whose modes they are rows, by the network unless told otherwise."""
     # An object of few points has no more regions than points.

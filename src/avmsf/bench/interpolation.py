@@ -4,39 +4,55 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
+from scipy.interpolate import RBFInterpolator
 from torch import Tensor
 
 from avmsf.bench.modalbaseline import ModalBaseline
-from avmsf.field.thinplate import Spline, fit_spline
+from avmsf.field.gains.model import places_of
+from avmsf.field.gains.positional import Axes
 
 
 @dataclass(frozen=True, eq=False)
 class SplineGains(ModalBaseline):
-    """The modes with gains in phase and in quadrature that are thin-plate splines over the training contacts.
+    """The modes with gains in phase and in quadrature that are thin-plate splines through the training contacts.
 
-    All gains are smoothed alike, each mode counting by the energy of its sound.
+    Contacts in one place count once, with their mean gains. With fewer places than twice what determines a linear
+    function the spline is linear in the distance, with a constant: the thin plate would run away beyond the contacts.
     """
 
     def amplitudes_at(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts two_modes"]:
         """Return the splines' gains in phase, then in quadrature."""
-        return self.spline.at(contacts).to(self.amplitudes)
-
-    @cached_property
-    def spline(self) -> Spline:
-        """The gains in phase, then in quadrature, as a function of place."""
-        # A gain g sounds with the energy g^2 / (4 d).
-        energy = 1 / (4 * self.bank.damping)
-        return fit_spline(self.train.contacts, self.amplitudes, importance=torch.cat([energy, energy]))
+        places, means = self._places
+        along, asked = self._axes.along(places), self._axes.along(contacts.double())
+        if len(places) == 1 or not along.shape[1]:
+            return means.mean(0, keepdim=True).expand(len(contacts), -1).to(self.amplitudes)
+        kernel, degree = ("thin_plate_spline", 1) if self._bends else ("linear", 0)
+        spline = RBFInterpolator(along.numpy(), means.numpy(), kernel=kernel, degree=degree)
+        return torch.from_numpy(np.asarray(spline(asked.numpy()))).to(self.amplitudes)
 
     @property
     def report(self) -> dict[str, Any]:
-        """What the spline is, as plain values: its kernel, directions, distinct contacts and smoothing."""
-        sites = self.spline.sites
-        return {
-            "kernel": "thin plate" if sites.bending else "distance",
-            "directions": sites.sites.shape[1],
-            "sites": sites.sites.shape[0],
-            "smoothing": sites.smoothing,
-        }
+        """What the spline is, as plain values: its kernel, directions and distinct places."""
+        directions = self._axes.along(self._places[0]).shape[1]
+        kernel = "thin plate" if self._bends else "distance"
+        return {"kernel": kernel, "directions": directions, "sites": len(self._places[0])}
+
+    @cached_property
+    def _places(self) -> tuple[Float64[Tensor, "places 3"], Float64[Tensor, "places two_modes"]]:
+        """Distinct places, and the mean gains there."""
+        owner = places_of(self.train.contacts.double())
+        members = (owner[None, :] == torch.arange(int(owner.max()) + 1)[:, None]).double()
+        mean = members / members.sum(1, keepdim=True)
+        return mean @ self.train.contacts.double(), mean @ self.amplitudes.double()
+
+    @cached_property
+    def _axes(self) -> Axes:
+        return Axes(self._places[0])
+
+    @property
+    def _bends(self) -> bool:
+        places = self._places[0]
+        return len(places) >= 2 * (self._axes.along(places).shape[1] + 1)

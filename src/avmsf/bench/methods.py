@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, RandomImpact, WhiteNoise
-from avmsf.bench.fieldmethods import QUICK, AutomaticField, FieldMethod, PhysicsField, SplineField, UninformedField
+from avmsf.bench.fieldmethods import QUICK, FieldMethod, MixtureField, UninformedField
 from avmsf.bench.gridfield import PAPER_GRID, QUICK_GRID, GridField
 from avmsf.bench.interpolation import SplineGains
 from avmsf.bench.recorded import Recorded
@@ -112,9 +112,10 @@ have noise beside them, as the field has: without it all is silent between modes
 
 FIELDS = (
     FieldMethod("field"),
-    SplineField("field-spline"),
-    PhysicsField("field-physics"),
-    AutomaticField("field-auto"),
+    MixtureField("field-auto"),
+    MixtureField("field-elastic", "elastic"),
+    MixtureField("field-smooth", "smooth"),
+    MixtureField("field-thin-plate", "thin-plate"),
     FieldMethod("field-positions", look="positions"),
     FieldMethod("field-unaligned", look="unaligned"),
     # All steps end to end take long enough without two trials of dampings beforehand. The noise is

@@ -10,7 +10,7 @@ from avmsf.bench.protocols import EvaluationProtocol
 from avmsf.bench.results import ResultsFolder
 from avmsf.bench.task import Look, Method
 from avmsf.capture.datasets.dataset import Dataset
-from avmsf.field.physics import Physics
+from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
 from avmsf.scene.features import FeatureField
 
@@ -28,8 +28,8 @@ class FeatureMaker(Protocol):
 class BodyMaker(Protocol):
     """Makes what fields know of an object's shape."""
 
-    def __call__(self, identifier: str) -> Physics:
-        """Return an object's recipe. Raises AvmsfError where its shape is unknown or unfit."""
+    def __call__(self, identifier: str) -> CandidateBodies:
+        """Return an object's bodies. Raises AvmsfError where its shape is unknown or unfit."""
         ...
 
 

@@ -21,7 +21,7 @@ _TABLE = (
     "knn-spectra",
     "spline-gains",
     "field",
-    "field-physics",
+    "field-elastic",
     "field-auto",
 )
 _ABLATED = ("field-positions", "field-no-initialisation", "field-unaligned", "field-no-residual")

@@ -20,7 +20,7 @@ from avmsf.bench.results import CaseRecord, ObjectRecord, ResultsFolder, one_lin
 from avmsf.bench.task import Look
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, EvaluationError
-from avmsf.field.physics import Physics
+from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.truth import Truth
 
@@ -78,7 +78,7 @@ def run_object(
             return draw_stranger(evaluation.dataset, identifier, impacts, seed=evaluation.seed)
 
         @cache
-        def physics() -> Physics | AvmsfError:
+        def bodies() -> CandidateBodies | AvmsfError:
             try:
                 return evaluation.bodies(identifier)
             except AvmsfError as error:
@@ -96,7 +96,7 @@ def run_object(
                     folder=results.path,
                     place=f"{identifier}/{number:02d}",
                     look=looks.of(case.views),
-                    physics=physics,
+                    bodies=bodies,
                     stranger=stranger,
                     listened=firsts[case.label] == case.key,
                 ),

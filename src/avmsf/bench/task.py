@@ -9,7 +9,7 @@ from torch import Tensor
 
 from avmsf.bench.renderer import Renderer
 from avmsf.capture.impacts import Impacts
-from avmsf.field.physics import Physics
+from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.scene.features import FeatureField
 
@@ -39,8 +39,8 @@ class Task:
     """Finds the modes of `train`, row for row."""
     features: Callable[[Look], FeatureField]
     """Makes what a field reads of the object's points. Raises SceneError where nothing shows the object's look."""
-    physics: Callable[[], Physics]
-    """Makes the recipe that knows the object's shape. Raises AvmsfError where the shape is unknown or unfit."""
+    bodies: Callable[[], CandidateBodies]
+    """Computes what may lie behind the object's surface. Raises AvmsfError where its shape is unknown or unfit."""
     stranger: Callable[[], Float[Tensor, " samples"]]
     """Draws, by `seed`, the recording of another object, at the sample rate and of the length of `train`. Raises
     EvaluationError where there is no other object."""

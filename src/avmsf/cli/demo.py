@@ -131,8 +131,7 @@ def _go_all_the_way(folder: Path, bar: OverallBar) -> tuple[dict[str, Scores], t
     facts = {
         "train": list(train.names),
         "test": list(test.names),
-        "gains": made.gains,
-        "choice": made.choice,
+        "report": field.origin.report,
         "stages": {each.stage: each.seconds for each in made.stages},
         "scores": score_values(scores),
     }

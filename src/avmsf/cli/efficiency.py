@@ -21,9 +21,9 @@ from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.errors import EvaluationError
 from avmsf.modal.extraction.finders import HighResolution
+from avmsf.pipeline.bodies import BodyConfig
 from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
-from avmsf.pipeline.physics import BodyConfig
 from avmsf.pipeline.scene import SceneConfig
 
 PICTURE, FIGURES = "efficiency.png", "efficiency.json"

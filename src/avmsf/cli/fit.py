@@ -1,9 +1,9 @@
 """`avmsf fit`: a capture folder in, a field file out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 import tyro
@@ -14,21 +14,20 @@ from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.modes import Method, finder
-from avmsf.cli.printing import console, figure, print_json, say
+from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scores import compare, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
-from avmsf.field.automatic import Automatic
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.physics import Physics
+from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.estimator import GainModel, estimator_for
 from avmsf.field.recipes import GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
 from avmsf.modal.extraction.extract import extract_once
-from avmsf.pipeline.choice import all_recipes, recipe_for
-from avmsf.pipeline.physics import BodyConfig, physics_of
+from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features
@@ -58,10 +57,10 @@ class Options:
     """Row of impacts.csv, counted from 0, that this choice of contacts starts from."""
     features: Path | None = None
     """File of features that `avmsf lift` wrote, in the frame of the contacts; without it positions on the surface."""
-    gains: Literal["auto", "physics", "spline", "attention"] = "auto"
-    """How gains are spread over the object: physics, by its elastic mode shapes, of a capture with a mesh; spline, by
-    thin-plate splines; attention, by the paper's network on the features; auto, by physics or splines, whichever
-    predicts training contacts better that are left out in turn."""
+    gain_model: GainModel = "auto"
+    """How gains vary over the object. auto: a Gaussian process over all kernel families, weighed by evidence; the
+    elastic one needs a mesh. network: the paper's attention network on the features. smooth, thin-plate, elastic: the
+    Gaussian process over one family, for study."""
     body: BodyConfig = field(default_factory=BodyConfig)
     method: Method = "high-resolution"
     """How modes are found; see `avmsf modes --help`."""
@@ -119,7 +118,7 @@ def run(options: Options) -> int:
     if len(train) < _FEW:
         say(f"{len(train)} recordings tell little of how loud modes are between contacts; {_FEW} or more tell much")
     # Before the modes: what is wrong with the object's shape shows in less time than they take.
-    recipe = _recipe(options, capture, train, features)
+    gains = _estimator(options, capture, train)
     say(f"finding the modes of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     modes = extract_once(train, finder(options.method, options.modes), _beside(options.output, "modes"))
     for sentence in describe_alignment(modes, train):
@@ -133,7 +132,7 @@ def run(options: Options) -> int:
                 features,
                 modes,
                 options.config,
-                gains=recipe,
+                gains=gains,
                 capture=capture.name,
                 settings=capture.settings,
                 checkpoint=checkpoint,
@@ -156,12 +155,11 @@ def run(options: Options) -> int:
         say(f"not trained on: {', '.join(test.names)}")
         screen.print(score_table(title, scores))
     report = fitted.origin.report
-    if "choice" in report:
-        for words in choice_words(report["gains"], report["choice"]):
-            screen.print(words, soft_wrap=True)
-    for words in suspect_words(fitted):
+    for words in describe_outliers(fitted):
         screen.print(words, soft_wrap=True)
     screen.print(summary(fitted, len(train)), soft_wrap=True)
+    if fitted.quality is not None:
+        screen.print(str(fitted.quality), soft_wrap=True)
     screen.print(f"wrote {options.output}", soft_wrap=True)
     if options.json:
         print_json(
@@ -181,18 +179,16 @@ def run(options: Options) -> int:
     return 0
 
 
-def _recipe(options: Options, capture: Capture, train: Impacts, features: FeatureField) -> GainRecipe | Automatic:
-    """Return how gains are spread."""
+def _estimator(options: Options, capture: Capture, train: Impacts) -> GainRecipe:
+    """Return what makes the gain model."""
 
-    def physics() -> Physics:
+    def bodies() -> CandidateBodies:
         if capture.surface is None:
-            raise FitError("physics needs the object's shape: lay its mesh into the capture folder as surface.obj")
+            raise FitError("the capture has no mesh: lay it into the folder as surface.obj")
         cache = _beside(options.output, "bodies")
-        return physics_of(capture.surface, options.body, impacts=train, cache=cache, tell=say)
+        return candidate_bodies(capture.surface, options.body, impacts=train, cache=cache, tell=say)
 
-    if options.gains == "auto":
-        return all_recipes(physics, tell=say)
-    return recipe_for(options.gains, {"attention": features}, physics)
+    return estimator_for(options.gain_model, bodies, log=say)
 
 
 def _beside(output: Path, ending: str) -> Path:
@@ -221,19 +217,9 @@ def part_contacts(
     return impacts, None
 
 
-def choice_words(name: str, choice: Mapping[str, Any]) -> list[str]:
-    """Say how gains are spread, and why."""
-    errors, missing = choice.get("errors", {}), choice.get("missing", {})
-    told = ", ".join(f"{each} {figure(error)}" for each, error in errors.items())
-    words = [f"gains by {name}" + (f"; errors at training contacts left out in turn: {told}" if told else "")]
-    return words + [f"not by {each}: {reason}" for each, reason in missing.items()]
-
-
-def suspect_words(fitted: SoundField) -> list[str]:
-    """Say which strikes disagree with all others, one a line."""
-    suspects = fitted.origin.report.get("suspects", {})
-    told = [f"left out of the gains, look at its row in impacts.csv: {words}" for words in suspects.values()]
-    return [*told, "a strike whose label was exchanged with one of these may be among the others"] if told else []
+def describe_outliers(fitted: SoundField) -> list[str]:
+    """Return a line for each recording whose contact disagrees with all others."""
+    return [f"check its row in impacts.csv: {found}" for found in fitted.origin.report.get("outliers", {}).values()]
 
 
 def summary(fitted: SoundField, contacts: int) -> str:

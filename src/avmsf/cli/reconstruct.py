@@ -10,7 +10,7 @@ import tyro
 from avmsf.capture import read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
-from avmsf.cli.fit import choice_words, part_contacts, recipe_of, summary, suspect_words
+from avmsf.cli.fit import describe_outliers, part_contacts, recipe_of, summary
 from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
@@ -20,11 +20,11 @@ from avmsf.cli.scores import compare, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import Progress
+from avmsf.field.gains.estimator import GainModel
 from avmsf.field.store import load
 from avmsf.files import copy_whole
-from avmsf.pipeline.choice import Spreading
+from avmsf.pipeline.bodies import BodyConfig
 from avmsf.pipeline.features import LiftConfig
-from avmsf.pipeline.physics import BodyConfig
 from avmsf.pipeline.reconstruct import ReconstructConfig, reconstruct
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig
@@ -54,10 +54,8 @@ class Options(SceneOptions):
     """Most modes to keep."""
     json: bool = False
     """Print one JSON object on the standard output, all else on the standard error."""
-    gains: Spreading = "auto"
-    """How gains are spread over the object: physics, by its elastic mode shapes; spline; visual or positions, by the
-    paper's network on what places look like or on where they are; auto, by physics or splines, whichever predicts
-    training contacts better that are left out in turn."""
+    gain_model: GainModel = "auto"
+    """How gains vary over the object; see `avmsf fit --help`."""
     body: BodyConfig = field(default_factory=BodyConfig)
     views: ViewsConfig = field(default_factory=ViewsConfig)
     splat: SplatConfig = field(default_factory=SplatConfig)
@@ -102,7 +100,7 @@ def run(options: Options) -> int:
                 capture,
                 train,
                 ReconstructConfig(
-                    options.gains,
+                    options.gain_model,
                     options.body,
                     SceneConfig(options.views, options.splat, options.lift),
                     options.fit,
@@ -125,16 +123,16 @@ def run(options: Options) -> int:
         screen.print(sentence, soft_wrap=True)
     if made.report:
         screen.print(features_words(made.report), soft_wrap=True)
-    for words in choice_words(made.gains, made.choice):
-        screen.print(words, soft_wrap=True)
     rows = [[each.stage, figure(each.seconds), "now" if each.fresh else "before"] for each in made.stages]
     screen.print(table("stages", ["stage", "seconds", "made"], rows))
     if test is not None:
         title = f"{len(test)} contacts not trained on, {len(train)} trained on; lower is better"
         screen.print(score_table(title, scores))
-    for words in suspect_words(fitted):
+    for words in describe_outliers(fitted):
         screen.print(words, soft_wrap=True)
     screen.print(summary(fitted, len(train)), soft_wrap=True)
+    if fitted.quality is not None:
+        screen.print(str(fitted.quality), soft_wrap=True)
     screen.print(f"the field is {made.field}", soft_wrap=True)
     if options.output is not None:
         screen.print(f"wrote {options.output}", soft_wrap=True)
@@ -143,8 +141,6 @@ def run(options: Options) -> int:
             {
                 "field": str(options.output or made.field),
                 "capture": capture.name,
-                "gains": made.gains,
-                "choice": made.choice,
                 "features_report": made.report,
                 "stages": [asdict(each) for each in made.stages],
                 "modes": len(fitted.bank),

@@ -18,9 +18,10 @@ from avmsf.cli.modes import mode_table
 from avmsf.cli.modetable import levels, mode_rows
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.scores import score_table, score_values
-from avmsf.field.belief import knows_doubt, struck_at
+from avmsf.field.attention import AttentionGains
 from avmsf.field.doubt import gain_doubt, spectrum_band
-from avmsf.field.soundfield import SoundField
+from avmsf.field.posterior import has_posterior, training_contacts
+from avmsf.field.soundfield import FieldQuality, SoundField
 from avmsf.field.store import load
 from avmsf.scene.points import farthest_points
 
@@ -145,10 +146,10 @@ def draw_field(
             names=chosen.names,
             title=f"{name}: recorded and rendered",
         )
-    if knows_doubt(field):
+    if has_posterior(field):
         doubt = gain_doubt(field, points)
         title = f"doubt of {name}"
-        pictures["doubt"] = draw_doubt(points, doubt, title=title, struck=struck_at(field))
+        pictures["doubt"] = draw_doubt(points, doubt, title=title, struck=training_contacts(field))
         pictures["spectrum"] = draw_band(spectrum_band(field, points[0]), title=f"{name}: one blow, and its doubt")
     for stem, picture in pictures.items():
         path = folder / f"{stem}.png"
@@ -170,9 +171,11 @@ def _unheard(impacts: Impacts, field: SoundField) -> tuple[Impacts, str]:
 
 
 def _gains_words(gains: dict[str, Any]) -> str:
-    what = {"attention": "the network's on features: {encoder}", "spline": "splines through {contacts} contacts"}
-    what["physics"] = "of {shapes} elastic mode shapes, by {contacts} contacts"
-    return what[gains.get("inner", gains["kind"])].format(**gains)
+    if gains.get("inner", gains["kind"]) == AttentionGains.kind:
+        return f"the network's on features: {gains['encoder']}"
+    return (
+        f"Gaussian process over {', '.join(dict.fromkeys(gains['families']))} kernels, by {gains['contacts']} contacts"
+    )
 
 
 def _words(values: dict[str, Any]) -> str:
@@ -188,7 +191,9 @@ def _words(values: dict[str, Any]) -> str:
         f"  gains      {_gains_words(values['gain_field'])}",
         f"  fitted to  {len(values['trained_on'])} recordings",
     ]
-    lines += [f"  left out   {words}" for words in report.get("suspects", {}).values()]
+    if isinstance(report.get("quality"), dict) and not report.get("edits"):
+        lines.append(f"  quality    {FieldQuality(**report['quality'])}")
+    lines += [f"  left out   {words}" for words in report.get("outliers", {}).values()]
     for edit in report.get("edits", []):
         lines.append(f"  edited     {_edit_words(edit)}")
     if report.get("validated"):

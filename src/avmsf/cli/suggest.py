@@ -15,8 +15,8 @@ from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.writing import expect_writable, write_text
 from avmsf.errors import FitError
-from avmsf.field.belief import expect_doubt
 from avmsf.field.doubt import gain_doubt
+from avmsf.field.posterior import unedited_mixture
 from avmsf.field.store import load
 from avmsf.field.suggest import Suggestions, suggest
 
@@ -60,7 +60,7 @@ def run(options: Options) -> int:
     for path in paths.values():
         expect_writable(path)
     field = load(options.field)
-    gains = expect_doubt(field)
+    gains = unedited_mixture(field)
     names: tuple[str, ...] | None = None
     given = False
     if options.candidates is None:

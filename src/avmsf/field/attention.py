@@ -110,7 +110,7 @@ class AttentionGains(nn.Module):
         """Return nothing: the network chose nothing beforehand."""
         return {}
 
-    def heeded(self, contacts: int) -> list[int]:
+    def used_rows(self, contacts: int) -> list[int]:
         """Return all contacts: the network doubts none."""
         return list(range(contacts))
 

@@ -9,8 +9,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.errors import FitError
-from avmsf.field.belief import deviation_of, energy_of, left_out, measured_gains, parts_of, scale_of
-from avmsf.field.doubtedgains import DoubtedGains
+from avmsf.field.posterior import energy_of, fitted_mixture, parts_of, scale_of, std_of
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.phase import turned_like
 from avmsf.modal.synthesis import synthesise_phased
@@ -62,7 +61,7 @@ def widening(field: SoundField, *, level: float = LEVEL) -> float:
     and for fewer than two contacts.
     """
     _expect_level(level)
-    scores = left_out(field).abs()
+    scores = fitted_mixture(field).standardized_errors().abs()
     if len(scores) < 2:
         raise FitError(f"{len(scores)} contacts cannot foretell one another: fit to two or more")
     return float(torch.nanquantile(scores.flatten(), level))
@@ -79,7 +78,7 @@ def gain_doubt(field: SoundField, points: Float[Tensor, "points 3"]) -> Float64[
     surface = field.gain_field.points
     step = max(1, len(surface) // _MAPPED)
     energy = energy_of(field, parts_of(field, surface[::step])).mean()
-    doubt = factor**2 * energy_of(field, deviation_of(field, points))
+    doubt = factor**2 * energy_of(field, std_of(field, points))
     return (doubt / energy.clamp_min(torch.finfo(torch.float64).tiny)).sqrt()
 
 
@@ -100,7 +99,7 @@ def spectrum_band(
     _expect_level(level)
     contacts, along = contact[None], None if direction is None else direction[None]
     factor = widening(field, level=level) / _normal(level)
-    mean, spread = parts_of(field, contacts, along)[0], factor * deviation_of(field, contacts, along)[0]
+    mean, spread = parts_of(field, contacts, along)[0], factor * std_of(field, contacts, along)[0]
     generator = torch.Generator().manual_seed(seed)
     drawn = mean + spread * torch.randn(_DRAWS, *mean.shape, generator=generator, dtype=torch.float64)
     spectra = torch.zeros(_DRAWS, field.samples // 2 + 1, dtype=torch.complex128)
@@ -136,30 +135,21 @@ def coverage(
     field's doubt, and is as wide as `widening` says. Raises FitError for gains that know no doubt and for gains of
     other modes.
     """
-    gains, scale = measured_gains(field), scale_of(field).square()[:, None]
+    gains, scale = fitted_mixture(field), scale_of(field).square()[:, None]
     if parts.shape != (len(contacts), len(field.bank), 2):
         raise FitError(
             f"gains are of shape {tuple(parts.shape)}: expected {len(contacts)} contacts, the field's "
             f"{len(field.bank)} modes and 2 parts"
         )
-    deviation = deviation_of(field, contacts, directions)
-    spread = (deviation.square() + scale * _scatter(gains)).sqrt()
+    deviation = std_of(field, contacts, directions)
+    spread = (deviation.square() + scale * gains.noise().square()).sqrt()
     foretold = parts_of(field, contacts, directions)
-    if gains.ways(contacts, directions) is None:
-        # Gains that know no directions count all blows as if from one side; which one it was they cannot tell.
-        agree = (parts * foretold / spread.square().clamp_min(torch.finfo(torch.float64).tiny)).sum(
-            (1, 2), keepdim=True
-        )
-        parts = torch.where(agree < 0, -parts, parts)
     parts = turned_like(parts, foretold)
     within = (parts - foretold).abs() <= widening(field, level=level) * spread
-    energy = (scale * gains.values.square().mean(0) / (4.0 * field.bank.damping.double())[:, None]).expand_as(parts)
+    energy = (
+        scale * torch.view_as_real(gains.values).square().mean(0) / (4.0 * field.bank.damping.double())[:, None]
+    ).expand_as(parts)
     return Coverage(float(within.double().mean()), float((within * energy).sum() / energy.sum()))
-
-
-def _scatter(gains: DoubtedGains) -> Float64[Tensor, "modes 2"]:
-    """Return the variance that a blow has of its own, where it is no blow that is doubted."""
-    return gains.noise.square()[gains.trusted].mean(0)
 
 
 def _spectra(field: SoundField, modes: Tensor) -> Tensor:

@@ -16,14 +16,14 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.arguments import expect_fitting, fingerprint
-from avmsf.field.automatic import Automatic
 from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField
+from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.losses import spectral_loss
+from avmsf.field.quality import with_quality
 from avmsf.field.recipes import GainCase, GainRecipe, along_phase
-from avmsf.field.gains.refinement import RefinedGains as MixtureRefinement
-from avmsf.field.refinement import RefinedGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.bank import ModalBank
@@ -63,7 +63,7 @@ def fit(
     modes: Extraction,
     config: FitConfig | None = None,
     *,
-    gains: GainRecipe | Automatic | None = None,
+    gains: GainRecipe | None = None,
     capture: str = "",
     settings: CaptureSettings | None = None,
     checkpoint: str | Path | None = None,
@@ -71,8 +71,8 @@ def fit(
 ) -> SoundField:
     """Fit a sound field to recordings (paper, section 3.5).
 
-    `modes` as extracted from `train`, or `uninformed` where there is no warm-up. `gains` is how the gain field is made,
-    or `Automatic`, which chooses among several ways. The default is thin-plate splines, for of the object's shape
+    `modes` as extracted from `train`, or `uninformed` where there is no warm-up. `gains` makes the gain model; the
+    default is the Gaussian process without elastic mode shapes (`MixtureEstimator`), for of the object's shape
     nothing is known here. `settings` are the capture's, which the field keeps: recordings that it is asked about later
     are read by them. What the config leaves open is chosen on a part of the training contacts held out for the purpose,
     then the field is fitted to all. With `checkpoint`, the state is kept there while the fit runs, on interruption and
@@ -84,26 +84,18 @@ def fit(
     expect_fitting(train, modes)
     case = gain_case(train, features, modes, config)
     train = case.train
-    recipe = Automatic() if gains is None else gains
-    told: dict[str, Any] = {}
-    if isinstance(recipe, Automatic):
-        choice = recipe.choose(case)
-        recipe, told = choice.recipe, choice.report
+    recipe = MixtureEstimator() if gains is None else gains
     job = _Job(case, recipe, None if checkpoint is None else Path(checkpoint), progress)
     chosen, report = job.choose()
     run = job.run("fit", list(range(len(train))), chosen)
     # Close modes may have passed one another on the way.
     order = torch.argsort(run.bank.frequency.detach())
-    report = {"gains": recipe.name, **told, **run.network.report, **report}
+    report = {"gains": recipe.name, **run.network.report, **report}
     bank = ModalBank(*(each.detach()[order] for each in (run.bank.frequency, run.bank.damping)))
     finished: GainField
     if isinstance(run.network, RefinedGains):
-        parts = fit_gains(train.sounds, bank, sample_rate=train.sample_rate)
-        finished = run.network.judged(order, along_phase(*parts, case.phase[order]))
-    elif isinstance(run.network, MixtureRefinement):
-        parts = fit_gains(train.sounds, bank, sample_rate=train.sample_rate)
-        along = along_phase(*parts, case.phase[order])
-        finished = run.network.judged(order, torch.view_as_complex(along.contiguous()))
+        parts = along_phase(*fit_gains(train.sounds, bank, sample_rate=train.sample_rate), case.phase[order])
+        finished = run.network.judged(order, torch.view_as_complex(parts.contiguous()))
     else:
         finished = run.network.finished(order)
     field = SoundField(
@@ -115,9 +107,10 @@ def fit(
         train.sounds.shape[1],
         Origin(capture, train.names, train.forces is not None, config, report, settings or CaptureSettings()),
     )
+    used = train.take(run.network.used_rows(len(train)))
     if config.residual and not config.noise_rate and config.steps:
-        return _with_measured_residual(field, train.take(run.network.heeded(len(train))))
-    return field
+        field = _with_measured_residual(field, used)
+    return with_quality(field, used)
 
 
 def _with_measured_residual(field: SoundField, train: Impacts) -> SoundField:
@@ -210,7 +203,7 @@ class _Job:
         """Train on the rows `learnt`; with `held`, note how well the best step does there."""
         run = self._start(learnt, plan)
         # What was struck elsewhere than its label says would pull the others' gains to its sound.
-        targets = self._targets([learnt[place] for place in run.network.heeded(len(learnt))])
+        targets = self._targets([learnt[place] for place in run.network.used_rows(len(learnt))])
         look = (
             None
             if held is None

@@ -1,7 +1,7 @@
 """All of a sound field that is no tensor, as the JSON in its file's header.
 
-{"format": 6, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
- "sizes": {"modes": 43, "bins": 1025},
+{"format": 7, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
+ "sizes": {"modes": 43, "bins": 1025, "recordings": [8, 132300]},
  "gain_field": {"kind": "attention", what the gain field says of itself},
  "config": {FitConfig}, "origin": {"capture": "bowl", "trained_on": [...], "per_newton": true, "report": {...},
                                    "settings": {CaptureSettings}}}
@@ -14,6 +14,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from avmsf._utils.text_files import parse_json
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
@@ -22,7 +24,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.records import count_of, like, record_of
 from avmsf.field.soundfield import Origin, SoundField
 
-FORMAT = 6
+FORMAT = 7
 """Number of this format; it grows with every change that older versions could not read."""
 
 
@@ -37,6 +39,8 @@ class Header:
     modes: int
     bins: int
     """Bands of the residual."""
+    recordings: tuple[int, int] | None
+    """Contacts and samples of the residual's recordings, where it has any."""
     kind: str
     """What sort of gain field it is."""
     gain_field: Mapping[str, Any]
@@ -58,6 +62,7 @@ class Header:
             samples=field.samples,
             modes=len(field.bank),
             bins=len(field.residual.magnitude),
+            recordings=_sizes(field.residual.recordings),
             kind=field.gain_field.kind,
             gain_field=field.gain_field.record(),
             origin=field.origin,
@@ -72,7 +77,7 @@ class Header:
             "version": version("avmsf"),
             "sample_rate": self.sample_rate,
             "samples": self.samples,
-            "sizes": {"modes": self.modes, "bins": self.bins},
+            "sizes": {"modes": self.modes, "bins": self.bins, "recordings": self.recordings},
             "gain_field": {"kind": self.kind, **self.gain_field},
             "config": asdict(self.origin.config),
             "origin": origin,
@@ -112,6 +117,7 @@ def _header(record: dict[str, Any]) -> Header:
         samples=count_of(record["samples"], "samples"),
         modes=count_of(sizes["modes"], "sizes.modes"),
         bins=count_of(sizes["bins"], "sizes.bins"),
+        recordings=None if sizes["recordings"] is None else _shape_of(sizes["recordings"]),
         kind=like(gains.pop("kind"), "", "gain_field.kind"),
         gain_field=gains,
         origin=Origin(
@@ -123,6 +129,15 @@ def _header(record: dict[str, Any]) -> Header:
             settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
         ),
     )
+
+
+def _sizes(recordings: Tensor | None) -> tuple[int, int] | None:
+    return None if recordings is None else (recordings.shape[0], recordings.shape[1])
+
+
+def _shape_of(sizes: Any) -> tuple[int, int]:
+    contacts, samples = (count_of(each, "sizes.recordings") for each in sizes)
+    return contacts, samples
 
 
 def broken(path: Path, error: Exception) -> FieldFileError:

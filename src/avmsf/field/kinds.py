@@ -2,8 +2,7 @@
 
 from avmsf.field.attention import AttentionGains
 from avmsf.field.gainfield import GainField
-from avmsf.field.modalbasis import ModalBasis
-from avmsf.field.thinplategains import ThinPlateGains
+from avmsf.field.gains.model import MixtureGains
 
-FITTED: dict[str, type[GainField]] = {each.kind: each for each in (AttentionGains, ThinPlateGains, ModalBasis)}
+FITTED: dict[str, type[GainField]] = {each.kind: each for each in (AttentionGains, MixtureGains)}
 """Those that hold no other field; `avmsf.field.scaledgains` holds one of them."""

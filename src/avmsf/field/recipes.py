@@ -11,8 +11,6 @@ from avmsf.capture.impacts import Impacts
 from avmsf.field.attention import AttentionGains
 from avmsf.field.config import FitConfig
 from avmsf.field.orientation import orientation_signs
-from avmsf.field.refinement import RefinedGains
-from avmsf.field.thinplategains import thin_plate_gains
 from avmsf.field.training import TrainableGains, gain_scale
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.scene.features import FeatureField
@@ -135,40 +133,3 @@ class Attention:
 
     def _features(self, case: GainCase) -> FeatureField:
         return case.features if self.features is None else self.features
-
-
-@dataclass(frozen=True)
-class ThinPlate:
-    """Thin-plate splines through the gains: positions alone, no training."""
-
-    @property
-    def name(self) -> str:
-        """`spline`."""
-        return "spline"
-
-    @property
-    def warms_up(self) -> bool:
-        """Splines are solved for."""
-        return False
-
-    def digest(self) -> str:
-        """Return the name: there is nothing to set."""
-        return self.name
-
-    def dampings(self, config: FitConfig) -> tuple[str, ...]:
-        """Return shared dampings alone: splines know of no others."""
-        return (SHARED,)
-
-    def start(self, case: GainCase, damping: str) -> RefinedGains:
-        """Return the splines through the gains, which are refined from there."""
-        field = thin_plate_gains(
-            case.train.contacts,
-            case.parts * case.signs.double()[:, None, None],
-            importance=1 / (4 * case.modes.bank.damping),
-            points=case.features.points,
-        )
-        return RefinedGains(field, case.modes.bank, signs=case.signs)
-
-    def rows(self, case: GainCase) -> Int[Tensor, " contacts"]:
-        """Return the contacts themselves."""
-        return torch.arange(len(case.train))

@@ -10,6 +10,8 @@ from torch import Tensor
 from avmsf.capture.settings import CaptureSettings
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField, Gains
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.scaledgains import ScaledGains, fitted_gains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.pulse import ForcePulse
 from avmsf.modal.residual import Residual, shape_noise
@@ -37,6 +39,30 @@ class Origin:
     """By which its recordings were read."""
 
 
+@dataclass(frozen=True)
+class FieldQuality:
+    """Relative STFT errors at training contacts, each predicted from those at all other places."""
+
+    places: int
+    """Places that were left out in turn, each with all of its recordings."""
+    error: float
+    """Of the field; modes, and the prior of its gain model's hypotheses, are those of all contacts."""
+    averaging: float
+    """Of the mean of the three nearest recordings at other places."""
+
+    def __str__(self) -> str:
+        """Say how good the field is; leaving out overstates the error, for spread contacts are far from each other."""
+        if self.error < self.averaging:
+            return (
+                f"At contacts left out the field errs by at most about {self.error:.2f}, averaging the three nearest "
+                f"recordings by {self.averaging:.2f} (relative STFT error, {self.places} places)."
+            )
+        return (
+            f"No better than averaging the three nearest recordings: {self.error:.2f} and {self.averaging:.2f} at "
+            f"contacts left out (relative STFT error, {self.places} places). Give a mesh, or record more places."
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class SoundField:
     """Renders the sound of a blow anywhere on one object (paper, eq. 4)."""
@@ -54,6 +80,15 @@ class SoundField:
     samples: int
     """Length of rendered sounds."""
     origin: Origin
+
+    @property
+    def quality(self) -> FieldQuality | None:
+        """How well its contacts are predicted from one another.
+
+        None for few places, for the attention network, and for an edited field, which nobody recorded.
+        """
+        found = None if self.origin.report.get("edits") else self.origin.report.get("quality")
+        return FieldQuality(**found) if isinstance(found, dict) else None
 
     @property
     def audible(self) -> Bool[Tensor, " modes"]:
@@ -113,13 +148,30 @@ class SoundField:
         recorded background noise does not depend on the force of an impact. The pulse leaves the noise as it is.
         """
         length = self.samples if samples is None else samples
-        noise = self.noise(samples)
+        noise = None if self.residual.recordings is not None else self.noise(samples)
         parts = []
         for rows in torch.split(torch.arange(len(contacts)), _BATCH):
             known = self.known(contacts[rows], directions=None if directions is None else directions[rows])
             modes = self._modes(known, length)
-            parts.append(modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate))
-        return force * (torch.cat(parts) + noise)
+            sounds = modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate)
+            way = None if directions is None else directions[rows]
+            parts.append(sounds + (self._recorded(contacts[rows], way, length) if noise is None else noise))
+        return force * torch.cat(parts)
+
+    def _recorded(
+        self,
+        contacts: Float[Tensor, "contacts 3"],
+        directions: Float[Tensor, "contacts 3"] | None,
+        samples: int,
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return the mean of what the nearest recordings have beside their modes; silence after their end."""
+        gains, recordings = fitted_gains(self.gain_field), self.residual.recordings
+        assert isinstance(gains, MixtureGains)
+        assert recordings is not None
+        length = self.gain_field.length if isinstance(self.gain_field, ScaledGains) else 1.0
+        rows, signs = gains.nearest(gains.sites(contacts.double() / length, directions))
+        found = (recordings[rows] * signs[..., None]).mean(1).float()[:, :samples]
+        return torch.nn.functional.pad(found, (0, samples - found.shape[1]))
 
     def noise(self, samples: int | None = None) -> Float[Tensor, " samples"]:
         """Return the noise that every blow of force 1 brings along; `samples` as in `render`."""

@@ -62,7 +62,7 @@ def load(path: str | Path) -> SoundField:
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
         _KINDS[header.kind].restore(header.gain_field, _of_gain_field(tensors)),
         tensors["phase"],
-        Residual(tensors["residual.magnitude"]),
+        Residual(tensors["residual.magnitude"], tensors.get("residual.recordings")),
         header.sample_rate,
         header.samples,
         header.origin,
@@ -76,6 +76,8 @@ def _tensors(field: SoundField) -> dict[str, Tensor]:
         "phase": field.phase,
         "residual.magnitude": field.residual.magnitude,
     }
+    if field.residual.recordings is not None:
+        named["residual.recordings"] = field.residual.recordings
     named |= {_GAIN_FIELD + name: tensor for name, tensor in field.gain_field.tensors().items()}
     # Safetensors refuses tensors that share memory, as a field's points may with its features.
     return {name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in named.items()}
@@ -156,6 +158,10 @@ def _skeleton(header: Header, path: Path) -> dict[str, Tensor]:
     bank = torch.empty(header.modes, dtype=torch.float64, device="meta")
     named = {"bank.frequency": bank, "bank.damping": bank, "phase": bank}
     named["residual.magnitude"] = torch.empty(header.bins, device="meta")
+    if header.recordings is not None:
+        if header.gain_field.get("contacts") != header.recordings[0]:
+            raise broken(path, ValueError(f"sizes.recordings is {header.recordings}, of other contacts than the gains"))
+        named["residual.recordings"] = torch.empty(header.recordings, device="meta")
     return named | {_GAIN_FIELD + name: tensor for name, tensor in gains.items()}
 
 

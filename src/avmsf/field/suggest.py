@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import FitError
-from avmsf.field.belief import beliefs, energy_of, expect_doubt, parts_of
 from avmsf.field.doubt import LEVEL, widening
-from avmsf.field.doubtedgains import Belief, DoubtedGains
+from avmsf.field.gains.model import PlaceCovariance
+from avmsf.field.posterior import energy_of, parts_of, unedited_mixture
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.points import farthest_points
 
@@ -73,14 +73,14 @@ def suggest(
     Raises FitError for gains that know no doubt, a count below 1, candidates that are not finite or not on the object,
     directions that are not one a candidate, and fewer candidates than contacts asked for.
     """
-    gains = expect_doubt(field)
+    gains = unedited_mixture(field)
     spread = farthest_points(gains.points, min(PLACES, len(gains.points)))
     points = gains.points[spread].double()
     chosen_from = points if candidates is None else candidates.double()
     _expect_directions(directions, candidates)
     _expect(gains.points, count, chosen_from)
     size = float((points.amax(0) - points.amin(0)).norm())
-    allowed = _apart(chosen_from, gains.contacts[gains.trusted], size=size)
+    allowed = _apart(chosen_from, gains.contacts, size=size)
     if int(allowed.sum()) < count:
         raise FitError(
             f"{count} contacts are asked for and {int(allowed.sum())} of the {len(chosen_from)} candidates have not "
@@ -88,10 +88,12 @@ def suggest(
         )
     kept = _weighed(chosen_from, allowed, max(MOST, count))
     chosen_from, allowed = chosen_from[kept], allowed[kept]
-    along = gains.ways(chosen_from, None if directions is None else directions[kept])
+    along = gains.sites(chosen_from, None if directions is None else directions[kept]).directions
     places = points if candidates is None else torch.cat([points, chosen_from])
-    ways = _ways(gains, points, along, candidates is None)
-    ledger = _Ledger(beliefs(field, places, ways), len(points), len(chosen_from))
+    ways = along if candidates is None else torch.cat([gains.sites(points).directions, along])
+    ledger = _Ledger(
+        gains.covariances(places, ways), 1.0 / (4.0 * field.bank.damping.double()), len(points), len(chosen_from)
+    )
     # Contacts that foretell one another perfectly leave nothing open.
     calibration = max((widening(field) / NormalDist().inv_cdf(0.5 + LEVEL / 2.0)) ** 2, torch.finfo(torch.float64).tiny)
     energy = float(energy_of(field, parts_of(field, points.float())).mean()) / calibration + float(ledger.open.mean())
@@ -108,7 +110,7 @@ def suggest(
         raise FitError(f"{count} contacts are asked for and the candidates are only {len(rows)} different places")
     return Suggestions(
         chosen_from[rows],
-        None if along is None else along[rows],
+        along[rows] if gains.directional else None,
         kept[rows],
         math.sqrt(float(before.mean()) / energy),
         tuple(after),
@@ -121,17 +123,23 @@ def suggest(
 class _Ledger:
     """What is not known yet, mode by mode, while strikes are added that have not been made."""
 
-    def __init__(self, believed: Iterator[Belief], points: int, candidates: int) -> None:
+    def __init__(
+        self,
+        covariances: Iterator[PlaceCovariance],
+        weights: Float64[Tensor, " modes"],
+        points: int,
+        candidates: int,
+    ) -> None:
         self.scatter: list[float] = []
         self.shared: list[Float64[Tensor, "places candidates"]] = []
         """Covariances between all places and the candidates, which are the last of the places."""
         self.points, self.candidates = points, candidates
         self.open = torch.zeros(points, dtype=torch.float64)
         """Variance at the points, all modes together."""
-        for belief in believed:
-            self.open = self.open + torch.diagonal(belief.covariance)[:points].clamp_min(0.0)
-            self.shared.append(belief.covariance[:, -candidates:].clone())
-            self.scatter.append(belief.scatter)
+        for weight, known in zip(weights.tolist(), covariances, strict=True):
+            self.open = self.open + weight * torch.diagonal(known.covariance)[:points].clamp_min(0.0)
+            self.shared.append(weight * known.covariance[:, -candidates:])
+            self.scatter.append(weight * known.noise)
 
     def worth(self) -> Float64[Tensor, " candidates"]:
         """Return by how much each candidate would lower the variance, summed over the points."""
@@ -151,14 +159,6 @@ class _Ledger:
     def _measured(self, shared: Tensor, scatter: float) -> Float64[Tensor, " candidates"]:
         own = torch.diagonal(shared[-self.candidates :]).clamp_min(0.0)
         return (own + scatter).clamp_min(torch.finfo(torch.float64).tiny)
-
-
-def _ways(
-    gains: DoubtedGains, points: Tensor, along: Float64[Tensor, "candidates 3"] | None, alike: bool
-) -> Float64[Tensor, "places 3"] | None:
-    """Return the directions of the blows at the points and at candidates beside them."""
-    straight = None if alike else gains.ways(points, None)
-    return along if straight is None or along is None else torch.cat([straight, along])
 
 
 def _weighed(

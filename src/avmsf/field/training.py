@@ -58,7 +58,7 @@ class TrainableGains(Protocol):
         """What it chose before the training, as plain values."""
         ...
 
-    def heeded(self, contacts: int) -> list[int]:
+    def used_rows(self, contacts: int) -> list[int]:
         """Return which of the contacts it was started from, as many as `contacts`, are to be trained on."""
         ...
 

@@ -8,8 +8,8 @@ from avmsf._utils.locks import NO_LIMIT
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.capture.surface import Surface
 from avmsf.errors import SceneError
-from avmsf.field.physics import Physics
-from avmsf.pipeline.physics import BodyConfig, physics_of, roughened
+from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.pipeline.bodies import BodyConfig, candidate_bodies, roughened
 from avmsf.pipeline.scene import SceneConfig, SceneStages
 from avmsf.pipeline.sources import ViewsConfig
 from avmsf.pipeline.stages import StageFolder
@@ -24,7 +24,7 @@ NOISE = 0.02
 
 @dataclass(frozen=True)
 class ObjectBodies:
-    """Makes the physics of a dataset's objects, each in a folder of its own beneath `cache`."""
+    """Computes the bodies of a dataset's objects, each in a folder of its own beneath `cache`."""
 
     dataset: Dataset
     cache: Path
@@ -35,9 +35,9 @@ class ObjectBodies:
     seed: int = 0
     """Start of the chance in the noise."""
 
-    def __call__(self, identifier: str) -> Physics:
-        """Return an object's recipe. Raises SceneError where its shape is unknown, SimulationError for an unfit one."""
-        return physics_of(self._surface(identifier), self.config, cache=self.cache / identifier / "bodies")
+    def __call__(self, identifier: str) -> CandidateBodies:
+        """Return an object's bodies. Raises SceneError where its shape is unknown, SimulationError for an unfit one."""
+        return candidate_bodies(self._surface(identifier), self.config, cache=self.cache / identifier / "bodies")
 
     def _surface(self, identifier: str) -> Surface:
         if self.geometry == "gaussians":

@@ -1,10 +1,9 @@
 """All the way: what a capture folder holds of an object's look and sound becomes a field, stage by stage."""
 
 import hashlib
-import json
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import cache as cache_result
 from pathlib import Path
 from typing import Any
@@ -16,16 +15,16 @@ from avmsf.capture import Capture, Impacts, Surface
 from avmsf.capture.placement import judge_placement
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import AvmsfError, CaptureError, FitError, SceneError
+from avmsf.errors import AvmsfError, CaptureError, SceneError
 from avmsf.field.config import FitConfig
-from avmsf.field.fit import Progress, fit, gain_case
-from avmsf.field.physics import Physics
-from avmsf.field.store import save
-from avmsf.files import write_whole
+from avmsf.field.fit import Progress, fit
+from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import Elastic
+from avmsf.field.gains.estimator import NETWORK, GainModel, estimator_for
+from avmsf.field.store import load, save
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import ModeFinder
-from avmsf.pipeline.choice import Spreading, all_recipes, recipe_for
-from avmsf.pipeline.physics import BodyConfig, physics_of
+from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
@@ -35,7 +34,7 @@ from avmsf.scene.ply import read_splats
 
 CACHE = ".avmsf"
 """Folder inside the capture's that keeps what each stage made."""
-MODES, CHOICE, FIELD = "modes.safetensors", "choice.json", "field.safetensors"
+MODES, FIELD = "modes.safetensors", "field.safetensors"
 """What the last stages call their outputs."""
 BODIES = "bodies"
 """Folder of elastic modes in the cache, kept by content."""
@@ -63,19 +62,14 @@ class Reconstruction:
     """What the features' file says of itself; empty where the folder shows nothing of the object."""
     modes: Extraction
     """The modes that the field started from."""
-    gains: str
-    """How the field's gains are spread: physics, spline, or the network on visual features or positions."""
-    choice: Mapping[str, Any]
-    """What that was decided on: `errors`, relative STFT errors at training contacts left out in turn, and `missing`,
-    why others took no part; empty where it was set."""
 
 
 @dataclass(frozen=True)
 class ReconstructConfig:
     """Settings of all stages."""
 
-    gains: Spreading = "auto"
-    """How gains are spread over the object."""
+    gain_model: GainModel = "auto"
+    """How gains vary over the object."""
     body: BodyConfig = field(default_factory=BodyConfig)
     """How the object's shape becomes bodies that vibrate."""
     scene: SceneConfig = field(default_factory=SceneConfig)
@@ -133,63 +127,44 @@ def _reconstruct(
     modes = extract_once(train, method, found.path)
     basis = {**heard, "features": shape.digest, "fit": asdict(config.fit)}
 
-    points = next(iter(shape.candidates.values()))
-
     @cache_result
-    def physics() -> Physics:
+    def bodies() -> CandidateBodies:
         listener.tell("bodies: what the object may be behind its surface")
-        return physics_of(shape.surface(), config.body, impacts=train, cache=stages.folder / BODIES, tell=listener.tell)
-
-    def choose(path: Path) -> None:
-        listener.tell("choice: how gains are spread, by training contacts left out in turn")
-        recipes = all_recipes(physics, tell=listener.tell)
-        choice = recipes.choose(gain_case(train, points, modes, config.fit))
-        has_physics = "physics" not in recipes.unavailable
-        words = json.dumps({"name": choice.recipe.name, "has_physics": has_physics, **choice.report["choice"]})
-        write_whole(path, lambda place: place.write_text(words, encoding="utf-8"), raising=FitError)
-
-    chosen, choice = None, {"name": config.gains}
-    if config.gains == "auto":
-        asked = {"body": asdict(config.body), "surface": shape.surface_digest}
-
-        def is_final(path: Path) -> bool:
-            """Whether a choice was made with physics, or there is still none, as for want of memory."""
-            if json.loads(path.read_text(encoding="utf-8"))["has_physics"]:
-                return True
-            try:
-                physics()
-            except AvmsfError:
-                return True
-            return False
-
-        chosen = stages.keep(CHOICE, {**basis, **asked}, choose, usable=is_final)
-        choice = json.loads(chosen.path.read_text(encoding="utf-8"))
-        del choice["has_physics"]
-    name = choice.pop("name")
+        cache = stages.folder / BODIES
+        return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, tell=listener.tell)
 
     def make(path: Path) -> None:
-        listener.tell(f"fit: a field of {len(modes.bank)} modes, gains by {name}")
+        listener.tell(f"fit: a field of {len(modes.bank)} modes")
+        gains = estimator_for(config.gain_model, bodies, features=shape.features, log=listener.tell)
         fitted = fit(
             train,
-            points,
+            shape.points,
             modes,
             config.fit,
-            gains=recipe_for(name, shape.candidates, physics),
+            gains=gains,
             capture=capture.name,
             settings=capture.settings,
             checkpoint=stages.checkpoint(FIELD),
             progress=fitting,
         )
-        report = {**fitted.origin.report, "choice": choice}
-        save(replace(fitted, origin=replace(fitted.origin, report=report)), path)
+        save(fitted, path)
 
-    recipe = {**basis, "modes": found.digest, "chosen": name, "name": capture.name, "body": asdict(config.body)}
-    recipe["settings"] = asdict(capture.settings)
-    recipe["surface"] = shape.surface_digest
-    kept = stages.keep(FIELD, recipe, make)
-    made = {**shape.made, "modes": found} | ({} if chosen is None else {"choice": chosen}) | {"fit": kept}
+    def is_final(path: Path) -> bool:
+        """Whether a kept field has the elastic family, or there is still none, as for want of memory."""
+        if config.gain_model == NETWORK or Elastic.kind not in load(path).origin.report.get("missing", {}):
+            return True
+        try:
+            bodies()
+        except AvmsfError:
+            return True
+        return False
+
+    recipe = {**basis, "modes": found.digest, "gain_model": config.gain_model, "name": capture.name}
+    recipe |= {"body": asdict(config.body), "settings": asdict(capture.settings), "surface": shape.surface_digest}
+    kept = stages.keep(FIELD, recipe, make, usable=is_final)
+    made = {**shape.made, "modes": found, "fit": kept}
     times = tuple(StageTime(name, each.seconds, each.fresh) for name, each in made.items())
-    return Reconstruction(kept.path, times, shape.report, modes, name, choice)
+    return Reconstruction(kept.path, times, shape.report, modes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +179,16 @@ class _Shape:
     """Makes the object's surface: its mesh, or what encloses its Gaussians. Raises SceneError without either."""
     surface_digest: str
     """Of what the surface is made of."""
+
+    @property
+    def points(self) -> FeatureField:
+        """The object's points with their positions as features."""
+        return self.candidates["positions"]
+
+    @property
+    def features(self) -> FeatureField:
+        """What the network reads: what places look like, or their positions where nothing shows that."""
+        return self.candidates.get("visual", self.points)
 
     @property
     def digest(self) -> str:

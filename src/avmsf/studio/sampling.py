@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.export.sampledfield import SampledField
-from avmsf.field.belief import scale_of
+from avmsf.field.posterior import scale_of
 from avmsf.field.scaledgains import ScaledGains, fitted_gains
 from avmsf.field.soundfield import SoundField
 

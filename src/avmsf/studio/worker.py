@@ -111,7 +111,6 @@ def make_field(task: Values, voice: Voice) -> Values:
     return {
         "field": str(made.field),
         "output": task["output"],
-        "gains": made.gains,
         "stages": [each.stage for each in made.stages if each.fresh],
     }
 

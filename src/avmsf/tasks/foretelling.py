@@ -7,8 +7,8 @@ from jaxtyping import Complex64, Float, Float32
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.field.belief import knows_doubt, measured_gains
 from avmsf.field.doubt import LEVEL, widening
+from avmsf.field.posterior import fitted_mixture, has_posterior
 from avmsf.field.soundfield import SoundField
 
 _BATCH = 2048
@@ -23,7 +23,7 @@ _TOLD = 3
 
 def judges_itself(field: SoundField) -> bool:
     """Return whether a field's own strikes tell how wrong it is where it was not struck."""
-    return knows_doubt(field) and int(measured_gains(field).trusted.sum()) >= _TOLD
+    return has_posterior(field) and len(fitted_mixture(field).contacts) >= _TOLD
 
 
 def widened(field: SoundField) -> float:

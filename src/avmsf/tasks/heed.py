@@ -15,8 +15,8 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.field.belief import measured_gains, scale_of
-from avmsf.field.doubtedgains import DoubtedGains
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.posterior import fitted_mixture, scale_of
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.points import farthest_points
 from avmsf.tasks.foretelling import foretell, judges_itself, patches, unknown, widened
@@ -43,7 +43,7 @@ def heed_of(field: SoundField) -> float:
     """
     if not judges_itself(field):
         return 1.0
-    gains = measured_gains(field)
+    gains = fitted_mixture(field)
     fitted = replace(field, gain_field=gains)
     strikes = _strikes(gains)
     points = gains.points.double()
@@ -61,9 +61,9 @@ def heed_of(field: SoundField) -> float:
     score = -0.5 * (_TRIED.log() / _BEFOREHAND).square()
     for strike, truth in zip(strikes.tolist(), truths.tolist(), strict=True):
         left = gains.without(_same_place(gains, strike))
-        if left.places < 2:
+        if left.place_count < 2:
             continue
-        heard = torch.view_as_complex(gains.values[strike][kept].double().contiguous()) * turned
+        heard = gains.values[strike][kept] * turned
         if not bool(heard.any()):
             continue
         loudest = float(heard.abs().max())
@@ -76,15 +76,14 @@ def heed_of(field: SoundField) -> float:
     return float(_TRIED[int(score.argmax())])
 
 
-def _strikes(gains: DoubtedGains) -> Int64[Tensor, " strikes"]:
+def _strikes(gains: MixtureGains) -> Int64[Tensor, " strikes"]:
     """Return the rows of the contacts that are left out."""
-    trusted = torch.nonzero(gains.trusted).flatten()
-    if len(trusted) <= _STRIKES:
-        return trusted
-    return trusted[farthest_points(gains.contacts[trusted], _STRIKES)]
+    if len(gains.contacts) <= _STRIKES:
+        return torch.arange(len(gains.contacts))
+    return farthest_points(gains.contacts, _STRIKES)
 
 
-def _same_place(gains: DoubtedGains, strike: int) -> Tensor:
+def _same_place(gains: MixtureGains, strike: int) -> Tensor:
     """Return which contacts are where one is."""
     size = (gains.points.amax(0) - gains.points.amin(0)).double().norm()
     return (gains.contacts - gains.contacts[strike]).norm(dim=1) <= _SAME * size

@@ -13,7 +13,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.field.doubtedgains import DoubtedGains
+from avmsf.field.gains.model import MixtureGains
 from avmsf.field.scaledgains import fitted_gains
 from avmsf.field.soundfield import SoundField
 
@@ -29,8 +29,8 @@ _NEIGHBOURS = 6
 def contacts_of(field: SoundField) -> int | None:
     """Return how many contacts in different places a field learnt from; None where that is not known."""
     gains = fitted_gains(field.gain_field)
-    if isinstance(gains, DoubtedGains):
-        return gains.places
+    if isinstance(gains, MixtureGains):
+        return gains.place_count
     return len(field.origin.trained_on) or None
 
 

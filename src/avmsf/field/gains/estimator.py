@@ -1,8 +1,8 @@
 """How a fit makes the gain model: from recordings whose gains are known, and the bodies behind the surface."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 from weakref import WeakKeyDictionary
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avmsf.capture.placement import surface_points
 from avmsf.capture.surface import Surface
-from avmsf.errors import FitError
+from avmsf.errors import AvmsfError, FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import FACTORS, Elastic
@@ -21,13 +21,16 @@ from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.placed import expect_placed
-from avmsf.field.recipes import SHARED, GainCase
+from avmsf.field.recipes import SHARED, Attention, GainCase, GainRecipe
+from avmsf.scene.features import FeatureField
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.nominal import NominalBody, body_name
 
 POSITIONAL: dict[str, type[KernelFamily]] = {Smooth.kind: Smooth, ThinPlate.kind: ThinPlate}
 """Families that need nothing but the contacts, by name."""
-AUTO = "auto"
+AUTO, NETWORK = "auto", "network"
+GainModel = Literal["auto", "network", "smooth", "thin-plate", "elastic"]
+"""The Gaussian process over all kernel families, the paper's attention network, or the process over one family."""
 FAMILIES = (*POSITIONAL, Elastic.kind)
 """What the model is made of beside the unstructured family, which is always there."""
 
@@ -125,6 +128,33 @@ class MixtureEstimator:
             return None
         fine = self.bodies.refine(body)
         return None if fine is body else fine
+
+
+def estimator_for(
+    name: GainModel,
+    bodies: Callable[[], CandidateBodies],
+    *,
+    features: FeatureField | None = None,
+    log: Callable[[str], None] | None = None,
+) -> GainRecipe:
+    """Return the estimator of this name; the network reads `features`, or the fit's own.
+
+    `bodies` computes what may lie behind the object's surface. Where it raises an AvmsfError there is no elastic family
+    in `auto`, which `log` is told; with `elastic` the error passes.
+    """
+    if name == NETWORK:
+        return Attention(features, NETWORK)
+    kinds = FAMILIES if name == AUTO else (name,)
+    if Elastic.kind not in kinds:
+        return MixtureEstimator(kinds)
+    try:
+        return MixtureEstimator(kinds, bodies())
+    except AvmsfError as error:
+        if name == Elastic.kind:
+            raise
+        if log is not None:
+            log(f"no elastic mode shapes: {error}")
+        return MixtureEstimator(kinds, missing=str(error))
 
 
 def measured_gains(case: GainCase) -> MeasuredGains:

@@ -24,6 +24,8 @@ from avmsf.simulate.nominal import NOMINAL
 SAME_PLACE = 0.01
 """Distance between contacts over the diagonal of the box around all, up to which they are one place: hammers do not hit
 more exactly."""
+NEIGHBORS = 3
+"""Nearest recordings that are averaged, as in the paper's baseline."""
 _BATCH = 512
 """Places whose covariances with the contacts are held at once."""
 _POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
@@ -73,6 +75,11 @@ class MixtureGains:
         return _complex(self.mixture.values)
 
     @property
+    def place_count(self) -> int:
+        """How many separate places the contacts are in."""
+        return int(self.places.max()) + 1
+
+    @property
     def places(self) -> Int[Tensor, " contacts"]:
         """Number of each contact's place, from 0 on."""
         return places_of(self.contacts)
@@ -91,13 +98,37 @@ class MixtureGains:
         unknown = length[:, 0] == 0
         used = given / length.clamp_min(torch.finfo(torch.float64).tiny)
         if bool(unknown.any()):
-            body = next((each for each in self.families if isinstance(each, Elastic)), None)
-            if body is not None and self.directional:
-                used[unknown] = -body.modes.normals(points[unknown])
+            outward = self.normals(points[unknown]) if self.directional else None
+            if outward is not None:
+                used[unknown] = -outward
             else:
                 near = cKDTree(self.contacts.numpy()).query(points[unknown].numpy())[1]
                 used[unknown] = self.training.directions[torch.from_numpy(near)]
         return Sites(points, used)
+
+    def nearest(
+        self, sites: Sites, others: Int[Tensor, " sites"] | None = None
+    ) -> tuple[Int[Tensor, "sites near"], Float64[Tensor, "sites near"]]:
+        """Return the rows of the three nearest training impacts, fewer where there are fewer, and the sign of each.
+
+        With c the cosine between two directions the squared distance is that of the contacts plus
+        (size / 2)^2 (1 - |c|), and the sign is that of c: an opposite impact has the opposite sound. `others` is the
+        place number of each site, whose own training impacts are left out.
+        """
+        cosine = sites.cosine(self.training)
+        squares = (sites.points[:, None] - self.contacts).square().sum(2)
+        squares = squares + (self.families[0].size / 2.0) ** 2 * (1.0 - cosine.abs())
+        usable = len(self.contacts)
+        if others is not None:
+            own = others[:, None] == self.places
+            squares, usable = squares.masked_fill(own, torch.inf), usable - int(own.sum(1).max())
+        rows = torch.topk(squares, min(NEIGHBORS, usable), largest=False, dim=1).indices
+        return rows, torch.where(cosine.gather(1, rows) < 0, -1.0, 1.0).double()
+
+    def normals(self, points: Float[Tensor, "points 3"]) -> Float64[Tensor, "points 3"] | None:
+        """Return the outward unit normals of the body's surface nearest to points, or None without a body."""
+        body = next((each for each in self.families if isinstance(each, Elastic)), None)
+        return None if body is None else body.modes.normals(points.double())
 
     def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
         """Return the mean gains of impacts at contacts (metres) along unit vectors, see `sites`."""

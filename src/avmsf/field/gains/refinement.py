@@ -53,7 +53,7 @@ class RefinedGains(nn.Module):
         """What the model's fit found."""
         return self.model.report
 
-    def heeded(self, contacts: int) -> list[int]:
+    def used_rows(self, contacts: int) -> list[int]:
         """Return the rows of the recordings that the model uses."""
         return self.used.tolist()
 

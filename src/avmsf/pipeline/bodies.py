@@ -1,4 +1,4 @@
-"""From what is known of an object's shape to the recipe of fields that know how it vibrates."""
+"""From an object's surface to the bodies that may lie behind it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.placement import surface_points
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
-from avmsf.field.physics import Physics, expect_enough
+from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.placed import expect_placed
 from avmsf.simulate.nominal import NominalBody, nominal_bodies, refined
 
@@ -60,27 +60,26 @@ class FinerBodies:
         return f"{self.freedoms}"
 
 
-def physics_of(
+def candidate_bodies(
     surface: Surface,
     config: BodyConfig | None = None,
     *,
     impacts: Impacts | None = None,
     cache: Path | None = None,
     tell: Callable[[str], None] | None = None,
-) -> Physics:
-    """Return the recipe for an object with this surface; elastic modes are kept by content in `cache`.
+) -> CandidateBodies:
+    """Return the bodies that may lie behind a surface; their mode shapes are kept by content in `cache`.
 
-    Raises SimulationError where no body can be had, and FitError, before any is computed, where the `impacts` that it
-    is meant for are too few, or their contacts do not lie on the surface.
+    Raises SimulationError where no body can be computed, and FitError, before any is, where the contacts of the
+    `impacts` that they are meant for do not lie on the surface.
     """
     config = BodyConfig() if config is None else config
     if impacts is not None:
-        expect_enough(len(impacts))
         expect_placed(impacts.contacts, surface_points(surface), names=impacts.names)
     walls = None if config.wall is None else [config.wall or None]
     bodies = nominal_bodies(surface, walls=walls, count=config.shapes, freedoms=config.freedoms, cache=cache, tell=tell)
     finer = FinerBodies(surface, config.freedoms, cache, tell or (lambda words: None))
-    return Physics(bodies, None if len(bodies.bodies) == 1 else finer)
+    return CandidateBodies(bodies, None if len(bodies.bodies) == 1 else finer)
 
 
 def roughened(surface: Surface, part: float, *, seed: int) -> Surface:

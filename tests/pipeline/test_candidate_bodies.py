@@ -1,0 +1,205 @@
+"""Bodies behind a surface as hypotheses of the gain model: what they predict, and which of them is made finer."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cache
+
+import pytest
+import torch
+
+from avmsf.capture.impacts import Impacts
+from avmsf.capture.surface import Surface
+from avmsf.errors import FitError
+from avmsf.field.config import FitConfig
+from avmsf.field.fit import fit, gain_case
+from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.estimator import MixtureEstimator, gain_variance
+from avmsf.field.recipes import GainCase
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.least_squares import fit_sine_gains
+from avmsf.modal.residual import Residual
+from avmsf.modal.synthesis import synthesise_phased
+from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.scene.features import FeatureField
+from avmsf.simulate.nominal import NominalBodies, NominalBody
+from made_dome import STIFFER, WALLS, bodies, dome, points, truth
+
+RATE, SAMPLES, LEVEL = 12000.0, 2400, 0.01
+CONFIG = FitConfig(warmup_steps=0, steps=6, fft_sizes=(1024, 256), early=1024, damping="shared")
+
+
+def estimator(*known: NominalBody, finer: "Finer | None" = None, kinds: tuple[str, ...] = ()) -> MixtureEstimator:
+    """Return the estimator of these bodies, or of all the dome's."""
+    candidates = CandidateBodies(NominalBodies(known or bodies(), {}), finer)
+    return MixtureEstimator(kinds, candidates) if kinds else MixtureEstimator(bodies=candidates)
+
+
+@dataclass
+class Finer:
+    """Makes bodies finer in name alone, and remembers which."""
+
+    fineness: str = ""
+    asked: list[NominalBody] = field(default_factory=list)
+
+    def __call__(self, body: NominalBody) -> NominalBody:
+        self.asked.append(body)
+        return replace(body, fine=True)
+
+    def digest(self) -> str:
+        return self.fineness
+
+
+def features() -> FeatureField:
+    return FeatureField.from_points(points())
+
+
+def modes_of(contacts: torch.Tensor, directions: torch.Tensor) -> tuple[ModalBank, torch.Tensor]:
+    """Return what of the dome's modes lies below half the sample rate, and their gains."""
+    elastic = truth(WALLS[1])
+    heard = torch.nonzero(elastic.frequency < 0.45 * RATE).flatten()
+    gains = elastic.gains(contacts, directions)[:, heard]
+    frequency = elastic.frequency[heard]
+    return ModalBank(frequency, 8.0 + 0.004 * frequency), (gains / 3.0).float()
+
+
+@cache
+def recorded(count: int, seed: int = 0) -> tuple[Impacts, Extraction]:
+    """Return impacts on the dome, noise and all, with its modes as extracted from them."""
+    generator = torch.Generator().manual_seed(seed)
+    contacts = points()[torch.randperm(len(points()), generator=generator)[:count]]
+    directions = -truth(WALLS[1]).normals(contacts)
+    bank, gains = modes_of(contacts, directions)
+    still = torch.zeros_like(bank.frequency)
+    sounds = synthesise_phased(gains, bank.frequency, bank.damping, still, samples=SAMPLES, sample_rate=RATE)
+    sounds = sounds + LEVEL * torch.randn(sounds.shape, generator=generator)
+    names = tuple(f"dome/{row:02d}" for row in range(count))
+    impacts = Impacts(contacts, sounds, RATE, names, directions.float())
+    found = fit_sine_gains(sounds, bank, sample_rate=RATE)
+    residual = Residual(torch.full((65,), LEVEL))
+    return impacts, Extraction(bank, found, residual, torch.zeros_like(found))
+
+
+def case(count: int = 12, **changes: torch.Tensor | None) -> GainCase:
+    impacts, modes = recorded(count)
+    return gain_case(replace(impacts, **changes), features(), modes, CONFIG)
+
+
+def test_bodies_halve_the_error_between_impacts() -> None:
+    impacts, modes = recorded(10)
+    others, _ = recorded(40, seed=3)
+    assert others.directions is not None
+    _, gains = modes_of(others.contacts, others.directions.double())
+
+    def error(gain_recipe: MixtureEstimator) -> float:
+        fitted = fit(impacts, features(), modes, CONFIG, gains=gain_recipe)
+        found = fitted.gains(others.contacts, directions=others.directions) * torch.cos(fitted.phase).float()
+        return float((found - gains).square().mean() / gains.square().mean()) ** 0.5
+
+    assert error(estimator()) < 0.5 * error(MixtureEstimator())
+
+
+def test_the_true_wall_and_its_stiffness_are_the_most_probable() -> None:
+    first, *others = estimator().fit(case()).report["bodies"]
+    assert first["body"] == bodies()[1].name
+    # Factors of the grid are 5 % apart.
+    assert first["factor"] == pytest.approx(STIFFER, rel=0.06)
+    assert first["weight"] > 10 * max(each["weight"] for each in others)
+
+
+def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> None:
+    finer = Finer()
+    # Both are walls of 4 mm by name; the wrong one comes first.
+    bad, good = (
+        replace(body, wall=wall, fine=False) for body, wall in zip(bodies()[:2], (0.00404, 0.00396), strict=True)
+    )
+    assert bad.name == good.name
+    first, second = estimator(bad, good, finer=finer).fit(case()).report["bodies"]
+    assert finer.asked == [good]
+    assert (first["wall"], first["fine"]) == (0.00396, True)
+    assert (second["wall"], second["fine"]) == (0.00404, False)
+
+
+def test_a_fine_body_is_not_computed_again() -> None:
+    finer = Finer()
+    estimator(finer=finer).fit(case())
+    assert finer.asked == []
+
+
+def test_estimators_of_other_bodies_or_elements_have_other_digests() -> None:
+    assert estimator().digest() == estimator().digest()
+    made = (estimator(), estimator(*bodies()[:2]), *(estimator(finer=Finer(each)) for each in ("20000", "40000")))
+    assert len({each.digest() for each in made}) == len(made)
+
+
+def test_reasons_against_other_bodies_are_reported() -> None:
+    known = CandidateBodies(NominalBodies(bodies()[1:2], {None: "the mesh is open"}))
+    assert MixtureEstimator(bodies=known).fit(case()).report["missing"] == {"filled": "the mesh is open"}
+
+
+@pytest.mark.parametrize("directions", [None, torch.zeros(12, 3)], ids=["no directions", "directions of length zero"])
+def test_impacts_of_unknown_direction_go_straight_into_the_body(directions: torch.Tensor | None) -> None:
+    found = estimator().fit(case(directions=directions)).training.directions
+    straight = -truth(WALLS[1]).normals(recorded(12)[0].contacts)
+    assert float((found * straight).sum(1).min()) > 0.99
+
+
+def test_the_variance_by_noise_is_the_scatter_of_least_squares_gains() -> None:
+    """Over 3000 draws of white noise, each mode alone: a variance of so many is good to 3 %."""
+    still, draws = torch.zeros(1, dtype=torch.float64), 3000
+    noise = LEVEL * torch.randn(draws, SAMPLES, generator=torch.Generator().manual_seed(2))
+    gains = torch.zeros(draws, 1)
+    impacts = Impacts(torch.zeros(draws, 3), noise, RATE, tuple(str(row) for row in range(draws)))
+    for frequency, damping in ((800.0, 3.0), (2500.0, 60.0)):
+        bank = ModalBank(still + frequency, still + damping)
+        modes = Extraction(bank, gains, Residual(torch.full((65,), LEVEL)), gains)
+        made = GainCase(impacts, features(), modes, still, gains, CONFIG)
+        scatter = float(fit_sine_gains(noise, bank, sample_rate=RATE).double().square().mean())
+        assert float(gain_variance(made)) == pytest.approx(scatter, rel=0.1)
+
+
+def moved_body(move: Callable[[torch.Tensor], torch.Tensor]) -> NominalBody:
+    """Return the true wall's body with its surface elsewhere."""
+    body = bodies()[1]
+    return replace(body, elastic=replace(body.elastic, nodes=move(body.elastic.nodes)))
+
+
+ELSEWHERE: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
+    "unit mm": lambda x: 1000.0 * x,
+    "unit inches": lambda x: x / 0.0254,
+    "another axis point up": lambda x: x[:, [0, 2, 1]] * x.new_tensor([1, -1, 1]),
+    "into one frame": lambda x: (
+        x @ torch.linalg.qr(torch.tensor([[1.0, 2, 3], [3, 1, -2], [1, -4, 1]]).double()).Q + 0.07
+    ),
+}
+
+
+@pytest.mark.parametrize("remedy", ELSEWHERE)
+def test_a_body_that_the_contacts_do_not_lie_on_takes_no_part_and_the_remedy_is_told(remedy: str) -> None:
+    body = moved_body(ELSEWHERE[remedy])
+    report = estimator(body).fit(case()).report
+    assert report["bodies"] == []
+    assert remedy in report["missing"]["elastic"]
+    with pytest.raises(FitError, match=remedy):
+        estimator(body, kinds=("elastic",)).fit(case())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [4, 12])
+def test_bodies_take_part_despite_rough_surfaces_thick_glue_and_a_wrong_row(count: int) -> None:
+    generator = torch.Generator().manual_seed(4)
+    contacts = recorded(count)[0].contacts
+    size = float((points().amax(0) - points().amin(0)).norm())
+    rough = moved_body(lambda x: x + 0.02 * size * torch.randn(x.shape, generator=generator, dtype=x.dtype))
+    above = contacts + 0.03 * size * torch.tensor([0.0, 0.0, 1.0])
+    above[-1] += 0.5 * size
+    for body, each in ((rough, contacts), (bodies()[1], above)):
+        assert estimator(body).fit(case(count, contacts=each)).report["bodies"]
+
+
+def test_contacts_elsewhere_are_refused_before_any_body_is_computed() -> None:
+    told: list[str] = []
+    surface = Surface(1000.0 * dome().vertices, dome().faces)
+    with pytest.raises(FitError, match="unit mm"):
+        candidate_bodies(surface, impacts=recorded(12)[0], tell=told.append)
+    assert told == []
