@@ -208,6 +208,15 @@ def test_weights_sum_to_one_and_none_is_negligible():
     assert bool((found.weights == 0).any())
 
 
+def test_kernels_of_no_weight_are_dropped():
+    given = hypotheses()
+    given.log_prior[1] = -1e3
+    found, kept = KernelMixture.weigh(given, mixture().values, mixture().floor)
+    assert kept.tolist() == [0, 2, 3]
+    assert torch.equal(found.kernels, given.kernels[kept])
+    assert torch.allclose(found.weights, weighed(mixture().values, mixture().floor, given).weights[kept])
+
+
 def test_without_active_series_weights_are_bayes_theorem():
     likelihood = torch.from_numpy(np.random.default_rng(4).uniform(size=(KERNELS, len(NOISE_SHARES), SERIES)))
     given = hypotheses()
