@@ -68,7 +68,7 @@ def test_kernels_are_the_written_ones():
 
 @pytest.mark.parametrize("memory", [0, 10**9])
 def test_kernels_do_not_depend_on_the_memory(monkeypatch, memory):
-    given, others = family(), impacts(7, seed=2)
+    given, others = family(), impacts(10, seed=2)
     kept = torch.tensor([3, 0, 100, 215])
     expected = torch.einsum("hb,bso->hso", given.shares[kept], given.basis(others, given.reference))
     monkeypatch.setattr(module, "_MEMORY", memory)
@@ -124,6 +124,22 @@ def test_a_fit_finds_the_factor_and_predicts_as_well_with_it():
     sites = impacts(8, seed=1)
     nominal, scaled = (fitted(sites, elastic=True, gains=measured(sites, factor=each)) for each in (1.0, 0.75))
     assert torch.allclose(error_elsewhere(scaled), error_elsewhere(nominal), atol=0.03)
+    for each, factor in ((nominal, 1.0), (scaled, 0.75)):
+        body = each.families[-1]
+        assert isinstance(body, Elastic)
+        assert abs(float(torch.log(FACTORS[body.factor_weights.argmax()] / factor))) <= 0.05
+
+
+def test_gains_tell_the_factor_where_frequencies_do_not():
+    """Of frequencies in geometric progression, each is another's as well; which shape a mode is says whose."""
+    progression = 400.0 * 1.3 ** torch.arange(SHAPES, dtype=torch.float64)
+    sites = impacts(12, seed=1)
+    body = Elastic(sites, SIZE, replace(plate(), frequency=progression))
+    gains = replace(measured(sites), frequency=1.3 * progression[:5])
+    given = [*families(sites, elastic=False), body]
+    values = series_of(gains.values)
+    weigh_factors([(each, log_evidence(each.kernels(), values, gains.floor)) for each in given], gains)
+    assert abs(float(torch.log(FACTORS[body.factor_weights.argmax()] / 1.3))) <= 0.05
 
 
 def test_a_frequency_alone_tells_which_of_two_alike_shapes_a_mode_is():
