@@ -117,7 +117,7 @@ class Elastic(KernelFamily):
         return shared.flatten(0, 2)
 
     def shape_evidence(self, evidence: Float64[Tensor, "kernels noises series"]) -> Float64[Tensor, "shapes series"]:
-        """Return the log evidence of each shape as center; profiles, remainders and noise shares are equally probable."""
+        """Return the log evidence of each shape as center; profiles, remainders and noises are equally probable."""
         shape = (len(PERTURBATIONS) + len(WIDTHS), len(self.modes), len(REMAINDERS) * evidence.shape[1], -1)
         each = evidence.reshape(shape).transpose(0, 1).flatten(1, 2)
         return torch.logsumexp(each, dim=1) - math.log(each.shape[1])
