@@ -66,6 +66,13 @@ def test_kernels_are_the_written_ones():
         assert torch.allclose(kernels[row_of(profile, shape, remainder)], expected, rtol=1e-5, atol=1e-5)
 
 
+def test_the_basis_elsewhere_is_the_shapes_there():
+    given, others = family(), impacts(10, seed=2)
+    there, here = (plate().gains(each.points, each.directions) for each in (others, given.reference))
+    expected = torch.einsum("pj,cj->jpc", there, here)
+    assert torch.allclose(given.basis(others, given.reference)[:-1], expected, rtol=1e-5, atol=1e-5)
+
+
 @pytest.mark.parametrize("memory", [0, 10**9])
 def test_kernels_do_not_depend_on_the_memory(monkeypatch, memory):
     given, others = family(), impacts(10, seed=2)

@@ -61,10 +61,18 @@ def test_mean_and_deviation_are_those_of_all_hypotheses(elastic):
     assert torch.allclose(torch.cat([found[..., 0], found[..., 1]], dim=1), deviation, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("elastic", [True, False])
-def test_covariances_are_those_of_the_most_probable_hypothesis(elastic):
+def torn() -> MixtureGains:
+    """Return the model with weights that differ between parts: the real one, of more energy, prefers the first."""
+    weights = torch.zeros_like(model().mixture.weights)
+    real = torch.arange(2 * MODES) < MODES
+    weights[0, 1], weights[-1, 1] = torch.where(real, 0.6, 0.1), torch.where(real, 0.4, 0.9)
+    return replace(model(), mixture=replace(model().mixture, weights=weights))
+
+
+@pytest.mark.parametrize("make", [model, lambda: model(elastic=False), torn])
+def test_covariances_are_those_of_the_most_probable_hypothesis(make):
     """Weighed by the energies of both parts, whose variances add up."""
-    given = model(elastic=elastic)
+    given = make()
     values, kernels = series_of(given.values), joint_kernels(given)
     found = list(given.covariances(ASKED.points, ASKED.directions))
     assert len(found) == MODES
@@ -106,6 +114,17 @@ def test_shares_are_of_the_families_that_modes_come_from():
     assert float(shares.amax(0).min()) > 0.9
 
 
+def test_one_contact_leaves_families_as_probable_as_they_were():
+    """Its gain may be of any scale, so it says nothing of the kernels; families of one kind share its probability."""
+    sites = impacts(1, seed=1)
+    unstructured, smooth, thin_plate = families(sites, elastic=False)
+    given = fit_mixture(
+        [unstructured, smooth, smooth, thin_plate], measured(sites), sites.points.float(), directional=True
+    )
+    expected = torch.tensor([0.05, 0.5, 0.5, 1.0], dtype=torch.float64) / 2.05
+    assert torch.allclose(given.shares(), expected[:, None].expand(-1, MODES), rtol=1e-9)
+
+
 def test_leave_one_out_does_not_know_the_place():
     """Whatever is measured at a place, by one impact or two, changes the prediction there through the weights alone."""
     given = model()
@@ -116,7 +135,7 @@ def test_leave_one_out_does_not_know_the_place():
         others = given.without(given.places == place)
         # One hypothesis alone has no weights that the others could change.
         weights = torch.zeros_like(given.mixture.weights)
-        weights[0, 0] = 1.0
+        weights[-1, 0] = 1.0
         single, rest = (replace(each, mixture=replace(each.mixture, weights=weights)) for each in (given, others))
         expected = gains_at(rest, given.training.take(rows))
         assert torch.allclose(single.leave_one_out()[rows], expected, rtol=1e-4, atol=1e-6)
