@@ -37,9 +37,9 @@ class MeasuredGains:
 
     @property
     def floor(self) -> Float64[Tensor, " series"]:
-        """The variance over the mean square of a part."""
-        size = self.values.abs().square().mean(0) / 2.0
-        return (self.variance / size.clamp_min(torch.finfo(torch.float64).tiny)).repeat(2)
+        """The variance over the mean square of a part; finite for a mode without gains too."""
+        size, limits = self.values.abs().square().mean(0) / 2.0, torch.finfo(torch.float64)
+        return (self.variance / size.clamp_min(limits.tiny)).clamp_max(limits.max).repeat(2)
 
 
 def fit_mixture(

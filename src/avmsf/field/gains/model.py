@@ -266,10 +266,11 @@ class MixtureGains:
     def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return tensors like those of a model of these sizes."""
         points, contacts, modes = (count_of(record[name], name) for name in ("points", "contacts", "modes"))
-        families, kept = record["families"], [count_of(each, "kept") for each in record["kept"]]
+        families, bodies = (like(record[name], [], name) for name in ("families", "bodies"))
+        kept = [count_of(each, "kept") for each in like(record["kept"], [], "kept")]
         unknown = sorted(set(families) - {*_POSITIONAL, Elastic.kind})
-        if unknown or len(families) != len(kept) or len(record["bodies"]) != families.count(Elastic.kind):
-            raise ValueError(f"families are {families}, with {len(kept)} numbers and {len(record['bodies'])} bodies")
+        if unknown or len(families) != len(kept) or len(bodies) != families.count(Elastic.kind):
+            raise ValueError(f"families are {families}, with {len(kept)} numbers and {len(bodies)} bodies")
         like(record["directional"], True, "directional")
         sizes: dict[str, tuple[int, ...]] = {
             "contacts": (contacts, 3),
@@ -280,13 +281,13 @@ class MixtureGains:
             "floor": (2 * modes,),
             "weights": (sum(kept), len(NOISE_SHARES), 2 * modes),
         }
-        for row, body in enumerate(record["bodies"]):
+        for row, body in enumerate(bodies):
             nodes, shapes = count_of(body["nodes"], "nodes"), count_of(body["shapes"], "shapes")
             sizes |= {f"bodies.{row}.frequency": (shapes,), f"bodies.{row}.nodes": (nodes, 3)}
         named = {name: torch.empty(size, dtype=torch.float64, device="meta") for name, size in sizes.items()}
         named |= {"points": torch.empty(points, 3, device="meta")}
         named |= {"kept": torch.empty(sum(kept), dtype=torch.int64, device="meta")}
-        for row, body in enumerate(record["bodies"]):
+        for row, body in enumerate(bodies):
             triangles = count_of(body["triangles"], "triangles")
             named[f"bodies.{row}.triangles"] = torch.empty(triangles, 6, dtype=torch.int64, device="meta")
             named[f"bodies.{row}.shapes"] = torch.empty(body["nodes"], body["shapes"], 3, device="meta")

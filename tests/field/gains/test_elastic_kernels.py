@@ -1,0 +1,200 @@
+"""The elastic family on a plate whose mode shapes are products of cosines: prediction, frequency factors, densities."""
+
+from dataclasses import replace
+from itertools import product
+
+import pytest
+import torch
+
+from avmsf.field.gains import elastic as module
+from avmsf.field.gains.elastic import (
+    FACTORS,
+    PERTURBATIONS,
+    REACH,
+    REMAINDERS,
+    WIDTHS,
+    Elastic,
+    factor_log_prior,
+)
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture, weigh_factors
+from avmsf.field.gains.mixture import log_evidence
+from avmsf.field.gains.model import MixtureGains, series_of
+from gain_cases import SIZE, families, impacts, measured, plate
+
+SHAPES = 6
+PROFILES = len(PERTURBATIONS) + len(WIDTHS)
+
+
+def family(count: int = 10) -> Elastic:
+    return Elastic(impacts(count, seed=1), SIZE, plate())
+
+
+def row_of(profile: int, shape: int, remainder: int) -> int:
+    return (profile * SHAPES + shape) * len(REMAINDERS) + remainder
+
+
+def error_elsewhere(model: MixtureGains) -> torch.Tensor:
+    """Return each mode's error at new places over its size there."""
+    asked = impacts(60, seed=5)
+    gains = model.at(asked.points, asked.directions)
+    true = measured(asked, noise=0.0).values
+    error = torch.complex(gains.mean, gains.quadrature) - true
+    return (error.abs().square().mean(0) / true.abs().square().mean(0)).sqrt()
+
+
+def fitted(sites: Sites, *, elastic: bool, gains: MeasuredGains) -> MixtureGains:
+    return fit_mixture(families(sites, elastic=elastic), gains, sites.points.float(), directional=True)
+
+
+def test_kernels_are_the_written_ones():
+    given, frequency = family(), plate().frequency
+    shapes = plate().gains(given.reference.points, given.reference.directions)
+    squares = (given.reference.points[:, None] - given.reference.points).square().sum(2)
+    smooth = torch.exp(-0.5 * squares / (REACH * SIZE) ** 2) * given.reference.cosine(given.reference)
+    kernels = given.kernels()
+    assert len(kernels) == PROFILES * SHAPES * len(REMAINDERS)
+    for profile, shape, remainder in product(range(PROFILES), range(SHAPES), range(len(REMAINDERS))):
+        apart = torch.log(frequency / frequency[shape])
+        if profile < len(PERTURBATIONS):
+            nearness = 1.0 / (1.0 + (2.0 * apart / PERTURBATIONS[profile]) ** 2)
+        else:
+            nearness = torch.exp(-0.5 * (apart / WIDTHS[profile - len(PERTURBATIONS)]) ** 2) + 1e-3
+        mixed = (shapes * nearness) @ shapes.T
+        share = REMAINDERS[remainder]
+        expected = (1.0 - share) * mixed / mixed.trace() * len(mixed) + share * smooth
+        assert torch.allclose(kernels[row_of(profile, shape, remainder)], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_the_basis_elsewhere_is_the_shapes_there():
+    given, others = family(), impacts(10, seed=2)
+    there, here = (plate().gains(each.points, each.directions) for each in (others, given.reference))
+    expected = torch.einsum("pj,cj->jpc", there, here)
+    assert torch.allclose(given.basis(others, given.reference)[:-1], expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("memory", [0, 10**9])
+def test_kernels_do_not_depend_on_the_memory(monkeypatch, memory):
+    given, others = family(), impacts(10, seed=2)
+    kept = torch.tensor([3, 0, 100, 215])
+    expected = torch.einsum("hb,bso->hso", given.shares[kept], given.basis(others, given.reference))
+    monkeypatch.setattr(module, "_MEMORY", memory)
+    assert torch.allclose(given.between(others, given.reference, kept), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_kernels_of_a_profile_and_a_remainder_share_a_category():
+    categories = family().categories().tolist()
+    rows = product(range(PROFILES), range(SHAPES), range(len(REMAINDERS)))
+    assert categories == [profile * len(REMAINDERS) + remainder for profile, _, remainder in rows]
+
+
+def test_a_shape_known_at_few_places_is_known_everywhere():
+    """Far better than smoothness alone knows it."""
+    sites = impacts(8, seed=1)
+    gains = measured(sites, noise=0.01)
+    smooth, shaped = (error_elsewhere(fitted(sites, elastic=each, gains=gains)) for each in (False, True))
+    assert float(smooth.min()) > 0.3
+    assert float(shaped.max()) < 0.1
+
+
+def test_a_body_is_of_no_weight_for_what_it_does_not_have():
+    """Its share of gains that are affine functions of the place is small; it takes nearly all of its own modes'."""
+    sites = impacts(20, seed=1, askew=0.0)
+    gains = measured(sites, noise=0.01)
+    affine = -sites.directions[:, 2] * (1.0 + 30.0 * sites.points[:, 0] - 45.0 * sites.points[:, 1])
+    foreign = replace(
+        gains, values=affine[:, None] * torch.tensor([1.0, -0.3j, 0.5, 2.0, 1.0j], dtype=torch.complex128)
+    )
+    own, other = (fitted(sites, elastic=True, gains=each) for each in (gains, foreign))
+    assert isinstance(own.families[-1], Elastic)
+    assert float(own.shares()[-1].min()) > 0.95
+    shares = other.shares()[-1] if isinstance(other.families[-1], Elastic) else torch.zeros(1)
+    assert float(shares.max()) < 0.05
+
+
+@pytest.mark.parametrize("factor", [0.3, 0.75, 1.0, 1.8])
+def test_a_factor_on_all_frequencies_is_found(factor):
+    sites = impacts(12, seed=1)
+    given = families(sites)
+    gains = measured(sites, factor=factor)
+    values = series_of(gains.values)
+    weigh_factors([(each, log_evidence(each.kernels(), values, gains.floor)) for each in given], gains)
+    elastic = given[-1]
+    assert isinstance(elastic, Elastic)
+    assert float(elastic.factor_weights.sum()) == pytest.approx(1.0)
+    found = FACTORS[elastic.factor_weights.argmax()]
+    # The factors considered are 5 % apart.
+    assert abs(float(torch.log(found / factor))) <= 0.05
+
+
+def test_a_fit_finds_the_factor_and_predicts_as_well_with_it():
+    sites = impacts(8, seed=1)
+    nominal, scaled = (fitted(sites, elastic=True, gains=measured(sites, factor=each)) for each in (1.0, 0.75))
+    assert torch.allclose(error_elsewhere(scaled), error_elsewhere(nominal), atol=0.03)
+    for each, factor in ((nominal, 1.0), (scaled, 0.75)):
+        body = each.families[-1]
+        assert isinstance(body, Elastic)
+        assert abs(float(torch.log(FACTORS[body.factor_weights.argmax()] / factor))) <= 0.05
+
+
+def test_gains_tell_the_factor_where_frequencies_do_not():
+    """Of frequencies in geometric progression, each is another's as well; which shape a mode is says whose."""
+    progression = 400.0 * 1.3 ** torch.arange(SHAPES, dtype=torch.float64)
+    sites = impacts(12, seed=1)
+    body = Elastic(sites, SIZE, replace(plate(), frequency=progression))
+    gains = replace(measured(sites), frequency=1.3 * progression[:5])
+    given = [*families(sites, elastic=False), body]
+    values = series_of(gains.values)
+    weigh_factors([(each, log_evidence(each.kernels(), values, gains.floor)) for each in given], gains)
+    assert abs(float(torch.log(FACTORS[body.factor_weights.argmax()] / 1.3))) <= 0.05
+
+
+def test_a_frequency_alone_tells_which_of_two_alike_shapes_a_mode_is():
+    """With one contact gains say nothing: the kernels whose center is nearest in frequency are most probable."""
+    given = family(1)
+    given.factor_weights = torch.where(torch.arange(len(FACTORS)) == 60, 1.0, 0.0).double()
+    prior = given.log_prior(torch.log(plate().frequency)).reshape(PROFILES, SHAPES, len(REMAINDERS), SHAPES)
+    assert torch.equal(prior[0, :, 0].argmax(0), torch.arange(SHAPES))
+    assert torch.equal(prior, prior[:1, :, :1].expand_as(prior))
+
+
+def test_the_density_of_a_measured_frequency_integrates_to_one():
+    """Over log frequency and all shapes of the body; it is stated over that of a uniform one."""
+    given = family(3)
+    low, high = torch.log(plate().frequency[[0, -1]]) + torch.tensor([-1.5, 1.5])
+    grid = torch.linspace(float(low), float(high), 601, dtype=torch.float64)
+    given.factor_weights = torch.where(torch.arange(len(FACTORS)) == 60, 1.0, 0.0).double()
+    width = float(grid[-1] - grid[0]) + 0.2
+    total = torch.trapezoid(given.match(grid)[60].exp(), grid) / width
+    assert total.tolist() == pytest.approx([1.0 / SHAPES] * SHAPES, rel=1e-3)
+    prior = given.log_prior(grid).reshape(PROFILES, SHAPES, len(REMAINDERS), -1)[0, :, 0]
+    assert float(torch.trapezoid(prior.exp().sum(0), grid)) / width == pytest.approx(1.0, rel=1e-3)
+
+
+def test_shapes_outside_the_measured_range_are_not_expected_in_it():
+    """Twice as many shapes, half of them far above all measured modes, leave the others' densities as they were."""
+    more = replace(
+        plate(),
+        frequency=torch.cat([plate().frequency, 100.0 * plate().frequency]),
+        shapes=torch.cat([plate().shapes] * 2, dim=1),
+    )
+    measured_modes = torch.log(plate().frequency)
+    one, other = (Elastic(impacts(3, seed=1), SIZE, body).match(measured_modes)[60] for body in (plate(), more))
+    assert torch.allclose(other[:SHAPES], one, rtol=1e-9)
+
+
+def test_the_factors_prior_is_a_density_of_the_log_factor():
+    density = factor_log_prior().exp()
+    # Its terms leave out the 1 / sqrt(2 pi) that all have in common.
+    total = float(torch.trapezoid(density, torch.log(FACTORS))) / (2.0 * torch.pi) ** 0.5
+    assert total == pytest.approx(1.0, abs=0.01)
+    assert float(FACTORS[density.argmax()]) == pytest.approx(1.0)
+
+
+def test_the_evidence_of_a_shape_is_that_of_the_kernels_around_it():
+    given = family()
+    constant = torch.full((len(given.shares), 3, 2), -7.0, dtype=torch.float64)
+    assert torch.allclose(given.shape_evidence(constant), torch.full((SHAPES, 2), -7.0, dtype=torch.float64))
+    shapes = plate().gains(given.reference.points, given.reference.directions)
+    found = given.shape_evidence(log_evidence(given.kernels(), shapes, torch.zeros(SHAPES, dtype=torch.float64)))
+    assert torch.equal(found.argmax(0), torch.arange(SHAPES))

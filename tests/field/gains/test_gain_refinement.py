@@ -1,0 +1,102 @@
+"""Gains refined end to end: where they start, where a shift takes them, and what it costs."""
+
+from functools import cache
+
+import pytest
+import torch
+
+from avmsf.field.gains.refinement import RefinedGains
+from avmsf.modal.bank import ModalBank
+from gain_cases import draw, impacts, model
+
+CONTACTS, MODES, RECORDINGS = 14, 5, 17
+USED = torch.tensor([3, 0, 16, 5, 4, 6, 7, 8, 9, 10, 11, 12, 13, 14])
+ORDER = torch.tensor([2, 4, 0])
+DAMPING = torch.tensor([12.0, 15.0, 30.0, 22.0, 60.0], dtype=torch.float64)
+
+
+def refined(shift: float = 0.0) -> RefinedGains:
+    bank = ModalBank(torch.linspace(400.0, 3000.0, MODES, dtype=torch.float64), DAMPING)
+    gains = RefinedGains(model(), bank, used=USED, training=RECORDINGS)
+    with torch.no_grad():
+        gains.shift += shift * direction()
+    return gains
+
+
+@cache
+def direction() -> torch.Tensor:
+    return draw(CONTACTS, MODES, 2, seed=4).float()
+
+
+def read(gains: RefinedGains, rows: torch.Tensor = USED) -> torch.Tensor:
+    found = gains.read(rows)
+    return torch.complex(found.mean.double(), found.quadrature.double()).detach()
+
+
+def mean_at_contacts(gains) -> torch.Tensor:
+    found = gains.at(gains.contacts, gains.training.directions)
+    return torch.complex(found.mean.double(), found.quadrature.double())
+
+
+def test_gains_start_as_the_models_mean_at_the_contacts():
+    assert torch.allclose(read(refined()), mean_at_contacts(model()), rtol=1e-4, atol=1e-4)
+    assert torch.equal(refined().finished(torch.arange(MODES)).values, model().values)
+    assert float(refined().penalty().detach()) == 0.0
+
+
+def test_rows_are_those_of_the_recordings():
+    rows = torch.tensor([16, 3, 16, 14])
+    assert refined(0.01).heeded(RECORDINGS) == USED.tolist()
+    assert torch.equal(read(refined(0.01), rows), read(refined(0.01))[[2, 0, 2, 13]])
+
+
+def test_a_shift_reads_as_the_model_of_the_moved_values():
+    gains = refined(0.01)
+    finished = gains.finished(torch.arange(MODES))
+    assert float((finished.values - model().values).abs().max()) > 0.1
+    assert torch.allclose(read(gains), mean_at_contacts(finished), rtol=1e-4, atol=1e-3)
+
+
+def test_a_shift_of_one_two_hundredth_moves_a_value_by_its_standard_error():
+    gains = refined()
+    with torch.no_grad():
+        gains.shift[6, 1, 0] = 1.0 / 200.0
+        gains.shift[2, 3, 1] = -1.0 / 200.0
+    moved = torch.view_as_real(gains.finished(torch.arange(MODES)).values - model().values)
+    expected = torch.zeros_like(moved)
+    expected[6, 1, 0], expected[2, 3, 1] = model().noise()[1, 0], -model().noise()[3, 1]
+    assert torch.allclose(moved, expected, rtol=1e-5, atol=1e-9)
+
+
+def test_finished_is_the_model_of_the_moved_values_in_another_order():
+    finished, asked = refined(0.01).finished(ORDER), impacts(9, seed=5)
+    expected = model().with_values(refined(0.01).finished(torch.arange(MODES)).values).take(ORDER)
+    assert torch.equal(finished.values, expected.values)
+    assert torch.equal(
+        finished.at(asked.points, asked.directions).mean, expected.at(asked.points, asked.directions).mean
+    )
+    assert not finished.mixture.values.requires_grad
+
+
+def test_a_shift_costs_its_squares_by_the_modes_energy():
+    """A mode's energy is its mean square over its damping, as it sounds."""
+    share = model().values.abs().square().sum(0) / DAMPING
+    share /= share.sum()
+    gains = refined(0.01)
+    with torch.no_grad():
+        # The second mode has nearly all of the energy.
+        gains.shift[:, 1] = 0.0
+    squares = (200.0 * gains.shift.detach().double()).square().mean((0, 2))
+    assert float(gains.penalty().detach()) == pytest.approx(float(0.05 * (squares * share).sum()), rel=1e-5)
+
+
+def test_the_finished_model_is_judged_by_the_measured_gains_of_its_recordings():
+    """Turned by the phase, one for each mode, that suits the model best."""
+    gains = refined(0.01)
+    finished = gains.finished(ORDER)
+    turn = torch.exp(1j * torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64))
+    measured = torch.view_as_complex(draw(RECORDINGS, len(ORDER), 2, seed=12))
+    measured[USED] = finished.values * turn
+    judged = gains.judged(ORDER, measured)
+    assert torch.equal(judged.values, finished.values)
+    assert torch.allclose(judged.measured, finished.values, rtol=1e-9)

@@ -1,0 +1,358 @@
+"""The mixture of Gaussian processes against textbook formulas with explicit matrices."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from avmsf.field.gains import mixture as module
+from avmsf.field.gains.mixture import (
+    NOISE_SHARES,
+    Hypotheses,
+    KernelMixture,
+    active_series,
+    log_evidence,
+    posterior_weights,
+)
+
+CONTACTS, PLACES, KERNELS, SERIES = 7, 4, 4, 5
+GROUPS = torch.tensor([0, 0, 1, 2, 1, 3, 1])
+
+
+@cache
+def joint_kernels() -> np.ndarray:
+    """Return kernels among contacts and places: of full rank, of rank one, of rank three, and none at all."""
+    generator = np.random.default_rng(1)
+    found = []
+    for rank in (CONTACTS + PLACES, 1, 3):
+        factor = generator.normal(size=(CONTACTS + PLACES, rank))
+        kernel = factor @ factor.T
+        found.append(kernel / np.diag(kernel)[:CONTACTS].mean())
+    return np.stack([*found, np.zeros_like(found[0])])
+
+
+def among() -> np.ndarray:
+    return joint_kernels()[:, :CONTACTS, :CONTACTS]
+
+
+@cache
+def drawn() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return values, floors and the log prior of each kernel and noise share for each series."""
+    generator = np.random.default_rng(2)
+    values = generator.normal(size=(CONTACTS, SERIES)) * [1.0, 10.0, 0.1, 3.0, 1.0]
+    # The first two series come from two of the kernels.
+    for series, kernel in ((0, 0), (1, 2)):
+        covariance = among()[kernel] + 0.01 * np.eye(CONTACTS)
+        values[:, series] = np.linalg.cholesky(covariance) @ values[:, series]
+    prior = generator.normal(size=(KERNELS, len(NOISE_SHARES), SERIES))
+    return values, generator.uniform(0.0, 0.05, SERIES), prior
+
+
+def textbook_evidence(kernel: np.ndarray, variance: float, values: np.ndarray) -> float:
+    """Return log of the integral of N(values; 0, s^2 C) ds / s, up to a constant of the number of values."""
+    covariance = kernel + variance * np.eye(len(values))
+    quadratic = values @ np.linalg.inv(covariance) @ values
+    return -0.5 * len(values) * np.log(quadratic) - 0.5 * np.linalg.slogdet(covariance)[1]
+
+
+def textbook_weights(rows: list[int], series: int) -> np.ndarray:
+    """Return the posterior of kernels and noise shares given some contacts' values."""
+    values, floor, prior = drawn()
+    evidence = [
+        [textbook_evidence(kernel[np.ix_(rows, rows)], q + floor[series], values[rows, series]) for q in NOISE_SHARES]
+        for kernel in among()
+    ]
+    joint = np.array(evidence) + prior[..., series]
+    weights = np.exp(joint - joint.max())
+    return weights / weights.sum()
+
+
+def textbook_prediction(
+    rows: list[int], asked: list[int], series: int, *, noise: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and standard deviation at contacts or places, given the values at the contacts `rows`."""
+    values, floor, _ = drawn()
+    known, weights = values[rows, series], textbook_weights(rows, series)
+    mean, square = np.zeros(len(asked)), np.zeros(len(asked))
+    for row, kernel in enumerate(joint_kernels()):
+        for column, share in enumerate(NOISE_SHARES):
+            variance = share + floor[series]
+            inverse = np.linalg.inv(kernel[np.ix_(rows, rows)] + variance * np.eye(len(rows)))
+            across = kernel[np.ix_(asked, rows)]
+            scale = known @ inverse @ known / len(rows)
+            location = across @ inverse @ known
+            within = np.diag(kernel)[asked] - np.diag(across @ inverse @ across.T) + (variance if noise else 0.0)
+            mean += weights[row, column] * location
+            square += weights[row, column] * (scale * within + location**2)
+    return mean, np.sqrt(square - mean**2)
+
+
+@cache
+def mixture() -> KernelMixture:
+    values, floor, _ = drawn()
+    weights = np.stack([textbook_weights(list(range(CONTACTS)), series) for series in range(SERIES)], axis=2)
+    return KernelMixture(*(torch.from_numpy(each.copy()) for each in (among(), values, floor, weights)))
+
+
+def hypotheses(**changes) -> Hypotheses:
+    kernels = torch.from_numpy(among().copy())
+    log_prior = torch.from_numpy(drawn()[2][:, 0].copy())
+    prior = torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64)
+    return replace(Hypotheses(kernels, torch.tensor([0, 1, 1, 2]), prior, log_prior), **changes)
+
+
+def weighed(values: torch.Tensor, floor: torch.Tensor, given: Hypotheses) -> KernelMixture:
+    """Return the posterior with all kernels, those of no weight too."""
+    found, kept = KernelMixture.weigh(given, values, floor)
+    assert torch.equal(found.kernels, given.kernels[kept])
+    weights = torch.zeros(len(given.kernels), *found.weights.shape[1:], dtype=torch.float64)
+    weights[kept] = found.weights
+    return replace(found, kernels=given.kernels, weights=weights)
+
+
+def test_evidence_is_the_textbook_one():
+    values, floor, _ = drawn()
+    found = log_evidence(*(torch.from_numpy(each.copy()) for each in (among(), values, floor)))
+    expected = [
+        [[textbook_evidence(k, q + floor[s], values[:, s]) for s in range(SERIES)] for q in NOISE_SHARES]
+        for k in among()
+    ]
+    assert found.numpy() == pytest.approx(np.array(expected), rel=1e-9)
+
+
+def test_evidence_is_the_likelihood_integrated_over_the_scale():
+    """Up to a constant that depends on the number of contacts alone, by numerical integration over log s."""
+    values, floor, _ = drawn()
+    kernels = among()[:, :3, :3]
+    found = log_evidence(*(torch.from_numpy(each.copy()) for each in (kernels, values[:3], floor)))
+    # By trapezoids, which converge exponentially for a function that vanishes at both ends.
+    log_s = np.linspace(-12.0, 24.0, 4001)
+    constants = []
+    for kernel, row in zip(kernels, found.numpy(), strict=True):
+        for column, share in enumerate(NOISE_SHARES):
+            for series in range(SERIES):
+                covariance = kernel + (share + floor[series]) * np.eye(3)
+                quadratic = values[:3, series] @ np.linalg.inv(covariance) @ values[:3, series]
+                density = np.exp(-0.5 * quadratic * np.exp(-2.0 * log_s) - 3.0 * log_s)
+                density /= np.sqrt(np.linalg.det(2.0 * np.pi * covariance))
+                constants.append(np.log(np.trapezoid(density, log_s)) - row[column, series])
+    assert constants == pytest.approx(np.full(len(constants), constants[0]), abs=1e-6)
+
+
+def test_evidence_does_not_depend_on_the_batches(monkeypatch):
+    tensors = [torch.from_numpy(each.copy()) for each in (among(), *drawn()[:2])]
+    whole = log_evidence(*tensors)
+    monkeypatch.setattr(module, "_MEMORY", 1)
+    assert torch.allclose(log_evidence(*tensors), whole, rtol=1e-12, atol=0.0)
+
+
+def test_mean_and_spread_are_those_of_the_sum_over_hypotheses():
+    joint = torch.from_numpy(joint_kernels().copy())
+    cross, own = joint[:, CONTACTS:, :CONTACTS], torch.diagonal(joint, dim1=1, dim2=2)[:, CONTACTS:]
+    mean, spread = torch.einsum("hpc,hcs->ps", cross, mixture().solve()), mixture().spread(cross, own)
+    for series in range(SERIES):
+        expected = textbook_prediction(
+            list(range(CONTACTS)), list(range(CONTACTS, CONTACTS + PLACES)), series, noise=False
+        )
+        assert mean[:, series].numpy() == pytest.approx(expected[0], rel=1e-8, abs=1e-10)
+        assert spread[:, series].numpy() == pytest.approx(expected[1], rel=1e-6)
+
+
+def test_standard_error_is_the_root_of_the_mean_noise_variance():
+    values, floor, _ = drawn()
+    for series in range(SERIES):
+        weights, total = textbook_weights(list(range(CONTACTS)), series), 0.0
+        for row, kernel in enumerate(among()):
+            for column, share in enumerate(NOISE_SHARES):
+                variance = share + floor[series]
+                inverse = np.linalg.inv(kernel + variance * np.eye(CONTACTS))
+                scale = values[:, series] @ inverse @ values[:, series] / CONTACTS
+                total += weights[row, column] * scale * variance
+        assert float(mixture().standard_error()[series]) == pytest.approx(np.sqrt(total), rel=1e-8)
+
+
+def test_smoother_takes_the_values_to_the_mean_at_the_contacts():
+    mean = torch.einsum("hpc,hcs->ps", mixture().kernels, mixture().solve())
+    smoothed = torch.einsum("scd,ds->cs", mixture().smoother(), mixture().values)
+    assert torch.allclose(smoothed, mean, rtol=1e-9, atol=1e-12)
+    other = torch.randn(CONTACTS, SERIES, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    moved = mixture().with_values(other)
+    mean = torch.einsum("hpc,hcs->ps", moved.kernels, moved.solve())
+    assert torch.allclose(torch.einsum("scd,ds->cs", mixture().smoother(), other), mean, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("groups", [torch.arange(CONTACTS), GROUPS])
+def test_leave_out_is_what_the_other_groups_predict(groups):
+    """By conditioning on the others alone: their evidence weighs the hypotheses, with the same prior."""
+    mean, deviation = mixture().leave_out(groups)
+    for group in torch.unique(groups):
+        rows = torch.nonzero(groups == group).flatten().tolist()
+        others = torch.nonzero(groups != group).flatten().tolist()
+        for series in range(SERIES):
+            expected = textbook_prediction(others, rows, series, noise=True)
+            assert mean[rows, series].numpy() == pytest.approx(expected[0], rel=1e-6, abs=1e-9)
+            assert deviation[rows, series].numpy() == pytest.approx(expected[1], rel=1e-6)
+
+
+def test_a_lone_group_is_predicted_as_silence():
+    mean, _ = mixture().leave_out(torch.zeros(CONTACTS, dtype=torch.int64))
+    assert torch.allclose(mean, torch.zeros_like(mean), atol=1e-9)
+
+
+def test_weights_sum_to_one_and_none_is_negligible():
+    found = weighed(mixture().values, mixture().floor, hypotheses())
+    assert torch.allclose(found.weights.sum((0, 1)), torch.ones(SERIES, dtype=torch.float64))
+    assert float(found.weights[found.weights > 0].min()) >= 2e-3
+    assert bool((found.weights == 0).any())
+
+
+def test_kernels_of_no_weight_are_dropped():
+    given = hypotheses()
+    given.log_prior[1] = -1e3
+    found, kept = KernelMixture.weigh(given, mixture().values, mixture().floor)
+    assert kept.tolist() == [0, 2, 3]
+    assert torch.equal(found.kernels, given.kernels[kept])
+    assert torch.allclose(found.weights, weighed(mixture().values, mixture().floor, given).weights[kept])
+
+
+def test_without_active_series_weights_are_bayes_theorem():
+    likelihood = torch.from_numpy(np.random.default_rng(4).uniform(size=(KERNELS, len(NOISE_SHARES), SERIES)))
+    given = hypotheses()
+    found = posterior_weights(likelihood, given, torch.zeros(SERIES, dtype=torch.bool))
+    prior = given.category_prior[given.category, None, None] / len(NOISE_SHARES) * given.log_prior[:, None].exp()
+    joint = prior * likelihood.exp()
+    assert torch.allclose(found, joint / joint.sum((0, 1)), rtol=1e-12)
+
+
+def learned_prior(likelihood: torch.Tensor, given: Hypotheses) -> torch.Tensor:
+    """Return the prior [categories, noises] that some series teach: the posterior of one more that says nothing."""
+    silent = torch.zeros(*likelihood.shape[:2], 1, dtype=torch.float64)
+    active = torch.arange(likelihood.shape[2] + 1) < likelihood.shape[2]
+    log_prior = torch.cat([given.log_prior, silent[:, 0]], dim=1)
+    both = posterior_weights(torch.cat([likelihood, silent], dim=2), replace(given, log_prior=log_prior), active)
+    counts = torch.bincount(given.category).double()[given.category, None]
+    total = torch.zeros(len(given.category_prior), likelihood.shape[1], dtype=torch.float64)
+    # Each of a category's kernels has the category's probability: the posterior of silence divides by their number.
+    total.index_add_(0, given.category, both[..., -1] / counts)
+    return total / total.sum()
+
+
+def summed_evidence(likelihood: torch.Tensor, given: Hypotheses, prior: torch.Tensor) -> float:
+    joint = likelihood + given.log_prior[:, None] + prior.log()[given.category][..., None]
+    return float(torch.logsumexp(joint.flatten(0, 1), dim=0).sum())
+
+
+def test_learning_the_prior_raises_the_summed_evidence():
+    """By no less than the pseudo-count, a tenth of a series each, times how far the prior has moved."""
+    likelihood = torch.from_numpy(3.0 * np.random.default_rng(3).normal(size=(KERNELS, len(NOISE_SHARES), 30)))
+    likelihood[0] += 2.0
+    given = hypotheses(log_prior=torch.zeros(KERNELS, 30, dtype=torch.float64))
+    learned = learned_prior(likelihood, given)
+    start = (given.category_prior / len(NOISE_SHARES))[:, None].expand_as(learned)
+    gain = summed_evidence(likelihood, given, learned) - summed_evidence(likelihood, given, start)
+    assert gain >= 0.1 * 30 * float((start * (start / learned).log()).sum()) > 0.0
+
+
+def test_a_category_that_no_series_supports_keeps_what_the_pseudo_count_gives_it():
+    likelihood = torch.zeros(KERNELS, len(NOISE_SHARES), 20, dtype=torch.float64)
+    likelihood[0, 1] = 50.0
+    given = hypotheses(log_prior=torch.zeros(KERNELS, 20, dtype=torch.float64))
+    learned = learned_prior(likelihood, given)
+    expected = 0.1 * (given.category_prior / len(NOISE_SHARES))[:, None].expand_as(learned).clone()
+    expected[0, 1] += 1.0
+    assert torch.allclose(learned, expected / 1.1, rtol=1e-6)
+
+
+def test_a_series_that_says_little_borrows_from_the_others():
+    generator = np.random.default_rng(6)
+    chosen = np.linalg.cholesky(among()[2] + 0.003 * np.eye(CONTACTS)) @ generator.normal(size=(CONTACTS, 20))
+    weak = torch.from_numpy(generator.normal(size=(CONTACTS, 1)))
+    floor, alike = torch.zeros(21, dtype=torch.float64), torch.zeros(KERNELS, 21, dtype=torch.float64)
+    # Against a floor of a hundred times the mean square, all kernels are nearly alike.
+    floor[-1] = 100.0
+    values = torch.cat([torch.from_numpy(chosen), weak], dim=1)
+    separate = hypotheses(
+        category=torch.arange(KERNELS),
+        category_prior=torch.full((KERNELS,), 0.25, dtype=torch.float64),
+        log_prior=alike,
+    )
+    together = weighed(values, floor, separate).weights[2, :, -1].sum()
+    alone = weighed(values[:, -1:], floor[-1:], replace(separate, log_prior=alike[:, :1])).weights[2, :, -1].sum()
+    assert float(alone) < 0.35
+    assert float(together) > 0.8
+
+
+def test_a_series_of_zeros_has_mean_zero_and_teaches_nothing():
+    values, floor, given = mixture().values, mixture().floor, hypotheses()
+    without = weighed(values, floor, given)
+    silent = torch.zeros(CONTACTS, 3, dtype=torch.float64)
+    more = replace(given, log_prior=torch.cat([given.log_prior, given.log_prior[:, :3]], dim=1))
+    found = weighed(torch.cat([values, silent], dim=1), torch.cat([floor, floor[:3]]), more)
+    assert torch.allclose(found.weights[..., :SERIES], without.weights, rtol=1e-12)
+    assert not found.solve()[..., SERIES:].any()
+    assert not found.leave_out(GROUPS)[0][:, SERIES:].any()
+    assert bool(torch.isfinite(found.weights).all())
+
+
+def test_rounding_is_no_energy():
+    values = torch.tensor([[1.0, 1e-9, 1e-12, 0.0]], dtype=torch.float64)
+    assert active_series(values).tolist() == [True, True, False, False]
+    assert not active_series(torch.zeros(3, 2, dtype=torch.float64)).any()
+
+
+def test_the_order_of_contacts_does_not_matter():
+    order = torch.tensor([3, 0, 6, 2, 5, 1, 4])
+    given, floor = hypotheses(), mixture().floor
+    one = weighed(mixture().values, floor, given)
+    turned = replace(given, kernels=given.kernels[:, order[:, None], order])
+    other = weighed(mixture().values[order], floor, turned)
+    assert torch.allclose(other.weights, one.weights, rtol=1e-8)
+    assert torch.allclose(other.solve(), one.solve()[:, order], rtol=1e-7, atol=1e-9)
+    for found, expected in zip(other.leave_out(GROUPS[order]), one.leave_out(GROUPS), strict=True):
+        assert torch.allclose(found, expected[order], rtol=1e-7, atol=1e-9)
+
+
+def test_the_order_of_series_does_not_matter():
+    order = torch.tensor([3, 0, 4, 2, 1])
+    given, values, floor = hypotheses(), mixture().values, mixture().floor
+    one = weighed(values, floor, given)
+    other = weighed(values[:, order], floor[order], replace(given, log_prior=given.log_prior[:, order]))
+    for found in (other, one.take(order)):
+        assert torch.allclose(found.weights, one.weights[..., order], rtol=1e-9)
+        assert torch.allclose(found.solve(), one.solve()[..., order], rtol=1e-8, atol=1e-10)
+        assert torch.allclose(found.standard_error(), one.standard_error()[order], rtol=1e-9)
+
+
+@pytest.mark.parametrize("factor", [-3.5, 1e-6])
+def test_scaled_values_scale_mean_and_deviation(factor):
+    joint = torch.from_numpy(joint_kernels().copy())
+    cross, own = joint[:, CONTACTS:, :CONTACTS], torch.diagonal(joint, dim1=1, dim2=2)[:, CONTACTS:]
+    one, other = (weighed(f * mixture().values, mixture().floor, hypotheses()) for f in (1.0, factor))
+    assert torch.allclose(other.weights, one.weights, rtol=1e-8)
+    pairs = [
+        (other.solve(), factor * one.solve()),
+        (other.spread(cross, own), abs(factor) * one.spread(cross, own)),
+        (other.standard_error(), abs(factor) * one.standard_error()),
+        (other.leave_out(GROUPS)[0], factor * one.leave_out(GROUPS)[0]),
+        (other.leave_out(GROUPS)[1], abs(factor) * one.leave_out(GROUPS)[1]),
+    ]
+    for found, expected in pairs:
+        assert torch.allclose(found, expected, rtol=1e-6, atol=1e-9 * abs(factor))
+
+
+def test_at_contacts_keeps_weights_and_forgets_values():
+    rows = torch.tensor([4, 0, 2])
+    found = mixture().at_contacts(rows)
+    assert torch.equal(found.weights, mixture().weights)
+    index = rows.tolist()
+    for series in range(SERIES):
+        values, floor, _ = drawn()
+        for kernel in range(KERNELS):
+            expected = sum(
+                float(mixture().weights[kernel, column, series])
+                * np.linalg.inv(among()[kernel][np.ix_(index, index)] + (share + floor[series]) * np.eye(3))
+                for column, share in enumerate(NOISE_SHARES)
+            )
+            assert found.solve()[kernel, :, series].numpy() == pytest.approx(expected @ values[index, series], rel=1e-8)

@@ -1,0 +1,358 @@
+"""The gain model: predictions against dense computations, invariances, and its record and tensors in a file."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from avmsf.field.gains import mixture as mixture_module
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.fitting import fit_mixture
+from avmsf.field.gains.mixture import NOISE_SHARES
+from avmsf.field.gains.model import SAME_PLACE, MixtureGains, places_of, series_of
+from gain_cases import draw, families, impacts, measured, model
+
+ASKED = impacts(9, seed=5)
+MODES = 5
+
+
+def gains_at(given: MixtureGains, sites: Sites = ASKED) -> torch.Tensor:
+    found = given.at(sites.points, sites.directions)
+    return torch.complex(found.mean.double(), found.quadrature.double())
+
+
+def deviation_at(given: MixtureGains, sites: Sites = ASKED) -> torch.Tensor:
+    return given.deviation(sites.points, sites.directions).double()
+
+
+def joint_kernels(given: MixtureGains) -> torch.Tensor:
+    """Return all kept kernels among the training impacts and the asked ones."""
+    training = given.training
+    both = Sites(torch.cat([training.points, ASKED.points]), torch.cat([training.directions, ASKED.directions]))
+    kept = zip(given.families, given.kept, strict=True)
+    return torch.cat([family.between(both, both, rows) for family, rows in kept])
+
+
+def dense(given: MixtureGains, kernel: torch.Tensor, share: int, series: int) -> tuple[torch.Tensor, ...]:
+    """Return one hypothesis's mean and covariance of a series at the asked places, and its noise's variance."""
+    values = series_of(given.values)
+    count, noise = len(values), NOISE_SHARES[share] + given.mixture.floor[series]
+    inverse = torch.linalg.inv(kernel[:count, :count] + noise * torch.eye(count, dtype=torch.float64))
+    across = kernel[count:, :count]
+    scale = values[:, series] @ inverse @ values[:, series] / count
+    mean = across @ inverse @ values[:, series]
+    return mean, scale * (kernel[count:, count:] - across @ inverse @ across.T), scale * noise
+
+
+@pytest.mark.parametrize("elastic", [True, False])
+def test_mean_and_deviation_are_those_of_all_hypotheses(elastic):
+    given = model(elastic=elastic)
+    kernels = joint_kernels(given)
+    mean = torch.zeros(len(ASKED), 2 * MODES, dtype=torch.float64)
+    square = torch.zeros_like(mean)
+    for row, share, series in torch.nonzero(given.mixture.weights).tolist():
+        location, covariance, _ = dense(given, kernels[row], share, series)
+        mean[:, series] += given.mixture.weights[row, share, series] * location
+        square[:, series] += given.mixture.weights[row, share, series] * (covariance.diagonal() + location.square())
+    deviation = (square - mean.square()).sqrt()
+    assert torch.allclose(series_of(gains_at(given)), mean, rtol=1e-5, atol=1e-6)
+    found = deviation_at(given)
+    assert torch.allclose(torch.cat([found[..., 0], found[..., 1]], dim=1), deviation, rtol=1e-4, atol=1e-6)
+
+
+def torn() -> MixtureGains:
+    """Return the model with weights that differ between parts: the real one, of more energy, prefers the first."""
+    weights = torch.zeros_like(model().mixture.weights)
+    real = torch.arange(2 * MODES) < MODES
+    weights[0, 1], weights[-1, 1] = torch.where(real, 0.6, 0.1), torch.where(real, 0.4, 0.9)
+    return replace(model(), mixture=replace(model().mixture, weights=weights))
+
+
+@pytest.mark.parametrize("make", [model, lambda: model(elastic=False), torn])
+def test_covariances_are_those_of_the_most_probable_hypothesis(make):
+    """Weighed by the energies of both parts, whose variances add up."""
+    given = make()
+    values, kernels = series_of(given.values), joint_kernels(given)
+    found = list(given.covariances(ASKED.points, ASKED.directions))
+    assert len(found) == MODES
+    for mode, each in enumerate(found):
+        parts = [mode, mode + MODES]
+        weight = sum(given.mixture.weights[..., part] * values[:, part].square().sum() for part in parts)
+        row, share = divmod(int(weight.flatten().argmax()), len(NOISE_SHARES))
+        both = [dense(given, kernels[row], share, part) for part in parts]
+        assert torch.allclose(each.covariance, sum(part[1] for part in both), rtol=1e-6, atol=1e-9)
+        assert each.noise == pytest.approx(float(sum(part[2] for part in both)), rel=1e-9)
+        assert float(torch.linalg.eigvalsh(each.covariance).min()) > -1e-9 * each.noise
+
+
+def test_covariances_at_the_contacts_are_below_the_noise():
+    given = model()
+    for each in given.covariances(given.contacts, given.training.directions):
+        assert float(each.covariance.diagonal().max()) < each.noise
+
+
+def test_without_noise_nothing_is_unknown_at_the_contacts(monkeypatch):
+    monkeypatch.setattr(mixture_module, "NOISE_SHARES", (1e-9,) * len(NOISE_SHARES))
+    sites = impacts(12, seed=1)
+    given = fit_mixture(
+        families(sites),
+        replace(measured(sites), variance=torch.zeros(MODES).double()),
+        sites.points.float(),
+        directional=True,
+    )
+    for each in given.covariances(sites.points, sites.directions):
+        assert float(each.covariance.diagonal().max()) < 1e-6 * float(given.values.abs().square().max())
+    assert torch.allclose(gains_at(given, sites), given.values, rtol=1e-3, atol=1e-4)
+
+
+def test_shares_are_of_the_families_that_modes_come_from():
+    shares = model().shares()
+    assert torch.allclose(shares.sum(0), torch.ones(MODES, dtype=torch.float64))
+    assert [family.kind for family in model().families] == ["unstructured", "smooth", "elastic"]
+    assert shares.argmax(0).tolist() == [2, 1, 2, 2, 0]
+    assert float(shares.amax(0).min()) > 0.9
+
+
+def test_one_contact_leaves_families_as_probable_as_they_were():
+    """Its gain may be of any scale, so it says nothing of the kernels; families of one kind share its probability."""
+    sites = impacts(1, seed=1)
+    unstructured, smooth, thin_plate = families(sites, elastic=False)
+    given = fit_mixture(
+        [unstructured, smooth, smooth, thin_plate], measured(sites), sites.points.float(), directional=True
+    )
+    expected = torch.tensor([0.05, 0.5, 0.5, 1.0], dtype=torch.float64) / 2.05
+    assert torch.allclose(given.shares(), expected[:, None].expand(-1, MODES), rtol=1e-9)
+
+
+def test_leave_one_out_does_not_know_the_place():
+    """Whatever is measured at a place, by one impact or two, changes the prediction there through the weights alone."""
+    given = model()
+    assert given.places.tolist().count(int(given.places[0])) == 2
+    mean = given.leave_one_out()
+    for place in given.places.unique().tolist():
+        rows = torch.nonzero(given.places == place).flatten()
+        others = given.without(given.places == place)
+        # One hypothesis alone has no weights that the others could change.
+        weights = torch.zeros_like(given.mixture.weights)
+        weights[-1, 0] = 1.0
+        single, rest = (replace(each, mixture=replace(each.mixture, weights=weights)) for each in (given, others))
+        expected = gains_at(rest, given.training.take(rows))
+        assert torch.allclose(single.leave_one_out()[rows], expected, rtol=1e-4, atol=1e-6)
+    assert float((mean - given.values).abs().square().sum() / given.values.abs().square().sum()) < 0.1
+
+
+def test_standardized_errors_are_of_size_one_for_draws_of_the_model():
+    """Over many modes drawn from a smooth kernel with one percent of noise."""
+    sites = impacts(16, seed=1)
+    smooth = families(sites)[1]
+    kernel = smooth.kernels()[2] + 0.01 * torch.eye(16, dtype=torch.float64)
+    drawn = torch.randn(16, 200, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
+    values = torch.linalg.cholesky(kernel).to(torch.complex128) @ drawn
+    gains = replace(
+        measured(sites),
+        values=values,
+        variance=torch.zeros(200, dtype=torch.float64),
+        frequency=torch.linspace(100.0, 9000.0, 200, dtype=torch.float64),
+        damping=torch.full((200,), 10.0, dtype=torch.float64),
+    )
+    given = fit_mixture(families(sites, elastic=False), gains, sites.points.float(), directional=True)
+    assert float(given.standardized_errors().square().mean().sqrt()) == pytest.approx(1.0, abs=0.15)
+
+
+def test_standardized_errors_judge_the_measured_gains():
+    given = model()
+    errors = given.standardized_errors()
+    assert errors.shape == (14, MODES, 2)
+    moved = given.judged_by(given.values + 1.0)
+    assert torch.equal(moved.leave_one_out(), given.leave_one_out())
+    assert torch.equal(moved.standardized_errors()[..., 1], errors[..., 1])
+    assert bool((moved.standardized_errors()[..., 0] > errors[..., 0]).all())
+
+
+@pytest.mark.parametrize("variance", [0.0, 1e-5, 100.0])
+def test_a_mode_without_gains_is_silent_and_changes_no_other(variance):
+    sites = impacts(12, seed=1)
+    gains, points = measured(sites), sites.points.float()
+    values = gains.values.clone()
+    values[:, 2] = 0.0
+    others = torch.tensor([0, 1, 3, 4])
+    silent = replace(gains, values=values, variance=torch.where(torch.arange(MODES) == 2, variance, gains.variance))
+    rest = replace(
+        gains,
+        **{name: getattr(gains, name)[..., others] for name in ("values", "variance", "frequency", "damping")},
+    )
+    one = fit_mixture(families(sites, elastic=False), silent, points, directional=True)
+    other = fit_mixture(families(sites, elastic=False), rest, points, directional=True)
+    assert not gains_at(one)[:, 2].any()
+    assert torch.equal(deviation_at(one)[:, 2], torch.zeros(len(ASKED), 2, dtype=torch.float64))
+    assert bool(one.standardized_errors()[:, 2].isnan().all())
+    assert torch.allclose(gains_at(one)[:, others], gains_at(other), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("factor", [-2.5, 1e-4])
+def test_scaled_gains_scale_the_model(factor):
+    sites = impacts(12, seed=1)
+    gains = measured(sites)
+    scaled = replace(gains, values=factor * gains.values, variance=factor**2 * gains.variance)
+    one, other = (
+        fit_mixture(families(sites), each, sites.points.float(), directional=True) for each in (gains, scaled)
+    )
+    assert torch.allclose(gains_at(other), factor * gains_at(one), rtol=1e-5, atol=1e-6 * abs(factor))
+    assert torch.allclose(deviation_at(other), abs(factor) * deviation_at(one), rtol=1e-4, atol=1e-6 * abs(factor))
+    assert torch.allclose(other.noise(), abs(factor) * one.noise(), rtol=1e-5)
+
+
+def test_the_order_of_contacts_and_modes_does_not_matter():
+    sites, contacts, modes = impacts(12, seed=1), torch.randperm(12), torch.tensor([2, 0, 4, 1, 3])
+    gains = measured(sites)
+    turned = replace(
+        gains,
+        values=gains.values[contacts][:, modes],
+        **{name: getattr(gains, name)[modes] for name in ("variance", "frequency", "damping")},
+    )
+    one = fit_mixture(families(sites), gains, sites.points.float(), directional=True)
+    other = fit_mixture(families(sites.take(contacts)), turned, sites.points.float(), directional=True)
+    assert torch.allclose(gains_at(other), gains_at(one)[:, modes], rtol=1e-4, atol=1e-5)
+    assert torch.allclose(other.leave_one_out(), one.leave_one_out()[contacts][:, modes], rtol=1e-4, atol=1e-5)
+
+
+def test_smoother_and_noise_go_with_their_modes_and_parts():
+    given = model()
+    smoothed = torch.einsum("mpcd,dmp->cmp", given.smoother(), torch.view_as_real(given.values)).contiguous()
+    assert torch.allclose(torch.view_as_complex(smoothed), gains_at(given, given.training), rtol=1e-5, atol=1e-6)
+    error = given.mixture.standard_error()
+    assert torch.equal(given.noise(), torch.stack([error[:MODES], error[MODES:]], dim=1))
+
+
+def test_take_takes_modes_in_their_order():
+    given, rows = model().judged_by(2.0 * model().values), torch.tensor([3, 0, 4])
+    taken = given.take(rows)
+    assert torch.equal(taken.values, given.values[:, rows])
+    assert torch.equal(taken.measured, given.measured[:, rows])
+    assert torch.allclose(gains_at(taken), gains_at(given)[:, rows], rtol=1e-6, atol=1e-7)
+    assert torch.allclose(deviation_at(taken), deviation_at(given)[:, rows], rtol=1e-5, atol=1e-7)
+    assert torch.allclose(taken.leave_one_out(), given.leave_one_out()[:, rows], rtol=1e-9)
+    assert torch.equal(taken.shares(), given.shares()[:, rows])
+    assert torch.equal(taken.noise(), given.noise()[rows])
+
+
+def test_without_contacts_the_rest_predicts():
+    given = model().judged_by(2.0 * model().values)
+    none = given.without(torch.zeros(14, dtype=torch.bool))
+    assert torch.allclose(gains_at(none), gains_at(given), rtol=1e-6, atol=1e-7)
+    left_out = torch.arange(14) % 3 == 1
+    rest = given.without(left_out)
+    assert torch.equal(rest.contacts, given.contacts[~left_out])
+    assert torch.equal(rest.values, given.values[~left_out])
+    assert torch.equal(rest.measured, given.measured[~left_out])
+    # As if their noise were without bounds, with the same weights.
+    kernels = joint_kernels(rest)
+    mean = torch.zeros(len(ASKED), 2 * MODES, dtype=torch.float64)
+    for row, share, series in torch.nonzero(rest.mixture.weights).tolist():
+        mean[:, series] += rest.mixture.weights[row, share, series] * dense(rest, kernels[row], share, series)[0]
+    assert torch.allclose(series_of(gains_at(rest)), mean, rtol=1e-5, atol=1e-6)
+
+
+def test_the_mean_is_linear_in_the_values():
+    given = model()
+    other = torch.view_as_complex(draw(14, MODES, 2, seed=8))
+    both = gains_at(given.with_values(2.0 * given.values - 3.0 * other))
+    assert torch.allclose(both, 2.0 * gains_at(given) - 3.0 * gains_at(given.with_values(other)), rtol=1e-4, atol=1e-5)
+    assert torch.equal(given.with_values(other).values, other)
+    assert torch.equal(given.with_values(given.values).mixture.weights, given.mixture.weights)
+
+
+def test_impacts_of_no_direction_go_straight_into_the_body():
+    given = model()
+    into = torch.zeros_like(ASKED.points)
+    into[:, 2] = -ASKED.points[:, 2].sign()
+    directions = 3.0 * ASKED.directions
+    directions[::2] = 0.0
+    sites = given.sites(ASKED.points, directions)
+    assert torch.allclose(sites.directions[::2], into[::2])
+    assert torch.allclose(sites.directions[1::2], ASKED.directions[1::2])
+    assert torch.allclose(given.sites(ASKED.points).directions, into)
+    assert not directions[::2].any()
+
+
+def test_without_a_body_they_go_as_the_nearest_training_impact():
+    given = model(elastic=False)
+    nearest = torch.cdist(ASKED.points, given.contacts).argmin(1)
+    assert torch.equal(given.sites(ASKED.points.float()).directions, given.training.directions[nearest])
+    zeros = torch.zeros_like(ASKED.points)
+    assert torch.equal(given.sites(ASKED.points, zeros).directions, given.training.directions[nearest])
+
+
+def test_a_model_that_knows_no_directions_takes_none():
+    given = replace(model(elastic=False), directional=False)
+    assert torch.equal(gains_at(given), gains_at(given, replace(ASKED, directions=-ASKED.directions)))
+
+
+@pytest.mark.parametrize("elastic", [True, False])
+def test_a_model_comes_back_from_its_tensors_to_the_last_bit(elastic):
+    given = model(elastic=elastic).judged_by(1.1 * model(elastic=elastic).values)
+    record = json.loads(json.dumps(given.record()))
+    tensors = {name: tensor.detach().clone().contiguous() for name, tensor in given.tensors().items()}
+    skeleton = MixtureGains.skeleton(record)
+    assert {name: (each.shape, each.dtype) for name, each in skeleton.items()} == {
+        name: (each.shape, each.dtype) for name, each in tensors.items()
+    }
+    back = MixtureGains.restore(record, tensors)
+    assert torch.equal(gains_at(back), gains_at(given))
+    assert torch.equal(deviation_at(back), deviation_at(given))
+    assert torch.equal(back.at(ASKED.points).mean, given.at(ASKED.points).mean)
+    assert torch.equal(back.leave_one_out(), given.leave_one_out())
+    assert torch.equal(back.standardized_errors(), given.standardized_errors())
+    pairs = zip(*(each.covariances(ASKED.points, None) for each in (back, given)), strict=True)
+    assert all(torch.equal(one.covariance, other.covariance) and one.noise == other.noise for one, other in pairs)
+    assert back.record() == record
+    assert back.directional is given.directional
+    assert torch.equal(back.points, given.points)
+
+
+NO_LIST = dict.fromkeys(["unstructured", "smooth", "elastic"], 1)
+WRONG = {
+    "points": [None, 0, -3, 2.0, "14", True],
+    "contacts": [None, 0, [14]],
+    "modes": [None, 0, 1.5],
+    "directional": [None, 1, "yes"],
+    "families": [None, 3, [], ["smooth"], ["attention", "smooth", "elastic"], "smooth", NO_LIST],
+    "kept": [None, 3, [], [1], ["2", 1, 1], [0, 1, 1]],
+    "bodies": [None, 3, [], [{}], [[]], [{"nodes": 0, "triangles": 3, "shapes": 2}], ["nodes"], [1]],
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_records_are_refused(name):
+    """By errors that the reader of files expects."""
+    record = model().record()
+    missing = {key: value for key, value in record.items() if key != name}
+    for wrong in (missing, *({**record, name: value} for value in WRONG[name])):
+        with pytest.raises((ValueError, TypeError, KeyError)):
+            MixtureGains.skeleton(wrong)
+
+
+def test_contacts_nearer_than_a_hundredth_are_one_place():
+    """Of the diagonal of the box around all; farther ones are not, and equal ones are always."""
+    corners = torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]], dtype=torch.float64)
+    near = torch.tensor([[1.0, 1.0, 0.0], [1.049, 1.0, 0.0], [2.0, 2.0, 0.0], [2.051, 2.0, 0.0]], dtype=torch.float64)
+    places = places_of(torch.cat([corners, near, near[:1], corners[1:]]))
+    assert places.unique().tolist() == [0, 1, 2, 3, 4]
+    groups = [[0], [1, 7], [2, 3, 6], [4], [5]]
+    assert sorted(torch.nonzero(places == place).flatten().tolist() for place in places.unique()) == groups
+    assert places_of(corners[:1]).tolist() == [0]
+    assert places_of(corners[[0, 0]]).tolist() == [0, 0]
+
+
+def test_places_do_not_grow_along_a_row():
+    """Of contacts each near to the next; nothing depends on the order of contacts."""
+    along = torch.linspace(0.0, 1.0, 161, dtype=torch.float64)
+    contacts = along[:, None] * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+    places = places_of(contacts)
+    for place in places.unique():
+        assert float(along[places == place].max() - along[places == place].min()) <= SAME_PLACE
+    assert len(places.unique()) < 161
+    order = torch.randperm(161, generator=torch.Generator().manual_seed(0))
+    together = places[:, None] == places
+    assert torch.equal((places_of(contacts[order])[:, None] == places_of(contacts[order])), together[order][:, order])
