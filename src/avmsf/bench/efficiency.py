@@ -19,7 +19,16 @@ from avmsf.scene.points import farthest_points
 
 COUNTS = (3, 4, 6, 8, 12, 16, 24, 32, 48)
 """Numbers of strikes learnt from, where no others are asked for."""
-METHODS = (BASELINE, "knn-gains", "spline-gains", "field-positions", "field-spline", "field-physics", "field-auto")
+METHODS = (
+    BASELINE,
+    "knn3-directions",
+    "knn-gains",
+    "spline-gains",
+    "field-positions",
+    "field-spline",
+    "field-physics",
+    "field-auto",
+)
 """Methods that take part, where no others are asked for: those that need no pictures of the object. All but
 the network, `field-positions`, take seconds for each figure."""
 _LEFT = 0.25

@@ -17,6 +17,7 @@ _TABLE = (
     "random-impact",
     "nearest",
     BASELINE,
+    "knn3-directions",
     "knn-gains",
     "knn-spectra",
     "spline-gains",
