@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+import torch
 from rich.table import Table
 
 from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, WhiteNoise, floor
@@ -10,7 +11,9 @@ from avmsf.bench.renderer import Renderer
 from avmsf.capture import Impacts
 from avmsf.cli.printing import figure, table
 from avmsf.field.soundfield import SoundField
+from avmsf.field.thinplate import places_of
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.wording import counted
 
 HEADINGS = {
     "relative_stft": "relative STFT error",
@@ -37,6 +40,14 @@ def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction)
     renderers |= {f"mean gains of {count} nearest": MeanGains(train, modes, count), "white noise": WhiteNoise(train)}
     scores = {name: evaluate(renderer, test) for name, renderer in renderers.items()}
     return scores | {"floor: the test strikes' own gains": score(floor(test, modes.bank), test)}
+
+
+def parts_words(train: Impacts, test: Impacts) -> str:
+    """Return how many places are not trained on and how many are, and their recordings where these are more."""
+    owners = places_of(torch.cat([train.contacts, test.contacts]).double()).split([len(train), len(test)])
+    heard, left = (len(owner.unique()) for owner in owners)
+    repeats = "" if (heard, left) == (len(train), len(test)) else f" ({len(test)} and {len(train)} recordings)"
+    return f"{counted(left, 'place')} not trained on, {heard} trained on{repeats}"
 
 
 def score_table(title: str, scores: Mapping[str, Scores]) -> Table:
