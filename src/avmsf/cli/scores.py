@@ -44,8 +44,8 @@ def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction)
 
 def parts_words(train: Impacts, test: Impacts) -> str:
     """Return how many places are not trained on and how many are, and their recordings where these are more."""
-    owners = places_of(torch.cat([train.contacts, test.contacts]).double()).split([len(train), len(test)])
-    heard, left = (len(owner.unique()) for owner in owners)
+    owners = places_of(torch.cat([train.contacts, test.contacts]).double()).tolist()
+    heard, left = len(set(owners[: len(train)])), len(set(owners[len(train) :]))
     repeats = "" if (heard, left) == (len(train), len(test)) else f" ({len(test)} and {len(train)} recordings)"
     return f"{counted(left, 'place')} not trained on, {heard} trained on{repeats}"
 
