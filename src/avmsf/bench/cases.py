@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
-from avmsf.field.thinplate import places_of
+from avmsf.field.places import rows_by_place
 from avmsf.scene.points import closest_points, farthest_points
 from avmsf.wording import counted
 
@@ -141,11 +141,8 @@ class Places:
     @classmethod
     def of(cls, impacts: Impacts) -> "Places":
         """Find the places of an object's impacts."""
-        contacts = impacts.contacts.double()
-        found: dict[int, list[int]] = {}
-        for row, place in enumerate(places_of(contacts).tolist() if len(impacts) else ()):
-            found.setdefault(place, []).append(row)
-        return cls(contacts[[rows[0] for rows in found.values()]], tuple(tuple(rows) for rows in found.values()))
+        rows = rows_by_place(impacts.contacts)
+        return cls(impacts.contacts.double()[[each[0] for each in rows]], rows)
 
     @property
     def recordings(self) -> int:
