@@ -106,7 +106,8 @@ def recorded_cast(folder: Path, *, words: bool, seed: int = 0) -> Cast:
         pairs = ", ".join(f"{each.source} to {each.target}" for each in RECORDED_TRANSITIONS)
         raise EvaluationError(f"{folder} holds no pair of materials that the protocol leads from and to ({pairs})")
     what = f"{len(objects)} objects of RealImpact, the nearest microphone, modes extracted from all recordings, gains "
-    what += "by kernels of positions (which 26 objects and which prompts the paper took is not said there, so that these are ours)"
+    what += "by kernels of positions (which 26 objects and which prompts the paper took is not said there, so that "
+    what += "these are ours)"
     left_out = f"not there, and left out: {', '.join(missing) or 'none'}."
     return Cast("realimpact", objects, tasks, what, known=False, remarks=(left_out,))
 

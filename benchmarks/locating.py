@@ -51,9 +51,9 @@ CONVENTIONS = (
     "rmed: distance between found and true contact over the diagonal of the box around the object's points, mean over "
     "held-out strikes; modulo: to the nearest image of the truth under the object's symmetries. random: expectation "
     "over all points.",
-    "fields: all kernel families, without end-to-end steps, fitted to a fifth of the strikes (aircraft: 15 of 74, three starts), "
-    "spread as far apart as they go. network: the paper's, quick recipe. no_residual: fitted and located as if there "
-    "were no noise.",
+    "fields: all kernel families, without end-to-end steps, fitted to a fifth of the strikes (aircraft: 15 of 74, "
+    "three starts), spread as far apart as they go. network: the paper's, quick recipe. no_residual: fitted and "
+    "located as if there were no noise.",
     "coverage90: part of the strikes that were located whose true contact lies in the 90 % region of the posterior, "
     "modulo symmetry; region: that region's part of the surface; refused: part of the strikes that were not located, "
     "which count as placed at random.",

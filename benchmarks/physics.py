@@ -1,4 +1,4 @@
-"""What a field with elastic mode shapes costs in time and memory, and how often its intervals hold gains whose truth is known."""
+"""Time and memory that a fit with elastic mode shapes takes, and how often its intervals hold the true gains."""
 
 import json
 import subprocess
@@ -33,8 +33,8 @@ COSTED_SIZE, COSTED_MODES = 0.5, 170
 COVERED = ("mug-ceramic", "bowl-glass", "bracket-steel", "pot-steel", "dish-ceramic", "spoon-wood")
 CONVENTIONS = (
     f"physics.seconds: of sim-20's {COSTED}, {COSTED_SIZE:g} m long, 8 recordings of it, from a mesh of unknown wall "
-    "to a field: bodies of several walls, the most probable one with 40,000 degrees of freedom, modes, fit end to end, in a "
-    "process of its own; seconds_cached: again, with the elastic shapes kept; filled: the same where it is told that "
+    "to a field: bodies of several walls, the most probable one with 40,000 degrees of freedom, modes, fit end to end, "
+    "in a process of its own; seconds_cached: again, with the elastic shapes kept; filled: the same where it is told that "
     "the mesh encloses the material whole, which it does. gigabytes: peak memory of that process. render_ms: of one "
     "sound, after the first.",
     "coverage90: part of the held-out recordings' own gains in the 90 % interval, of 32 blows with each of "

@@ -44,7 +44,7 @@ class _Case:
     train: Impacts
     test: Impacts
     features: FeatureField
-    recipe: GainRecipe
+    gains: MixtureEstimator
 
 
 def measure(options: Options) -> Report:
@@ -73,7 +73,7 @@ def _judged(case: _Case, rate: float, options: Options) -> tuple[float, float, f
     """Return the tail's level in dB, the relative STFT error and L1-log of one fit."""
     config = replace(QUICK_LOOK if options.quick_look else FitConfig(damping="shared"), noise_rate=rate)
     modes = extract(case.train)
-    field, test = fit(case.train, case.features, modes, config, gains=case.recipe), modes.aligned(case.test)
+    field, test = fit(case.train, case.features, modes, config, gains=case.gains), modes.aligned(case.test)
     sounds = field.render(test.contacts, directions=test.directions)
     levels = [_tail_power(each, test.sample_rate) for each in (sounds, test.sounds)]
     means = score(sounds, test).mean()
@@ -105,8 +105,8 @@ def _aircraft(options: Options) -> Iterator[_Case]:
     capture = capture_in_place("aircraft_response")
     assert capture.surface is not None
     train, test = split(capture.impacts, count=15)
-    recipe = MixtureEstimator() if options.quick_look else filled_estimator(capture.surface, options)
-    yield _Case("aircraft", train, test, surface_features(capture), recipe)
+    gains = MixtureEstimator() if options.quick_look else filled_estimator(capture.surface, options)
+    yield _Case("aircraft", train, test, surface_features(capture), gains)
 
 
 def _sim20(options: Options) -> Iterator[_Case]:

@@ -246,6 +246,7 @@ def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys
         "field",
         "nearest strike",
         "mean waveform of 3 nearest",
+        "mean waveform of 3 nearest, by direction",
         "mean gains of 3 nearest",
         "white noise",
         "floor: the test strikes' own gains",

@@ -1,4 +1,4 @@
-"""Error over the number of strikes: how contacts are chosen, what is drawn, and the command that does both."""
+"""Error over the number of places: how contacts are chosen, what is drawn, and the command that does both."""
 
 import json
 from itertools import pairwise
@@ -30,7 +30,7 @@ def test_choices_grow_and_all_of_a_start_are_judged_alike() -> None:
     growing = Growing(starts=2)
     assert isinstance(growing, Choosing)
     cases = growing.cases(impacts)
-    assert [case.label for case in cases[::2]] == [f"{count} strikes" for count in (3, 4, 6, 8, 12, 16, 24)]
+    assert [case.label for case in cases[::2]] == [f"{count} places" for count in (3, 4, 6, 8, 12, 16, 24)]
     assert len({case.key for case in cases}) == 14
     for first in ("0.wav", "20.wav"):
         of_start = [case for case in cases if case.fold == f"from {first}"]
@@ -50,8 +50,8 @@ def test_repeated_strikes_stay_together() -> None:
 
 
 WRONG = {
-    "2 different contacts are too few": (Growing(), 2),
-    "12 contacts to learn from leave none of 12": (Growing((3, 12)), 12),
+    "more places than 2": (Growing(), 2),
+    "fewer places to learn from than all 12, got 12": (Growing((3, 12)), 12),
 }
 
 
@@ -63,7 +63,7 @@ def test_numbers_that_a_capture_does_not_have_are_refused(message: str) -> None:
 
 
 def test_settings_that_mean_nothing_are_refused() -> None:
-    with pytest.raises(EvaluationError, match=r"numbers of strikes are \[0, 3\]: expected 1 or more"):
+    with pytest.raises(EvaluationError, match=r"1 or more, got \[0, 3\]"):
         Growing((0, 3))
     with pytest.raises(EvaluationError, match="starts = 0: expected 1"):
         Growing(starts=0)
@@ -71,9 +71,9 @@ def test_settings_that_mean_nothing_are_refused() -> None:
 
 def record_of(errors: dict[tuple[str, int, str], tuple[float | None, ...]]) -> ObjectRecord:
     keys = sorted({(count, fold) for _, count, fold in errors})
-    cases = tuple(CaseRecord(f"{count} strikes: {fold}", f"{count} strikes", (), ()) for count, fold in keys)
+    cases = tuple(CaseRecord(f"{count} places: {fold}", f"{count} places", (), ()) for count, fold in keys)
     outcomes = tuple(
-        Outcome(f"{count} strikes: {fold}", method, {"l1": values}) for (method, count, fold), values in errors.items()
+        Outcome(f"{count} places: {fold}", method, {"l1": values}) for (method, count, fold), values in errors.items()
     )
     return ObjectRecord("mug", cases=cases, outcomes=outcomes)
 

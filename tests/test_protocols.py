@@ -92,7 +92,7 @@ def test_fewer_views_change_nothing_but_the_views() -> None:
 def test_too_few_contacts_are_refused() -> None:
     lonely = replace(struck(3), contacts=torch.zeros(3, 3, dtype=torch.float64))
     for choosing in (Farthest(), Closest(), LeaveOneOut(), Shots()):
-        with pytest.raises(EvaluationError, match="from 1 different contacts"):
+        with pytest.raises(EvaluationError, match="3 recordings at 1 place"):
             choosing.cases(lonely)
 
 

@@ -159,4 +159,5 @@ def mixture_gains(contacts: Tensor, bank: ModalBank, points: Tensor) -> MixtureG
     generator = torch.Generator().manual_seed(0)
     values = torch.randn(len(contacts), len(bank), dtype=torch.complex128, generator=generator)
     variance = torch.full((len(bank),), 1e-4, dtype=torch.float64)
-    return fit_mixture(families, MeasuredGains(values, variance, bank.frequency, bank.damping), points, directional=True)
+    measured = MeasuredGains(values, variance, bank.frequency, bank.damping)
+    return fit_mixture(families, measured, points, directional=True)

@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.bench.evaluation import split
+from avmsf.bench.baselines import MeanWaveform
+from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.scores import compare
 from avmsf.field.config import FitConfig
@@ -48,3 +49,26 @@ def test_jitter_of_the_starts_does_not_count() -> None:
         errors[deviation] = {name: each.mean()["relative_stft"] for name, each in scores.items()}
     for name in ("field", "mean waveform of 3 nearest"):
         assert errors[3.0][name] == pytest.approx(errors[0.0][name], rel=0.04), name
+
+
+@pytest.mark.parametrize("directed", [True, False])
+def test_neighbors_by_direction_are_scored_where_directions_are_known(directed: bool) -> None:
+    generator = torch.Generator().manual_seed(0)
+    plate = Plate(alpha=40.0)
+    contacts = sample_contacts(plate, 10, generator=generator)
+    straight = strike(plate, contacts, sample_rate=8000.0, seconds=0.1, generator=generator, highest=2500.0)
+    # Every other impact comes from behind, and its sound is the negated one.
+    signs = torch.tensor([1.0, -1.0]).repeat(5)[:, None]
+    directions = torch.tensor([0.0, 0.0, -1.0]) * signs
+    impacts = replace(straight, sounds=signs * straight.sounds, directions=directions if directed else None)
+    train, test = split(impacts, count=7)
+    modes = extract(train)
+    field = fit(train, FeatureField.from_contacts(contacts), modes, FitConfig(steps=0), gains=ThinPlate())
+    scores = compare(field, train, test, modes)
+    by_direction = scores.get("mean waveform of 3 nearest, by direction")
+    assert (by_direction is not None) == directed
+    if by_direction is not None:
+        alike_train, alike_test = split(straight, count=7)
+        alike = evaluate(MeanWaveform(alike_train), alike_test).mean()
+        assert by_direction.mean() == pytest.approx(alike, rel=1e-5)
+        assert scores["mean waveform of 3 nearest"].mean() != pytest.approx(alike, rel=0.1)

@@ -1,16 +1,21 @@
-"""Which contacts of an object are learnt from and which are judged by: the ways of choosing them, as data."""
+"""Which contacts of an object are learnt from and which are judged by: the ways of choosing them, as data.
+
+Places are chosen, counted and left out, not recordings: all recordings at a place go to one side. A test at a place
+that was trained on would be too easy.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
+from avmsf.field.places import rows_by_place
 from avmsf.scene.points import closest_points, farthest_points
+from avmsf.wording import counted
 
 
 @dataclass(frozen=True)
@@ -36,13 +41,10 @@ class Case:
 
 @runtime_checkable
 class Choosing(Protocol):
-    """A way to choose training contacts.
-
-    Impacts at one and the same contact stay on one side, lest a test be at a place already heard.
-    """
+    """A way to choose training places, with all recordings there."""
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return the cases of an object. Raises EvaluationError where its contacts are too few."""
+        """Return the cases of an object. Raises EvaluationError where its places are too few."""
         ...
 
 
@@ -51,12 +53,12 @@ class Farthest:
     """Training contacts as far apart as they go, from the first one on (paper, section 4.1)."""
 
     fraction: float = 0.2
-    """Part of the impacts to train on, at least 2 contacts."""
+    """Part of the places to train on, at least 2 places."""
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return the one case, the same as that of `avmsf.bench.evaluation.split`."""
-        places = _Places.of(impacts)
-        wanted = places.expect(max(2, round(self.fraction * len(impacts))))
+        places = Places.of(impacts)
+        wanted = places.expect_part(self.fraction)
         return (places.case("farthest", farthest_points(places.contacts, wanted)),)
 
 
@@ -65,22 +67,22 @@ class Closest:
     """Training contacts in one region: the first contact and those nearest to it (paper, supplement)."""
 
     fraction: float = 0.2
-    """Part of the impacts to train on, at least 2 contacts."""
+    """Part of the places to train on, at least 2 places."""
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return the one case."""
-        places = _Places.of(impacts)
-        wanted = places.expect(max(2, round(self.fraction * len(impacts))))
+        places = Places.of(impacts)
+        wanted = places.expect_part(self.fraction)
         return (places.case("closest", closest_points(places.contacts, wanted)),)
 
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """Every contact is judged by once, after learning from all others."""
+    """Every place is judged by once, after learning from all others."""
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return a case for each different contact, named by its first recording."""
-        places = _Places.of(impacts)
+        """Return a case for each place, named by its first recording."""
+        places = Places.of(impacts)
         count = len(places.rows)
         places.expect(count - 1)
         return tuple(
@@ -91,14 +93,14 @@ class LeaveOneOut:
 
 @dataclass(frozen=True)
 class Shots:
-    """Fewer and fewer training contacts, each choice within the one before, judged by the same contacts throughout."""
+    """Fewer and fewer training places, each choice within the one before, judged by the same places throughout."""
 
     counts: tuple[int, ...] = (16, 8, 4, 2, 1)
-    """Numbers of training contacts; those that would leave no contact to judge by are left out."""
+    """Numbers of training places; those that would leave no place to judge by are left out."""
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return a case for each number; all are judged by the contacts that the largest leaves over."""
-        places = _Places.of(impacts)
+        """Return a case for each number; all are judged by the places that the largest leaves over."""
+        places = Places.of(impacts)
         counts = [count for count in self.counts if count < len(places.rows)] or [places.expect(min(self.counts))]
         order = farthest_points(places.contacts, max(counts)).tolist()
         test = places.case("", order).test
@@ -125,34 +127,53 @@ class FewerViews:
 
 
 @dataclass(frozen=True, eq=False)
-class _Places:
-    """The different contacts of an object, in the order of their first impacts."""
+class Places:
+    """The places at which an object was struck, by `places_of`, in the order of their first recordings.
+
+    Repeated recordings are of one place even if their contacts were measured anew each time.
+    """
 
     contacts: Float64[Tensor, "places 3"]
+    """Contact of the first recording at each, metres."""
     rows: tuple[tuple[int, ...], ...]
-    """The impacts at each."""
+    """The recordings at each."""
 
     @classmethod
-    def of(cls, impacts: Impacts) -> "_Places":
-        found: dict[tuple[float, ...], list[int]] = {}
-        for row, contact in enumerate(impacts.contacts.double().tolist()):
-            found.setdefault(tuple(contact), []).append(row)
-        contacts = torch.tensor(list(found), dtype=torch.float64).reshape(-1, 3)
-        return cls(contacts, tuple(tuple(rows) for rows in found.values()))
+    def of(cls, impacts: Impacts) -> "Places":
+        """Find the places of an object's impacts."""
+        rows = rows_by_place(impacts.contacts)
+        return cls(impacts.contacts.double()[[each[0] for each in rows]], rows)
 
-    def expect(self, wanted: int) -> int:
-        """Return `wanted`, or raise EvaluationError where so many training contacts leave none to judge by."""
-        if not 1 <= wanted < len(self.rows):
+    @property
+    def recordings(self) -> int:
+        """How many recordings there are at all places."""
+        return sum(map(len, self.rows))
+
+    def number_of(self, row: int) -> int:
+        """Return the place of a recording. Raises EvaluationError for a row that is none."""
+        for place, rows in enumerate(self.rows):
+            if row in rows:
+                return place
+        raise EvaluationError(f"expected a recording to start from, 0 to {self.recordings - 1}, got {row}")
+
+    def expect(self, wanted: int, *, least: int = 1) -> int:
+        """Return `wanted`, or raise EvaluationError where so many places to train on are too few or leave no other."""
+        if not least <= wanted < len(self.rows):
             raise EvaluationError(
-                f"{wanted} contacts to train on cannot be chosen from {len(self.rows)} different contacts: at least 1 "
-                "is needed to train and 1 to test; record more contacts or take another protocol"
+                f"expected a number of places to train on from {least} to {len(self.rows) - 1}, so that one is left to "
+                f"test, got {wanted}: there are {counted(self.recordings, 'recording')} at "
+                f"{counted(len(self.rows), 'place')}; choose another number or record more places"
             )
         return wanted
 
+    def expect_part(self, fraction: float) -> int:
+        """Return how many places a fraction of them is, at least 2. Raises EvaluationError as `expect`."""
+        return self.expect(max(2, round(fraction * len(self.rows))), least=2)
+
     def case(self, label: str, chosen: Iterable[int] | Tensor, *, fold: str = "") -> Case:
-        """Return the case that trains on the chosen contacts: first impacts first, then the repeated ones."""
+        """Return the case that trains on the chosen places: first recordings first, then the repeated ones."""
         taken = [self.rows[int(place)] for place in chosen]
         train = [rows[0] for rows in taken] + sorted(row for rows in taken for row in rows[1:])
         heard = set(train)
-        test = tuple(row for row in range(sum(map(len, self.rows))) if row not in heard)
+        test = tuple(row for row in range(self.recordings) if row not in heard)
         return Case(label, tuple(train), test, fold)

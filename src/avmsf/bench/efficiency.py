@@ -1,4 +1,4 @@
-"""Sample efficiency: how the error falls with the number of strikes learnt from, method by method, and its picture."""
+"""Sample efficiency: how the error falls with the number of places learnt from, method by method, and its picture."""
 
 import math
 from collections.abc import Sequence
@@ -6,60 +6,73 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
-from avmsf.bench.cases import Case
+from avmsf.bench.cases import Case, Places
 from avmsf.bench.protocols import BASELINE, EvaluationProtocol
 from avmsf.bench.results import ObjectRecord
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
 from avmsf.scene.points import farthest_points
+from avmsf.wording import counted
 
 COUNTS = (3, 4, 6, 8, 12, 16, 24, 32, 48)
-"""Numbers of strikes learnt from, where no others are asked for."""
-METHODS = (BASELINE, "knn-gains", "spline-gains", "field-positions", "field-smooth", "field-elastic", "field-auto")
+"""Numbers of places learnt from, where no others are asked for."""
+METHODS = (
+    BASELINE,
+    "knn3-directions",
+    "knn-gains",
+    "spline-gains",
+    "field-positions",
+    "field-smooth",
+    "field-elastic",
+    "field-auto",
+)
 """Methods that take part, where no others are asked for: those that need no pictures of the object. All but
 the network, `field-positions`, take seconds for each figure."""
 _LEFT = 0.25
-"""Part of the contacts that is kept to be judged by, where counts are not asked for."""
+"""Part of the places that is kept to be judged by, where counts are not asked for."""
 _MARKS = "os^DvPX*<>hd"
 
 
 @dataclass(frozen=True)
 class Growing:
-    """More and more contacts to learn from, spread as far apart as they go, from several first ones.
+    """More and more places to learn from, spread as far apart as they go, from several first ones.
 
-    Each choice holds the smaller ones of its start, and all of a start are judged by the same contacts: those that the
+    Each choice holds the smaller ones of its start, and all of a start are judged by the same places: those that the
     largest leaves over.
     """
 
     counts: tuple[int, ...] = ()
-    """Numbers of contacts to learn from; of `COUNTS` those that leave a quarter to judge by, where there is none."""
+    """Numbers of places to learn from; of `COUNTS` those that leave a quarter to judge by, where there is none."""
     starts: int = 3
-    """First contacts, spread evenly over the table's rows."""
+    """First places, spread evenly over the table."""
 
     def __post_init__(self) -> None:
         if any(count < 1 for count in self.counts):
-            raise EvaluationError(f"numbers of strikes are {list(self.counts)}: expected 1 or more each")
+            raise EvaluationError(f"expected numbers of places of 1 or more, got {list(self.counts)}")
         if self.starts < 1:
             raise EvaluationError(f"starts = {self.starts}: expected 1 or more")
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return a case for each start and number. Raises EvaluationError where a number leaves nothing to judge by."""
-        places, owner = torch.unique(impacts.contacts.double(), dim=0, return_inverse=True)
-        counts = self._counts(len(places))
-        found = []
-        for first in dict.fromkeys(round(number * len(impacts) / self.starts) for number in range(self.starts)):
-            order = farthest_points(places, max(counts), start=int(owner[first])).tolist()
-            taken = [torch.nonzero(owner == place).flatten().tolist() for place in order]
-            heard = {row for rows in taken for row in rows}
-            test = tuple(row for row in range(len(impacts)) if row not in heard)
-            for count in counts:
-                train = tuple(row for rows in taken[:count] for row in rows)
-                found.append(Case(label_of(count), train, test, fold=f"from {impacts.names[first]}"))
-        return tuple(sorted(found, key=lambda case: len(case.train)))
+        places = Places.of(impacts)
+        total = len(places.rows)
+        counts = self._counts(total)
+        firsts = dict.fromkeys(round(number * total / self.starts) for number in range(self.starts))
+        orders = {first: farthest_points(places.contacts, max(counts), start=first).tolist() for first in firsts}
+        tests = {first: places.case("", order).test for first, order in orders.items()}
+        return tuple(
+            Case(
+                label_of(count),
+                places.case("", order[:count]).train,
+                tests[first],
+                fold=f"from {impacts.names[places.rows[first][0]]}",
+            )
+            for count in counts
+            for first, order in orders.items()
+        )
 
     def _counts(self, places: int) -> tuple[int, ...]:
         if not self.counts:
@@ -67,20 +80,20 @@ class Growing:
             if counts:
                 return counts
             raise EvaluationError(
-                f"{places} different contacts are too few to learn from {min(COUNTS)} and be judged by a quarter: "
-                "record more, or name the numbers of strikes"
+                f"expected more places than {places} to learn from {min(COUNTS)} and be judged by a quarter: record "
+                "more, or name the numbers of places"
             )
         if max(self.counts) >= places:
             raise EvaluationError(
-                f"{max(self.counts)} contacts to learn from leave none of {places} different ones to judge by: ask for "
-                f"{places - 1} at most"
+                f"expected fewer places to learn from than all {places}, got {max(self.counts)}: ask for {places - 1} "
+                "at most"
             )
         return tuple(sorted(set(self.counts)))
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One method's error over the number of strikes that it learnt from."""
+    """One method's error over the number of places that it learnt from."""
 
     method: str
     counts: tuple[int, ...]
@@ -99,15 +112,15 @@ class Curve:
 
 
 def label_of(count: int) -> str:
-    """Return what a number of strikes is called."""
-    return f"{count} strike{'s' if count > 1 else ''}"
+    """Return what a number of places is called."""
+    return counted(count, "place")
 
 
 def efficiency_protocol(counts: Sequence[int], *, starts: int, methods: Sequence[str]) -> EvaluationProtocol:
     """Return the experiment as an evaluation runs it."""
     return EvaluationProtocol(
         "efficiency",
-        "Learn from more and more contacts, spread as far apart as they go; test on those that the most leave over.",
+        "Learn from more and more places, spread as far apart as they go; test on those that the most leave over.",
         Growing(tuple(counts), starts),
         tuple(methods),
     )
@@ -137,7 +150,7 @@ def curves(record: ObjectRecord, *, metric: str) -> tuple[Curve, ...]:
 
 
 def draw_efficiency(found: Sequence[Curve], *, metric: str, title: str) -> Figure:
-    """Draw the error over the number of strikes, both logarithmic, with the range over the starts as a band."""
+    """Draw the error over the number of places, both logarithmic, with the range over the starts as a band."""
     figure = Figure(figsize=(8, 5.2), layout="constrained")
     axes = figure.subplots()
     order = sorted(found, key=lambda curve: -curve.mean[-1])
@@ -154,7 +167,7 @@ def draw_efficiency(found: Sequence[Curve], *, metric: str, title: str) -> Figur
     axes.set_yticks([tick for tick in _TICKS if low <= math.log10(tick) <= high])
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel("strikes learnt from, spread as far apart as they go")
+    axes.set_xlabel("places learnt from, spread as far apart as they go")
     axes.set_ylabel("relative STFT error (1 = silence)" if metric == "relative_stft" else metric)
     axes.grid(which="major", alpha=0.25)
     axes.legend(frameon=False)

@@ -8,12 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf.bench.cases import Places
 from avmsf.bench.conventions import PAPER, Convention
 from avmsf.bench.metrics import PerContact, default_fft_sizes, relative_stft_error, validate
 from avmsf.bench.renderer import Renderer
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
-from avmsf.scene.points import farthest_points, nearest_points
+from avmsf.scene.points import farthest_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,29 +43,20 @@ class Scores:
 def split(
     impacts: Impacts, *, fraction: float = 0.2, count: int | None = None, start: int = 0
 ) -> tuple[Impacts, Impacts]:
-    """Return (train, test): farthest-point sampling of contacts for training, all the others for testing.
+    """Return (train, test): all recordings at places spread as far apart as they go, and all the others.
 
-    `count` training contacts, or else the nearest whole number to `fraction` of all impacts and at least 2. Training
-    impacts are in the order of their choice, from row `start` on; so with more contacts the first ones stay the same.
-    Impacts at one and the same contact stay together, with the training ones if it is chosen, lest a test be at a place
-    already heard. Raises EvaluationError where fewer than 2 contacts would remain to train or none to test.
+    Contacts nearer to each other than 1 % of the diagonal of the box around all are one place (`places_of`). `count`
+    places to train on, or else the nearest whole number to `fraction` of all places and at least 2. Training
+    recordings are in the order of their places' choice, from the place of row `start` on, one a place, and then the
+    repeated ones; so with more places the first ones stay the same. Raises EvaluationError where fewer than 2 places
+    would remain to train or none to test.
     """
     if count is None and not 0.0 < fraction < 1.0:
-        raise EvaluationError(f"the fraction of impacts to train on must lie between 0 and 1, got {fraction:g}")
-    wanted = max(2, round(fraction * len(impacts))) if count is None else count
-    distinct = len(torch.unique(impacts.contacts, dim=0))
-    if not 2 <= wanted < distinct:
-        raise EvaluationError(
-            f"{wanted} contacts to train on cannot be chosen from {len(impacts)} impacts at {distinct} different "
-            "contacts: at least 2 are needed to train and 1 to test; record more contacts or choose another number"
-        )
-    chosen = farthest_points(impacts.contacts, wanted, start=start)
-    owner = nearest_points(impacts.contacts[chosen], impacts.contacts)[:, 0]
-    repeated = (impacts.contacts == impacts.contacts[chosen][owner]).all(dim=1)
-    repeats = set(torch.nonzero(repeated).flatten().tolist()) - set(chosen.tolist())
-    train = chosen.tolist() + sorted(repeats)
-    test = sorted(set(range(len(impacts))) - set(train))
-    return impacts.take(train), impacts.take(test)
+        raise EvaluationError(f"the fraction of places to train on must lie between 0 and 1, got {fraction:g}")
+    places = Places.of(impacts)
+    wanted = places.expect_part(fraction) if count is None else places.expect(count, least=2)
+    case = places.case("", farthest_points(places.contacts, wanted, start=places.number_of(start)))
+    return impacts.take(case.train), impacts.take(case.test)
 
 
 def evaluate(

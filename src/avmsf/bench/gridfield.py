@@ -9,13 +9,13 @@ from avmsf.bench.fieldmethods import QUICK, fit_field
 from avmsf.bench.task import Look, Task
 from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
+from avmsf.field.places import held_out, rows_by_place
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.spectra import envelope
-from avmsf.scene.points import farthest_points
 
 _FEWEST_TO_VALIDATE = 6
-"""Training contacts from which on a part of them is held out to choose settings by, as in `fit` itself."""
+"""Training places from which on a part of them is held out to choose settings by, as in `fit` itself."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ QUICK_GRID = Grid((8, 16, 32), (3e-3, 1e-3), (150,), (1.0,))
 class GridField:
     """A field whose settings are chosen from a grid on validation contacts, a part of the training contacts alone.
 
-    The quarter of the training contacts that farthest-point sampling takes last is held out; every candidate is fitted
+    The quarter of the training places that farthest-point sampling takes last is held out; every candidate is fitted
     to the others and judged there by ENV (paper, supplement), the mean over contacts of the root mean square difference
-    of envelopes. The best is fitted to all training contacts; of equals the first. With fewer than six contacts nothing
+    of envelopes. The best is fitted to all training contacts; of equals the first. With fewer than six places nothing
     is held out, and the base settings are taken. Modes are those of all training contacts.
     """
 
@@ -63,12 +63,11 @@ class GridField:
     def fit(self, task: Task) -> SoundField:
         """Choose and fit the field, whose report has what was chosen. Raises as FieldMethod."""
         features, modes = task.features(self.look), task.modes()
-        count = round(self.base.validation * len(task.train))
-        if len(task.train) < _FEWEST_TO_VALIDATE or count < 1:
+        held = held_out(task.train.contacts, self.base.validation)
+        if len(rows_by_place(task.train.contacts)) < _FEWEST_TO_VALIDATE or not held:
             field = fit_field(task, task.train, features, modes, self.base)
             return _with_report(field, {"validated": False})
-        order = farthest_points(task.train.contacts, len(task.train)).tolist()
-        held, learnt = order[-count:], sorted(order[:-count])
+        learnt = [row for row in range(len(task.train)) if row not in held]
         candidates = list(self.grid.candidates(self.base))
         errors = [
             _held_out_error(

@@ -86,6 +86,10 @@ def _mean_waveform(task: Task) -> MeanWaveform:
     return MeanWaveform(task.train, count=_count(task))
 
 
+def _directed_mean_waveform(task: Task) -> MeanWaveform:
+    return MeanWaveform(task.train, count=_count(task), by_direction=True)
+
+
 def _mean_gains(task: Task) -> MeanGains:
     return MeanGains(task.train, task.modes(), count=_count(task), noise=True, seed=task.seed)
 
@@ -103,6 +107,7 @@ BASELINES = (
     Baseline("random-impact", _random_impact),
     Baseline("nearest", _nearest),
     Baseline("knn3", _mean_waveform),
+    Baseline("knn3-directions", _directed_mean_waveform),
     Baseline("knn-gains", _mean_gains),
     Baseline("knn-spectra", _mean_spectra),
     Baseline("spline-gains", _spline_gains),

@@ -17,6 +17,7 @@ _TABLE = (
     "random-impact",
     "nearest",
     BASELINE,
+    "knn3-directions",
     "knn-gains",
     "knn-spectra",
     "spline-gains",
@@ -52,15 +53,15 @@ PROTOCOLS = {
     each.name: each
     for each in (
         EvaluationProtocol(
-            "farthest", "Train on 20 % of the contacts, spread as far apart as they go; test on the others.", Farthest()
+            "farthest", "Train on 20 % of the places, spread as far apart as they go; test on the others.", Farthest()
         ),
-        EvaluationProtocol("leave-one-out", "Test on every contact once, after training on all others.", LeaveOneOut()),
+        EvaluationProtocol("leave-one-out", "Test on every place once, after training on all others.", LeaveOneOut()),
         EvaluationProtocol(
-            "closest", "Train on 20 % of the contacts in one region, test on the others.", Closest(), subset="ablation"
+            "closest", "Train on 20 % of the places, in one region, test on the others.", Closest(), subset="ablation"
         ),
         EvaluationProtocol(
             "shots",
-            "Train on 16, 8, 4, 2 and 1 contacts, each choice within the one before; test on the same others.",
+            "Train on 16, 8, 4, 2 and 1 places, each choice within the one before; test on the same others.",
             Shots(),
             subset="ablation",
         ),

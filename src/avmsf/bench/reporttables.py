@@ -105,10 +105,10 @@ def _opening(records: Sequence[ObjectRecord], identity: Mapping[str, Any], label
     return Section(
         f"{identity['protocol']} on {identity['dataset']}",
         (
-            f"{about}Objects: {len(records)}; training contacts of each: {_span(trained)}; "
-            f"test contacts in all: {tested}"
+            f"{about}Objects: {len(records)}; training recordings of each: {_span(trained)}; "
+            f"test recordings in all: {tested}"
             f"{f' ({labels[0]})' if len(labels) > 1 else ''}; avmsf {identity['version']}, seed {identity['seed']}.",
-            "Figures are means over an object's test contacts (CDPAM's over a few of them, `cdpam_contacts` below, 0 "
+            "Figures are means over an object's test recordings (CDPAM's over a few of them, `cdpam_contacts` below, 0 "
             "for all), then over objects, ± the standard error over objects. "
             "Lower is better; of MAC, and of modes found, more is. L1, L1-log and ENV are in the convention `paper` of "
             "docs/conventions.md; relative STFT is free of unit and level. With level='full-scale' an "

@@ -67,6 +67,7 @@ class ObjectRecord:
     digest: str = ""
     """Of the recordings, and of the truth where it is known."""
     contacts: int = 0
+    """How many places were struck."""
     sample_rate: float = 0.0
     duration: float = 0.0
     """Seconds of every sound."""

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.bench.caserun import CaseRun
-from avmsf.bench.cases import Case
+from avmsf.bench.cases import Case, Places
 from avmsf.bench.knowntruth import truth_at, truth_from_first_sample, truth_of
 from avmsf.bench.otherobjects import draw_stranger
 from avmsf.bench.plan import Evaluation
@@ -64,7 +64,7 @@ def run_object(
             material=facts.material,
             inferred=facts.inferred,
             digest=digest,
-            contacts=len(impacts),
+            contacts=len(Places.of(impacts).rows),
             sample_rate=impacts.sample_rate,
             duration=impacts.duration,
             cases=tuple(known.get(case.key) or _named(case, impacts) for case in cases),

@@ -38,7 +38,7 @@ VERBS = {
     "dataset": "Say what of a dataset is there, object by object, and what is missing.",
     "simulate": "Simulate objects, how they sound and how they look, as capture folders with their truth.",
     "evaluate": "Judge methods by contacts that they were not trained on, on all objects of a dataset.",
-    "efficiency": "Show how the error falls with the number of strikes learnt from, for several methods.",
+    "efficiency": "Show how the error falls with the number of places learnt from, for several methods.",
     "demo": "Go all the way on a built-in example: images, Gaussians, features, a field, sounds, pictures.",
 }
 """Each verb's module in this package, and the first sentence of its help."""

@@ -18,7 +18,7 @@ from avmsf.cli.demofolder import RECORD, record, replaced_whole
 from avmsf.cli.modetable import amplitudes, levels
 from avmsf.cli.overallbar import OverallBar
 from avmsf.cli.printing import console, figure, json_text, print_text
-from avmsf.cli.scores import compare, score_markdown, score_table, score_values
+from avmsf.cli.scores import compare, parts_words, score_markdown, score_table, score_values
 from avmsf.cli.writing import Level, write_sound, write_text
 from avmsf.export.webpage import write_webpage
 from avmsf.field.config import FitConfig
@@ -140,8 +140,7 @@ def _go_all_the_way(folder: Path, bar: OverallBar) -> tuple[dict[str, Scores], t
 
 
 def _title(train: Impacts, test: Impacts) -> str:
-    contacts = f"{len(test)} contacts not trained on, {len(train)} trained on"
-    return f"{contacts}; lower is better; the floor has no noise, which L1-log counts"
+    return f"{parts_words(train, test)}; lower is better; the floor has no noise, which L1-log counts"
 
 
 def _write_sounds(folder: Path, field: SoundField, train: Impacts, heard: Impacts) -> None:

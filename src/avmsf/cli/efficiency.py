@@ -1,4 +1,4 @@
-"""`avmsf efficiency`: how many strikes each method needs, as a picture and as figures."""
+"""`avmsf efficiency`: how many places each method needs, as a picture and as figures."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -25,6 +25,7 @@ from avmsf.pipeline.bodies import BodyConfig
 from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.pipeline.scene import SceneConfig
+from avmsf.wording import counted
 
 PICTURE, FIGURES = "efficiency.png", "efficiency.json"
 """What is written for each object beside the results' own files."""
@@ -32,23 +33,24 @@ PICTURE, FIGURES = "efficiency.png", "efficiency.json"
 
 @dataclass(frozen=True)
 class Options:
-    """Show how the error falls with the number of strikes learnt from, for several methods.
+    """Show how the error falls with the number of places learnt from, for several methods.
 
-    Training contacts are spread as far apart as they go, from several first ones; the same others judge all methods
+    Training places are spread as far apart as they go, from several first ones; the same others judge all methods
     and numbers. Every figure is kept as it comes: after an interruption the same command goes on, and methods may be
     added later.
     """
 
     data: tyro.conf.Positional[Path]
-    """A capture folder with enough strikes, or a folder of such or a dataset with --object."""
+    """A capture folder with enough places, or a folder of such or a dataset with --object."""
     object: str | None = None
     """Which object of a dataset; not needed where there is only one."""
     methods: tuple[str, ...] = METHODS
     """Methods, apart from each other by commas or blanks, by the names that `avmsf evaluate` knows."""
     counts: tuple[int, ...] = ()
-    """Numbers of strikes to learn from; 3, 4, 6, 8, 12, 16, ... as far as a quarter is left to judge by."""
+    """Numbers of places to learn from, with all recordings there; 3, 4, 6, 8, 12, 16, ... as far as a quarter is left
+    to judge by."""
     starts: int = 3
-    """First contacts, spread evenly over the table."""
+    """First places, spread evenly over the table."""
     metric: Literal["relative_stft", "l1", "l1_log", "envelope"] = "relative_stft"
     """What is drawn."""
     body: BodyConfig = field(default_factory=BodyConfig)
@@ -109,7 +111,7 @@ def run(options: Options) -> int:
     found = curves(record, metric=options.metric)
     picture, figures = (folder / chosen / name for name in (PICTURE, FIGURES))
     starts = "one choice" if options.starts == 1 else f"{options.starts} choices"
-    contacts = f"{record.contacts} contacts, {starts} of those learnt from"
+    contacts = f"{counted(record.contacts, 'place')}, {starts} of those learnt from"
     save_picture(draw_efficiency(found, metric=options.metric, title=f"{chosen}: {contacts}"), picture)
     failures = {f"{each.method}, {each.case}": each.failure for each in record.outcomes if each.failure is not None}
     values = {
@@ -125,7 +127,7 @@ def run(options: Options) -> int:
     for curve in found:
         by_count = dict(zip(curve.counts, curve.mean, strict=True))
         rows.append([curve.method, *(decimals(by_count.get(count), 3) for count in counts)])
-    heading = f"{options.metric} of {chosen} by the number of strikes learnt from; {contacts}"
+    heading = f"{options.metric} of {chosen} by the number of places learnt from; {contacts}"
     screen.print(table(heading, ("method", *map(str, counts)), rows))
     for where, why in failures.items():
         screen.print(f"failed: {where}: {why}", soft_wrap=True)

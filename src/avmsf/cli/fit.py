@@ -16,7 +16,7 @@ from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.progress import FitBar
-from avmsf.cli.scores import compare, score_table, score_values
+from avmsf.cli.scores import compare, parts_words, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
 from avmsf.field.config import PAPER, FitConfig
@@ -50,11 +50,12 @@ class Options:
     settings: Path | None = None
     """A capture.toml to use in place of the folder's own."""
     train_fraction: float | None = None
-    """Fit to this part of the contacts, spread as far apart as they go, and score the field on the others."""
+    """Fit to all recordings at this part of the places, spread as far apart as they go, and score the field on the
+    others. Contacts nearer than 1 % of the extent of all are one place."""
     train_count: int | None = None
-    """Likewise with so many contacts."""
+    """Likewise with so many places."""
     start: int = 0
-    """Row of impacts.csv, counted from 0, that this choice of contacts starts from."""
+    """Row of impacts.csv, counted from 0, whose place this choice starts from."""
     features: Path | None = None
     """File of features that `avmsf lift` wrote, in the frame of the contacts; without it positions on the surface."""
     gain_model: GainModel = "auto"
@@ -151,7 +152,7 @@ def run(options: Options) -> int:
     scores = {} if test is None else compare(fitted, train, test, modes)
     screen = console(errors=options.json)
     if test is not None:
-        title = f"{len(test)} contacts not trained on, {len(train)} trained on; lower is better"
+        title = f"{parts_words(train, test)}; lower is better"
         say(f"not trained on: {', '.join(test.names)}")
         screen.print(score_table(title, scores))
     report = fitted.origin.report

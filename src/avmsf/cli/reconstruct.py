@@ -16,7 +16,7 @@ from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import SceneOptions, features_words
-from avmsf.cli.scores import compare, score_table, score_values
+from avmsf.cli.scores import compare, parts_words, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import Progress
@@ -43,11 +43,12 @@ class Options(SceneOptions):
     output: Annotated[Path | None, tyro.conf.arg(metavar="FIELD.safetensors")] = None
     """File to copy the field to."""
     train_fraction: float | None = None
-    """Fit to this part of the contacts, spread as far apart as they go, and score the field on the others."""
+    """Fit to all recordings at this part of the places, spread as far apart as they go, and score the field on the
+    others. Contacts nearer than 1 % of the extent of all are one place."""
     train_count: int | None = None
-    """Likewise with so many contacts."""
+    """Likewise with so many places."""
     start: int = 0
-    """Row of impacts.csv, counted from 0, that this choice of contacts starts from."""
+    """Row of impacts.csv, counted from 0, whose place this choice starts from."""
     method: Method = "high-resolution"
     """How modes are found; see `avmsf modes --help`."""
     modes: int = 128
@@ -126,7 +127,7 @@ def run(options: Options) -> int:
     rows = [[each.stage, figure(each.seconds), "now" if each.fresh else "before"] for each in made.stages]
     screen.print(table("stages", ["stage", "seconds", "made"], rows))
     if test is not None:
-        title = f"{len(test)} contacts not trained on, {len(train)} trained on; lower is better"
+        title = f"{parts_words(train, test)}; lower is better"
         screen.print(score_table(title, scores))
     for words in describe_outliers(fitted):
         screen.print(words, soft_wrap=True)

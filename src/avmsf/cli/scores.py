@@ -2,14 +2,18 @@
 
 from collections.abc import Mapping
 
+import torch
 from rich.table import Table
 
 from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, WhiteNoise, floor
 from avmsf.bench.evaluation import Scores, evaluate, score
+from avmsf.bench.renderer import Renderer
 from avmsf.capture import Impacts
 from avmsf.cli.printing import figure, table
+from avmsf.field.places import places_of
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.wording import counted
 
 HEADINGS = {
     "relative_stft": "relative STFT error",
@@ -26,14 +30,24 @@ def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction)
     All by recordings that start where those start that the modes were found in.
     """
     train, test, count = modes.aligned(train), modes.aligned(test), min(3, len(train))
-    return {
-        "field": evaluate(field, test),
-        "nearest strike": evaluate(NearestStrike(train), test),
-        f"mean waveform of {count} nearest": evaluate(MeanWaveform(train, count), test),
-        f"mean gains of {count} nearest": evaluate(MeanGains(train, modes, count), test),
-        "white noise": evaluate(WhiteNoise(train), test),
-        "floor: the test strikes' own gains": score(floor(test, modes.bank), test),
+    renderers: dict[str, Renderer] = {
+        "field": field,
+        "nearest strike": NearestStrike(train),
+        f"mean waveform of {count} nearest": MeanWaveform(train, count),
     }
+    if train.directions is not None:
+        renderers[f"mean waveform of {count} nearest, by direction"] = MeanWaveform(train, count, by_direction=True)
+    renderers |= {f"mean gains of {count} nearest": MeanGains(train, modes, count), "white noise": WhiteNoise(train)}
+    scores = {name: evaluate(renderer, test) for name, renderer in renderers.items()}
+    return scores | {"floor: the test strikes' own gains": score(floor(test, modes.bank), test)}
+
+
+def parts_words(train: Impacts, test: Impacts) -> str:
+    """Return how many places are not trained on and how many are, and their recordings where these are more."""
+    owners = places_of(torch.cat([train.contacts, test.contacts]).double()).tolist()
+    heard, left = len(set(owners[: len(train)])), len(set(owners[len(train) :]))
+    repeats = "" if (heard, left) == (len(train), len(test)) else f" ({len(test)} and {len(train)} recordings)"
+    return f"{counted(left, 'place')} not trained on, {heard} trained on{repeats}"
 
 
 def score_table(title: str, scores: Mapping[str, Scores]) -> Table:

@@ -75,7 +75,7 @@ class FitConfig:
     damping: Literal["shared", "per-contact", "validated"] = "validated"
     """Whether dampings vary with the contact; `validated` tries both and keeps what validation contacts prefer."""
     validation: float = 0.25
-    """Part of the training contacts that choices are validated on; with fewer than 6 contacts none are."""
+    """Part of the training places that choices are validated on; with fewer than 6 places none are."""
     phase: Literal["common", "sine"] = "common"
     """How modes start: each with the phase that the training recordings agree on, or as sines (paper, eq. 3)."""
     residual: bool = True
@@ -95,7 +95,7 @@ class FitConfig:
         if self.seed >= 2**63:
             raise FitError(f"seed = {self.seed}: expected less than 2^63")
         if not 0 <= self.validation <= 0.5:
-            raise FitError(f"validation = {self.validation}: expected 0 to 0.5, the part of the contacts held out")
+            raise FitError(f"validation = {self.validation}: expected 0 to 0.5, the part of the places held out")
         if self.warmup_steps + self.steps == 0:
             raise FitError("warmup_steps = 0 and steps = 0: expected at least one step of either, or nothing is learnt")
         # A rate as low as a structure's takes a quarter of each size, which has to be even.

@@ -22,6 +22,7 @@ from avmsf.field.gainfield import GainField
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.losses import spectral_loss
+from avmsf.field.places import held_out, rows_by_place
 from avmsf.field.quality import with_quality
 from avmsf.field.recipes import GainCase, GainRecipe, along_phase
 from avmsf.field.soundfield import Origin, SoundField
@@ -33,7 +34,6 @@ from avmsf.modal.phase import common_phase
 from avmsf.modal.residual import Residual, estimate_residual
 from avmsf.modal.spectra import envelope
 from avmsf.scene.features import FeatureField
-from avmsf.scene.points import farthest_points
 
 _FEWEST_TO_VALIDATE = 6
 _CHECKPOINT_SECONDS = 30.0
@@ -176,11 +176,10 @@ class _Job:
         """Return what the config leaves open, decided on validation contacts, and how it was decided."""
         dampings = self.recipe.dampings(self.config)
         default = _Plan(dampings[0], self.steps)
-        count = round(self.config.validation * len(self.train))
+        held = held_out(self.train.contacts, self.config.validation)
         undecided = len(dampings) > 1 or (self.config.patience > 0 and self.recipe.warms_up)
-        if len(self.train) < _FEWEST_TO_VALIDATE or count < 1 or not undecided:
+        if len(rows_by_place(self.train.contacts)) < _FEWEST_TO_VALIDATE or not held or not undecided:
             return default, {"damping": default.damping, "validated": False}
-        held = farthest_points(self.train.contacts, len(self.train)).tolist()[-count:]
         learnt = [row for row in range(len(self.train)) if row not in held]
         for damping in dampings:
             name = f"trial with {damping} damping"

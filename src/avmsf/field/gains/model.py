@@ -5,10 +5,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Complex128, Float, Float32, Float64, Int
-from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -17,13 +15,11 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from avmsf.field.places import places_of
 from avmsf.field.records import count_of, like
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.nominal import NOMINAL
 
-SAME_PLACE = 0.01
-"""Distance between contacts over the diagonal of the box around all, up to which they are one place: hammers do not hit
-more exactly."""
 NEIGHBORS = 3
 """Nearest recordings that are averaged, as in the paper's baseline."""
 _BATCH = 512
@@ -338,20 +334,6 @@ class MixtureGains:
                 return family, kept[row : row + 1]
             row -= len(kept)
         raise AssertionError(row)
-
-
-def places_of(contacts: Float64[Tensor, "contacts 3"]) -> Int[Tensor, " contacts"]:
-    """Return the number of each contact's place, from 0 on; no two of one are farther apart than `SAME_PLACE`."""
-    places, owner = torch.unique(contacts, dim=0, return_inverse=True)
-    distance = SAME_PLACE * float((places.amax(0) - places.amin(0)).norm())
-    near = np.unique(cKDTree(places.numpy()).query_pairs(distance, output_type="ndarray"))
-    if not len(near):
-        return owner
-    # Complete linkage: along a row of contacts each near to the next, places would else grow without end.
-    groups = fcluster(linkage(places[near].numpy(), "complete"), distance, criterion="distance")
-    first = np.arange(len(places))
-    first[near] = near[np.unique(groups, return_index=True)[1][groups - 1]]
-    return torch.unique(torch.from_numpy(first), return_inverse=True)[1][owner]
 
 
 def series_of(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, "contacts series"]:
