@@ -58,9 +58,13 @@ def load(path: str | Path) -> SoundField:
     words, tensors = _read(path)
     header = read_header(words, path)
     _expect_tensors(tensors, header, path)
+    try:
+        gains = _KINDS[header.kind].restore(header.gain_field, _of_gain_field(tensors))
+    except ValueError as error:
+        raise broken(path, error) from error
     return SoundField(
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
-        _KINDS[header.kind].restore(header.gain_field, _of_gain_field(tensors)),
+        gains,
         tensors["phase"],
         Residual(tensors["residual.magnitude"], tensors.get("residual.recordings")),
         header.sample_rate,

@@ -46,7 +46,7 @@ def test_gains_start_as_the_models_mean_at_the_contacts():
 
 def test_rows_are_those_of_the_recordings():
     rows = torch.tensor([16, 3, 16, 14])
-    assert refined(0.01).heeded(RECORDINGS) == USED.tolist()
+    assert refined(0.01).used_rows(RECORDINGS) == USED.tolist()
     assert torch.equal(read(refined(0.01), rows), read(refined(0.01))[[2, 0, 2, 13]])
 
 

@@ -307,6 +307,9 @@ class MixtureGains:
             for kind, size in zip(record["families"], tensors["scale"].tolist(), strict=True)
         )
         kept = torch.split(tensors["kept"], record["kept"])
+        for family, rows in zip(families, kept, strict=True):
+            if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < len(family.shares):
+                raise ValueError(f"kept is {rows.min()} to {rows.max()} of {len(family.shares)} {family.kind} kernels")
         kernels = torch.cat([family.kernels()[rows] for family, rows in zip(families, kept, strict=True)])
         values, measured = (torch.view_as_complex(tensors[name].contiguous()) for name in ("values", "measured"))
         mixture = KernelMixture(kernels, series_of(values), tensors["floor"], tensors["weights"])

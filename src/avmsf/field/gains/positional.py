@@ -20,7 +20,7 @@ _FLAT = 1e-3
 
 
 class Unstructured(KernelFamily):
-    """Gains that have nothing to do with the place, and gains that are the same everywhere.
+    """Gains that are independent from place to place, and gains that are the same everywhere.
 
     With the first, predictions shrink towards silence; without it a mode that is noise alone would be interpolated.
     """
@@ -30,15 +30,16 @@ class Unstructured(KernelFamily):
 
     def __init__(self, reference: Sites, size: float) -> None:
         super().__init__(reference, size)
-        self.shares = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
+        self.shares = torch.eye(2, dtype=torch.float64)
 
     def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
-        """Return a constant."""
-        return sites.cosine(others)[None]
+        """Return one for impacts at exactly the same point and zero for others, and a constant."""
+        same = (sites.points[:, None] == others.points).all(2).double()
+        return torch.stack([same, torch.ones_like(same)]) * sites.cosine(others)
 
     def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
         """Return ones."""
-        return torch.ones(1, len(sites), dtype=torch.float64)
+        return torch.ones(2, len(sites), dtype=torch.float64)
 
 
 class Smooth(KernelFamily):
