@@ -36,7 +36,7 @@ def ceramic() -> SoundField:
     """Return a field whose dampings are near to ceramic's."""
     damping = rayleigh_damping(2 * math.pi * FREQUENCY, CERAMIC) * torch.tensor([1.1, 1.0, 0.9, 1.2, 1.0])
     bank, phase = ModalBank(FREQUENCY, damping), torch.zeros(5, dtype=torch.float64)
-    return SoundField(bank, FIELDS["spline"](), phase, Residual(torch.full((9,), 1e-6)), RATE, 2400, Origin("plate"))
+    return SoundField(bank, FIELDS["positional"](), phase, Residual(torch.full((9,), 1e-6)), RATE, 2400, Origin("plate"))
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from avmsf.field.store import load, save
 from avmsf.modal.residual import Residual
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats, write_splats
-from made_fields import BANK, SIDES, spline
+from made_fields import BANK, SIDES, positional
 
 Streams = pytest.CaptureFixture[str]
 RATE, SAMPLES = 8000.0, 1200
@@ -30,7 +30,7 @@ def field_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("field") / "plate.safetensors"
     phase = torch.linspace(0, 0.5, len(BANK), dtype=torch.float64)
     noise = Residual(torch.full((9,), 1e-3))
-    save(SoundField(BANK, spline(), phase, noise, RATE, SAMPLES, Origin("plate", config=FitConfig(seed=1))), path)
+    save(SoundField(BANK, positional(), phase, noise, RATE, SAMPLES, Origin("plate", config=FitConfig(seed=1))), path)
     return path
 
 
@@ -47,7 +47,7 @@ def test_a_mesh_goes_into_the_glb(field_file: Path, tmp_path: Path, capsys: Stre
 
 
 def gaussians(path: Path) -> GaussianCloud:
-    points = spline().points[:40]
+    points = positional().points[:40]
     draw = torch.Generator().manual_seed(0)
     color = torch.rand(40, 1, 3, generator=draw)
     cloud = GaussianCloud(

@@ -22,7 +22,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise
 from avmsf.tasks.locator import Locator
-from made_fields import BANK, spline
+from made_fields import BANK, positional
 
 Streams = pytest.CaptureFixture[str]
 RATE, SAMPLES = 8000, 4000
@@ -61,7 +61,7 @@ class Place:
 def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
     folder = tmp_path_factory.mktemp("place")
     zero = torch.zeros(len(BANK), dtype=torch.float64)
-    field = SoundField(BANK, spline(), zero, Residual(torch.full((9,), 1e-3)), float(RATE), SAMPLES, Origin("plate"))
+    field = SoundField(BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), float(RATE), SAMPLES, Origin("plate"))
     save(field, folder / "plate.safetensors")
     locator = Locator.of(field)
     return Place(folder, str(folder / "plate.safetensors"), locator.points, locator.gains)

@@ -21,7 +21,7 @@ from avmsf.export.sampledfield import SampledField
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.residual import Residual
-from made_fields import BANK, spline
+from made_fields import BANK, positional
 
 Streams = pytest.CaptureFixture[str]
 RATE, SAMPLES = 8000.0, 4000
@@ -31,7 +31,7 @@ RATE, SAMPLES = 8000.0, 4000
 def field_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("field") / "plate.safetensors"
     zero = torch.zeros(len(BANK), dtype=torch.float64)
-    save(SoundField(BANK, spline(), zero, Residual(torch.full((9,), 1e-3)), RATE, SAMPLES, Origin("plate")), path)
+    save(SoundField(BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), RATE, SAMPLES, Origin("plate")), path)
     return path
 
 
@@ -68,7 +68,7 @@ def test_a_score_is_played_to_its_end(field_file: Path, tmp_path: Path) -> None:
     track.append(mido.Message("note_on", note=72, velocity=100, time=480))
     file.tracks.append(track)
     file.save(tmp_path / "one.mid")
-    point = spline().points[5].tolist()
+    point = positional().points[5].tolist()
     millimetres = [str(1000 * value) for value in point]
     words = ["--midi", str(tmp_path / "one.mid"), "--keys", "pitch", "--at", *millimetres, "--unit", "mm"]
     words += ["--level-db", "-20"]

@@ -12,7 +12,7 @@ from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.pulse import ForcePulse
 from avmsf.modal.residual import Residual
-from made_fields import BANK, spline
+from made_fields import BANK, positional
 
 PLACE = torch.tensor([[0.05, 0.03, 0.002]], dtype=torch.float64)
 AT = ("--at", "0.05", "0.03", "0.002")
@@ -20,7 +20,7 @@ AT = ("--at", "0.05", "0.03", "0.002")
 
 def sounding() -> SoundField:
     phase = torch.zeros(len(BANK), dtype=torch.float64)
-    return SoundField(BANK, spline(), phase, Residual(torch.full((9,), 0.01)), 8000.0, 2000, Origin("plate"))
+    return SoundField(BANK, positional(), phase, Residual(torch.full((9,), 0.01)), 8000.0, 2000, Origin("plate"))
 
 
 @pytest.fixture

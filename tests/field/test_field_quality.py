@@ -1,0 +1,96 @@
+"""What a fit says of its own quality, and which residual it takes."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from avmsf.bench.baselines import MeanWaveform
+from avmsf.bench.evaluation import evaluate
+from avmsf.field.config import FitConfig
+from avmsf.field.fit import fit
+from avmsf.field.soundfield import FieldQuality
+from avmsf.field.store import load, save
+from avmsf.modal.extraction.extract import extract
+from avmsf.scene.features import FeatureField
+from delayed_plate import SAMPLES, strikes
+
+CONFIG = FitConfig(warmup_steps=0, steps=3)
+
+
+def parted(recorded):
+    """Return 16 recordings to fit to and 4 others, without their margins: they are aligned."""
+    final = replace(recorded, before=None, after=None)
+    return final.take(range(16)), final.take(range(16, 20))
+
+
+def fitted(train, config=CONFIG):
+    return fit(train, FeatureField.from_contacts(strikes(20).contacts, count=300), extract(train), config)
+
+
+def with_clicks(recorded):
+    """Return recordings that have the same burst, which no mode explains, in all of them."""
+    burst = 0.3 * torch.randn(SAMPLES, generator=torch.Generator().manual_seed(1))
+    burst[300:] = 0.0
+    return replace(recorded, sounds=recorded.sounds + burst)
+
+
+def test_the_error_at_contacts_left_out_is_about_that_at_new_ones():
+    train, test = parted(strikes(20))
+    field = fitted(train)
+    # Two of the sixteen contacts are in one place.
+    assert field.quality.places == 15
+    assert field.quality.error < field.quality.averaging
+    new = evaluate(field, test).mean()["relative_stft"]
+    assert new / 2 < field.quality.error < 2 * new
+    averaged = evaluate(MeanWaveform(train), test).mean()["relative_stft"]
+    assert averaged / 2 < field.quality.averaging < 2 * averaged
+
+
+def test_what_recordings_have_in_common_beside_their_modes_is_kept(tmp_path):
+    train, test = parted(with_clicks(strikes(20)))
+    field = fitted(train)
+    assert field.residual.recordings is not None
+    report = field.origin.report["residual"]
+    assert report["recordings"] < report["noise"]
+    noisy = replace(field, residual=replace(field.residual, recordings=None))
+    errors = [evaluate(each, test).mean()["relative_stft"] for each in (field, noisy)]
+    assert errors[0] < 0.8 * errors[1]
+    save(field, tmp_path / "field.safetensors")
+    known = load(tmp_path / "field.safetensors")
+    assert torch.equal(known.render(test.contacts), field.render(test.contacts))
+    # Longer than the recordings there is silence, as beyond their end nothing is known.
+    assert torch.equal(known.render(test.contacts, samples=SAMPLES + 50)[:, :100], known.render(test.contacts)[:, :100])
+
+
+def test_without_a_residual_none_is_kept():
+    train, _ = parted(with_clicks(strikes(20)))
+    field = fitted(train, replace(CONFIG, residual=False))
+    assert field.residual.recordings is None
+    assert set(field.origin.report["residual"]) == {"noise"}
+
+
+def test_independent_noise_is_rendered_as_noise():
+    train, _ = parted(strikes(20))
+    noise = 0.05 * torch.randn(train.sounds.shape, generator=torch.Generator().manual_seed(2))
+    assert fitted(replace(train, sounds=train.sounds + noise)).residual.recordings is None
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_places_say_nothing_of_quality(count):
+    field = fitted(replace(strikes(20), before=None, after=None).take(range(count)))
+    assert field.quality is None
+
+
+def test_the_sentence_names_both_errors_and_what_to_do():
+    better, worse = str(FieldQuality(9, 0.321, 0.72)), str(FieldQuality(9, 0.81, 0.72))
+    assert "0.32" in better
+    assert "0.72" in better
+    assert "mesh" not in better
+    assert "mesh" in worse
+
+
+def test_an_edited_field_has_no_quality():
+    field = fitted(parted(strikes(20))[0])
+    edited = replace(field, origin=replace(field.origin, report={**field.origin.report, "edits": [{"edit": "x"}]}))
+    assert edited.quality is None
