@@ -5,8 +5,8 @@ Everything is judged by log predictive ratios (`ratios`), in nats per mode. The 
     J(S) = sum over i not in S of min(L_i(S), 3) - .3 |S|,
 
 found by adding, removing or exchanging one contact; the kernels are weighed again without S. A contact of S is an
-outlier if it is contradicted as strongly as the others are supported, L_i < -mean L, and if another site or the
-opposite direction explains it. Where places say little of the gains nothing is an outlier.
+outlier if its own label is refuted, L_i < -1.5, and if another site or the opposite direction explains it. Where places
+say little of the gains nothing is an outlier.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,6 +38,8 @@ _ROUNDS = 3
 """Of fit and search."""
 _LEAST_STEP = 1e-9
 """Nats that a step of the search has to add: more than rounding does."""
+_REFUTED = -1.5
+"""Nats below which a contact's own label is refuted."""
 _EXPLAINED = 0.4
 """Part of the others' mean ratio that a contact has to reach at another place."""
 _SURE = 2.0
@@ -201,7 +203,7 @@ def _located(search: _Search, row: int, places: Sites, mean: float) -> Outlier |
     ratios = search.ratios.elsewhere(row, search.aside, Sites(points, directions))
     own, best = float(ratios[0, row]), int(ratios.amax(0).argmax())
     ratio, needed = float(ratios[:, best].max()), _EXPLAINED * mean
-    if own >= -mean or ratio < needed:
+    if own >= _REFUTED or ratio < needed:
         return None
     x, y, z = points[best].tolist()
     distance = float((points[best] - contacts.points[row]).norm())
