@@ -1,7 +1,8 @@
 """How a fit makes the gain model: from recordings whose gains are known, and the bodies behind the surface."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 from weakref import WeakKeyDictionary
 
@@ -17,12 +18,15 @@ from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import FACTORS, Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.outliers import Fit, Judgment, judge_contacts, predicts_better
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.placed import expect_placed
 from avmsf.field.recipes import SHARED, Attention, GainCase, GainRecipe
 from avmsf.scene.features import FeatureField
+from avmsf.scene.points import farthest_points
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.nominal import NominalBody, body_name
 
@@ -33,6 +37,8 @@ GainModel = Literal["auto", "network", "smooth", "thin-plate", "elastic"]
 """The Gaussian process over all kernel families, the paper's attention network, or the process over one family."""
 FAMILIES = (*POSITIONAL, Elastic.kind)
 """What the model is made of beside the unstructured family, which is always there."""
+_PLACES = 500
+"""Points of the surface where the contacts that contradict the others may have been."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,30 +84,38 @@ class MixtureEstimator:
 
         Raises FitError where the elastic family alone was asked for and cannot be had.
         """
-        model = self.fit(case)
-        return RefinedGains(model, case.modes.bank, used=torch.arange(len(case.train)), training=len(case.train))
+        model, used = self.fit(case)
+        return RefinedGains(model, case.modes.bank, used=used, training=len(case.train))
 
-    def fit(self, case: GainCase) -> MixtureGains:
-        """Return the gain model. Raises as `start`.
+    def fit(self, case: GainCase) -> tuple[MixtureGains, Int[Tensor, " used"]]:
+        """Return the gain model and the rows of the contacts that it is fitted to. Raises as `start`.
 
         Of several coarse bodies the most probable one is computed with finer elements, and the model is fitted again,
-        until the most probable one is fine.
+        until the most probable one is fine. Contacts that the others contradict are left out where these are predicted
+        better from each other without them.
         """
         bodies, missing = self._usable_bodies(case)
-        size = 2.0 * case.features.half_diagonal
-        sites = _sites(case, bodies)
-        names = [kind for kind in POSITIONAL if kind in self.kinds]
-        positional = [Unstructured(sites, size), *(POSITIONAL[kind](sites, size) for kind in names)]
-        measured, directional = measured_gains(case), bool(bodies) or case.train.directions is not None
-        elastic = [Elastic(sites, size, body.elastic) for body in bodies]
+        directional, every = bool(bodies) or case.train.directions is not None, torch.arange(len(case.train))
+        fit = _Fit(case, self.kinds, _sites(case, bodies), directional)
         while True:
-            model = fit_mixture([*positional, *elastic], measured, case.features.points, directional=directional)
-            weights = _body_weights(model, elastic, measured)
+            families = fit.families(every, bodies)
+            model = fit(every, families)
+            weights = _body_weights(model, families, fit.measured)
             best = max(range(len(bodies)), key=weights.__getitem__, default=None)
             fine = None if best is None else self._refined(bodies[best])
             if best is None or fine is None:
-                return replace(model, report=_report(bodies, elastic, weights, missing))
-            bodies[best], elastic[best] = fine, Elastic(sites, size, fine.elastic)
+                break
+            bodies[best] = fine
+        judgment, used = _judged(fit, model, None if best is None else bodies[best]), every
+        if judgment.outliers:
+            rows = torch.tensor([row for row in every.tolist() if row not in {each.row for each in judgment.outliers}])
+            fewer_families = fit.families(rows, bodies)
+            fewer = fit(rows, fewer_families)
+            if predicts_better(fewer, model, rows, fit.measured):
+                model, families, used = fewer, fewer_families, rows
+                weights = _body_weights(model, families, fit.measured)
+        report = _report(bodies, families, weights, missing) | _judgment_report(judgment, case, used)
+        return replace(model, report=report), used
 
     def _usable_bodies(self, case: GainCase) -> tuple[list[NominalBody], dict[str, str]]:
         """Return the bodies that the contacts lie on, and why there are none."""
@@ -157,6 +171,40 @@ def estimator_for(
         return MixtureEstimator(kinds, missing=str(error))
 
 
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Fits families to some of a case's contacts."""
+
+    case: GainCase
+    kinds: tuple[str, ...]
+    sites: Sites
+    """All contacts."""
+    directional: bool
+    """Whether directions are known, or a body says which way its surface faces."""
+
+    @cached_property
+    def measured(self) -> MeasuredGains:
+        """The gains at all contacts."""
+        return measured_gains(self.case)
+
+    def families(self, rows: Int[Tensor, " rows"], bodies: Sequence[NominalBody]) -> list[KernelFamily]:
+        """Return the families of these contacts; the elastic ones come last, in the order of the bodies."""
+        sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
+        positional = [POSITIONAL[kind](sites, size) for kind in POSITIONAL if kind in self.kinds]
+        return [Unstructured(sites, size), *positional, *(Elastic(sites, size, body.elastic) for body in bodies)]
+
+    def __call__(
+        self,
+        rows: Int[Tensor, " rows"],
+        families: Sequence[KernelFamily],
+        noise_shares: tuple[float, ...] = NOISE_SHARES,
+    ) -> MixtureGains:
+        """Return the gain model of families of these contacts."""
+        measured = replace(self.measured, values=self.measured.values[rows])
+        points = self.case.features.points
+        return fit_mixture(families, measured, points, directional=self.directional, noise_shares=noise_shares)
+
+
 def measured_gains(case: GainCase) -> MeasuredGains:
     """Return a case's gains, with the variance that its background noise gives them."""
     values = torch.view_as_complex(case.parts.contiguous())
@@ -196,16 +244,28 @@ def _expect_on_body(case: GainCase, elastic: ElasticModes) -> None:
     expect_placed(case.train.contacts, _POINTS[elastic], names=case.train.names)
 
 
-def _body_weights(model: MixtureGains, elastic: Sequence[Elastic], measured: MeasuredGains) -> list[float]:
+def _judged(fit: _Fit, model: MixtureGains, body: NominalBody | None) -> Judgment:
+    """Return what contradicts the other contacts; the body is the most probable one."""
+    points = model.points[farthest_points(model.points, min(_PLACES, len(model.points)))]
+
+    def fitted(bodies: list[NominalBody]) -> Fit:
+        return lambda rows, noise_shares: fit(rows, fit.families(rows, bodies), noise_shares)
+
+    elastic = None if body is None else fitted([body])
+    return judge_contacts(fitted([]), elastic, fit.sites, model.sites(points), fit.measured)
+
+
+def _body_weights(model: MixtureGains, families: Sequence[KernelFamily], measured: MeasuredGains) -> list[float]:
     """Return each body's posterior probability, mean over modes by their energy."""
     share = measured.energy / measured.energy.sum().clamp_min(torch.finfo(torch.float64).tiny)
     known = dict(zip(map(id, model.families), (model.shares() @ share).tolist(), strict=True))
-    return [known.get(id(each), 0.0) for each in elastic]
+    return [known.get(id(each), 0.0) for each in families if isinstance(each, Elastic)]
 
 
 def _report(
-    bodies: Sequence[NominalBody], elastic: Sequence[Elastic], weights: Sequence[float], missing: dict[str, str]
+    bodies: Sequence[NominalBody], families: Sequence[KernelFamily], weights: Sequence[float], missing: dict[str, str]
 ) -> dict[str, Any]:
+    elastic = [each for each in families if isinstance(each, Elastic)]
     found = [
         {
             "body": body.name,
@@ -217,6 +277,16 @@ def _report(
         for body, family, weight in zip(bodies, elastic, weights, strict=True)
     ]
     return {"bodies": sorted(found, key=lambda each: -each["weight"]), "missing": missing}
+
+
+def _judgment_report(judgment: Judgment, case: GainCase, used: Int[Tensor, " used"]) -> dict[str, Any]:
+    names, contacts, credibility = case.train.names, case.train.contacts, judgment.credibility
+    kept = set(used.tolist())
+    return {
+        "outliers": {names[each.row]: each.describe(names, contacts) for each in judgment.outliers},
+        "excluded": [name for row, name in enumerate(names) if row not in kept],
+        "credibility": None if credibility is None else asdict(credibility) | {"credible": credibility.credible},
+    }
 
 
 _POINTS: WeakKeyDictionary[ElasticModes, Tensor] = WeakKeyDictionary()

@@ -10,7 +10,14 @@ from torch import Tensor
 
 from avmsf.field.gains.elastic import Elastic, factor_log_prior
 from avmsf.field.gains.family import KernelFamily
-from avmsf.field.gains.mixture import Hypotheses, KernelMixture, active_series, log_evidence, posterior_weights
+from avmsf.field.gains.mixture import (
+    NOISE_SHARES,
+    Hypotheses,
+    KernelMixture,
+    active_series,
+    log_evidence,
+    posterior_weights,
+)
 from avmsf.field.gains.model import MixtureGains, series_of
 
 _STRONGEST = 16
@@ -48,11 +55,12 @@ def fit_mixture(
     points: Float32[Tensor, "points 3"],
     *,
     directional: bool,
+    noise_shares: tuple[float, ...] = NOISE_SHARES,
 ) -> MixtureGains:
     """Return the gain model of some families, all of the same reference impacts, by evidence."""
     values, floor = series_of(measured.values), measured.floor
     kernels = [family.kernels() for family in families]
-    evidence = [log_evidence(each, values, floor) for each in kernels]
+    evidence = [log_evidence(each, values, floor, noise_shares) for each in kernels]
     pairs = list(zip(families, evidence, strict=True))
     weigh_factors(pairs, measured)
     kinds = [family.kind for family in families]
@@ -72,7 +80,7 @@ def fit_mixture(
     starts = [0, *ends[:-1]]
     rows = [used[(used >= start) & (used < end)] - start for start, end in zip(starts, ends, strict=True)]
     some = [(family, each) for family, each in zip(families, rows, strict=True) if len(each)]
-    mixture = KernelMixture(hypotheses.kernels[used], values, floor, weights[used])
+    mixture = KernelMixture(hypotheses.kernels[used], values, floor, weights[used], noise_shares)
     kept_families, kept = zip(*some, strict=True)
     return MixtureGains(points, families[0].reference, kept_families, kept, mixture, directional)
 

@@ -69,20 +69,25 @@ class KernelMixture:
     floor: Float64[Tensor, " series"]
     """Known variance of the values over their mean square, added to every noise share."""
     weights: Float64[Tensor, "kernels noises series"]
-    """Posterior probability of each kernel with each of `NOISE_SHARES`; they sum to one for each series."""
+    """Posterior probability of each kernel with each noise share; they sum to one for each series."""
+    noise_shares: tuple[float, ...] = NOISE_SHARES
 
     @classmethod
     def weigh(
-        cls, hypotheses: Hypotheses, values: Float64[Tensor, "contacts series"], floor: Float64[Tensor, " series"]
+        cls,
+        hypotheses: Hypotheses,
+        values: Float64[Tensor, "contacts series"],
+        floor: Float64[Tensor, " series"],
+        noise_shares: tuple[float, ...] = NOISE_SHARES,
     ) -> tuple["KernelMixture", Int[Tensor, " kept"]]:
         """Return the posterior and the rows of the hypotheses' kernels that it kept.
 
         Series without any energy have no part in learning the prior.
         """
-        likelihood = log_evidence(hypotheses.kernels, values, floor)
+        likelihood = log_evidence(hypotheses.kernels, values, floor, noise_shares)
         weights = posterior_weights(likelihood, hypotheses, active_series(values))
         kept = torch.nonzero(weights.sum((1, 2)) > 0).flatten()
-        return cls(hypotheses.kernels[kept], values, floor, weights[kept]), kept
+        return cls(hypotheses.kernels[kept], values, floor, weights[kept], noise_shares), kept
 
     def with_values(self, values: Float64[Tensor, "contacts series"]) -> "KernelMixture":
         """Return the same hypotheses with the same weights, for other values."""
@@ -100,7 +105,7 @@ class KernelMixture:
     @cached_property
     def noise_variance(self) -> Float64[Tensor, "noises series"]:
         """The variance v of the noise over s^2."""
-        return torch.tensor(NOISE_SHARES, dtype=torch.float64)[:, None] + self.floor
+        return torch.tensor(self.noise_shares, dtype=torch.float64)[:, None] + self.floor
 
     @cached_property
     def eigen(self) -> tuple[Float64[Tensor, "kernels contacts"], Float64[Tensor, "kernels contacts contacts"]]:
@@ -216,9 +221,10 @@ def log_evidence(
     kernels: Float64[Tensor, "kernels contacts contacts"],
     values: Float64[Tensor, "contacts series"],
     floor: Float64[Tensor, " series"],
+    noise_shares: tuple[float, ...] = NOISE_SHARES,
 ) -> Float64[Tensor, "kernels noises series"]:
     """Return the log evidence of each kernel with each noise share, up to a constant of the number of contacts."""
-    noises = torch.tensor(NOISE_SHARES, dtype=torch.float64)[:, None] + floor
+    noises = torch.tensor(noise_shares, dtype=torch.float64)[:, None] + floor
     found = torch.empty(len(kernels), len(noises), values.shape[1], dtype=torch.float64)
     size = max(1, _MEMORY // (len(values) * max(len(values), values.shape[1])))
     for rows in torch.split(torch.arange(len(kernels)), size):

@@ -178,7 +178,7 @@ class MixtureGains:
         best = both.flatten(0, 1).argmax(0)
         scale = self.mixture.quadratic.reshape(*self.mixture.weights.shape[:2], 2, modes).sum(2) / count
         for mode in range(modes):
-            row, share = divmod(int(best[mode]), len(NOISE_SHARES))
+            row, share = divmod(int(best[mode]), len(self.mixture.noise_shares))
             family, kernel = self._family_of(row)
             cross = family.between(sites, self.training, kernel)[0]
             own = family.between(sites, sites, kernel)[0]

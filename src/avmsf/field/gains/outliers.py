@@ -1,0 +1,220 @@
+"""Training contacts whose label (place and direction) contradicts the others, and whether a body is to be believed.
+
+Everything is judged by log predictive ratios (`ratios`), in nats per mode. The contacts S that are set aside maximize
+
+    J(S) = sum over i not in S of min(L_i(S), 3) - .3 |S|,
+
+found by adding, removing or exchanging one contact; the kernels are weighed again without S. A contact of S is an
+outlier if its own label is refuted, L_i < -1.5, and if another site or the opposite direction explains it. Where places
+say little of the gains nothing is an outlier.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Float64, Int
+from torch import Tensor
+
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.fitting import MeasuredGains
+from avmsf.field.gains.mixture import NOISE_SHARES
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.ratios import PredictiveRatios
+from avmsf.field.places import places_of
+
+WIDE_NOISE_SHARES = (*NOISE_SHARES, 0.1, 0.3, 1.0, 3.0)
+"""A wrong label may look like noise: the hypotheses that contacts are judged by have to allow for it."""
+_INFORMATIVE = 0.7
+"""Mean ratio, nats per mode, from which on places say enough to accuse a contact, or to name a body."""
+_BODY_GAIN = 0.3
+"""Nats per mode that a body has to add. An aircraft's and a ruler's add .7 to 1.7, with shuffled shapes .16 at most."""
+_ENOUGH, _COST = 3.0, 0.3
+"""Nats above which a contact does not argue for setting others aside, and that a contact set aside costs."""
+_MOST = 4
+"""One contact in so many may be set aside."""
+_LEAST_PLACES = 6
+"""Of fewer, one is hardly predicted by the others."""
+_ROUNDS = 3
+"""Of fit and search."""
+_LEAST_STEP = 1e-9
+"""Nats that a step of the search has to add: more than rounding does."""
+_REFUTED = -1.5
+"""Nats below which a contact's own label is refuted."""
+_EXPLAINED = 0.4
+"""Part of the others' mean ratio that a contact has to reach at another place."""
+_SURE = 2.0
+"""Standard errors by which the others' errors have to fall."""
+
+Fit = Callable[[Int[Tensor, " rows"], tuple[float, ...]], MixtureGains]
+"""Fits the gain model to some of the contacts with these noise shares."""
+
+
+@dataclass(frozen=True)
+class Credibility:
+    """How well contacts are predicted from each other, with the body behind the surface and without."""
+
+    with_body: float
+    """Mean log predictive ratio over the contacts that are not set aside, nats per mode."""
+    without_body: float
+
+    @property
+    def credible(self) -> bool:
+        """Whether a body may be named: its mode shapes tell what the distances between contacts do not."""
+        return self.with_body >= _INFORMATIVE and self.with_body - self.without_body >= _BODY_GAIN
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A contact that the others contradict, and where on the object it would agree with them."""
+
+    row: int
+    """Among the training contacts."""
+    ratio: float
+    """Log predictive ratio, nats per mode: below zero the place predicts its gains worse than no place does."""
+    place: tuple[float, float, float]
+    """Where it is explained best, object frame, metres."""
+    place_ratio: float
+    """The ratio there."""
+    distance: float
+    """From its own place, metres."""
+    reversed: bool
+    """Whether the opposite direction explains it at its own place."""
+
+    def describe(self, names: Sequence[str], contacts: Float[Tensor, "contacts 3"]) -> str:
+        """Return what is wrong with it in words, from the names and places (metres) of all training contacts."""
+        ratios = (
+            f"log predictive ratio {self.ratio:.2g} nats, there {self.place_ratio:.2g}; above 0 the place is plausible"
+        )
+        if self.distance == 0.0:
+            return f"{names[self.row]} fits its place if its direction is reversed ({ratios})"
+        place = torch.tensor(self.place, dtype=torch.float64)
+        apart = (contacts.double() - place).norm(dim=1)
+        own, apart[self.row] = float(apart[self.row]), torch.inf
+        other = int(apart.argmin())
+        where = ", ".join(f"{each + 0.0:.4g}" for each in self.place)
+        found = f"{names[self.row]} does not fit its place; it fits ({where}) m, {self.distance:.2g} m away"
+        if float(apart[other]) < own:
+            found += f", nearest to {names[other]}: their labels may have been exchanged"
+        if self.reversed:
+            found += "; or its direction is reversed"
+        return f"{found} ({ratios})"
+
+
+@dataclass(frozen=True)
+class Judgment:
+    """What the log predictive ratios say of the contacts, and of the body."""
+
+    outliers: tuple[Outlier, ...]
+    """By ratio, the lowest first."""
+    credibility: Credibility | None
+    """None without a body."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """A set of contacts set aside, and the ratios under the hypotheses without them."""
+
+    ratios: PredictiveRatios
+    aside: frozenset[int]
+
+    def mean(self) -> float:
+        """Return the others' mean ratio."""
+        return float(self.ratios.without(self.aside)[0].nanmean())
+
+
+def judge_contacts(plain: Fit, elastic: Fit | None, sites: Sites, places: Sites, measured: MeasuredGains) -> Judgment:
+    """Return the contacts that the others contradict, and whether the body is credible.
+
+    `plain` fits the gain model without elastic families, `elastic` with them, where there is a body. Contacts are
+    judged without the body unless it is credible. `sites` are all contacts, `places` impacts all over the object.
+    """
+    if elastic is None:
+        return Judgment(_outliers(_search(plain, sites, measured), places), None)
+    found = _search(elastic, sites, measured)
+    without = PredictiveRatios(plain(_others(sites, found.aside), WIDE_NOISE_SHARES), sites, measured)
+    credibility = Credibility(found.mean(), _Search(without, found.aside).mean())
+    used = found if credibility.credible else _search(plain, sites, measured)
+    return Judgment(_outliers(used, places), credibility)
+
+
+def set_aside(ratios: PredictiveRatios, start: frozenset[int] = frozenset()) -> frozenset[int]:
+    """Return the best set that adding, removing or exchanging one contact leads to, of a quarter of them at most."""
+    most, current = len(ratios.sites) // _MOST, start
+    score = float(_score(ratios.without(current)[0], len(current)))
+    while True:
+        tried: list[tuple[float, frozenset[int]]] = []
+        for base in (current, *(current - {row} for row in sorted(current))):
+            single, pairs = ratios.without(base)
+            tried.append((float(_score(single, len(base))), base))
+            if len(base) < most:
+                more = torch.where(torch.isnan(single), -torch.inf, _score(pairs, len(base) + 1))
+                tried.append((float(more.max()), base | {int(more.argmax())}))
+        best, found = max(tried, key=lambda each: each[0])
+        if best <= score + _LEAST_STEP:
+            return current
+        score, current = best, found
+
+
+def predicts_better(
+    fewer: MixtureGains, whole: MixtureGains, rows: Int[Tensor, " rows"], measured: MeasuredGains
+) -> bool:
+    """Return whether contacts are surely predicted better from each other by a model that only they are in.
+
+    `fewer` is fitted to the contacts `rows` alone, `whole` to all. The leave-one-place-out errors over the gains, each
+    mode by its energy, have to fall by more than two standard errors of the paired differences.
+    """
+    values = measured.values[rows]
+    power = (values.abs().square() / measured.damping).sum(1)
+    less, more = (
+        ((predicted - values).abs().square() / measured.damping).sum(1).div(power).sqrt()
+        for predicted in (fewer.leave_one_out(), whole.leave_one_out()[rows])
+    )
+    fall = (more - less)[power > 0]
+    return float(fall.mean()) > _SURE * float(fall.std()) / len(fall) ** 0.5
+
+
+def _search(fit: Fit, sites: Sites, measured: MeasuredGains) -> _Search:
+    """Return the contacts to set aside, the kernels being weighed without those of the round before."""
+    aside: frozenset[int] = frozenset()
+    enough = len(torch.unique(places_of(sites.points))) >= _LEAST_PLACES
+    for _ in range(_ROUNDS):
+        ratios = PredictiveRatios(fit(_others(sites, aside), WIDE_NOISE_SHARES), sites, measured)
+        before, aside = aside, set_aside(ratios, aside) if enough else aside
+        if aside == before:
+            break
+    return _Search(ratios, aside)
+
+
+def _outliers(search: _Search, places: Sites) -> tuple[Outlier, ...]:
+    """Return the contacts set aside that are contradicted and that another site explains, the lowest ratio first."""
+    mean = search.mean()
+    if mean < _INFORMATIVE:
+        return ()
+    found = [_located(search, row, places, mean) for row in sorted(search.aside)]
+    return tuple(sorted((each for each in found if each is not None), key=lambda each: each.ratio))
+
+
+def _located(search: _Search, row: int, places: Sites, mean: float) -> Outlier | None:
+    """Return a contact as an outlier if it is one by the standard of the others' mean ratio."""
+    contacts = search.ratios.sites
+    points, directions = (
+        torch.cat([getattr(each, name) for each in (contacts, places)]) for name in ("points", "directions")
+    )
+    ratios = search.ratios.elsewhere(row, search.aside, Sites(points, directions))
+    own, best = float(ratios[0, row]), int(ratios.amax(0).argmax())
+    ratio, needed = float(ratios[:, best].max()), _EXPLAINED * mean
+    if own >= _REFUTED or ratio < needed:
+        return None
+    x, y, z = points[best].tolist()
+    distance = float((points[best] - contacts.points[row]).norm())
+    return Outlier(row, own, (x, y, z), ratio, distance, float(ratios[1, row]) >= needed)
+
+
+def _others(sites: Sites, aside: frozenset[int]) -> Int[Tensor, " rows"]:
+    return torch.tensor([row for row in range(len(sites)) if row not in aside])
+
+
+def _score(ratios: Float64[Tensor, "contacts *sets"], count: int) -> Float64[Tensor, "*sets"]:
+    """Return J of sets of this size."""
+    return ratios.clamp_max(_ENOUGH).nansum(0) - _COST * count

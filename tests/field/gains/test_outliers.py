@@ -1,0 +1,199 @@
+"""Wrong labels contradict the other contacts, right ones do not, and where places say nothing nobody is accused."""
+
+import math
+
+import pytest
+import torch
+from jaxtyping import Float64, Int
+from torch import Tensor
+
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.mixture import NOISE_SHARES
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.outliers import (
+    WIDE_NOISE_SHARES,
+    Credibility,
+    Fit,
+    Outlier,
+    judge_contacts,
+    predicts_better,
+    set_aside,
+)
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from avmsf.field.gains.ratios import PredictiveRatios
+
+CONTACTS, MODES = 20, 12
+
+
+def _sites(count: int = CONTACTS) -> Sites:
+    """Impacts on the unit square, all along z."""
+    generator = torch.Generator().manual_seed(3)
+    points = torch.cat([torch.rand(count, 2, generator=generator), torch.zeros(count, 1)], dim=1).double()
+    return Sites(points, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(count, 3))
+
+
+def _gains(sites: Sites, *, noise: float = 0.02) -> MeasuredGains:
+    """Gains of plane waves of long wavelengths, as a supported plate's lowest modes have them."""
+    generator = torch.Generator().manual_seed(5)
+    wave = 3.0 * torch.rand(MODES, 3, generator=generator, dtype=torch.float64)
+    phase = 2.0 * math.pi * torch.rand(MODES, generator=generator, dtype=torch.float64)
+    values = torch.cos(sites.points @ wave.T + phase) * sites.directions[:, 2:]
+    error = torch.randn(*values.shape, 2, generator=generator, dtype=torch.float64) * noise
+    frequency = torch.linspace(100.0, 2000.0, MODES, dtype=torch.float64)
+    return MeasuredGains(
+        torch.complex(values + error[..., 0], 0.3 * values + error[..., 1]),
+        torch.full((MODES,), noise**2, dtype=torch.float64),
+        frequency,
+        torch.linspace(2.0, 20.0, MODES, dtype=torch.float64),
+    )
+
+
+def _fit(sites: Sites, measured: MeasuredGains) -> Fit:
+    def fit(rows: Int[Tensor, " rows"], noise_shares: tuple[float, ...]) -> MixtureGains:
+        some = MeasuredGains(measured.values[rows], measured.variance, measured.frequency, measured.damping)
+        families = [kind(sites.take(rows), 1.4) for kind in (Unstructured, Smooth, ThinPlate)]
+        return fit_mixture(families, some, sites.points.float(), directional=True, noise_shares=noise_shares)
+
+    return fit
+
+
+def _every(sites: Sites) -> Int[Tensor, " rows"]:
+    return torch.arange(len(sites))
+
+
+def _places() -> Sites:
+    one = torch.linspace(0.0, 1.0, 12, dtype=torch.float64)
+    grid = torch.cartesian_prod(one, one, torch.zeros(1, dtype=torch.float64))
+    return Sites(grid, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(len(grid), 3))
+
+
+def _found(sites: Sites, measured: MeasuredGains) -> tuple[Outlier, ...]:
+    return judge_contacts(_fit(sites, measured), None, sites, _places(), measured).outliers
+
+
+def _exchanged(sites: Sites, one: int, other: int) -> Sites:
+    rows = _every(sites)
+    rows[[one, other]] = rows[[other, one]]
+    return sites.take(rows)
+
+
+def _dense_ratio(ratios: PredictiveRatios, row: int, others: list[int]) -> Float64[Tensor, ""]:
+    """The definition, with the library's own Student t: each contact given the others, series by series."""
+    total, count = torch.zeros((), dtype=torch.float64), len(others)
+    for series, weight in enumerate(ratios.weight):
+        known, cross = ratios.covariance[series][others][:, others], ratios.covariance[series, row, others]
+        values, value = ratios.values[others, series], ratios.values[row, series]
+        solved, shrunk = torch.linalg.solve(known, values), torch.linalg.solve(known, cross)
+        scale = (values @ solved / count * (ratios.covariance[series, row, row] - cross @ shrunk)).sqrt()
+        placed = torch.distributions.StudentT(count, cross @ solved, scale)
+        nowhere = torch.distributions.StudentT(
+            count, torch.zeros((), dtype=torch.float64), values.square().mean().sqrt()
+        )
+        total += weight * (placed.log_prob(value) - nowhere.log_prob(value))
+    return total
+
+
+def _ratios() -> PredictiveRatios:
+    sites = _sites(9)
+    measured = _gains(sites, noise=0.1)
+    return PredictiveRatios(_fit(sites, measured)(_every(sites), WIDE_NOISE_SHARES), sites, measured)
+
+
+def test_ratio_is_that_of_student_densities_given_the_other_contacts() -> None:
+    ratios = _ratios()
+    for aside in (frozenset[int](), frozenset({2, 7})):
+        expected = [
+            _dense_ratio(ratios, row, [each for each in range(9) if each != row and each not in aside])
+            for row in range(9)
+        ]
+        torch.testing.assert_close(ratios.at(aside), torch.stack(expected), rtol=1e-9, atol=1e-9)
+
+
+def test_setting_one_more_contact_aside_needs_no_new_inverse() -> None:
+    ratios, aside = _ratios(), frozenset({4})
+    _, pairs = ratios.without(aside)
+    for other in (0, 8):
+        torch.testing.assert_close(
+            pairs[:, other], ratios.without(aside | {other})[0], rtol=1e-9, atol=1e-9, equal_nan=True
+        )
+
+
+def test_ratio_at_a_contacts_own_site_is_its_own() -> None:
+    ratios, aside = _ratios(), frozenset({4})
+    for row in (1, 4):
+        same = ratios.elsewhere(row, aside, ratios.sites.take(torch.tensor([row])))[0, 0]
+        torch.testing.assert_close(same, ratios.at(aside)[row], rtol=1e-9, atol=1e-9)
+
+
+def test_right_labels_are_not_accused() -> None:
+    sites = _sites()
+    assert _found(sites, _gains(sites)) == ()
+
+
+def test_exchanged_labels_are_found_with_the_places_exchanged() -> None:
+    true = _sites()
+    labels = _exchanged(true, 9, 16)
+    found = {each.row: each for each in _found(labels, _gains(true))}
+    assert set(found) == {9, 16}
+    for row in found:
+        # Within two steps of the grid of where it was really hit.
+        apart = torch.tensor(found[row].place, dtype=torch.float64) - true.points[row]
+        assert float(apart.norm()) < 2.0 / 11.0
+    names = [f"hit{row}" for row in range(CONTACTS)]
+    text = found[9].describe(names, labels.points.float())
+    assert "hit9" in text
+    assert "hit16" in text
+
+
+def test_a_reversed_direction_is_found_at_its_own_place() -> None:
+    true = _sites()
+    directions = true.directions.clone()
+    directions[6] = -directions[6]
+    (found,) = _found(Sites(true.points, directions), _gains(true))
+    assert found.row == 6
+    assert found.reversed
+    assert found.distance < 1.0 / 11.0
+
+
+def test_noise_accuses_nobody() -> None:
+    sites = _sites()
+    measured = _gains(sites)
+    for seed in range(5):
+        generator = torch.Generator().manual_seed(seed)
+        # Steps of a factor of ten between contacts: some fit badly wherever they are.
+        size = 10.0 ** torch.randint(0, 2, (CONTACTS, 1), generator=generator)
+        noise = torch.randn(CONTACTS, MODES, dtype=torch.complex128, generator=generator) * size
+        assert _found(sites, MeasuredGains(noise, measured.variance, measured.frequency, measured.damping)) == ()
+
+
+def test_few_places_accuse_nobody() -> None:
+    sites = _sites(5).take(torch.arange(5).repeat(2))
+    measured, directions = _gains(sites), sites.directions.clone()
+    directions[6] = -directions[6]
+    assert _found(Sites(sites.points, directions), measured) == ()
+
+
+def test_gains_that_no_place_explains_are_no_wrong_label() -> None:
+    sites = _sites()
+    measured = _gains(sites)
+    generator = torch.Generator().manual_seed(0)
+    measured.values[6] = 5.0 * torch.randn(MODES, dtype=torch.complex128, generator=generator)
+    ratios = PredictiveRatios(_fit(sites, measured)(_every(sites), WIDE_NOISE_SHARES), sites, measured)
+    assert 6 in set_aside(ratios)
+    assert _found(sites, measured) == ()
+
+
+def test_leaving_wrong_labels_out_predicts_the_others_better_and_right_ones_not() -> None:
+    true = _sites()
+    rows = torch.tensor([row for row in range(CONTACTS) if row not in (9, 16)])
+    for labels, better in ((_exchanged(true, 9, 16), True), (true, False)):
+        measured = _gains(true)
+        fit = _fit(labels, measured)
+        fewer, whole = fit(rows, NOISE_SHARES), fit(_every(true), NOISE_SHARES)
+        assert predicts_better(fewer, whole, rows, measured) == better
+
+
+@pytest.mark.parametrize(("with_body", "without", "credible"), [(0.8, 0.4, True), (0.6, 0.1, False), (2.0, 1.9, False)])
+def test_body_has_to_predict_and_to_add(with_body: float, without: float, credible: bool) -> None:
+    assert Credibility(with_body, without).credible == credible
