@@ -81,7 +81,7 @@ def test_a_file_names_its_tensors_and_itself(tmp_path):
     assert {name.removeprefix("gain_field.") for name in names if name.startswith("gain_field.")} == set(
         field().gain_field.state_dict()
     )
-    assert record["format"] == 6
+    assert record["format"] == 7
     assert record["version"] == "0.1.0"
     assert record["sample_rate"] == 8000.0
     assert record["origin"]["capture"] == "a plate"
@@ -274,11 +274,29 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path):
 
 def test_a_newer_format_is_refused_by_name(tmp_path):
     def change(_: dict, record: dict) -> None:
-        record.update(format=7, version="3.1.4", something="new")
+        record.update(format=8, version="3.1.4", something="new")
 
-    with pytest.raises(FieldFileError, match=r"of format 6, found format 7, written by avmsf 3\.1\.4") as caught:
+    with pytest.raises(FieldFileError, match=r"of format 7, found format 8, written by avmsf 3\.1\.4") as caught:
         load(changed(tmp_path, change))
     assert "install a newer avmsf" in str(caught.value)
+
+
+def test_a_field_of_format_6_is_read_with_the_gaussian_noise_that_it_was_saved_with(tmp_path):
+    def change(_: dict, record: dict) -> None:
+        record["format"] = 6
+        del record["config"]["residual_noise"]
+
+    loaded = load(changed(tmp_path, change))
+    config = replace(field().origin.config, residual_noise="gaussian")
+    assert loaded.origin.config == config
+    before = replace(field(), origin=replace(field().origin, config=config))
+    assert torch.equal(loaded.render(CONTACTS), before.render(CONTACTS))
+
+
+@pytest.mark.parametrize("config", [None, [], "none"])
+def test_a_field_of_format_6_whose_settings_are_none_is_refused(tmp_path, config):
+    with pytest.raises(FieldFileError):
+        load(changed(tmp_path, lambda _, record: record.update(format=6, config=config)))
 
 
 def test_missing_and_unexpected_tensors_are_named(tmp_path):
@@ -347,6 +365,7 @@ def test_a_record_that_is_not_of_these_tensors_is_refused(tmp_path, keys, value)
         (("config", "clusters"), 0, "clusters"),
         (("config", "fft_sizes"), "1024", "fft_sizes"),
         (("config", "unheard_of"), 1, "unheard_of"),
+        (("config", "residual_noise"), 0, "residual_noise"),
         (("origin", "trained_on"), [1], "trained_on"),
         (("origin",), None, "NoneType"),
         (("origin", "settings", "highpass"), -1.0, "highpass"),
@@ -358,7 +377,9 @@ def test_a_damaged_record_is_refused_with_what_is_wrong(tmp_path, keys, value, r
         load(path)
 
 
-@pytest.mark.parametrize("keys", [("config", "seed"), ("gain_field", "shape", "layers"), ("origin", "report")])
+@pytest.mark.parametrize(
+    "keys", [("config", "seed"), ("config", "residual_noise"), ("gain_field", "shape", "layers"), ("origin", "report")]
+)
 def test_nothing_that_a_record_lacks_is_made_up(tmp_path, keys):
     def change(_: dict, record: dict) -> None:
         for key in keys[:-1]:
@@ -369,12 +390,12 @@ def test_nothing_that_a_record_lacks_is_made_up(tmp_path, keys):
         load(changed(tmp_path, change))
 
 
-@pytest.mark.parametrize("words", ["", "[]", "{", '"avmsf"', '{"format": 6}'])
+@pytest.mark.parametrize("words", ["", "[]", "{", '"avmsf"', '{"format": 7}'])
 def test_a_record_that_is_none_is_refused(tmp_path, words):
     path = tmp_path / "plate.safetensors"
     save(field(), path)
     path.write_bytes(to_bytes(from_bytes(path.read_bytes()), {"avmsf": words}))
-    with pytest.raises(FieldFileError, match="expected the header of a sound field of format 6, found another"):
+    with pytest.raises(FieldFileError, match="expected the header of a sound field of format 7, found another"):
         load(path)
 
 

@@ -1,6 +1,6 @@
 """All of a sound field that is no tensor, as the JSON in its file's header.
 
-{"format": 6, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
+{"format": 7, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
  "sizes": {"modes": 43, "bins": 1025},
  "gain_field": {"kind": "attention", what the gain field says of itself},
  "config": {FitConfig}, "origin": {"capture": "bowl", "trained_on": [...], "per_newton": true, "report": {...},
@@ -22,8 +22,9 @@ from avmsf.field.config import FitConfig
 from avmsf.field.records import count_of, like, record_of
 from avmsf.field.soundfield import Origin, SoundField
 
-FORMAT = 6
-"""Number of this format; it grows with every change that older versions could not read."""
+FORMAT = 7
+"""Number of this format; it grows with every change that older versions could not read. Format 6, which lacks
+`config.residual_noise`, is read too."""
 
 
 @dataclass(frozen=True)
@@ -93,13 +94,16 @@ def read_header(words: str, path: Path) -> Header:
         found, writer = record["format"], record["version"]
     except (ValueError, TypeError, KeyError) as error:
         raise broken(path, error) from error
-    if found != FORMAT:
+    if found not in (6, FORMAT):
         raise FieldFileError(
             f"{path}: expected a sound field of format {FORMAT}, found format {found}, written by avmsf {writer} "
             f"(this is avmsf {version('avmsf')}): "
             + ("fit the field again" if isinstance(found, int) and found < FORMAT else "install a newer avmsf")
         )
     try:
+        if found == 6:
+            # Its only noise was Gaussian: the field keeps its sound.
+            record["config"] = {"residual_noise": "gaussian", **record["config"]}
         return _header(record)
     except (ValueError, TypeError, KeyError, FitError, CaptureError) as error:
         raise broken(path, error) from error
