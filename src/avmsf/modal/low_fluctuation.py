@@ -47,7 +47,7 @@ def generate(*, steps: int = 120, period: int = PERIOD, rate: float = 0.03, seed
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for _ in range(steps):
         optimizer.zero_grad()
-        fluctuation(sequence).backward()
+        fluctuation(sequence).backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         schedule.step()
     return sequence.detach()
