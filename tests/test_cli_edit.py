@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import soundfile
 import torch
+from avmsf.field.thinplategains import ThinPlateGains
 
 from avmsf.cli import edit, main, steering
 from avmsf.cli.edit import parse, run
@@ -15,7 +16,6 @@ from avmsf.cli.editmaterial import old_material
 from avmsf.errors import AvmsfError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
-from avmsf.field.thinplategains import ThinPlateGains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.simulate.material import CERAMIC, GLASS, STEEL, WOOD
@@ -36,7 +36,9 @@ def ceramic() -> SoundField:
     """Return a field whose dampings are near to ceramic's."""
     damping = rayleigh_damping(2 * math.pi * FREQUENCY, CERAMIC) * torch.tensor([1.1, 1.0, 0.9, 1.2, 1.0])
     bank, phase = ModalBank(FREQUENCY, damping), torch.zeros(5, dtype=torch.float64)
-    return SoundField(bank, FIELDS["positional"](), phase, Residual(torch.full((9,), 1e-6)), RATE, 2400, Origin("plate"))
+    return SoundField(
+        bank, FIELDS["positional"](), phase, Residual(torch.full((9,), 1e-6)), RATE, 2400, Origin("plate")
+    )
 
 
 @pytest.fixture

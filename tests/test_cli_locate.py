@@ -61,7 +61,9 @@ class Place:
 def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
     folder = tmp_path_factory.mktemp("place")
     zero = torch.zeros(len(BANK), dtype=torch.float64)
-    field = SoundField(BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), float(RATE), SAMPLES, Origin("plate"))
+    field = SoundField(
+        BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), float(RATE), SAMPLES, Origin("plate")
+    )
     save(field, folder / "plate.safetensors")
     locator = Locator.of(field)
     return Place(folder, str(folder / "plate.safetensors"), locator.points, locator.gains)

@@ -348,6 +348,7 @@ def test_a_record_that_is_not_of_these_tensors_is_refused(tmp_path, keys, value)
         (("config", "clusters"), 0, "clusters"),
         (("config", "fft_sizes"), "1024", "fft_sizes"),
         (("config", "unheard_of"), 1, "unheard_of"),
+        (("config", "residual_noise"), 0, "residual_noise"),
         (("origin", "trained_on"), [1], "trained_on"),
         (("origin",), None, "NoneType"),
         (("origin", "settings", "highpass"), -1.0, "highpass"),
@@ -359,7 +360,9 @@ def test_a_damaged_record_is_refused_with_what_is_wrong(tmp_path, keys, value, r
         load(path)
 
 
-@pytest.mark.parametrize("keys", [("config", "seed"), ("gain_field", "shape", "layers"), ("origin", "report")])
+@pytest.mark.parametrize(
+    "keys", [("config", "seed"), ("config", "residual_noise"), ("gain_field", "shape", "layers"), ("origin", "report")]
+)
 def test_nothing_that_a_record_lacks_is_made_up(tmp_path, keys):
     def change(_: dict, record: dict) -> None:
         for key in keys[:-1]:

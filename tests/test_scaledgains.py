@@ -27,7 +27,9 @@ def test_gains_and_deviations_are_the_inner_fields_times_the_factors(name):
     assert before.damping is None or torch.equal(before.damping, after.damping)
     assert (before.damping is None) == (after.damping is None)
     deviations = [each.deviation(PLACES, BLOWS) for each in (inner, scaled)]
-    assert deviations[0] is None or torch.allclose(deviations[1], deviations[0] * FACTORS.abs().float()[:, None], rtol=1e-6)
+    assert deviations[0] is None or torch.allclose(
+        deviations[1], deviations[0] * FACTORS.abs().float()[:, None], rtol=1e-6
+    )
     assert torch.equal(scaled.points, inner.points)
 
 

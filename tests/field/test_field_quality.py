@@ -76,7 +76,7 @@ def test_independent_noise_is_rendered_as_noise():
     assert fitted(replace(train, sounds=train.sounds + noise)).residual.recordings is None
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("count", [2, 3])
 def test_few_places_say_nothing_of_quality(count):
     field = fitted(replace(strikes(20), before=None, after=None).take(range(count)))
     assert field.quality is None

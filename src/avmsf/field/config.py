@@ -80,8 +80,11 @@ class FitConfig:
     """How modes start: each with the phase that the training recordings agree on, or as sines (paper, eq. 3)."""
     residual: bool = True
     """Whether noise is modelled beside the modes."""
+    residual_noise: Literal["low-fluctuation", "gaussian"] = "low-fluctuation"
+    """Noise that is filtered to the residual's spectrum when the field is rendered: a fixed sequence whose spectrogram
+    hardly fluctuates, 2 dB below a recording's noise, or a random draw at its level (paper)."""
     seed: int = 0
-    """Start of all chance in the fit: initial weights and noise."""
+    """Start of all chance in the fit: initial weights, noise in training, and rendered Gaussian noise."""
 
     def __post_init__(self) -> None:
         for name, least in _LEAST.items():
@@ -144,6 +147,7 @@ PAPER = FitConfig(
     interleave=1,
     early_weight=1.0,
     phase="sine",
+    residual_noise="gaussian",
 )
 """The paper's settings where it states them (supplement, training setup), the middle of each of its lists: clusters,
 learning rate, steps, resolutions, hop and the beginning's weight. It leaves the network's other sizes, the warm-up and

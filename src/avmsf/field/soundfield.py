@@ -14,7 +14,7 @@ from avmsf.field.gains.model import MixtureGains
 from avmsf.field.scaledgains import ScaledGains, fitted_gains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.pulse import ForcePulse
-from avmsf.modal.residual import Residual, shape_noise
+from avmsf.modal.residual import Residual, low_fluctuation_noise, shape_noise
 from avmsf.modal.synthesis import synthesise_phased
 
 _BATCH = 32
@@ -140,8 +140,8 @@ class SoundField:
         """Return the sound of a blow at each contact, along `directions` as in `gains`, times `force`.
 
         `force` in newtons where the recordings were divided by theirs, else relative to an average one of them. Of
-        `samples` samples, or as long as the training sounds. The noise is one draw, the same at every contact and in
-        every call, so that a contact's sound depends on nothing else. Modes that are not `audible` are silent.
+        `samples` samples, or as long as the training sounds. The noise is the same at every contact and in every call,
+        so that a contact's sound depends on nothing else. Modes that are not `audible` are silent.
 
         `pulse` is what a softer hammer adds to the recorded blows' own pulses, in which the modes answer it; it has
         the same impulse, however long it is. The noise grows with `force` as the modes do, which is a simplification:
@@ -174,9 +174,15 @@ class SoundField:
         return torch.nn.functional.pad(found, (0, samples - found.shape[1]))
 
     def noise(self, samples: int | None = None) -> Float[Tensor, " samples"]:
-        """Return the noise that every blow of force 1 brings along; `samples` as in `render`."""
-        generator = torch.Generator().manual_seed(self.origin.config.seed)
+        """Return the residual noise of an impact of force 1; `samples` as in `render`.
+
+        Of the kind that the fit's configuration names: a fixed sequence of low fluctuation, or a Gaussian draw
+        (paper, eq. 6), which differs with `samples`.
+        """
         length = self.samples if samples is None else samples
+        if self.origin.config.residual_noise == "low-fluctuation":
+            return low_fluctuation_noise(self.residual.magnitude, samples=length)
+        generator = torch.Generator().manual_seed(self.origin.config.seed)
         return shape_noise(self.residual.magnitude, contacts=1, samples=length, generator=generator)[0]
 
     def _modes(self, known: Gains, samples: int) -> Float[Tensor, "contacts samples"]:

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from avmsf.modal.low_fluctuation import white_sequence
+
 _REFERENCE = 1 << 17
 """Least number of samples of the white noise that the search for the quietest segments is calibrated on."""
 _FINENESS = 8
@@ -45,13 +47,30 @@ def shape_noise(
     """
     length = _even_length(samples)
     frequencies = length // 2 + 1
+    white = torch.randn(contacts, frequencies, 2, generator=generator).to(magnitude.device)
+    spectrum = torch.view_as_complex(white) * (_interpolated(magnitude, frequencies) * math.sqrt(length / 2))
+    return torch.fft.irfft(spectrum, n=length)[:, :samples]
+
+
+def low_fluctuation_noise(magnitude: Float[Tensor, " bins"], *, samples: int) -> Float[Tensor, " samples"]:
+    """Return the fixed sequence of `avmsf.modal.low_fluctuation` filtered to `magnitude` as `shape_noise` filters.
+
+    Its STFT magnitudes are near the median of those of `shape_noise`, and its root mean square is .78 times that of
+    `shape_noise`. One period is filtered circularly and repeated without a gap, so that a longer sound begins as a
+    shorter one. Differentiable in `magnitude`.
+    """
+    sequence = white_sequence().to(magnitude)
+    spectrum = torch.fft.rfft(sequence) * _interpolated(magnitude, len(sequence) // 2 + 1)
+    period = torch.fft.irfft(spectrum, n=len(sequence))
+    return period.repeat(math.ceil(samples / len(sequence)))[:samples]
+
+
+def _interpolated(magnitude: Float[Tensor, " bins"], frequencies: int) -> Float[Tensor, " frequencies"]:
+    """Return the magnitude at evenly spaced frequencies from 0 Hz to half the sample rate, linear between bins."""
     place = torch.linspace(0, len(magnitude) - 1, frequencies, device=magnitude.device)
     left = place.floor().long().clamp_max(len(magnitude) - 2)
     share = place - left
-    envelope = (1 - share) * magnitude[left] + share * magnitude[left + 1]
-    white = torch.randn(contacts, frequencies, 2, generator=generator).to(magnitude.device)
-    spectrum = torch.view_as_complex(white) * (envelope * math.sqrt(length / 2))
-    return torch.fft.irfft(spectrum, n=length)[:, :samples]
+    return (1 - share) * magnitude[left] + share * magnitude[left + 1]
 
 
 def noise_power(

@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.field.gains import mixture as mixture_module
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import fit_mixture
 from avmsf.field.gains.mixture import NOISE_SHARES
@@ -93,14 +92,14 @@ def test_covariances_at_the_contacts_are_below_the_noise():
         assert float(each.covariance.diagonal().max()) < each.noise
 
 
-def test_without_noise_nothing_is_unknown_at_the_contacts(monkeypatch):
-    monkeypatch.setattr(mixture_module, "NOISE_SHARES", (1e-9,) * len(NOISE_SHARES))
+def test_without_noise_nothing_is_unknown_at_the_contacts():
     sites = impacts(12, seed=1)
     given = fit_mixture(
         families(sites),
         replace(measured(sites), variance=torch.zeros(MODES).double()),
         sites.points.float(),
         directional=True,
+        noise_shares=(1e-9,),
     )
     for each in given.covariances(sites.points, sites.directions):
         assert float(each.covariance.diagonal().max()) < 1e-6 * float(given.values.abs().square().max())
