@@ -13,6 +13,7 @@ from benchmarks import (
     align,
     extract,
     field,
+    gains,
     physics,
     proof,
     residual,
@@ -30,6 +31,7 @@ from benchmarks.report import Options, show
 BENCHMARKS: dict[str, ModuleType] = {
     "align": align,
     "field": field,
+    "gains": gains,
     "extract": extract,
     "speed": speed,
     "scene": scene,
