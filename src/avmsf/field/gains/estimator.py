@@ -1,5 +1,7 @@
 """How a fit makes the gain model: from recordings whose gains are known, and the bodies behind the surface."""
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,15 +22,19 @@ from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.refinement import RefinedGains
+from avmsf.field.gains.symmetry import Characters, Symmetric
+from avmsf.field.gains.visual import Visual
 from avmsf.field.placed import expect_placed
 from avmsf.field.recipes import SHARED, GainCase
+from avmsf.scene.features import GEOMETRY
+from avmsf.scene.symmetry import Symmetries
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.nominal import NominalBody, body_name
 
 POSITIONAL: dict[str, type[KernelFamily]] = {Smooth.kind: Smooth, ThinPlate.kind: ThinPlate}
 """Families that need nothing but the contacts, by name."""
 AUTO = "auto"
-FAMILIES = (*POSITIONAL, Elastic.kind)
+FAMILIES = (*POSITIONAL, Symmetric.kind, Visual.kind, Elastic.kind)
 """What the model is made of beside the unstructured family, which is always there."""
 
 
@@ -42,6 +48,8 @@ class MixtureEstimator:
     """What may lie behind the surface; without it there is no elastic family."""
     missing: str = ""
     """Why there are no bodies, for the report."""
+    symmetries: Symmetries | None = None
+    """Of the object's geometry; without any there is no symmetry family."""
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.kinds) - set(FAMILIES))
@@ -59,8 +67,10 @@ class MixtureEstimator:
         return False
 
     def digest(self) -> str:
-        """Return a digest of the families and the bodies."""
-        return f"{' '.join(self.kinds)} {'' if self.bodies is None else self.bodies.digest()}"
+        """Return a digest of the families, the bodies and the symmetries."""
+        bodies = "" if self.bodies is None else self.bodies.digest()
+        symmetries = "" if self.symmetries is None else json.dumps(self.symmetries.to_dict())
+        return hashlib.sha256(f"{' '.join(self.kinds)} {bodies} {symmetries}".encode()).hexdigest()
 
     def dampings(self, config: FitConfig) -> tuple[str, ...]:
         """Return shared dampings alone: a mode's damping does not depend on the contact."""
@@ -88,8 +98,13 @@ class MixtureEstimator:
         size = 2.0 * case.features.half_diagonal
         sites = _sites(case, bodies)
         names = [kind for kind in POSITIONAL if kind in self.kinds]
-        positional = [Unstructured(sites, size), *(POSITIONAL[kind](sites, size) for kind in names)]
+        positional: list[KernelFamily] = [Unstructured(sites, size), *(POSITIONAL[kind](sites, size) for kind in names)]
         measured, directional = measured_gains(case), bool(bodies) or case.train.directions is not None
+        characters = Characters.of(self.symmetries) if self.symmetries and Symmetric.kind in self.kinds else None
+        if characters is not None and len(characters.values):
+            positional.append(Symmetric(sites, size, characters, directional=directional))
+        if Visual.kind in self.kinds and case.features.encoder != GEOMETRY:
+            positional.append(Visual(sites, size, case.features.points, case.features.features))
         elastic = [Elastic(sites, size, body.elastic) for body in bodies]
         while True:
             model = fit_mixture([*positional, *elastic], measured, case.features.points, directional=directional)

@@ -17,6 +17,8 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from avmsf.field.gains.symmetry import Characters, Symmetric
+from avmsf.field.gains.visual import Visual
 from avmsf.field.records import count_of, like
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.nominal import NOMINAL
@@ -27,6 +29,8 @@ more exactly."""
 _BATCH = 512
 """Places whose covariances with the contacts are held at once."""
 _POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
+_OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "characters", Visual.kind: "features"}
+"""Families that know something of the object, and the entry of the record with its size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,10 +210,14 @@ class MixtureGains:
                 for family in self.families
                 if isinstance(family, Elastic)
             ],
+            "characters": [
+                list(family.characters.values.shape) for family in self.families if isinstance(family, Symmetric)
+            ],
+            "features": [family.features.shape[1] for family in self.families if isinstance(family, Visual)],
         }
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the contacts, the gains there, the weights, and each body's mode shapes."""
+        """Return the contacts, the gains there, the weights, and what families know of the object."""
         named = {
             "points": self.points,
             "contacts": self.training.points,
@@ -221,6 +229,11 @@ class MixtureGains:
             "kept": torch.cat(self.kept),
             "weights": self.mixture.weights,
         }
+        for family in self.families:
+            if isinstance(family, Symmetric):
+                named |= {"motions": family.characters.motions, "characters": family.characters.values}
+            elif isinstance(family, Visual):
+                named["features"] = family.features
         bodies = [family.modes for family in self.families if isinstance(family, Elastic)]
         for row, body in enumerate(bodies):
             named |= {
@@ -236,9 +249,12 @@ class MixtureGains:
         """Return tensors like those of a model of these sizes."""
         points, contacts, modes = (count_of(record[name], name) for name in ("points", "contacts", "modes"))
         families, kept = record["families"], [count_of(each, "kept") for each in record["kept"]]
-        unknown = sorted(set(families) - {*_POSITIONAL, Elastic.kind})
-        if unknown or len(families) != len(kept) or len(record["bodies"]) != families.count(Elastic.kind):
-            raise ValueError(f"families are {families}, with {len(kept)} numbers and {len(record['bodies'])} bodies")
+        unknown = sorted(set(families) - {*_POSITIONAL, *_OF_OBJECT})
+        if unknown or len(families) != len(kept):
+            raise ValueError(f"families are {families}, with {len(kept)} numbers")
+        for kind, name in _OF_OBJECT.items():
+            if len(record[name]) != families.count(kind) or (kind != Elastic.kind and len(record[name]) > 1):
+                raise ValueError(f"families are {families}, with {len(record[name])} {name}")
         like(record["directional"], True, "directional")
         sizes: dict[str, tuple[int, ...]] = {
             "contacts": (contacts, 3),
@@ -249,11 +265,16 @@ class MixtureGains:
             "floor": (2 * modes,),
             "weights": (sum(kept), len(NOISE_SHARES), 2 * modes),
         }
+        for characters, motions in record["characters"]:
+            sizes["motions"] = (count_of(motions, "motions"), 3, 4)
+            sizes["characters"] = (count_of(characters, "characters"), motions)
         for row, body in enumerate(record["bodies"]):
             nodes, shapes = count_of(body["nodes"], "nodes"), count_of(body["shapes"], "shapes")
             sizes |= {f"bodies.{row}.frequency": (shapes,), f"bodies.{row}.nodes": (nodes, 3)}
         named = {name: torch.empty(size, dtype=torch.float64, device="meta") for name, size in sizes.items()}
         named |= {"points": torch.empty(points, 3, device="meta")}
+        for dim in record["features"]:
+            named["features"] = torch.empty(points, count_of(dim, "features"), device="meta")
         named |= {"kept": torch.empty(sum(kept), dtype=torch.int64, device="meta")}
         for row, body in enumerate(record["bodies"]):
             triangles = count_of(body["triangles"], "triangles")
@@ -274,10 +295,19 @@ class MixtureGains:
             )
             for row in range(len(record["bodies"]))
         )
-        families = tuple(
-            Elastic(training, size, next(bodies)) if kind == Elastic.kind else _POSITIONAL[kind](training, size)
-            for kind, size in zip(record["families"], tensors["scale"].tolist(), strict=True)
-        )
+
+        def family_of(kind: str, size: float) -> KernelFamily:
+            if kind == Elastic.kind:
+                return Elastic(training, size, next(bodies))
+            if kind == Symmetric.kind:
+                characters = Characters(tensors["motions"], tensors["characters"])
+                return Symmetric(training, size, characters, directional=record["directional"])
+            if kind == Visual.kind:
+                return Visual(training, size, tensors["points"], tensors["features"])
+            return _POSITIONAL[kind](training, size)
+
+        scale = tensors["scale"].tolist()
+        families = tuple(family_of(kind, size) for kind, size in zip(record["families"], scale, strict=True))
         kept = torch.split(tensors["kept"], record["kept"])
         kernels = torch.cat([family.kernels()[rows] for family, rows in zip(families, kept, strict=True)])
         values, measured = (torch.view_as_complex(tensors[name].contiguous()) for name in ("values", "measured"))
