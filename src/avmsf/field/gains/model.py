@@ -17,7 +17,7 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
-from avmsf.field.gains.symmetry import Characters, Symmetric
+from avmsf.field.gains.symmetry import Group, Symmetric
 from avmsf.field.gains.visual import Visual
 from avmsf.field.records import count_of, like
 from avmsf.simulate.elastic import ElasticModes
@@ -29,7 +29,7 @@ more exactly."""
 _BATCH = 512
 """Places whose covariances with the contacts are held at once."""
 _POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
-_OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "characters", Visual.kind: "features"}
+_OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "symmetries", Visual.kind: "features"}
 """Families that know something of the object, and the entry of the record with its size."""
 
 
@@ -210,8 +210,10 @@ class MixtureGains:
                 for family in self.families
                 if isinstance(family, Elastic)
             ],
-            "characters": [
-                list(family.characters.values.shape) for family in self.families if isinstance(family, Symmetric)
+            "symmetries": [
+                [list(group.characters.shape) for group in family.groups]
+                for family in self.families
+                if isinstance(family, Symmetric)
             ],
             "features": [family.features.shape[1] for family in self.families if isinstance(family, Visual)],
         }
@@ -231,7 +233,8 @@ class MixtureGains:
         }
         for family in self.families:
             if isinstance(family, Symmetric):
-                named |= {"motions": family.characters.motions, "characters": family.characters.values}
+                for row, group in enumerate(family.groups):
+                    named |= {f"groups.{row}.motions": group.motions, f"groups.{row}.characters": group.characters}
             elif isinstance(family, Visual):
                 named["features"] = family.features
         bodies = [family.modes for family in self.families if isinstance(family, Elastic)]
@@ -265,9 +268,9 @@ class MixtureGains:
             "floor": (2 * modes,),
             "weights": (sum(kept), len(NOISE_SHARES), 2 * modes),
         }
-        for characters, motions in record["characters"]:
-            sizes["motions"] = (count_of(motions, "motions"), 3, 4)
-            sizes["characters"] = (count_of(characters, "characters"), motions)
+        for row, (characters, order) in enumerate(group for family in record["symmetries"] for group in family):
+            sizes[f"groups.{row}.motions"] = (count_of(order, "motions"), 3, 4)
+            sizes[f"groups.{row}.characters"] = (count_of(characters, "characters"), order)
         for row, body in enumerate(record["bodies"]):
             nodes, shapes = count_of(body["nodes"], "nodes"), count_of(body["shapes"], "shapes")
             sizes |= {f"bodies.{row}.frequency": (shapes,), f"bodies.{row}.nodes": (nodes, 3)}
@@ -300,8 +303,9 @@ class MixtureGains:
             if kind == Elastic.kind:
                 return Elastic(training, size, next(bodies))
             if kind == Symmetric.kind:
-                characters = Characters(tensors["motions"], tensors["characters"])
-                return Symmetric(training, size, characters, directional=record["directional"])
+                rows = range(len(record["symmetries"][0]))
+                groups = [Group(tensors[f"groups.{row}.motions"], tensors[f"groups.{row}.characters"]) for row in rows]
+                return Symmetric(training, size, groups, directional=record["directional"])
             if kind == Visual.kind:
                 return Visual(training, size, tensors["points"], tensors["features"])
             return _POSITIONAL[kind](training, size)

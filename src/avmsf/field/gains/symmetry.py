@@ -1,19 +1,20 @@
 """The symmetry family: a mode's shape belongs to a symmetry of the object's geometry, with a sign that it keeps.
 
 Where a body is symmetric, each mode shape either keeps or changes its sign under a mirror or a half turn g, and gains
-at one side follow from those at the other. With k a smooth kernel between impacts, the covariance of functions of
-either kind is (k(x, x') +- k(x, g x')) / 2, where g moves the place and turns the direction. Over a group it is
+at one side follow from those at the other. With k the kernel of another family, which does not change when both impacts
+are moved, the covariance of functions of either kind is (k(x, x') +- k(x, g x')) / 2, where g moves the place and turns
+the direction. Over a group of motions it is
 
     K_chi(x, x') = sum_g chi(g) k(x, g x') / |G|,
 
-one for each real character chi (Serre, Linear Representations of Finite Groups, 1977, section 2.6): it is positive
-semidefinite as k does not change when both impacts are moved. Groups are those of each mirror, of each turn, and of
-each two mirrors or half turns that commute. Which sign a mode has is left to the evidence.
+one for each real character chi (Serre, Linear Representations of Finite Groups, 1977, section 2.6). Groups are those of
+each mirror, of each turn, and of each two mirrors or half turns that commute. Which sign a mode has is left to the
+evidence. No object is exactly symmetric: a share p of k itself is added, (1 - p) K_chi + p k.
 """
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -21,11 +22,12 @@ import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
-from avmsf.field.gains.family import KernelFamily, Sites, scaled, squared_exponential
+from avmsf.field.gains.family import KernelFamily, Sites
+from avmsf.field.gains.positional import ThinPlate
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
 
-LENGTHS = (0.1, 0.2, 0.4)
-"""Lengths of the smooth kernels over the object's size."""
+REMAINDERS = (0.1, 0.3)
+"""Shares p of what is not symmetric."""
 TURNS = 12
 """Order that stands for a turn by any angle: waves up to half as many around the axis are told apart."""
 HOLES = 0.05
@@ -34,106 +36,126 @@ two captures true ones have at most .02, those that a thin or open shape only se
 _ALIKE = math.sin(math.radians(7.5))
 """Sine of the angle up to which lines are parallel or perpendicular: axes of groups up to order 12 are 15 degrees
 apart, so that no other lies nearer."""
+_LEAST = 0.01
+"""Least part of the variance at the contacts that a character must have: where all contacts lie on a mirror plane
+nothing is known of functions that are odd."""
 
 
 @dataclass(frozen=True, eq=False)
-class Characters:
-    """Motions that carry an object onto itself, and characters of the groups that they form."""
+class Group:
+    """Motions that carry an object onto itself, and the characters of the group that they form."""
 
-    motions: Float64[Tensor, "motions 3 4"]
+    motions: Float64[Tensor, "order 3 4"]
     """A point x goes to A x + b, [A b] being the motion, A orthogonal, b in metres. The first one is the identity."""
-    values: Float64[Tensor, "characters motions"]
-    """Of each motion in each character; zero for motions of other groups."""
+    characters: Float64[Tensor, "characters order"]
+    """Of each motion. The first is one everywhere."""
 
-    @classmethod
-    def of(cls, symmetries: Symmetries) -> "Characters":
-        """Return the characters of the groups of an object's symmetries; none where it has none beyond doubt."""
-        mirrors = [each for each in symmetries.mirrors if each.missing <= HOLES]
-        turns = [each for each in symmetries.rotations if each.missing <= HOLES]
-        center = _center([*mirrors, *turns])
-        groups: list[tuple[list[Tensor], Tensor]] = []
-        flips = [(each.normal.double(), -1.0) for each in mirrors]
-        groups += [([_flip(line, sign)], _SIGNS) for line, sign in flips]
-        for turn in turns:
-            order = TURNS if turn.order is None else turn.order
-            groups.append((_turns(turn.axis.double(), order), _cyclic(order)))
-            if order % 2 == 0:
-                flips.append((turn.axis.double(), 1.0))
-        groups += [(each, torch.kron(_SIGNS, _SIGNS)) for each in _pairs(flips)]
-        linear = [torch.eye(3, dtype=torch.float64), *itertools.chain(*(each for each, _ in groups))]
-        values = torch.zeros(sum(len(each) for _, each in groups), len(linear), dtype=torch.float64)
-        row, column = 0, 1
-        for turned, signs in groups:
-            rows = slice(row, row + len(signs))
-            values[rows, 0] = signs[:, 0]
-            values[rows, column : column + len(turned)] = signs[:, 1:]
-            row, column = row + len(signs), column + len(turned)
-        parts = torch.stack(linear)
-        return cls(torch.cat([parts, (center - parts @ center)[..., None]], dim=2), values)
+    def images(self, sites: Sites, *, directional: bool) -> Iterator[Sites]:
+        """Yield the impacts as each motion leaves them; it turns their directions only where these are known."""
+        for motion in self.motions:
+            linear = motion[:, :3].T
+            directions = sites.directions @ linear if directional else sites.directions
+            yield Sites(sites.points @ linear + motion[:, 3], directions)
 
 
 class Symmetric(KernelFamily):
-    """Squared exponential kernels of several lengths, projected on the characters of the object's symmetries."""
+    """Thin plates, projected on the characters of the object's symmetries.
+
+    Their affine parts are those of all images of the contacts, so that motions do not change the kernels.
+    """
 
     kind: ClassVar[str] = "symmetry"
 
-    def __init__(self, reference: Sites, size: float, characters: Characters, *, directional: bool) -> None:
-        """Set up; `directional` says whether directions of impacts are known, which motions then turn."""
+    def __init__(self, reference: Sites, size: float, groups: Sequence[Group], *, directional: bool) -> None:
+        """Set up; `directional` says whether directions of impacts are known."""
         super().__init__(reference, size)
-        self.characters, self._directional = characters, directional
-        self._lengths = size * torch.tensor(LENGTHS, dtype=torch.float64)
-        alone = torch.eye(len(LENGTHS), dtype=torch.float64)
-        self.shares = scaled(torch.kron(characters.values, alone), self.diagonal(reference))
+        self.groups, self._directional = tuple(groups), directional
+        self._bases = [ThinPlate(self._orbit(group), size) for group in groups]
+        kernels = len(self._bases[0].shares)
+        one = torch.eye(kernels, dtype=torch.float64)
+        symmetric = torch.block_diag(*[torch.kron(_shares(group.characters), one) for group in groups])
+        whole = torch.block_diag(*[torch.kron(_identity(group.characters), one) for group in groups])
+        own = self.diagonal(reference).mean(1)
+        seen = symmetric @ own > _LEAST * (whole @ own)
+        symmetric, whole = (each[seen] / (each[seen] @ own)[:, None] for each in (symmetric, whole))
+        self.shares = torch.cat([(1.0 - share) * symmetric + share * whole for share in REMAINDERS])
+        group_of = torch.cat([torch.full((len(each.characters),), row) for row, each in enumerate(groups)])
+        category = (group_of[:, None] * kernels + torch.arange(kernels)).flatten()[seen]
+        known = torch.unique(category, return_inverse=True)[1]
+        count = int(known.max()) + 1
+        self._category = torch.cat([known + step * count for step in range(len(REMAINDERS))])
 
     def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
-        """Return the kernels between the impacts and the images of the others, motion by motion."""
-        return torch.cat([self._moved(sites, others, motion) for motion in self.characters.motions])
+        """Return the kernels between the impacts and each image of the others, group by group."""
+        return torch.cat(list(self._moved(sites, others)))
 
     def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
         """Return the kernels between each impact and its own images."""
-        found = []
-        for motion in self.characters.motions:
-            image = self._image(sites, motion)
-            square = (sites.points - image.points).square().sum(1)
-            cosine = (sites.directions * image.directions).sum(1)
-            found.append(torch.exp(-0.5 * square / self._lengths[:, None].square()) * cosine)
-        return torch.cat(found)
+        each = [self.basis(sites.take(row), sites.take(row))[:, 0] for row in torch.arange(len(sites)).split(1)]
+        return torch.cat(each, dim=1)
 
     def categories(self) -> Int[Tensor, " kernels"]:
-        """Return one category for each group and length: each mode has a character of its own."""
-        # The first character of a group is one everywhere; the others sum to zero over it.
-        group = (self.characters.values >= 0).all(1).cumsum(0) - 1
-        return (group[:, None] * len(LENGTHS) + torch.arange(len(LENGTHS))).flatten()
+        """Return one category for each group, kernel and remainder: each mode has a character of its own."""
+        return self._category
 
     def log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "kernels modes"]:
         """Return the log probability of each character in its group: all are equally probable."""
-        category = self.categories()
-        return -torch.bincount(category)[category].double().log()[:, None].expand(-1, len(log_frequency))
+        count = torch.bincount(self._category)[self._category].double()
+        return -count.log()[:, None].expand(-1, len(log_frequency))
 
     def mean(
         self, sites: Sites, known: Sites, coefficients: Float64[Tensor, "basis contacts series"]
     ) -> Float64[Tensor, "sites series"]:
         """Return the family's part of the means, motion by motion: all images at once would take much memory."""
-        parts = zip(self.characters.motions, coefficients.split(len(LENGTHS)), strict=True)
-        found = torch.zeros(len(sites), coefficients.shape[2], dtype=torch.float64)
-        for motion, part in parts:
-            found += torch.einsum("lpc,lcs->ps", self._moved(sites, known, motion), part)
+        found, row = torch.zeros(len(sites), coefficients.shape[2], dtype=torch.float64), 0
+        for moved in self._moved(sites, known):
+            found += torch.einsum("bpc,bcs->ps", moved, coefficients[row : row + len(moved)])
+            row += len(moved)
         return found
 
-    def _moved(
-        self, sites: Sites, others: Sites, motion: Float64[Tensor, "3 4"]
-    ) -> Float64[Tensor, "lengths sites others"]:
-        image = self._image(others, motion)
-        return squared_exponential(sites.points, image.points, self._lengths) * sites.cosine(image)
+    def _moved(self, sites: Sites, others: Sites) -> Iterator[Float64[Tensor, "kernels sites others"]]:
+        for group, base in zip(self.groups, self._bases, strict=True):
+            for image in group.images(others, directional=self._directional):
+                yield base.between(sites, image, torch.arange(len(base.shares)))
 
-    def _image(self, sites: Sites, motion: Float64[Tensor, "3 4"]) -> Sites:
-        linear = motion[:, :3].T
-        directions = sites.directions @ linear if self._directional else sites.directions
-        return Sites(sites.points @ linear + motion[:, 3], directions)
+    def _orbit(self, group: Group) -> Sites:
+        images = list(group.images(self.reference, directional=self._directional))
+        return Sites(torch.cat([each.points for each in images]), torch.cat([each.directions for each in images]))
+
+
+def groups_of(symmetries: Symmetries) -> tuple[Group, ...]:
+    """Return the groups that an object's symmetries form; none where it has none beyond doubt."""
+    mirrors = [each for each in symmetries.mirrors if each.missing <= HOLES]
+    turns = [each for each in symmetries.rotations if each.missing <= HOLES]
+    if not (mirrors or turns):
+        return ()
+    center = _center([*mirrors, *turns])
+    flips = [(each.normal.double(), -1.0) for each in mirrors]
+    found = [([_flip(line, sign)], _SIGNS) for line, sign in flips]
+    for turn in turns:
+        order = TURNS if turn.order is None else turn.order
+        found.append((_turns(turn.axis.double(), order), _cyclic(order)))
+        if order % 2 == 0:
+            flips.append((turn.axis.double(), 1.0))
+    found += [(each, torch.kron(_SIGNS, _SIGNS)) for each in _pairs(flips)]
+    one = torch.eye(3, dtype=torch.float64)
+    groups = []
+    for moved, characters in found:
+        linear = torch.stack([one, *moved])
+        groups.append(Group(torch.cat([linear, (center - linear @ center)[..., None]], dim=2), characters))
+    return tuple(groups)
 
 
 _SIGNS = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64)
 """The characters of a group of two."""
+
+
+def _shares(characters: Float64[Tensor, "characters order"]) -> Float64[Tensor, "characters order"]:
+    return characters / characters.shape[1]
+
+
+def _identity(characters: Float64[Tensor, "characters order"]) -> Float64[Tensor, "characters order"]:
+    return torch.eye(1, characters.shape[1], dtype=torch.float64).expand(len(characters), -1)
 
 
 def _flip(line: Float64[Tensor, " 3"], sign: float) -> Float64[Tensor, "3 3"]:
@@ -185,8 +207,6 @@ def _same(group: Sequence[Tensor], other: Sequence[Tensor]) -> bool:
 
 def _center(symmetries: Sequence[MirrorSymmetry | RotationalSymmetry]) -> Float64[Tensor, " 3"]:
     """Return the point nearest to all planes and axes, which meet where an object is bounded."""
-    if not symmetries:
-        return torch.zeros(3, dtype=torch.float64)
     points = torch.stack([each.point.double() for each in symmetries])
     across = torch.stack([_across(each) for each in symmetries])
     side = (across @ points[..., None]).flatten()
