@@ -37,7 +37,8 @@ AUTO = "auto"
 FAMILIES = (*POSITIONAL, Symmetric.kind, Elastic.kind)
 """What the model is made of beside the unstructured family, which is always there."""
 KNOWN = (*FAMILIES, Visual.kind)
-"""All families; whether looks help has not been measured on photographs, so that they must be asked for by name."""
+"""All families. Looks must be asked for by name: with the built-in descriptors of four simulated objects they made the
+errors between 0.4 % smaller and 1.7 % larger without a body, and changed nothing beside one."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from typing import ClassVar
 
 import torch
 from jaxtyping import Float64, Int
+from scipy.linalg import block_diag
 from torch import Tensor
 
 from avmsf.field.gains.family import KernelFamily, Sites
@@ -73,8 +74,8 @@ class Symmetric(KernelFamily):
         self._bases = [ThinPlate(self._orbit(group), size) for group in groups]
         kernels = len(self._bases[0].shares)
         one = torch.eye(kernels, dtype=torch.float64)
-        symmetric = torch.block_diag(*[torch.kron(_shares(group.characters), one) for group in groups])
-        whole = torch.block_diag(*[torch.kron(_identity(group.characters), one) for group in groups])
+        symmetric = _blocks([torch.kron(_shares(group.characters), one) for group in groups])
+        whole = _blocks([torch.kron(_identity(group.characters), one) for group in groups])
         own = self.diagonal(reference).mean(1)
         seen = symmetric @ own > _LEAST * (whole @ own)
         symmetric, whole = (each[seen] / (each[seen] @ own)[:, None] for each in (symmetric, whole))
@@ -91,7 +92,7 @@ class Symmetric(KernelFamily):
 
     def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
         """Return the kernels between each impact and its own images."""
-        each = [self.basis(sites.take(row), sites.take(row))[:, 0] for row in torch.arange(len(sites)).split(1)]
+        each = [self.basis(sites.take(row), sites.take(row))[:, 0] for row in torch.split(torch.arange(len(sites)), 1)]
         return torch.cat(each, dim=1)
 
     def categories(self) -> Int[Tensor, " kernels"]:
@@ -148,6 +149,10 @@ def groups_of(symmetries: Symmetries) -> tuple[Group, ...]:
 
 _SIGNS = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64)
 """The characters of a group of two."""
+
+
+def _blocks(each: Sequence[Float64[Tensor, "_rows _columns"]]) -> Float64[Tensor, "rows columns"]:
+    return torch.from_numpy(block_diag(*(block.numpy() for block in each)))
 
 
 def _shares(characters: Float64[Tensor, "characters order"]) -> Float64[Tensor, "characters order"]:
