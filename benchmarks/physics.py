@@ -35,8 +35,8 @@ CONVENTIONS = (
     f"physics.seconds: of sim-20's {COSTED}, {COSTED_SIZE:g} m long, 8 recordings of it, from a mesh of unknown wall "
     "to a field: bodies of several walls, the most probable one with 40,000 degrees of freedom, modes, fit end to end, "
     "in a process of its own; seconds_cached: again, with the elastic shapes kept; filled: the same where it is told "
-    "that the mesh encloses the material whole, which it does. gigabytes: peak memory of that process. render_ms: of one "
-    "sound, after the first.",
+    "that the mesh encloses the material whole, which it does. gigabytes: peak memory of that process. render_ms: of "
+    "one sound, after the first.",
     "coverage90: part of the held-out recordings' own gains in the 90 % interval, of 32 blows with each of "
     "six objects of sim-20 where 8 were learnt from; by_energy: by their energy; error: relative STFT error there.",
 )

@@ -31,6 +31,8 @@ from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features
+from avmsf.scene.symmetry import Symmetries
+from avmsf.scene.symmetrysearch import find_symmetries
 
 _FEW = 8
 """Recordings below which little is told of the gains between contacts."""
@@ -189,7 +191,14 @@ def _estimator(options: Options, capture: Capture, train: Impacts) -> GainRecipe
         cache = _beside(options.output, "bodies")
         return candidate_bodies(capture.surface, options.body, impacts=train, cache=cache, tell=say)
 
-    return estimator_for(options.gain_model, bodies, log=say)
+    def symmetries() -> Symmetries | None:
+        if capture.surface is None:
+            return None
+        generator = torch.Generator().manual_seed(options.config.seed)
+        points = FeatureField.from_mesh(capture.surface, generator=generator).points
+        return find_symmetries(points, generator=generator)
+
+    return estimator_for(options.gain_model, bodies, symmetries=symmetries, log=say)
 
 
 def _beside(output: Path, ending: str) -> Path:

@@ -31,6 +31,7 @@ from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.gaussiansurface import gaussian_surface
 from avmsf.scene.ply import read_splats
+from avmsf.scene.symmetry import Symmetries
 
 CACHE = ".avmsf"
 """Folder inside the capture's that keeps what each stage made."""
@@ -135,7 +136,9 @@ def _reconstruct(
 
     def make(path: Path) -> None:
         listener.tell(f"fit: a field of {len(modes.bank)} modes")
-        gains = estimator_for(config.gain_model, bodies, features=shape.features, log=listener.tell)
+        gains = estimator_for(
+            config.gain_model, bodies, symmetries=shape.symmetries, features=shape.features, log=listener.tell
+        )
         fitted = fit(
             train,
             shape.points,
@@ -189,6 +192,11 @@ class _Shape:
     def features(self) -> FeatureField:
         """What the network reads: what places look like, or their positions where nothing shows that."""
         return self.candidates.get("visual", self.points)
+
+    def symmetries(self) -> Symmetries | None:
+        """Return the symmetries that the features were pooled over, if any were looked for."""
+        found = self.report.get("symmetries")
+        return None if found is None else Symmetries.from_dict(found)
 
     @property
     def digest(self) -> str:

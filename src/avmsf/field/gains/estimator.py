@@ -1,5 +1,7 @@
 """How a fit makes the gain model: from recordings whose gains are known, and the bodies behind the surface."""
 
+import hashlib
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -23,20 +25,26 @@ from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.outliers import Fit, Judgment, judge_contacts, predicts_better
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.refinement import RefinedGains
+from avmsf.field.gains.symmetry import Group, Symmetric, groups_of
+from avmsf.field.gains.visual import Visual
 from avmsf.field.placed import expect_placed
 from avmsf.field.recipes import SHARED, Attention, GainCase, GainRecipe
-from avmsf.scene.features import FeatureField
+from avmsf.scene.features import GEOMETRY, FeatureField
 from avmsf.scene.points import farthest_points
+from avmsf.scene.symmetry import Symmetries
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.nominal import NominalBody, body_name
 
 POSITIONAL: dict[str, type[KernelFamily]] = {Smooth.kind: Smooth, ThinPlate.kind: ThinPlate}
 """Families that need nothing but the contacts, by name."""
 AUTO, NETWORK = "auto", "network"
-GainModel = Literal["auto", "network", "smooth", "thin-plate", "elastic"]
+GainModel = Literal["auto", "network", "smooth", "thin-plate", "symmetry", "visual", "elastic"]
 """The Gaussian process over all kernel families, the paper's attention network, or the process over one family."""
-FAMILIES = (*POSITIONAL, Elastic.kind)
+FAMILIES = (*POSITIONAL, Symmetric.kind, Elastic.kind)
 """What the model is made of beside the unstructured family, which is always there."""
+KNOWN = (*FAMILIES, Visual.kind)
+"""All families. Looks must be asked for by name: with the built-in descriptors of four simulated objects they made the
+errors between 0.4 % smaller and 1.7 % larger without a body, and changed nothing beside one."""
 _PLACES = 500
 """Points of the surface where the contacts that contradict the others may have been."""
 
@@ -51,11 +59,17 @@ class MixtureEstimator:
     """What may lie behind the surface; without it there is no elastic family."""
     missing: str = ""
     """Why there are no bodies, for the report."""
+    symmetries: Symmetries | None = None
+    """Of the object's geometry; without any there is no symmetry family.
+
+    Nor is there where a body is usable, whose mode shapes have the symmetries already: beside them the family made the
+    error of one of 11 splits of captures 6 % larger, and none smaller than by 2 %.
+    """
 
     def __post_init__(self) -> None:
-        unknown = sorted(set(self.kinds) - set(FAMILIES))
+        unknown = sorted(set(self.kinds) - set(KNOWN))
         if unknown:
-            raise FitError(f"kinds: expected some of {', '.join(FAMILIES)}, got {', '.join(unknown)}")
+            raise FitError(f"kinds: expected some of {', '.join(KNOWN)}, got {', '.join(unknown)}")
 
     @property
     def name(self) -> str:
@@ -68,8 +82,10 @@ class MixtureEstimator:
         return False
 
     def digest(self) -> str:
-        """Return a digest of the families and the bodies."""
-        return f"{' '.join(self.kinds)} {'' if self.bodies is None else self.bodies.digest()}"
+        """Return a digest of the families, the bodies and the symmetries."""
+        bodies = "" if self.bodies is None else self.bodies.digest()
+        symmetries = "" if self.symmetries is None else json.dumps(self.symmetries.to_dict())
+        return hashlib.sha256(f"{' '.join(self.kinds)} {bodies} {symmetries}".encode()).hexdigest()
 
     def dampings(self, config: FitConfig) -> tuple[str, ...]:
         """Return shared dampings alone: a mode's damping does not depend on the contact."""
@@ -96,7 +112,8 @@ class MixtureEstimator:
         """
         bodies, missing = self._usable_bodies(case)
         directional, every = bool(bodies) or case.train.directions is not None, torch.arange(len(case.train))
-        fit = _Fit(case, self.kinds, _sites(case, bodies), directional)
+        groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
+        fit = _Fit(case, self.kinds, _sites(case, bodies), directional, groups)
         while True:
             families = fit.families(every, bodies)
             model = fit(every, families)
@@ -148,19 +165,20 @@ def estimator_for(
     name: GainModel,
     bodies: Callable[[], CandidateBodies],
     *,
+    symmetries: Callable[[], Symmetries | None] = lambda: None,
     features: FeatureField | None = None,
     log: Callable[[str], None] | None = None,
 ) -> GainRecipe:
     """Return the estimator of this name; the network reads `features`, or the fit's own.
 
-    `bodies` computes what may lie behind the object's surface. Where it raises an AvmsfError there is no elastic family
-    in `auto`, which `log` is told; with `elastic` the error passes.
+    `bodies` computes what may lie behind the object's surface. Where it raises an AvmsfError, `auto` has no elastic
+    family, which `log` is told, and takes the `symmetries` of the object's shape; with `elastic` the error passes.
     """
     if name == NETWORK:
         return Attention(features, NETWORK)
+    if name != AUTO and name != Elastic.kind:
+        return MixtureEstimator((name,), symmetries=symmetries() if name == Symmetric.kind else None)
     kinds = FAMILIES if name == AUTO else (name,)
-    if Elastic.kind not in kinds:
-        return MixtureEstimator(kinds)
     try:
         return MixtureEstimator(kinds, bodies())
     except AvmsfError as error:
@@ -168,7 +186,7 @@ def estimator_for(
             raise
         if log is not None:
             log(f"no elastic mode shapes: {error}")
-        return MixtureEstimator(kinds, missing=str(error))
+        return MixtureEstimator(kinds, missing=str(error), symmetries=symmetries())
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +199,8 @@ class _Fit:
     """All contacts."""
     directional: bool
     """Whether directions are known, or a body says which way its surface faces."""
+    groups: tuple[Group, ...]
+    """Symmetries of the object's shape."""
 
     @cached_property
     def measured(self) -> MeasuredGains:
@@ -190,8 +210,14 @@ class _Fit:
     def families(self, rows: Int[Tensor, " rows"], bodies: Sequence[NominalBody]) -> list[KernelFamily]:
         """Return the families of these contacts; the elastic ones come last, in the order of the bodies."""
         sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
-        positional = [POSITIONAL[kind](sites, size) for kind in POSITIONAL if kind in self.kinds]
-        return [Unstructured(sites, size), *positional, *(Elastic(sites, size, body.elastic) for body in bodies)]
+        found: list[KernelFamily] = [Unstructured(sites, size)]
+        found += [POSITIONAL[kind](sites, size) for kind in POSITIONAL if kind in self.kinds]
+        if self.groups and Symmetric.kind in self.kinds:
+            found.append(Symmetric(sites, size, self.groups, directional=self.directional))
+        features = self.case.features
+        if Visual.kind in self.kinds and features.encoder != GEOMETRY:
+            found.append(Visual(sites, size, features.points, features.features))
+        return [*found, *(Elastic(sites, size, body.elastic) for body in bodies)]
 
     def __call__(
         self,

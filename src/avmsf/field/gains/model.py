@@ -15,6 +15,8 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from avmsf.field.gains.symmetry import Group, Symmetric
+from avmsf.field.gains.visual import Visual
 from avmsf.field.places import places_of
 from avmsf.field.records import count_of, like
 from avmsf.simulate.elastic import ElasticModes
@@ -25,6 +27,8 @@ NEIGHBORS = 3
 _BATCH = 512
 """Places whose covariances with the contacts are held at once."""
 _POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
+_OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "symmetries", Visual.kind: "features"}
+"""Families that know something of the object, and the entry of the record with its size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,10 +237,16 @@ class MixtureGains:
                 for family in self.families
                 if isinstance(family, Elastic)
             ],
+            "symmetries": [
+                [list(group.characters.shape) for group in family.groups]
+                for family in self.families
+                if isinstance(family, Symmetric)
+            ],
+            "features": [family.features.shape[1] for family in self.families if isinstance(family, Visual)],
         }
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the contacts, the gains there, the weights, and each body's mode shapes."""
+        """Return the contacts, the gains there, the weights, and what families know of the object."""
         named = {
             "points": self.points,
             "contacts": self.training.points,
@@ -248,6 +258,12 @@ class MixtureGains:
             "kept": torch.cat(self.kept),
             "weights": self.mixture.weights,
         }
+        for family in self.families:
+            if isinstance(family, Symmetric):
+                for row, group in enumerate(family.groups):
+                    named |= {f"groups.{row}.motions": group.motions, f"groups.{row}.characters": group.characters}
+            elif isinstance(family, Visual):
+                named["features"] = family.features
         bodies = [family.modes for family in self.families if isinstance(family, Elastic)]
         for row, body in enumerate(bodies):
             named |= {
@@ -264,9 +280,13 @@ class MixtureGains:
         points, contacts, modes = (count_of(record[name], name) for name in ("points", "contacts", "modes"))
         families, bodies = (like(record[name], [], name) for name in ("families", "bodies"))
         kept = [count_of(each, "kept") for each in like(record["kept"], [], "kept")]
-        unknown = sorted(set(families) - {*_POSITIONAL, Elastic.kind})
-        if unknown or len(families) != len(kept) or len(bodies) != families.count(Elastic.kind):
-            raise ValueError(f"families are {families}, with {len(kept)} numbers and {len(bodies)} bodies")
+        unknown = sorted(set(families) - {*_POSITIONAL, *_OF_OBJECT})
+        if unknown or len(families) != len(kept):
+            raise ValueError(f"families are {families}, with {len(kept)} numbers")
+        for kind, name in _OF_OBJECT.items():
+            given = len(like(record[name], [], name))
+            if given != families.count(kind) or (kind != Elastic.kind and given > 1):
+                raise ValueError(f"families are {families}, with {given} {name}")
         like(record["directional"], True, "directional")
         sizes: dict[str, tuple[int, ...]] = {
             "contacts": (contacts, 3),
@@ -277,11 +297,16 @@ class MixtureGains:
             "floor": (2 * modes,),
             "weights": (sum(kept), len(NOISE_SHARES), 2 * modes),
         }
+        for row, (characters, order) in enumerate(group for family in record["symmetries"] for group in family):
+            sizes[f"groups.{row}.motions"] = (count_of(order, "motions"), 3, 4)
+            sizes[f"groups.{row}.characters"] = (count_of(characters, "characters"), order)
         for row, body in enumerate(bodies):
             nodes, shapes = count_of(body["nodes"], "nodes"), count_of(body["shapes"], "shapes")
             sizes |= {f"bodies.{row}.frequency": (shapes,), f"bodies.{row}.nodes": (nodes, 3)}
         named = {name: torch.empty(size, dtype=torch.float64, device="meta") for name, size in sizes.items()}
         named |= {"points": torch.empty(points, 3, device="meta")}
+        for dim in record["features"]:
+            named["features"] = torch.empty(points, count_of(dim, "features"), device="meta")
         named |= {"kept": torch.empty(sum(kept), dtype=torch.int64, device="meta")}
         for row, body in enumerate(bodies):
             triangles = count_of(body["triangles"], "triangles")
@@ -302,10 +327,20 @@ class MixtureGains:
             )
             for row in range(len(record["bodies"]))
         )
-        families = tuple(
-            Elastic(training, size, next(bodies)) if kind == Elastic.kind else _POSITIONAL[kind](training, size)
-            for kind, size in zip(record["families"], tensors["scale"].tolist(), strict=True)
-        )
+
+        def family_of(kind: str, size: float) -> KernelFamily:
+            if kind == Elastic.kind:
+                return Elastic(training, size, next(bodies))
+            if kind == Symmetric.kind:
+                rows = range(len(record["symmetries"][0]))
+                groups = [Group(tensors[f"groups.{row}.motions"], tensors[f"groups.{row}.characters"]) for row in rows]
+                return Symmetric(training, size, groups, directional=record["directional"])
+            if kind == Visual.kind:
+                return Visual(training, size, tensors["points"], tensors["features"])
+            return _POSITIONAL[kind](training, size)
+
+        scale = tensors["scale"].tolist()
+        families = tuple(family_of(kind, size) for kind, size in zip(record["families"], scale, strict=True))
         kept = torch.split(tensors["kept"], record["kept"])
         for family, rows in zip(families, kept, strict=True):
             if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < len(family.shares):

@@ -1,0 +1,161 @@
+"""Kernels of an object's symmetries: closed forms, positive semidefinite, the same in any pose, and kept in files."""
+
+import math
+
+import pytest
+import torch
+
+from avmsf.field.gains import symmetry
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from avmsf.field.gains.symmetry import Symmetric, groups_of
+from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
+
+SIZE = 1.0
+
+
+def vector(*numbers: float) -> torch.Tensor:
+    return torch.tensor(numbers, dtype=torch.float64)
+
+
+def mirror(normal: torch.Tensor, point: torch.Tensor, missing: float = 0.0) -> MirrorSymmetry:
+    return MirrorSymmetry(normal, point, 0.0, missing)
+
+
+def of(*found: MirrorSymmetry | RotationalSymmetry) -> Symmetries:
+    mirrors = tuple(each for each in found if isinstance(each, MirrorSymmetry))
+    turns = tuple(each for each in found if isinstance(each, RotationalSymmetry))
+    return Symmetries(turns, mirrors, 0.01, 0.38, math.inf)
+
+
+CENTER = vector(0.1, -0.2, 0.3)
+X = mirror(vector(1, 0, 0), CENTER)
+Y = mirror(vector(0, 1, 0), CENTER)
+TURN = RotationalSymmetry(vector(0, 0, 1), CENTER, 4, 0.0, 0.0)
+ROUND = RotationalSymmetry(vector(0, 0, 1), CENTER, None, 0.0, 0.0)
+
+
+def impacts(count: int, seed: int = 0) -> Sites:
+    generator = torch.Generator().manual_seed(seed)
+    points = CENTER + 0.5 * (torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5)
+    directions = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    return Sites(points, torch.nn.functional.normalize(directions, dim=1))
+
+
+def reflected(sites: Sites) -> Sites:
+    across = vector(-1, 1, 1)
+    return Sites(CENTER + (sites.points - CENTER) * across, sites.directions * across)
+
+
+def measured(values: torch.Tensor) -> MeasuredGains:
+    modes = values.shape[1]
+    frequency = 100.0 * torch.arange(1, modes + 1, dtype=torch.float64)
+    return MeasuredGains(values, torch.zeros(modes, dtype=torch.float64), frequency, torch.ones_like(frequency))
+
+
+def fit(found: Symmetries, known: Sites, values: torch.Tensor, *, alone: bool = True) -> MixtureGains:
+    symmetric = Symmetric(known, SIZE, groups_of(found), directional=True)
+    other = [] if alone else [Unstructured(known, SIZE), Smooth(known, SIZE), ThinPlate(known, SIZE)]
+    return fit_mixture([*other, symmetric], measured(values), known.points.float(), directional=True)
+
+
+@pytest.mark.parametrize("found", [of(X), of(X, Y), of(X, Y, TURN), of(ROUND)], ids=["mirror", "pair", "four", "round"])
+def test_kernels_are_positive_semidefinite_and_one_on_the_mean_diagonal(found: Symmetries) -> None:
+    known, others = impacts(7), impacts(9, seed=1)
+    family = Symmetric(known, SIZE, groups_of(found), directional=True)
+    kept = torch.arange(len(family.shares))
+    both = Sites(torch.cat([known.points, others.points]), torch.cat([known.directions, others.directions]))
+    kernels = family.between(both, both, kept)
+    torch.testing.assert_close(kernels, kernels.mT, atol=1e-9, rtol=0.0)
+    lowest = torch.linalg.eigvalsh(kernels)
+    assert bool((lowest[:, 0] > -1e-7 * lowest[:, -1]).all())
+    torch.testing.assert_close(family.own(known, kept).mean(1), torch.ones(len(kept), dtype=torch.float64))
+    torch.testing.assert_close(family.own(both, kept), torch.diagonal(kernels, dim1=1, dim2=2), atol=1e-9, rtol=0.0)
+
+
+def test_characters_of_a_group_sum_to_the_kernel_itself() -> None:
+    for group in groups_of(of(X, Y, TURN)):
+        order = len(group.motions)
+        if len(group.characters) == order:
+            torch.testing.assert_close(
+                group.characters @ group.characters.T, order * torch.eye(order, dtype=torch.float64)
+            )
+        assert bool((group.characters[0] == 1).all())
+
+
+def test_motions_of_a_group_are_closed_though_the_planes_found_are_not_quite_perpendicular() -> None:
+    tilted = mirror(torch.nn.functional.normalize(vector(0.03, 1, 0.02), dim=0), CENTER)
+    groups = groups_of(of(X, tilted))
+    assert [len(group.motions) for group in groups] == [2, 2, 4]
+    whole = torch.cat([groups[2].motions, vector(0, 0, 0, 1).expand(4, 1, 4)], dim=1)
+    for one in whole:
+        for other in whole:
+            assert float((whole - one @ other).abs().amax((1, 2)).min()) < 1e-12
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["even", "odd"])
+def test_gains_on_the_other_side_are_those_of_the_mirrored_contact_with_the_modes_sign(
+    sign: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(symmetry, "REMAINDERS", (0.0,))
+    near = impacts(6, seed=2)
+    points = torch.cat([CENTER + (near.points - CENTER).abs(), reflected(near).points[:3]])
+    near = Sites(points[:6], near.directions)
+    images = reflected(near).take(torch.arange(3))
+    known = Sites(torch.cat([near.points, images.points]), torch.cat([near.directions, images.directions]))
+    generator = torch.Generator().manual_seed(3)
+    values = torch.randn(6, 4, generator=generator, dtype=torch.complex128)
+    # Contacts 0 to 2 are struck on both sides, which gives the sign; 3 to 5 on one alone.
+    model = fit(of(X), known, torch.cat([values, sign * values[:3]]))
+    beyond = reflected(near).take(torch.arange(3, 6))
+    here = near.take(torch.arange(3, 6))
+    there, own = (model.at(each.points, each.directions).mean for each in (beyond, here))
+    assert float(own.abs().max()) > 0.1
+    torch.testing.assert_close(there, sign * own)
+
+
+def test_predictions_move_with_the_object() -> None:
+    known, places = impacts(8), impacts(5, seed=4)
+    values = torch.randn(8, 3, generator=torch.Generator().manual_seed(5), dtype=torch.complex128)
+    turn, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64))
+    shift = vector(1.0, -2.0, 0.5)
+
+    def moved(sites: Sites) -> Sites:
+        return Sites(sites.points @ turn.T + shift, sites.directions @ turn.T)
+
+    there = of(mirror(turn @ X.normal, turn @ CENTER + shift), mirror(turn @ Y.normal, turn @ CENTER + shift))
+    first = fit(of(X, Y), known, values).at(places.points, places.directions)
+    second = fit(there, moved(known), values).at(moved(places).points, moved(places).directions)
+    torch.testing.assert_close(first.mean, second.mean, atol=1e-4, rtol=1e-3)
+
+
+def test_a_model_that_was_saved_says_the_same() -> None:
+    known, places = impacts(8), impacts(5, seed=4)
+    values = torch.randn(8, 3, generator=torch.Generator().manual_seed(5), dtype=torch.complex128)
+    model = fit(of(X, Y, ROUND), known, values, alone=False)
+    assert Symmetric.kind in model.record()["families"]
+    tensors = model.tensors()
+    like = MixtureGains.skeleton(model.record())
+    assert {name: (each.shape, each.dtype) for name, each in like.items()} == {
+        name: (each.shape, each.dtype) for name, each in tensors.items()
+    }
+    read = MixtureGains.restore(model.record(), tensors)
+    torch.testing.assert_close(
+        read.at(places.points, places.directions).mean, model.at(places.points, places.directions).mean
+    )
+
+
+def test_what_only_holes_allow_is_no_symmetry() -> None:
+    assert groups_of(of(mirror(vector(1, 0, 0), CENTER, missing=0.4))) == ()
+
+
+def test_functions_that_vanish_at_all_contacts_are_left_out() -> None:
+    on_plane = impacts(6)
+    on_plane.points[:, 0] = CENTER[0]
+    upright = Sites(on_plane.points, vector(0, 0, 1).expand(6, 3))
+    family = Symmetric(upright, SIZE, groups_of(of(X)), directional=True)
+    aside = Sites(upright.points + vector(0.1, 0, 0), upright.directions)
+    assert float(family.own(aside, torch.arange(len(family.shares))).max()) < 10.0
+    assert len(family.shares) == 6  # Three thin plates, two remainders, even functions alone.

@@ -1,0 +1,73 @@
+"""Kernels of looks: positive semidefinite, gains shared by places that look alike, and features kept in files."""
+
+import torch
+
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.positional import Unstructured
+from avmsf.field.gains.visual import Visual
+
+SIZE = 1.0
+
+
+def sites(points: torch.Tensor) -> Sites:
+    return Sites(points, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(len(points), 3))
+
+
+def object_points() -> tuple[torch.Tensor, torch.Tensor]:
+    """Return a line of points whose looks repeat after half of it."""
+    along = torch.linspace(0.0, 1.0, 41)[:-1]
+    points = torch.stack([along, torch.zeros(40), torch.zeros(40)], dim=1)
+    angle = 4 * torch.pi * along
+    return points, torch.stack([angle.cos(), angle.sin()], dim=1)
+
+
+def visual(known: Sites) -> Visual:
+    return Visual(known, SIZE, *object_points())
+
+
+def fit(known: Sites, values: torch.Tensor) -> MixtureGains:
+    modes = values.shape[1]
+    frequency = 100.0 * torch.arange(1, modes + 1, dtype=torch.float64)
+    gains = MeasuredGains(values, torch.zeros(modes, dtype=torch.float64), frequency, torch.ones_like(frequency))
+    families = [Unstructured(known, SIZE), visual(known)]
+    return fit_mixture(families, gains, object_points()[0], directional=False)
+
+
+def test_kernels_are_positive_semidefinite_and_one_on_the_diagonal() -> None:
+    known = sites(object_points()[0][::3].double())
+    family = visual(known)
+    kernels = family.kernels()
+    assert float(torch.linalg.eigvalsh(kernels)[:, 0].min()) > -1e-9
+    torch.testing.assert_close(torch.diagonal(kernels, dim1=1, dim2=2), torch.ones(kernels.shape[:2]).double())
+
+
+def test_places_that_look_alike_share_gains() -> None:
+    points, features = object_points()
+    known = sites(points[:20:2].double())
+    values = features[:20:2, :1].to(torch.complex128) * torch.tensor([1.0, 2.0j], dtype=torch.complex128)
+    far = points[20::2].double()
+    predicted = fit(known, values).at(far)
+    torch.testing.assert_close(predicted.mean[:, 0], values[:, 0].real.float(), atol=0.1, rtol=0.0)
+    torch.testing.assert_close(predicted.quadrature[:, 1], values[:, 1].imag.float(), atol=0.2, rtol=0.0)
+
+
+def test_the_unit_of_features_does_not_matter() -> None:
+    points, features = object_points()
+    known = sites(points[::4].double())
+    other = Visual(known, SIZE, points, 100.0 * features)
+    torch.testing.assert_close(other.kernels(), visual(known).kernels(), atol=1e-6, rtol=0.0)
+
+
+def test_a_model_that_was_saved_says_the_same() -> None:
+    points, features = object_points()
+    known = sites(points[:20:2].double())
+    model = fit(known, features[:20:2].to(torch.complex128))
+    tensors = model.tensors()
+    like = MixtureGains.skeleton(model.record())
+    assert {name: (each.shape, each.dtype) for name, each in like.items()} == {
+        name: (each.shape, each.dtype) for name, each in tensors.items()
+    }
+    read = MixtureGains.restore(model.record(), tensors)
+    torch.testing.assert_close(read.at(points).mean, model.at(points).mean)
