@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import soundfile
 import torch
-from avmsf.field.thinplategains import ThinPlateGains
 
 from avmsf.cli import edit, main, steering
 from avmsf.cli.edit import parse, run
 from avmsf.cli.editmaterial import old_material
 from avmsf.errors import AvmsfError
+from avmsf.field.gains.family import Sites
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.bank import ModalBank
@@ -24,7 +24,7 @@ from avmsf.tasks.materialstatistics import MaterialStatistics
 from avmsf.tasks.recast import RATIO_ONLY, rayleigh_damping, recast
 from avmsf.tasks.retune import retune
 from made_audio import save_audio
-from made_fields import FIELDS, places
+from made_fields import FIELDS, mixture, places
 
 Streams = pytest.CaptureFixture[str]
 RATE = 8000.0
@@ -223,10 +223,12 @@ def test_edits_are_shown_by_what_they_did(field: Path, capsys: Streams) -> None:
 
 
 def test_the_loudest_place_is_that_of_both_parts_of_the_gains(field: Path) -> None:
-    values = torch.zeros(3, 5, 2, dtype=torch.float64)
-    values[0, :, 0], values[1, :, 1] = 1.0, 3.0
+    values = torch.zeros(3, 5, dtype=torch.complex128)
+    values[0], values[1] = 1.0, 3.0j
     corners = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], dtype=torch.float64)
-    loud = replace(ceramic(), gain_field=ThinPlateGains(corners.float(), corners, values, 0.0))
+    alike = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(3, 3)
+    gains = replace(mixture(Sites(corners, alike), values, directional=False), points=corners.float())
+    loud = replace(ceramic(), gain_field=gains)
     assert edit._contact(loud, None).tolist() == pytest.approx([0.1, 0.0, 0.0])
 
 

@@ -12,7 +12,7 @@ from avmsf.cli import suggest as command
 from avmsf.cli.suggest import parse, run
 from avmsf.errors import AvmsfError
 from avmsf.field.store import save
-from believing_field import bar_contacts, drawn_gains, physics_field, sound_field, spline_field
+from believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
 
 Streams = pytest.CaptureFixture[str]
 
@@ -21,7 +21,7 @@ Streams = pytest.CaptureFixture[str]
 def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
     contacts = bar_contacts(6)
     path = tmp_path_factory.mktemp("fields") / "bar.safetensors"
-    save(sound_field(physics_field(contacts, drawn_gains(contacts, seed=1))), path)
+    save(sound_field(elastic_field(contacts, drawn_gains(contacts, seed=1))), path)
     return path
 
 
@@ -61,10 +61,10 @@ def test_directions_that_candidates_bring_are_not_said_to_go_straight_in(
         assert ("0.6000" in out) != straight
 
 
-def test_splines_say_no_direction(tmp_path: Path, capsys: Streams) -> None:
+def test_gains_without_directions_say_none(tmp_path: Path, capsys: Streams) -> None:
     contacts = bar_contacts(6)
     path = tmp_path / "bar.safetensors"
-    save(sound_field(spline_field(contacts, drawn_gains(contacts, seed=1))), path)
+    save(sound_field(positional_field(contacts, drawn_gains(contacts, seed=1))), path)
     assert run(parse([str(path), "--count", "1"])) == 0
     out, _ = capsys.readouterr()
     assert "error after" in out

@@ -80,7 +80,7 @@ def test_gains_are_a_number_a_contact_and_mode(name):
     assert all(bool(torch.isfinite(each).all()) for each in parts(field, PLACES, BLOWS))
     assert known.damping is None or float(field.at(PLACES).damping.min()) > 0
     assert (deviation is None) == ("attention" in name)
-    assert deviation is None or 0 <= float(field.deviation(PLACES).min()) < float(field.deviation(PLACES).max())
+    assert deviation is None or float(field.deviation(PLACES).min()) > 0
     # They vary over the object, or nothing below would be seen.
     assert float(field.at(PLACES).mean.std(0).max()) > 0
 

@@ -18,7 +18,7 @@ from avmsf.tasks.listening import WINDOW, Blow, Listener
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.retune import retune
 from avmsf.tasks.ringing import Ringing
-from made_fields import BANK, spline
+from made_fields import BANK, positional
 
 RATE = 8000.0
 STRUCK = (68, 60, 102, 8, 107)
@@ -31,7 +31,7 @@ FORCES = (1.0, -0.6, 2.0, 0.7, -1.0)
 @cache
 def locator() -> Locator:
     zero = torch.zeros(len(BANK), dtype=torch.float64)
-    field = SoundField(BANK, spline(), zero, Residual(torch.full((9,), 1e-3)), RATE, 4000, Origin("plate"))
+    field = SoundField(BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), RATE, 4000, Origin("plate"))
     return Locator.of(field)
 
 

@@ -26,7 +26,7 @@ from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
 from avmsf.simulate.shapes.shape import Symmetry
 from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locator import Locator
-from made_fields import BANK, spline
+from made_fields import BANK, positional
 
 RATE, SAMPLES = 8000.0, 3000
 STRUCK = (68, 60, 102, 8)
@@ -114,7 +114,7 @@ def test_chance_is_the_mean_distance_from_the_nearest_right_place() -> None:
 @cache
 def locator() -> Locator:
     zero = torch.zeros(len(BANK), dtype=torch.float64)
-    field = SoundField(BANK, spline(), zero, Residual(torch.full((9,), 1e-3)), RATE, SAMPLES, Origin("plate"))
+    field = SoundField(BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), RATE, SAMPLES, Origin("plate"))
     return Locator.of(field)
 
 

@@ -147,17 +147,15 @@ def _write_fields(folder: Path) -> None:
 
 
 def mixture_gains(contacts: Tensor, bank: ModalBank, points: Tensor) -> MixtureGains:
-    """Return a gain model of every family, for drawn gains and a sheet of 0.2 m as the body."""
+    """Return a gain model of every family, with a sheet of 0.2 m as the body."""
     size = float((points.amax(0) - points.amin(0)).norm())
     sites = Sites(contacts, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(len(contacts), 3))
     corners = 0.2 * torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     sheet = shell(Surface(corners, torch.tensor([[0, 1, 2], [0, 2, 3]])), thickness=0.004, detail=0.5)
-    families = [
-        *(each(sites, size) for each in (Unstructured, Smooth, ThinPlate)),
-        Elastic(sites, size, elastic_modes(sheet, NOMINAL, count=4)),
-    ]
-    generator = torch.Generator().manual_seed(0)
-    values = torch.randn(len(contacts), len(bank), dtype=torch.complex128, generator=generator)
+    body = Elastic(sites, size, elastic_modes(sheet, NOMINAL, count=5))
+    families = [*(each(sites, size) for each in (Unstructured, Smooth, ThinPlate)), body]
+    # The body's own gains, or its family would be left out.
+    values = body.modes.gains(sites.points, sites.directions)[:, : len(bank)].to(torch.complex128)
     variance = torch.full((len(bank),), 1e-4, dtype=torch.float64)
     measured = MeasuredGains(values, variance, bank.frequency, bank.damping)
     return fit_mixture(families, measured, points, directional=True)

@@ -63,7 +63,9 @@ def test_neighbors_by_direction_are_scored_where_directions_are_known(directed: 
     impacts = replace(straight, sounds=signs * straight.sounds, directions=directions if directed else None)
     train, test = split(impacts, count=7)
     modes = extract(train)
-    field = fit(train, FeatureField.from_contacts(contacts), modes, FitConfig(steps=0), gains=ThinPlate())
+    field = fit(
+        train, FeatureField.from_contacts(contacts), modes, FitConfig(steps=0), gains=MixtureEstimator(("thin-plate",))
+    )
     scores = compare(field, train, test, modes)
     by_direction = scores.get("mean waveform of 3 nearest, by direction")
     assert (by_direction is not None) == directed

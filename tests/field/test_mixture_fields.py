@@ -1,4 +1,4 @@
-"""The gain model as a whole: its symmetries, what it leaves alone, and what mode shapes are worth."""
+"""The gain model on a plate: its symmetries, impacts too near to tell apart, and what mode shapes are worth."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.simulate.elastic import ElasticModes
-from made_fields import BANK, DIAGONAL, FIELDS, blows, places, plate, struck
+from made_fields import BANK, DIAGONAL, blows, places, plate, struck
 
 PLACES = places(60, seed=8)
 BLOWS = blows(PLACES, seed=9)
@@ -22,10 +22,8 @@ def fitted(sites: Sites, values: Tensor, body: ElasticModes | None = None, *, si
     families = [each(sites, size) for each in (Unstructured, Smooth, ThinPlate)]
     if body is not None:
         families.append(Elastic(sites, size, body))
-    modes = values.shape[1]
-    frequency, damping = (each.repeat(2)[:modes] for each in (BANK.frequency, BANK.damping))
-    variance = torch.full((modes,), 1e-4, dtype=torch.float64)
-    measured = MeasuredGains(values, variance, frequency, damping)
+    variance = torch.full((len(BANK),), 1e-4, dtype=torch.float64)
+    measured = MeasuredGains(values, variance, BANK.frequency, BANK.damping)
     return fit_mixture(families, measured, sites.points.float(), directional=True)
 
 
@@ -59,35 +57,12 @@ def test_an_object_that_is_moved_turned_and_enlarged_has_the_same_gains(body):
 
 
 @pytest.mark.parametrize("body", [None, plate()], ids=["positional", "elastic"])
-def test_the_order_of_impacts_and_the_sides_they_come_from_do_not_matter(body):
+def test_impacts_from_the_other_side_with_opposite_gains_say_the_same(body):
     sites, values = struck(12)
     expected = mean(fitted(sites, values, body), PLACES, BLOWS)
-    order = torch.randperm(12, generator=torch.Generator().manual_seed(1))
-    expect_close(mean(fitted(sites.take(order), values[order], body), PLACES, BLOWS), expected)
     side = torch.where(torch.arange(12) % 3 == 0, -1.0, 1.0).double()[:, None]
     opposite = Sites(sites.points, side * sites.directions)
     expect_close(mean(fitted(opposite, side * values, body), PLACES, BLOWS), expected)
-
-
-def test_louder_gains_are_the_same_model_louder():
-    sites, values = struck(12)
-    model = fitted(sites, values)
-    for louder in (fitted(sites, 7.0 * values), model.with_values(7.0 * values)):
-        # The measurement's variance, which is no louder, hardly counts.
-        expect_close(mean(louder, PLACES, BLOWS), 7.0 * mean(model, PLACES, BLOWS), within=1e-2)
-    torch.testing.assert_close(louder.deviation(PLACES), 7.0 * model.deviation(PLACES))
-    torch.testing.assert_close(louder.noise(), 7.0 * model.noise())
-    torch.testing.assert_close(louder.standardized_errors(), model.standardized_errors())
-
-
-@pytest.mark.parametrize("name", ["positional", "directional", "elastic"])
-def test_means_at_the_contacts_are_smoothed_gains(name):
-    model = FIELDS[name]()
-    parts = torch.einsum("mdce,emd->cmd", model.smoother(), torch.view_as_real(model.values))
-    found = mean(model, model.contacts, model.training.directions)
-    expect_close(found, torch.view_as_complex(parts.contiguous()))
-    # Clean gains are hardly smoothed: the largest noise that is considered is 3 % of their power.
-    assert float((found - model.values).abs().square().mean() / model.values.abs().square().mean()) < 0.03
 
 
 def test_mode_shapes_predict_what_positions_cannot_and_know_how_well():
@@ -102,15 +77,6 @@ def test_mode_shapes_predict_what_positions_cannot_and_know_how_well():
     within = torch.view_as_real(errors[0]).abs() < 1.645 * deviation
     # Of draws from the model .9; shapes that are exact leave less unknown than the hypotheses allow for.
     assert float(within.double().mean()) > 0.85
-
-
-def test_a_mode_without_gains_stays_silent_and_leaves_the_others_alone():
-    sites, values = struck(12)
-    model = fitted(sites, torch.cat([values, 0.0 * values[:, :1]], dim=1))
-    assert not bool(mean(model, PLACES)[:, -1].any())
-    assert not bool(model.deviation(PLACES)[:, -1].any())
-    assert bool(torch.isnan(model.standardized_errors()[:, -1]).all())
-    expect_close(mean(model, PLACES)[:, :-1], mean(fitted(sites, values), PLACES))
 
 
 def test_two_impacts_near_each_other_that_differ_do_not_make_gains_run_away():

@@ -100,7 +100,7 @@ def test_bodies_halve_the_error_between_impacts() -> None:
 
 
 def test_the_true_wall_and_its_stiffness_are_the_most_probable() -> None:
-    first, *others = estimator().fit(case()).report["bodies"]
+    first, *others = estimator().start(case(), "shared").report["bodies"]
     assert first["body"] == bodies()[1].name
     # Factors of the grid are 5 % apart.
     assert first["factor"] == pytest.approx(STIFFER, rel=0.06)
@@ -114,7 +114,7 @@ def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> No
         replace(body, wall=wall, fine=False) for body, wall in zip(bodies()[:2], (0.00404, 0.00396), strict=True)
     )
     assert bad.name == good.name
-    first, second = estimator(bad, good, finer=finer).fit(case()).report["bodies"]
+    first, second = estimator(bad, good, finer=finer).start(case(), "shared").report["bodies"]
     assert finer.asked == [good]
     assert (first["wall"], first["fine"]) == (0.00396, True)
     assert (second["wall"], second["fine"]) == (0.00404, False)
@@ -122,7 +122,7 @@ def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> No
 
 def test_a_fine_body_is_not_computed_again() -> None:
     finer = Finer()
-    estimator(finer=finer).fit(case())
+    estimator(finer=finer).start(case(), "shared")
     assert finer.asked == []
 
 
@@ -134,12 +134,12 @@ def test_estimators_of_other_bodies_or_elements_have_other_digests() -> None:
 
 def test_reasons_against_other_bodies_are_reported() -> None:
     known = CandidateBodies(NominalBodies(bodies()[1:2], {None: "the mesh is open"}))
-    assert MixtureEstimator(bodies=known).fit(case()).report["missing"] == {"filled": "the mesh is open"}
+    assert MixtureEstimator(bodies=known).start(case(), "shared").report["missing"] == {"filled": "the mesh is open"}
 
 
 @pytest.mark.parametrize("directions", [None, torch.zeros(12, 3)], ids=["no directions", "directions of length zero"])
 def test_impacts_of_unknown_direction_go_straight_into_the_body(directions: torch.Tensor | None) -> None:
-    found = estimator().fit(case(directions=directions)).training.directions
+    found = estimator().start(case(directions=directions), "shared").model.training.directions
     straight = -truth(WALLS[1]).normals(recorded(12)[0].contacts)
     assert float((found * straight).sum(1).min()) > 0.99
 
@@ -177,11 +177,11 @@ ELSEWHERE: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
 @pytest.mark.parametrize("remedy", ELSEWHERE)
 def test_a_body_that_the_contacts_do_not_lie_on_takes_no_part_and_the_remedy_is_told(remedy: str) -> None:
     body = moved_body(ELSEWHERE[remedy])
-    report = estimator(body).fit(case()).report
+    report = estimator(body).start(case(), "shared").report
     assert report["bodies"] == []
     assert remedy in report["missing"]["elastic"]
     with pytest.raises(FitError, match=remedy):
-        estimator(body, kinds=("elastic",)).fit(case())
+        estimator(body, kinds=("elastic",)).start(case(), "shared")
 
 
 @pytest.mark.slow
@@ -194,7 +194,7 @@ def test_bodies_take_part_despite_rough_surfaces_thick_glue_and_a_wrong_row(coun
     above = contacts + 0.03 * size * torch.tensor([0.0, 0.0, 1.0])
     above[-1] += 0.5 * size
     for body, each in ((rough, contacts), (bodies()[1], above)):
-        assert estimator(body).fit(case(count, contacts=each)).report["bodies"]
+        assert estimator(body).start(case(count, contacts=each), "shared").report["bodies"]
 
 
 def test_contacts_elsewhere_are_refused_before_any_body_is_computed() -> None:
