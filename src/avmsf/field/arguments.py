@@ -24,6 +24,12 @@ def expect_fitting(train: Impacts, modes: Extraction) -> None:
                 f"{name}: expected finite samples and coordinates, found NaN or infinity: leave the recording out or "
                 "read it again"
             )
+    if train.directions is not None and not bool(torch.isfinite(train.directions).all()):
+        row = int(torch.nonzero(~torch.isfinite(train.directions).all(1))[0])
+        raise FitError(
+            f"{train.names[row]}: expected a finite direction, got {train.directions[row].tolist()}: give the way the "
+            "hammer moves, or zeros where it is not known"
+        )
     if float(train.sounds.abs().max()) == 0.0:
         raise FitError("all recordings are silent: there is nothing to fit; check the channel that was read")
     if len(modes.gains) != len(train):

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Complex128, Float32, Float64
+from jaxtyping import Bool, Complex128, Float32, Float64
 from torch import Tensor
 
 from avmsf.field.gains.elastic import Elastic, factor_log_prior
@@ -22,6 +22,8 @@ from avmsf.field.gains.model import MixtureGains, series_of
 
 _STRONGEST = 16
 """Modes of the most energy, which decide on the factor on nominal frequencies: many weak ones are not the body's."""
+_SUBSTANTIAL = 1e-3
+"""Part of a mode's energy from which on a part of its gains counts in learning the prior."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,15 @@ class MeasuredGains:
     def energy(self) -> Float64[Tensor, " modes"]:
         """Of each mode's sound, up to a constant."""
         return self.values.abs().square().sum(0) / self.damping
+
+    @property
+    def substantial(self) -> Bool[Tensor, " series"]:
+        """Which parts have a thousandth of their mode's energy: smaller ones are what the common phase leaves of noise.
+
+        They have no part in learning the prior, in which every series counts alike.
+        """
+        power = torch.stack([self.values.real.square().sum(0), self.values.imag.square().sum(0)])
+        return (power >= _SUBSTANTIAL * power.sum(0)).flatten()
 
     @property
     def floor(self) -> Float64[Tensor, " series"]:
@@ -74,7 +85,7 @@ def fit_mixture(
     log_frequency = torch.log(measured.frequency)
     log_prior = torch.cat([family.log_prior(log_frequency) for family in families]).repeat(1, 2)
     hypotheses = Hypotheses(torch.cat(kernels), torch.cat(category), torch.cat(prior), log_prior)
-    weights = posterior_weights(torch.cat(evidence), hypotheses, active_series(values))
+    weights = posterior_weights(torch.cat(evidence), hypotheses, active_series(values) & measured.substantial)
     used = torch.nonzero(weights.sum((1, 2)) > 0).flatten()
     ends = torch.tensor([len(family.shares) for family in families]).cumsum(0).tolist()
     starts = [0, *ends[:-1]]

@@ -39,8 +39,9 @@ _ROUNDS = 5
 """Of expectation maximization."""
 _PSEUDO_COUNT = 0.1
 """Series' worth of belief in the prior of categories, for each series."""
-_NEGLIGIBLE = 2e-3
-"""Posterior probability below which a hypothesis is dropped for a series."""
+_NEGLIGIBLE = 1e-2
+"""Posterior probability, over the most probable one's of a series, below which a hypothesis is dropped. Not an absolute
+one: few contacts leave thousands of hypotheses almost equally probable."""
 _MEMORY = 4_000_000
 """Numbers held at once in a batch of kernels."""
 _TINY = torch.finfo(torch.float64).tiny
@@ -240,7 +241,7 @@ def log_evidence(
 def posterior_weights(
     likelihood: Float64[Tensor, "kernels noises series"], hypotheses: Hypotheses, active: Bool[Tensor, " series"]
 ) -> Float64[Tensor, "kernels noises series"]:
-    """Return the posterior probabilities, those below 2/1000 as zero, with the prior of categories learned.
+    """Return the posterior probabilities, negligible ones as zero, with the prior of categories learned.
 
     Each pair of a category and a noise share has a probability of its own.
     """
@@ -255,7 +256,7 @@ def posterior_weights(
         counts = counts.index_add(0, category, weights.sum(1))
         learned = counts / counts.sum()
     weights = torch.softmax(joint + learned.log()[category, None], dim=0)
-    weights = torch.where(weights < _NEGLIGIBLE, 0.0, weights)
+    weights = torch.where(weights < _NEGLIGIBLE * weights.amax(0), 0.0, weights)
     return (weights / weights.sum(0)).reshape(shape)
 
 

@@ -214,9 +214,10 @@ class MixtureGains:
         return replace(self, training=training, mixture=mixture, measured=measured)
 
     def shares(self) -> Float64[Tensor, "families modes"]:
-        """Return the posterior probability of each family, mean over both parts of each mode's gains."""
+        """Return the posterior probability of each family: mean over both parts of each mode, by their energy."""
+        power = self.mixture.values.square().sum(0).reshape(2, -1).clamp_min(torch.finfo(torch.float64).tiny)
         rows = torch.split(self.mixture.weights.sum(1), [len(each) for each in self.kept])
-        return torch.stack([each.sum(0).reshape(2, -1).mean(0) for each in rows])
+        return torch.stack([(each.sum(0).reshape(2, -1) * power / power.sum(0)).sum(0) for each in rows])
 
     def record(self) -> dict[str, Any]:
         """Return the sizes and the families' names."""
@@ -318,6 +319,7 @@ class MixtureGains:
     def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "MixtureGains":
         """Return the model."""
         training = Sites(tensors["contacts"], tensors["directions"])
+        _expect_sound(tensors, len(record["bodies"]))
         bodies = iter(
             ElasticModes(
                 **{name: tensors[f"bodies.{row}.{name}"] for name in ("frequency", "nodes", "triangles")},
@@ -343,8 +345,7 @@ class MixtureGains:
         families = tuple(family_of(kind, size) for kind, size in zip(record["families"], scale, strict=True))
         kept = torch.split(tensors["kept"], record["kept"])
         for family, rows in zip(families, kept, strict=True):
-            if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < len(family.shares):
-                raise ValueError(f"kept is {rows.min()} to {rows.max()} of {len(family.shares)} {family.kind} kernels")
+            _expect_rows(rows, len(family.shares), f"kept {family.kind} kernels")
         kernels = torch.cat([family.kernels()[rows] for family, rows in zip(families, kept, strict=True)])
         values, measured = (torch.view_as_complex(tensors[name].contiguous()) for name in ("values", "measured"))
         mixture = KernelMixture(kernels, series_of(values), tensors["floor"], tensors["weights"])
@@ -372,6 +373,24 @@ class MixtureGains:
                 return family, kept[row : row + 1]
             row -= len(kept)
         raise AssertionError(row)
+
+
+def _expect_sound(tensors: Mapping[str, Tensor], bodies: int) -> None:
+    """Raise ValueError for values that no fit leaves: they would fail only when gains are asked for."""
+    positive = ["scale", *(f"bodies.{row}.frequency" for row in range(bodies))]
+    for name in positive:
+        if not bool((tensors[name] > 0).all()):
+            raise ValueError(f"expected {name} above 0, got {float(tensors[name].min()):g}")
+    for name in ("weights", "floor"):
+        if not bool((tensors[name] >= 0).all()):
+            raise ValueError(f"expected {name} of 0 or more, got {float(tensors[name].min()):g}")
+    for row in range(bodies):
+        _expect_rows(tensors[f"bodies.{row}.triangles"], len(tensors[f"bodies.{row}.nodes"]), "corners of triangles")
+
+
+def _expect_rows(rows: Int[Tensor, "*rows"], count: int, name: str) -> None:
+    if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < count:
+        raise ValueError(f"expected {name} from 0 to {count - 1}, got {int(rows.min())} to {int(rows.max())}")
 
 
 def series_of(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, "contacts series"]:
