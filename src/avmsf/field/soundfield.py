@@ -54,12 +54,12 @@ class FieldQuality:
         """Say how good the field is; leaving out overstates the error, for spread contacts are far from each other."""
         if self.error < self.averaging:
             return (
-                f"At contacts left out the field errs by at most about {self.error:.2f}, averaging the three nearest "
-                f"recordings by {self.averaging:.2f} (relative STFT error, {self.places} places)."
+                f"At contacts left out the relative STFT error of the field is at most about {self.error:.2f}, of "
+                f"averaging the three nearest recordings {self.averaging:.2f} ({self.places} places)."
             )
         return (
-            f"No better than averaging the three nearest recordings: {self.error:.2f} and {self.averaging:.2f} at "
-            f"contacts left out (relative STFT error, {self.places} places). Give a mesh, or record more places."
+            f"No better than averaging the three nearest recordings: relative STFT errors of {self.error:.2f} and "
+            f"{self.averaging:.2f} at contacts left out ({self.places} places). Give a mesh, or record more places."
         )
 
 
