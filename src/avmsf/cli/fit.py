@@ -62,8 +62,8 @@ class Options:
     """File of features that `avmsf lift` wrote, in the frame of the contacts; without it positions on the surface."""
     gain_model: GainModel = "auto"
     """How gains vary over the object. auto: a Gaussian process over all kernel families, weighed by evidence; the
-    elastic one needs a mesh. network: the paper's attention network on the features. smooth, thin-plate, elastic: the
-    Gaussian process over one family, for study."""
+    elastic one needs a mesh. network: the paper's attention network on the features. The others: the Gaussian process
+    over one family, for study; symmetry needs a mesh, visual needs --features."""
     body: BodyConfig = field(default_factory=BodyConfig)
     method: Method = "high-resolution"
     """How modes are found; see `avmsf modes --help`."""

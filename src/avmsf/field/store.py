@@ -60,7 +60,7 @@ def load(path: str | Path) -> SoundField:
     _expect_tensors(tensors, header, path)
     try:
         gains = _KINDS[header.kind].restore(header.gain_field, _of_gain_field(tensors))
-    except ValueError as error:
+    except (ValueError, RuntimeError) as error:  # RuntimeError: torch's decompositions, of damaged values
         raise broken(path, error) from error
     return SoundField(
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),

@@ -21,6 +21,7 @@ from avmsf.field.fit import Progress, fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import NETWORK, GainModel, estimator_for
+from avmsf.field.gains.visual import Visual
 from avmsf.field.store import load, save
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import ModeFinder
@@ -141,7 +142,7 @@ def _reconstruct(
         )
         fitted = fit(
             train,
-            shape.points,
+            shape.features if config.gain_model == Visual.kind else shape.points,
             modes,
             config.fit,
             gains=gains,

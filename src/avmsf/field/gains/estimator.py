@@ -111,8 +111,12 @@ class MixtureEstimator:
         better from each other without them.
         """
         bodies, missing = self._usable_bodies(case)
-        directional, every = bool(bodies) or case.train.directions is not None, torch.arange(len(case.train))
+        directional, every = bool(bodies) or _has_directions(case), torch.arange(len(case.train))
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
+        if self.name == Symmetric.kind and not groups:
+            raise FitError("symmetry: expected symmetries of the object's shape, found none: take another gain model")
+        if self.name == Visual.kind and case.features.encoder == GEOMETRY:
+            raise FitError("visual: expected visual features, found positions alone: give --features, or take another")
         fit = _Fit(case, self.kinds, _sites(case, bodies), directional, groups)
         while True:
             families = fit.families(every, bodies)
@@ -252,15 +256,27 @@ def gain_variance(case: GainCase) -> Float64[Tensor, " modes"]:
 
 
 def _sites(case: GainCase, bodies: Sequence[NominalBody]) -> Sites:
-    """Return the training impacts; unknown directions go straight into the body, or are all alike without one."""
+    """Return the training impacts; unknown directions go straight into the body.
+
+    Without a body they are that of the nearest impact whose direction is known, or all alike where none is.
+    """
     points = case.train.contacts.double()
     given = torch.zeros_like(points) if case.train.directions is None else case.train.directions.double()
     length = given.norm(dim=1, keepdim=True)
-    unknown = length[:, 0] == 0
+    known = length[:, 0] > 0
     used = given / length.clamp_min(torch.finfo(torch.float64).tiny)
-    alike = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    used[unknown] = -bodies[0].elastic.normals(points[unknown]) if bodies else alike
+    if bodies:
+        used[~known] = -bodies[0].elastic.normals(points[~known])
+    elif bool(known.any()):
+        apart = (points[~known, None] - points[known]).square().sum(2)
+        used[~known] = used[known][apart.argmin(1)]
+    else:
+        used[:] = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     return Sites(points, used)
+
+
+def _has_directions(case: GainCase) -> bool:
+    return case.train.directions is not None and bool(case.train.directions.any())
 
 
 def _expect_on_body(case: GainCase, elastic: ElasticModes) -> None:

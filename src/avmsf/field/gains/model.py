@@ -24,8 +24,8 @@ from avmsf.simulate.nominal import NOMINAL
 
 NEIGHBORS = 3
 """Nearest recordings that are averaged, as in the paper's baseline."""
-_BATCH = 512
-"""Places whose covariances with the contacts are held at once."""
+_MEMORY = 4_000_000
+"""Covariances between places and contacts that are held at once, over all kernels."""
 _POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
 _OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "symmetries", Visual.kind: "features"}
 """Families that know something of the object, and the entry of the record with its size."""
@@ -144,7 +144,8 @@ class MixtureGains:
     ) -> Float[Tensor, "contacts modes 2"]:
         """Return the posterior standard deviation of both parts of the gains, without the noise of a measurement."""
         sites = self.sites(contacts, directions)
-        found = [self._spread(sites.take(rows)) for rows in torch.split(torch.arange(len(sites)), _BATCH)]
+        size = max(1, _MEMORY // (len(self.mixture.kernels) * len(self.contacts)))
+        found = [self._spread(sites.take(rows)) for rows in torch.split(torch.arange(len(sites)), size)]
         return _parts(torch.cat(found)).float()
 
     def noise(self) -> Float64[Tensor, "modes 2"]:
@@ -157,7 +158,7 @@ class MixtureGains:
         return found.reshape(2, -1, *found.shape[1:]).transpose(0, 1)
 
     def leave_one_out(self) -> Complex128[Tensor, "contacts modes"]:
-        """Return the gains at each contact as the contacts at all other places predict them."""
+        """Return the gains at each contact as the measured ones at all other places predict them."""
         return _complex(self._left_out[0])
 
     def standardized_errors(self) -> Float64[Tensor, "contacts modes 2"]:
@@ -359,7 +360,9 @@ class MixtureGains:
 
     @cached_property
     def _left_out(self) -> tuple[Float64[Tensor, "contacts series"], Float64[Tensor, "contacts series"]]:
-        return self.mixture.leave_out(self.places)
+        """Of the measured gains: those that were refined end to end have seen the recordings that are left out."""
+        mixture = self.mixture if self.measured is None else self.mixture.with_values(series_of(self.measured))
+        return mixture.leave_out(self.places)
 
     def _spread(self, sites: Sites) -> Float64[Tensor, "sites series"]:
         pairs = list(zip(self.families, self.kept, strict=True))

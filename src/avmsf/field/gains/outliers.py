@@ -86,8 +86,10 @@ class Outlier:
         ratios = (
             f"log predictive ratio {self.ratio:.2g} nats, there {self.place_ratio:.2g}; above 0 the place is plausible"
         )
+        if self.distance == 0.0 and self.reversed:
+            return f"{names[self.row]} fits its place if its direction or its polarity is reversed ({ratios})"
         if self.distance == 0.0:
-            return f"{names[self.row]} fits its place if its direction is reversed ({ratios})"
+            return f"{names[self.row]} fits its place in another direction ({ratios})"
         place = torch.tensor(self.place, dtype=torch.float64)
         apart = (contacts.double() - place).norm(dim=1)
         own, apart[self.row] = float(apart[self.row]), torch.inf
@@ -97,7 +99,7 @@ class Outlier:
         if float(apart[other]) < own:
             found += f", nearest to {names[other]}: their labels may have been exchanged"
         if self.reversed:
-            found += "; or its direction is reversed"
+            found += "; or its direction or its polarity is reversed"
         return f"{found} ({ratios})"
 
 

@@ -15,6 +15,8 @@ AFFINE_SHARES = (0.5, 0.9)
 """Shares of an affine function of the position beside a smooth one."""
 DRIFT_SHARES = (0.3, 0.7, 0.95)
 """Shares of the thin plate's affine part."""
+_ROUNDING = 1e-6
+"""Distance over the object's size up to which float32 and a change of scale may move a point."""
 _FLAT = 1e-3
 """Extent over the longest below which contacts do not differ along an axis."""
 
@@ -33,8 +35,9 @@ class Unstructured(KernelFamily):
         self.shares = torch.eye(2, dtype=torch.float64)
 
     def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
-        """Return one for impacts at exactly the same point and zero for others, and a constant."""
-        same = (sites.points[:, None] == others.points).all(2).double()
+        """Return one for impacts at the same point, but for rounding, and zero for others; and a constant."""
+        squares = (sites.points[:, None] - others.points).square().sum(2)
+        same = (squares <= (_ROUNDING * self.size) ** 2).double()
         return torch.stack([same, torch.ones_like(same)]) * sites.cosine(others)
 
     def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
