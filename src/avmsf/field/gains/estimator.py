@@ -98,7 +98,7 @@ class MixtureEstimator:
     def start(self, case: GainCase, damping: str) -> RefinedGains:
         """Return the gain model, to be refined end to end.
 
-        Raises FitError where the elastic family alone was asked for and cannot be had.
+        Raises FitError where one family alone was asked for, elastic, symmetry or visual, and it cannot be had.
         """
         model, used = self.fit(case)
         return RefinedGains(model, case.modes.bank, used=used, training=len(case.train))
