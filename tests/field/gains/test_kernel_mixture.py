@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-import avmsf.field.gains.mixture as mixture_module
 from avmsf.field.gains import mixture as module
 from avmsf.field.gains.mixture import (
     NOISE_SHARES,
@@ -23,6 +22,12 @@ GROUPS = torch.tensor([0, 0, 1, 2, 1, 3, 1])
 
 
 @cache
+def posterior(given: Hypotheses, values: torch.Tensor, floor: torch.Tensor) -> tuple[KernelMixture, torch.Tensor]:
+    """Weigh hypotheses, their prior learned from all series that have any energy."""
+    evidence = log_evidence(given.kernels, values, floor)
+    return KernelMixture.weigh(given, evidence, values, floor, active=active_series(values))
+
+
 def joint_kernels() -> np.ndarray:
     """Return kernels among contacts and places: of full rank, of rank one, of rank three, and none at all."""
     generator = np.random.default_rng(1)
@@ -106,7 +111,7 @@ def hypotheses(**changes) -> Hypotheses:
 
 def weighed(values: torch.Tensor, floor: torch.Tensor, given: Hypotheses) -> KernelMixture:
     """Return the posterior with all kernels, those of no weight too."""
-    found, kept = KernelMixture.weigh(given, values, floor)
+    found, kept = posterior(given, values, floor)
     assert torch.equal(found.kernels, given.kernels[kept])
     weights = torch.zeros(len(given.kernels), *found.weights.shape[1:], dtype=torch.float64)
     weights[kept] = found.weights
@@ -213,7 +218,7 @@ def test_weights_sum_to_one_and_none_is_negligible():
 def test_kernels_of_no_weight_are_dropped():
     given = hypotheses()
     given.log_prior[1] = -1e3
-    found, kept = KernelMixture.weigh(given, mixture().values, mixture().floor)
+    found, kept = posterior(given, mixture().values, mixture().floor)
     assert kept.tolist() == [0, 2, 3]
     assert torch.equal(found.kernels, given.kernels[kept])
     assert torch.allclose(found.weights, weighed(mixture().values, mixture().floor, given).weights[kept])
@@ -258,7 +263,7 @@ def test_learning_the_prior_raises_the_summed_evidence():
 
 
 def test_a_category_that_no_series_supports_keeps_what_the_pseudo_count_gives_it(monkeypatch):
-    monkeypatch.setattr(mixture_module, "_NEGLIGIBLE", 0.0)
+    monkeypatch.setattr(module, "_NEGLIGIBLE", 0.0)
     likelihood = torch.zeros(KERNELS, len(NOISE_SHARES), 20, dtype=torch.float64)
     likelihood[0, 1] = 50.0
     given = hypotheses(log_prior=torch.zeros(KERNELS, 20, dtype=torch.float64))
@@ -366,6 +371,6 @@ def test_thousands_of_equally_probable_kernels_keep_their_weights():
     category, prior = torch.zeros(3000, dtype=torch.int64), torch.ones(1, dtype=torch.float64)
     given = Hypotheses(kernels, category, prior, torch.zeros(3000, 1, dtype=torch.float64))
     values = torch.tensor([[1.0], [-0.5]], dtype=torch.float64)
-    found, kept = KernelMixture.weigh(given, values, torch.zeros(1, dtype=torch.float64))
+    found, kept = posterior(given, values, torch.zeros(1, dtype=torch.float64))
     assert len(kept) == 3000
     assert float(found.weights.sum()) == pytest.approx(1.0)

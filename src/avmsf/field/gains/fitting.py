@@ -10,14 +10,7 @@ from torch import Tensor
 
 from avmsf.field.gains.elastic import Elastic, factor_log_prior
 from avmsf.field.gains.family import KernelFamily
-from avmsf.field.gains.mixture import (
-    NOISE_SHARES,
-    Hypotheses,
-    KernelMixture,
-    active_series,
-    log_evidence,
-    posterior_weights,
-)
+from avmsf.field.gains.mixture import NOISE_SHARES, Hypotheses, KernelMixture, active_series, log_evidence
 from avmsf.field.gains.model import MixtureGains, series_of
 
 _STRONGEST = 16
@@ -85,13 +78,14 @@ def fit_mixture(
     log_frequency = torch.log(measured.frequency)
     log_prior = torch.cat([family.log_prior(log_frequency) for family in families]).repeat(1, 2)
     hypotheses = Hypotheses(torch.cat(kernels), torch.cat(category), torch.cat(prior), log_prior)
-    weights = posterior_weights(torch.cat(evidence), hypotheses, active_series(values) & measured.substantial)
-    used = torch.nonzero(weights.sum((1, 2)) > 0).flatten()
+    active = active_series(values) & measured.substantial
+    mixture, used = KernelMixture.weigh(
+        hypotheses, torch.cat(evidence), values, floor, active=active, noise_shares=noise_shares
+    )
     ends = torch.tensor([len(family.shares) for family in families]).cumsum(0).tolist()
     starts = [0, *ends[:-1]]
     rows = [used[(used >= start) & (used < end)] - start for start, end in zip(starts, ends, strict=True)]
     some = [(family, each) for family, each in zip(families, rows, strict=True) if len(each)]
-    mixture = KernelMixture(hypotheses.kernels[used], values, floor, weights[used], noise_shares)
     kept_families, kept = zip(*some, strict=True)
     return MixtureGains(points, families[0].reference, kept_families, kept, mixture, directional)
 

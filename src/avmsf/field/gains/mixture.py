@@ -77,16 +77,18 @@ class KernelMixture:
     def weigh(
         cls,
         hypotheses: Hypotheses,
+        evidence: Float64[Tensor, "kernels noises series"],
         values: Float64[Tensor, "contacts series"],
         floor: Float64[Tensor, " series"],
+        *,
+        active: Bool[Tensor, " series"],
         noise_shares: tuple[float, ...] = NOISE_SHARES,
     ) -> tuple["KernelMixture", Int[Tensor, " kept"]]:
-        """Return the posterior and the rows of the hypotheses' kernels that it kept.
+        """Return the posterior and the rows of the hypotheses' kernels that it kept, from their `log_evidence`.
 
-        Series without any energy have no part in learning the prior.
+        The prior is learned from the `active` series alone.
         """
-        likelihood = log_evidence(hypotheses.kernels, values, floor, noise_shares)
-        weights = posterior_weights(likelihood, hypotheses, active_series(values))
+        weights = posterior_weights(evidence, hypotheses, active)
         kept = torch.nonzero(weights.sum((1, 2)) > 0).flatten()
         return cls(hypotheses.kernels[kept], values, floor, weights[kept], noise_shares), kept
 

@@ -62,13 +62,6 @@ class PredictiveRatios:
         noise = self._noise[:, None, None] * torch.eye(len(self.sites), dtype=torch.float64)
         return self._kernels(self.sites, self.sites) + noise
 
-    def at(self, aside: frozenset[int] = frozenset()) -> Float64[Tensor, " contacts"]:
-        """Return L_i(S) of all contacts, S being `aside` without i itself."""
-        found = self.without(aside)[0]
-        for row in aside:
-            found[row] = self.without(aside - {row})[0][row]
-        return found
-
     def without(
         self, aside: frozenset[int]
     ) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, "contacts contacts"]]:
