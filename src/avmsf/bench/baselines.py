@@ -16,14 +16,11 @@ from torch.nn.functional import normalize
 from avmsf.bench.modalbaseline import ModalBaseline
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
+from avmsf.field.gains.family import Sites, nearest_sites
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains, fit_sine_gains
 from avmsf.modal.synthesis import synthesise
 from avmsf.scene.points import nearest_points
-
-_PERPENDICULAR = 1e-6
-"""Largest cosine that the rounding of float32 (6e-8 a component) can leave between perpendicular directions. It has no
-sign."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,12 +78,9 @@ class NearestStrike:
 class MeanWaveform:
     """The mean of the nearest training sounds, sample by sample: the paper's KNN. Phases cancel in it.
 
-    With `by_direction`, where the directions of both sides are known, an impact's direction is part of where it is.
-    For unit directions u and u' at a distance r, c = u . u' and an object of size s, the squared distance is
-    r^2 + (s / 2)^2 (1 - |c|), and the sound is multiplied by the sign of c: a linear object answers an opposite force
-    with the negated sound. A perpendicular impact so counts as half the object away, for it excites modes in other
-    proportions, as an impact elsewhere does. s is the diagonal of the box around the training contacts, as the object
-    itself is not known here. Recordings are neighbors, each one, also those of one contact.
+    With `by_direction`, where the directions of both sides are known, an impact's direction is part of where it is, by
+    `nearest_sites`. The size there is the diagonal of the box around the training contacts, as the object itself is not
+    known here. Recordings are neighbors, each one, also those of one contact.
     """
 
     train: Impacts
@@ -109,12 +103,11 @@ class MeanWaveform:
         """Return the mean of the nearest training contacts' sounds."""
         if not self.by_direction or directions is None or self.train.directions is None:
             return self.train.sounds[nearest_points(self.train.contacts, contacts, count=self.count)].mean(dim=1)
-        known = self.train.contacts.double()
-        cosine = normalize(directions.double()) @ normalize(self.train.directions.double()).T
-        size = (known.amax(0) - known.amin(0)).norm()
-        squared = (contacts.double()[:, None, :] - known).square().sum(2) + (size / 2).square() * (1 - cosine.abs())
-        rows = squared.argsort(dim=1, stable=True)[:, : self.count]
-        signs = torch.where(cosine.gather(1, rows) < -_PERPENDICULAR, -1.0, 1.0).to(self.train.sounds.dtype)
+        known = Sites(self.train.contacts.double(), normalize(self.train.directions.double()))
+        asked = Sites(contacts.double(), normalize(directions.double()))
+        size = float((known.points.amax(0) - known.points.amin(0)).norm())
+        rows, signs = nearest_sites(asked, known, size=size, count=self.count)
+        signs = signs.to(self.train.sounds.dtype)
         return (signs[:, :, None] * self.train.sounds[rows]).mean(dim=1)
 
 

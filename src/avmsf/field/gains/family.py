@@ -5,8 +5,12 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float64, Int
+from jaxtyping import Bool, Float64, Int
 from torch import Tensor
+
+_PERPENDICULAR = 1e-6
+"""Largest cosine that the rounding of float32 (6e-8 a component) can leave between perpendicular directions. It has no
+sign."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +37,24 @@ class Sites:
         perpendicular impacts say nothing of each other, and an opposite one changes the gain's sign.
         """
         return self.directions @ other.directions.T
+
+
+def nearest_sites(
+    sites: Sites, others: Sites, *, size: float, count: int, excluded: Bool[Tensor, "sites others"] | None = None
+) -> tuple[Int[Tensor, "sites near"], Float64[Tensor, "sites near"]]:
+    """Return the rows of the nearest impacts, at most `count` and none that is excluded, and the sign of each.
+
+    With c the cosine between two directions the squared distance is that of the points plus (size / 2)^2 (1 - |c|): a
+    perpendicular impact counts as half the object away, for it excites modes in other proportions, as an impact
+    elsewhere does. The sign is that of c: a linear object answers an opposite force with the negated sound.
+    """
+    cosine = sites.cosine(others)
+    squares = (sites.points[:, None] - others.points).square().sum(2) + (size / 2.0) ** 2 * (1.0 - cosine.abs())
+    usable = len(others)
+    if excluded is not None:
+        squares, usable = squares.masked_fill(excluded, torch.inf), usable - int(excluded.sum(1).max())
+    rows = squares.argsort(dim=1, stable=True)[:, : min(count, usable)]
+    return rows, torch.where(cosine.gather(1, rows) < -_PERPENDICULAR, -1.0, 1.0).double()
 
 
 class KernelFamily(ABC):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from avmsf.field.gainfield import Gains
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.family import KernelFamily, Sites
+from avmsf.field.gains.family import KernelFamily, Sites, nearest_sites
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.symmetry import Group, Symmetric
@@ -109,21 +109,12 @@ class MixtureGains:
     def nearest(
         self, sites: Sites, others: Int[Tensor, " sites"] | None = None
     ) -> tuple[Int[Tensor, "sites near"], Float64[Tensor, "sites near"]]:
-        """Return the rows of the three nearest training impacts, fewer where there are fewer, and the sign of each.
+        """Return the rows of the three nearest training impacts and the sign of each, by `nearest_sites`.
 
-        With c the cosine between two directions the squared distance is that of the contacts plus
-        (size / 2)^2 (1 - |c|), and the sign is that of c: an opposite impact has the opposite sound. `others` is the
-        place number of each site, whose own training impacts are left out.
+        `others` is the place number of each site, whose own training impacts are left out.
         """
-        cosine = sites.cosine(self.training)
-        squares = (sites.points[:, None] - self.contacts).square().sum(2)
-        squares = squares + (self.families[0].size / 2.0) ** 2 * (1.0 - cosine.abs())
-        usable = len(self.contacts)
-        if others is not None:
-            own = others[:, None] == self.places
-            squares, usable = squares.masked_fill(own, torch.inf), usable - int(own.sum(1).max())
-        rows = torch.topk(squares, min(NEIGHBORS, usable), largest=False, dim=1).indices
-        return rows, torch.where(cosine.gather(1, rows) < 0, -1.0, 1.0).double()
+        own = None if others is None else others[:, None] == self.places
+        return nearest_sites(sites, self.training, size=self.families[0].size, count=NEIGHBORS, excluded=own)
 
     def normals(self, points: Float[Tensor, "points 3"]) -> Float64[Tensor, "points 3"] | None:
         """Return the outward unit normals of the body's surface nearest to points, or None without a body."""
