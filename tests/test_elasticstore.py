@@ -15,7 +15,7 @@ from avmsf.simulate.material import GLASS
 
 @pytest.fixture(scope="module")
 def modes() -> ElasticModes:
-    return elastic_modes(block((0.07, 0.05, 0.011), (2, 1, 1)), GLASS, count=4)
+    return elastic_modes(block((0.07, 0.05, 0.011), (2, 1, 1)), GLASS, count=4, perturbed=True)
 
 
 def test_what_is_read_is_what_was_written(modes, tmp_path):
@@ -23,6 +23,8 @@ def test_what_is_read_is_what_was_written(modes, tmp_path):
     back = load_modes(tmp_path / "new" / "modes.safetensors")
     for name in ("frequency", "nodes", "triangles", "shapes"):
         assert torch.equal(getattr(back, name), getattr(modes, name))
+    for name in ("stiffness", "mass", "poisson"):
+        assert (getattr(back.perturbations, name) == getattr(modes.perturbations, name)).all()
     assert (back.material, back.mass) == (modes.material, modes.mass)
     assert torch.equal(back.at(modes.nodes[:5]), modes.at(modes.nodes[:5]))
 
@@ -43,8 +45,9 @@ def test_files_that_hold_no_modes(modes, tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda record, tensors: record.update(format=9), "expected elastic modes of format 1, found format 9"),
+        (lambda record, tensors: record.update(format=9), "expected elastic modes of format 2, found format 9"),
         (lambda record, tensors: record.pop("mass"), "its header is damaged .*mass"),
+        (lambda record, tensors: tensors.pop("poisson"), r"expected the tensors .*poisson \["),
         (lambda record, tensors: tensors.pop("nodes"), r"expected the tensors .*nodes \["),
         (lambda record, tensors: tensors["triangles"].add_(10_000), "names a node that is not there"),
     ],

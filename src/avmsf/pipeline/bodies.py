@@ -23,8 +23,8 @@ class BodyConfig:
     wall: float | None = None
     """Thickness of the object's wall, metres, where it is known; 0 for a body that its surface encloses whole. By
     itself it tries several, and the recordings choose."""
-    shapes: int = 60
-    """Lowest elastic mode shapes that gains are made of."""
+    shapes: int = 80
+    """Lowest elastic mode shapes that gains are made of, and on which stiffness and density are updated."""
     freedoms: int = 40_000
     """Degrees of freedom of the finite elements, about."""
 

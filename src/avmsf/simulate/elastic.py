@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,9 +12,10 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import SimulationError
+from avmsf.fem.perturbation import Perturbations, perturbations
 from avmsf.simulate.closest import Closest, ClosestPoints
 from avmsf.simulate.eigen import lowest_vibrations, rigid_motions
-from avmsf.simulate.elements import SecondOrder, mass, stiffness
+from avmsf.simulate.elements import SecondOrder, elements_of, mass, stiffness
 from avmsf.simulate.material import Material
 from avmsf.simulate.solid import Solid
 
@@ -40,6 +41,8 @@ class ElasticModes:
     material: Material
     mass: float
     """Kilograms."""
+    perturbations: Perturbations | None = None
+    """How the modes change with the body's stiffness and density, where that was asked for."""
 
     def __len__(self) -> int:
         return self.frequency.shape[0]
@@ -73,6 +76,12 @@ class ElasticModes:
             along = torch.einsum("cmd,cd->cm", self.shapes[rows[:, node]], directions.double())
             total += weights[:, node, None] * along
         return total
+
+    def near(self, places: Float[Tensor, "contacts 3"]) -> "ElasticModes":
+        """Return the modes on those triangles of the surface alone that are nearest to the places."""
+        triangles = self.triangles[np.unique(self._nearest(places).rows)]
+        nodes, rows = torch.unique(triangles, return_inverse=True)
+        return replace(self, nodes=self.nodes[nodes], triangles=rows, shapes=self.shapes[nodes])
 
     def _nearest(self, places: Float[Tensor, "contacts 3"]) -> Closest:
         """Return the nearest triangles, and the nearest points of them."""
@@ -115,6 +124,7 @@ def elastic_modes(
     density_factor: Float[Tensor, " cells"] | None = None,
     springs: Sequence[tuple[Float[Tensor, " 3"], float]] | None = None,
     highest: float | None = None,
+    perturbed: bool = False,
 ) -> ElasticModes:
     """Return the lowest `count` elastic modes of a body by second-order finite elements, none above `highest` Hz.
 
@@ -122,7 +132,8 @@ def elastic_modes(
     on its surface and their stiffness in newtons per metre, the same in all directions. A free body's six rigid
     motions are no modes of it. On soft springs they are slow modes, and every mode that has more than half of its
     kinetic energy in a rigid motion is left out. Springs so stiff that the body bends before it moves as a whole
-    leave no such mode, and then none is left out.
+    leave no such mode, and then none is left out. With `perturbed` the modes come with the first-order changes of
+    their matrices, for a body without factors.
 
     Raises SimulationError for a body of several parts or too few nodes, factors and springs that are not positive,
     and where no mode lies below `highest`.
@@ -154,8 +165,15 @@ def elastic_modes(
             f"no mode up to {highest:g} Hz, the lowest is at {float(frequency[0]):g} Hz: raise `highest`, or make the "
             "body larger or thinner"
         )
+    whole = found.shapes.reshape(len(mesh.nodes), 3, -1)[:, :, :kept]
+    changes = None
+    if perturbed:
+        changes = perturbations(
+            elements_of(mesh), whole, size=float(solid.size), young=material.young, poisson=material.poisson,
+            density=material.density,
+        )  # fmt: skip
     outer, triangles = np.unique(mesh.boundary, return_inverse=True)
-    shapes = found.shapes.reshape(len(mesh.nodes), 3, -1)[outer, :, :kept].transpose(0, 2, 1)
+    shapes = whole[outer].transpose(0, 2, 1)
     return ElasticModes(
         frequency=frequency[:kept].clone(),
         nodes=torch.from_numpy(mesh.nodes[outer]),
@@ -163,6 +181,7 @@ def elastic_modes(
         shapes=torch.from_numpy(np.ascontiguousarray(shapes)),
         material=material,
         mass=float((solid.volumes * light).sum()) * material.density,
+        perturbations=changes,
     )
 
 

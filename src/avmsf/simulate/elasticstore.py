@@ -1,6 +1,7 @@
 """Elastic modes as one file: safetensors with the tensors of `ElasticModes`, and one JSON in the header for the rest.
 
-{"format": 1, "version": "0.1.0", "mass": 0.31, "sizes": {"modes": 64, "nodes": 9000, "triangles": 4400},
+{"format": 2, "version": "0.1.0", "mass": 0.31,
+ "sizes": {"modes": 64, "nodes": 9000, "triangles": 4400, "fields": null},
  "material": {"name": "ceramic", "density": 2700.0, "young": 7.2e10, "poisson": 0.19, "alpha": 6.0, "beta": 1e-7}}
 """
 
@@ -19,13 +20,15 @@ from torch import Tensor
 from avmsf._utils.caching import keep_if_possible
 from avmsf._utils.text_files import parse_json
 from avmsf.errors import SimulationError
+from avmsf.fem.perturbation import Perturbations
 from avmsf.files import write_whole
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.material import Material
 
-FORMAT = 1
+FORMAT = 2
 """Number of this format; it grows with every change that older versions could not read."""
 _KEY = "avmsf_elastic"
+_PERTURBATIONS = ("stiffness", "mass", "poisson")
 
 
 def save_modes(modes: ElasticModes, path: str | Path) -> None:
@@ -40,11 +43,18 @@ def save_modes(modes: ElasticModes, path: str | Path) -> None:
         "triangles": modes.triangles,
         "shapes": modes.shapes,
     }
+    if modes.perturbations is not None:
+        tensors |= {name: torch.from_numpy(getattr(modes.perturbations, name)) for name in _PERTURBATIONS}
     record = {
         "format": FORMAT,
         "version": version("avmsf"),
         "mass": modes.mass,
-        "sizes": {"modes": len(modes), "nodes": len(modes.nodes), "triangles": len(modes.triangles)},
+        "sizes": {
+            "modes": len(modes),
+            "nodes": len(modes.nodes),
+            "triangles": len(modes.triangles),
+            "fields": None if modes.perturbations is None else len(modes.perturbations.stiffness),
+        },
         "material": asdict(modes.material),
     }
     content = to_bytes(
@@ -77,6 +87,10 @@ def load_modes(path: str | Path) -> ElasticModes:
             "triangles": ((sizes["triangles"], 6), torch.int64),
             "shapes": ((sizes["nodes"], sizes["modes"], 3), torch.float64),
         }
+        square, fields = (sizes["modes"], sizes["modes"]), sizes["fields"]
+        if fields is not None:
+            each = ((fields, *square), (fields, *square), square)
+            expected |= {name: (shape, torch.float64) for name, shape in zip(_PERTURBATIONS, each, strict=True)}
     except (ValueError, TypeError, KeyError) as error:
         raise SimulationError(f"{path}: its header is damaged ({error!r}): compute the modes again") from error
     present = {name: (tuple(tensor.shape), tensor.dtype) for name, tensor in tensors.items()}
@@ -87,7 +101,8 @@ def load_modes(path: str | Path) -> ElasticModes:
     rows = tensors["triangles"]
     if len(rows) and (int(rows.min()) < 0 or int(rows.max()) >= sizes["nodes"]):
         raise SimulationError(f"{path}: a triangle names a node that is not there: compute the modes again")
-    return ElasticModes(tensors["frequency"], tensors["nodes"], rows, tensors["shapes"], material, weight)
+    changes = None if fields is None else Perturbations(*(tensors[name].numpy() for name in _PERTURBATIONS))
+    return ElasticModes(tensors["frequency"], tensors["nodes"], rows, tensors["shapes"], material, weight, changes)
 
 
 def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, tell: Callable[[str], None]) -> ElasticModes:

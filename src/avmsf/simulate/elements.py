@@ -14,6 +14,7 @@ import scipy.sparse
 from jaxtyping import Float64, Int
 from torch import Tensor
 
+from avmsf.fem.perturbation import Elements
 from avmsf.simulate.material import Material
 from avmsf.simulate.solid import Solid
 
@@ -113,6 +114,12 @@ def mass(mesh: SecondOrder, density: Float64[Tensor, " cells"]) -> scipy.sparse.
     """
     weight = (mesh.solid.volumes * density).numpy()
     return mesh.assemble(weight[:, None, None] * _REFERENCE_MASS)
+
+
+def elements_of(mesh: SecondOrder) -> Elements:
+    """Return what the matrices are integrated from."""
+    centers = mesh.nodes[mesh.cells[:, :4]].mean(axis=1)
+    return Elements(mesh.cells, centers, mesh.solid.volumes.numpy(), _slopes(mesh), _REFERENCE_MASS)
 
 
 def _slopes(mesh: SecondOrder) -> Float64[np.ndarray, "cells points 10 3"]:

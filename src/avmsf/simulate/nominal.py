@@ -28,7 +28,7 @@ WALLS = tuple(float(part) for part in np.geomspace(0.003, 0.05, 6))
 """Thickness of walls that are tried, over the diagonal of the box around the surface."""
 TRIAL = 12_000
 """Degrees of freedom at most of each of several bodies."""
-_FORMAT = 2
+_FORMAT = 3
 """Number of the way in which bodies are made; kept files of another are not read."""
 
 
@@ -42,11 +42,13 @@ class NominalBody:
     """Free boundary, nominal material."""
     fine: bool = True
     """Whether its elements are as many as were asked for; `refined` makes those finer that were made to be compared."""
+    updated: float | None = None
+    """Log evidence that it gained from measured gains by departures of its stiffness and density; None without."""
 
     @property
     def name(self) -> str:
         """What it is, for people."""
-        return body_name(self.wall)
+        return body_name(self.wall) + ("" if self.updated is None else ", stiffness and density updated")
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +65,7 @@ def nominal_bodies(
     surface: Surface,
     *,
     walls: Sequence[float | None] | None = None,
-    count: int = 60,
+    count: int = 80,
     freedoms: int = 40_000,
     cache: Path | None = None,
     tell: Callable[[str], None] | None = None,
@@ -152,25 +154,25 @@ class _Maker:
         """Return one body with so many degrees of freedom, or with at most `TRIAL` where it need not be fine."""
         if not fine and freedoms > TRIAL:
             try:
-                return NominalBody(wall, self._modes(wall, TRIAL), fine=False)
+                return NominalBody(wall, self._modes(wall, TRIAL, perturbed=False), fine=False)
             except SimulationError as error:
                 # Thin walls are lost in few tetrahedra.
                 self._tell(f"again with more tetrahedra ({error})")
-        return NominalBody(wall, self._modes(wall, freedoms))
+        return NominalBody(wall, self._modes(wall, freedoms, perturbed=True))
 
-    def _modes(self, wall: float | None, freedoms: int) -> ElasticModes:
+    def _modes(self, wall: float | None, freedoms: int, *, perturbed: bool) -> ElasticModes:
         """Return the modes of one body, read from where they are kept."""
-        kept = self._kept(wall, freedoms)
-        return modes_once(kept, lambda: self._computed(wall, freedoms), tell=self._tell)
+        kept = self._kept(wall, freedoms, perturbed=perturbed)
+        return modes_once(kept, lambda: self._computed(wall, freedoms, perturbed=perturbed), tell=self._tell)
 
-    def _computed(self, wall: float | None, freedoms: int) -> ElasticModes:
+    def _computed(self, wall: float | None, freedoms: int, *, perturbed: bool) -> ElasticModes:
         expect_memory(freedoms)
         self._tell(f"tetrahedra of the body, {body_name(wall)}")
         solid = self._solid(wall, freedoms)
         size = freedoms_of(solid)
         self._tell(f"{self._count} elastic modes of {size} degrees of freedom")
         try:
-            return elastic_modes(solid, NOMINAL, count=self._count)
+            return elastic_modes(solid, NOMINAL, count=self._count, perturbed=perturbed)
         except MemoryError as error:
             raise SimulationError(
                 f"the modes of {size} degrees of freedom do not fit into the memory: ask for fewer, as "
@@ -184,7 +186,7 @@ class _Maker:
             self._walls[freedoms] = wall_solids(self.checked, freedoms)
         return self._walls[freedoms](wall)
 
-    def _kept(self, wall: float | None, freedoms: int) -> Path | None:
+    def _kept(self, wall: float | None, freedoms: int, *, perturbed: bool) -> Path | None:
         if self._cache is None:
             return None
         values = {
@@ -195,6 +197,7 @@ class _Maker:
             "wall": wall,
             "count": self._count,
             "freedoms": freedoms,
+            "perturbed": perturbed,
         }
         return self._cache / f"nominal-{key_of(values)}.safetensors"
 

@@ -1,0 +1,125 @@
+"""How a body's stiffness and mass change, to first order, where its material departs from the nominal one.
+
+The departures are smooth: Young's modulus and the density are multiplied by 1 + sum_l theta_l b_l(x), where b_l are the
+leading eigenfunctions of the covariance exp(-r^2 / (2 L^2)) over the body (Karhunen and Loeve; Ghanem and Spanos,
+Stochastic Finite Elements, 1991), scaled so that the squares of all sum to one everywhere. Variation of a wall's
+thickness changes both and is covered by the two. On the basis of mode shapes Phi, of unit modal mass,
+
+    A_l = Phi' K[b_l] Phi,   T_l = Phi' M[b_l] Phi,   N = Phi' dK/dnu Phi,
+
+with K[b] and M[b] the stiffness and mass matrices in which b takes the place of the factor 1, and nu Poisson's ratio.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int
+
+FIELDS = 24
+"""Smooth functions for the stiffness, and as many for the density."""
+_LENGTH = 0.25
+"""Correlation length L of a departure, over the body's size."""
+_SAMPLES = 600
+"""Cells on which the eigenfunctions are solved for; the others follow by Nystroem's formula."""
+_CHUNK = 1024
+"""Cells at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Perturbations:
+    """First-order changes of the modal stiffness and mass matrices."""
+
+    stiffness: Float64[np.ndarray, "fields modes modes"]
+    """A_l, 1/s2."""
+    mass: Float64[np.ndarray, "fields modes modes"]
+    """T_l, without unit."""
+    poisson: Float64[np.ndarray, "modes modes"]
+    """N, 1/s2."""
+
+
+@dataclass(frozen=True, eq=False)
+class Elements:
+    """Second-order tetrahedra with what their stiffness and mass matrices are integrated from."""
+
+    cells: Int[np.ndarray, "cells 10"]
+    """Rows of nodes."""
+    centers: Float64[np.ndarray, "cells 3"]
+    """Metres."""
+    volumes: Float64[np.ndarray, " cells"]
+    """Cubic metres."""
+    slopes: Float64[np.ndarray, "cells points 10 3"]
+    """Gradients of the shape functions at quadrature points of equal weight, 1/m."""
+    reference_mass: Float64[np.ndarray, "10 10"]
+    """Integrals of the products of shape functions over a cell of volume 1."""
+
+
+def perturbations(
+    elements: Elements,
+    shapes: Float64[np.ndarray, "nodes 3 modes"],
+    *,
+    size: float,
+    young: float,
+    poisson: float,
+    density: float,
+    seed: int = 0,
+) -> Perturbations:
+    """Return the changes on the basis of some mode shapes, 1 / sqrt(kg)."""
+    fields = smooth_fields(elements.centers, elements.volumes, length=_LENGTH * size, seed=seed)
+    modes = shapes.shape[2]
+    shear, squeeze = young / (2.0 * (1.0 + poisson)), young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
+    by_poisson = (
+        -young / (2.0 * (1.0 + poisson) ** 2),
+        young * (1.0 + 2.0 * poisson**2) / ((1.0 + poisson) * (1.0 - 2.0 * poisson)) ** 2,
+    )
+    stiff, heavy = np.zeros((len(fields), modes, modes)), np.zeros((len(fields), modes, modes))
+    turned = np.zeros((modes, modes))
+    root = np.linalg.cholesky(elements.reference_mass)
+    for first in range(0, len(elements.cells), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        moved = shapes[elements.cells[part]]
+        weight = elements.volumes[part] / elements.slopes.shape[1]
+        distortion, dilation = _strains(elements.slopes[part], moved, np.sqrt(weight))
+        both = np.concatenate([np.sqrt(2.0 * shear) * distortion, np.sqrt(squeeze) * dilation[:, :, None]], axis=2)
+        flat = both.reshape(len(weight), -1, modes)
+        moving = np.einsum("ab,cadm->cbdm", root, moved).reshape(len(weight), 30, modes)
+        moving *= np.sqrt(density * elements.volumes[part])[:, None, None]
+        for row, values in enumerate(fields[:, part]):
+            stiff[row] += _products(flat, values)
+            heavy[row] += _products(moving, values)
+        turned += 2.0 * by_poisson[0] * _products(distortion.reshape(len(weight), -1, modes), np.ones(len(weight)))
+        turned += by_poisson[1] * _products(dilation, np.ones(len(weight)))
+    return Perturbations(stiff, heavy, turned)
+
+
+def smooth_fields(
+    centers: Float64[np.ndarray, "cells 3"], volumes: Float64[np.ndarray, " cells"], *, length: float, seed: int
+) -> Float64[np.ndarray, "fields cells"]:
+    """Return the leading eigenfunctions of the covariance, at cells, whose squares sum to one in each cell."""
+    count = min(_SAMPLES, len(centers))
+    generator = np.random.default_rng(seed)
+    some = np.sort(generator.choice(len(centers), count, replace=False, p=volumes / volumes.sum()))
+    covariance = _covariance(centers[some], centers[some], length)
+    values, vectors = np.linalg.eigh(covariance)
+    kept = slice(max(0, count - FIELDS), count)
+    # Nystroem: at other places the eigenfunction is its average over the samples, weighted by the covariance.
+    found = (_covariance(centers, centers[some], length) @ (vectors[:, kept] / values[kept] ** 0.5)).T[::-1]
+    return found / np.sqrt(np.square(found).sum(0))
+
+
+def _covariance(one: np.ndarray, other: np.ndarray, length: float) -> np.ndarray:
+    squares = (one**2).sum(1)[:, None] + (other**2).sum(1) - 2.0 * one @ other.T
+    return np.exp(-0.5 * np.maximum(squares, 0.0) / length**2)
+
+
+def _strains(slopes: np.ndarray, moved: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return six strains [cells, points, 6, modes], shears times the square root of two, and their trace."""
+    gradient = np.einsum("cpai,cajm->cpijm", slopes, moved) * weight[:, None, None, None, None]
+    normal = [gradient[:, :, axis, axis] for axis in range(3)]
+    shears = [(gradient[:, :, i, j] + gradient[:, :, j, i]) / np.sqrt(2.0) for i, j in ((0, 1), (1, 2), (0, 2))]
+    return np.stack([*normal, *shears], axis=2), sum(normal)
+
+
+def _products(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the sum over cells of values times rows' rows."""
+    flat = rows.reshape(-1, rows.shape[-1])
+    return flat.T @ (flat * np.repeat(values, rows.shape[1])[:, None])
