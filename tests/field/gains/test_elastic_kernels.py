@@ -17,9 +17,9 @@ from avmsf.field.gains.elastic import (
     factor_log_prior,
 )
 from avmsf.field.gains.family import Sites
-from avmsf.field.gains.fitting import MeasuredGains, fit_mixture, weigh_factors
-from avmsf.field.gains.mixture import log_evidence
-from avmsf.field.gains.model import MixtureGains, series_of
+from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, weigh_factors
+from avmsf.field.gains.mixture import NOISE_SHARES, log_evidence
+from avmsf.field.gains.model import MixtureGains
 from gain_cases import SIZE, families, impacts, measured, plate
 
 SHAPES = 6
@@ -117,8 +117,7 @@ def test_a_factor_on_all_frequencies_is_found(factor):
     sites = impacts(12, seed=1)
     given = families(sites)
     gains = measured(sites, factor=factor)
-    values = series_of(gains.values)
-    weigh_factors([(each, log_evidence(each.kernels(), values, gains.floor)) for each in given], gains)
+    weigh_factors([WeighedFamily.of(each, gains, NOISE_SHARES) for each in given], gains)
     elastic = given[-1]
     assert isinstance(elastic, Elastic)
     assert float(elastic.factor_weights.sum()) == pytest.approx(1.0)
@@ -144,8 +143,7 @@ def test_gains_tell_the_factor_where_frequencies_do_not():
     body = Elastic(sites, SIZE, replace(plate(), frequency=progression))
     gains = replace(measured(sites), frequency=1.3 * progression[:5])
     given = [*families(sites, elastic=False), body]
-    values = series_of(gains.values)
-    weigh_factors([(each, log_evidence(each.kernels(), values, gains.floor)) for each in given], gains)
+    weigh_factors([WeighedFamily.of(each, gains, NOISE_SHARES) for each in given], gains)
     assert abs(float(torch.log(FACTORS[body.factor_weights.argmax()] / 1.3))) <= 0.05
 
 

@@ -59,7 +59,7 @@ class Elastic(KernelFamily):
     def __init__(self, reference: Sites, size: float, modes: ElasticModes) -> None:
         super().__init__(reference, size)
         # As a file keeps them, so that a field that was read renders what the saved one does.
-        self.modes = replace(modes, shapes=modes.shapes.float().double())
+        self.modes = replace(modes, shapes=modes.shapes.float().double(), perturbations=None)
         self.factor_weights = torch.softmax(factor_log_prior(), dim=0)
         """Probability of each of `FACTORS`."""
         self._reach = torch.tensor([REACH * size], dtype=torch.float64)

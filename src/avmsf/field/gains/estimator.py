@@ -19,13 +19,14 @@ from avmsf.field.config import FitConfig
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import FACTORS, Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
-from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.outliers import Fit, Judgment, judge_contacts, predicts_better
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.symmetry import Group, Symmetric, groups_of
+from avmsf.field.gains.updating import update
 from avmsf.field.gains.visual import Visual
 from avmsf.field.placed import expect_placed
 from avmsf.field.recipes import SHARED, Attention, GainCase, GainRecipe
@@ -108,7 +109,8 @@ class MixtureEstimator:
 
         Of several coarse bodies the most probable one is computed with finer elements, and the model is fitted again,
         until the most probable one is fine. Contacts that the others contradict are left out where these are predicted
-        better from each other without them.
+        better from each other without them. Last, the most probable body with its
+        stiffness and density updated becomes one more hypothesis.
         """
         bodies, missing = self._usable_bodies(case)
         directional, every = bool(bodies) or _has_directions(case), torch.arange(len(case.train))
@@ -134,7 +136,11 @@ class MixtureEstimator:
             fewer = fit(rows, fewer_families)
             if predicts_better(fewer, model, rows, fit.measured):
                 model, families, used = fewer, fewer_families, rows
-                weights = _body_weights(model, families, fit.measured)
+        if best is not None and (updated := fit.updated(used, bodies[best])) is not None:
+            bodies.append(updated)
+            families = fit.families(used, bodies)
+            model = fit(used, families)
+        weights = _body_weights(model, families, fit.measured)
         report = _report(bodies, families, weights, missing) | _judgment_report(judgment, case, used)
         return replace(model, report=report), used
 
@@ -233,6 +239,19 @@ class _Fit:
         measured = replace(self.measured, values=self.measured.values[rows])
         points = self.case.features.points
         return fit_mixture(families, measured, points, directional=self.directional, noise_shares=noise_shares)
+
+    def updated(self, rows: Int[Tensor, " rows"], body: NominalBody) -> NominalBody | None:
+        """Return the body with its stiffness and density updated; None where that has no higher evidence."""
+        if body.elastic.perturbations is None:
+            return None
+        sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
+        measured = replace(self.measured, values=self.measured.values[rows])
+        others = [WeighedFamily.of(family, measured, NOISE_SHARES) for family in self.families(rows, [])]
+        found = update(
+            body.elastic, sites, measured.frequency, measured.values.real,
+            lambda modes: matched(others, Elastic(sites, size, modes), measured),
+        )  # fmt: skip
+        return None if found is None else replace(body, elastic=found[0], updated=found[1])
 
 
 def measured_gains(case: GainCase) -> MeasuredGains:

@@ -8,10 +8,18 @@ import torch
 from jaxtyping import Bool, Complex128, Float32, Float64
 from torch import Tensor
 
-from avmsf.field.gains.elastic import Elastic, factor_log_prior
+from avmsf.field.gains.elastic import FACTORS, Elastic, factor_log_prior
 from avmsf.field.gains.family import KernelFamily
-from avmsf.field.gains.mixture import NOISE_SHARES, Hypotheses, KernelMixture, active_series, log_evidence
+from avmsf.field.gains.mixture import (
+    NOISE_SHARES,
+    Hypotheses,
+    KernelMixture,
+    active_series,
+    log_evidence,
+    log_joint,
+)
 from avmsf.field.gains.model import MixtureGains, series_of
+from avmsf.field.gains.updating import Matched
 
 _STRONGEST = 16
 """Modes of the most energy, which decide on the factor on nominal frequencies: many weak ones are not the body's."""
@@ -47,10 +55,30 @@ class MeasuredGains:
         return (power >= _SUBSTANTIAL * power.sum(0)).flatten()
 
     @property
+    def informative(self) -> Bool[Tensor, " series"]:
+        """Which series the prior is learned from: those that are substantial and not of a silent mode."""
+        return active_series(series_of(self.values)) & self.substantial
+
+    @property
     def floor(self) -> Float64[Tensor, " series"]:
         """The variance over the mean square of a part; finite for a mode without gains too."""
         size, limits = self.values.abs().square().mean(0) / 2.0, torch.finfo(torch.float64)
         return (self.variance / size.clamp_min(limits.tiny)).clamp_max(limits.max).repeat(2)
+
+
+@dataclass(frozen=True, eq=False)
+class WeighedFamily:
+    """A family with what the gains say of its kernels."""
+
+    family: KernelFamily
+    kernels: Float64[Tensor, "kernels contacts contacts"]
+    evidence: Float64[Tensor, "kernels noises series"]
+
+    @classmethod
+    def of(cls, family: KernelFamily, measured: MeasuredGains, noise_shares: tuple[float, ...]) -> "WeighedFamily":
+        """Return the family with its log evidence."""
+        kernels = family.kernels()
+        return cls(family, kernels, log_evidence(kernels, series_of(measured.values), measured.floor, noise_shares))
 
 
 def fit_mixture(
@@ -63,25 +91,12 @@ def fit_mixture(
 ) -> MixtureGains:
     """Return the gain model of some families, all of the same reference impacts, by evidence."""
     values, floor = series_of(measured.values), measured.floor
-    kernels = [family.kernels() for family in families]
-    evidence = [log_evidence(each, values, floor, noise_shares) for each in kernels]
-    pairs = list(zip(families, evidence, strict=True))
-    weigh_factors(pairs, measured)
-    kinds = [family.kind for family in families]
-    category, prior, first = [], [], 0
-    for family in families:
-        own = family.categories() + first
-        count = int(own.max()) + 1 - first
-        category.append(own)
-        prior.append(torch.full((count,), family.prior / kinds.count(family.kind) / count, dtype=torch.float64))
-        first += count
-    log_frequency = torch.log(measured.frequency)
-    log_prior = torch.cat([family.log_prior(log_frequency) for family in families]).repeat(1, 2)
-    hypotheses = Hypotheses(torch.cat(kernels), torch.cat(category), torch.cat(prior), log_prior)
-    active = active_series(values) & measured.substantial
+    weighed = [WeighedFamily.of(family, measured, noise_shares) for family in families]
+    weigh_factors(weighed, measured)
     mixture, used = KernelMixture.weigh(
-        hypotheses, torch.cat(evidence), values, floor, active=active, noise_shares=noise_shares
-    )
+        hypotheses_of(weighed, measured), torch.cat([each.evidence for each in weighed]), values, floor,
+        active=measured.informative, noise_shares=noise_shares,
+    )  # fmt: skip
     ends = torch.tensor([len(family.shares) for family in families]).cumsum(0).tolist()
     starts = [0, *ends[:-1]]
     rows = [used[(used >= start) & (used < end)] - start for start, end in zip(starts, ends, strict=True)]
@@ -90,22 +105,71 @@ def fit_mixture(
     return MixtureGains(points, families[0].reference, kept_families, kept, mixture, directional)
 
 
-def weigh_factors(families: Sequence[tuple[KernelFamily, Tensor]], measured: MeasuredGains) -> None:
+def hypotheses_of(families: Sequence[WeighedFamily], measured: MeasuredGains) -> Hypotheses:
+    """Return the kernels of all families and how probable each is beforehand."""
+    kinds = [each.family.kind for each in families]
+    category, prior, first = [], [], 0
+    for each in families:
+        own = each.family.categories() + first
+        count = int(own.max()) + 1 - first
+        share = each.family.prior / kinds.count(each.family.kind) / count
+        category.append(own)
+        prior.append(torch.full((count,), share, dtype=torch.float64))
+        first += count
+    log_frequency = torch.log(measured.frequency)
+    log_prior = torch.cat([each.family.log_prior(log_frequency) for each in families]).repeat(1, 2)
+    return Hypotheses(torch.cat([each.kernels for each in families]), torch.cat(category), torch.cat(prior), log_prior)
+
+
+def weigh_factors(families: Sequence[WeighedFamily], measured: MeasuredGains) -> None:
     """Give each elastic family the probabilities of the factors on its frequencies, from the strongest modes.
 
     A mode is a perturbed shape of the body with some frequency, or no shape of it; both parts of its gains share the
     shape. Given a factor the modes are independent of each other.
     """
-    others = [(family, each) for family, each in families if not isinstance(family, Elastic)]
-    total = sum(family.prior for family, _ in others)
-    none = torch.cat(
-        [each.flatten(0, 1) + math.log(family.prior / total / each[:, :, 0].numel()) for family, each in others]
-    )
-    unknown = torch.logsumexp(none, dim=0).reshape(2, -1).sum(0)
+    unknown = _no_shape(families)
     rows = torch.topk(measured.energy, min(_STRONGEST, len(measured.energy))).indices
-    for family, each in families:
-        if isinstance(family, Elastic):
-            known = family.shape_evidence(each).reshape(len(family.modes), 2, -1).sum(1)
-            single = torch.logsumexp(family.match(torch.log(measured.frequency)) + known, dim=1)
+    for each in families:
+        if isinstance(each.family, Elastic):
+            density = each.family.match(torch.log(measured.frequency))
+            single = torch.logsumexp(density + _shape(each, each.family), dim=1)
             both = torch.logaddexp(single, unknown)[:, rows]
-            family.factor_weights = torch.softmax(both.sum(1) + factor_log_prior(), dim=0)
+            each.family.factor_weights = torch.softmax(both.sum(1) + factor_log_prior(), dim=0)
+
+
+def matched(families: Sequence[WeighedFamily], elastic: Elastic, measured: MeasuredGains) -> Matched:
+    """Return what gains say of a body: of its shapes and of all gains, with it among the families."""
+    weighed = [*families, WeighedFamily.of(elastic, measured, NOISE_SHARES)]
+    weigh_factors(weighed, measured)
+    active = measured.informative
+    joint = log_joint(torch.cat([each.evidence for each in weighed]), hypotheses_of(weighed, measured), active)
+    total = torch.logsumexp(joint[..., active].flatten(0, 1), dim=0).sum()
+    # Parts that say nothing of their mode's shape are left out, and each mode counts its frequency once.
+    prior = torch.logsumexp(
+        elastic.match(torch.log(measured.frequency)) + elastic.factor_weights.log()[:, None, None], dim=0
+    )
+    joined = torch.cat([prior + _shape(weighed[-1], elastic, active), _no_shape(families, active)[None]])
+    factor = float(FACTORS[elastic.factor_weights.argmax()])
+    return Matched(float(total), torch.softmax(joined, dim=0)[:-1], math.log(factor))
+
+
+def _shape(
+    weighed: WeighedFamily, elastic: Elastic, active: Bool[Tensor, " series"] | None = None
+) -> Float64[Tensor, "shapes modes"]:
+    """Return the log evidence of each shape, that of both parts."""
+    found = elastic.shape_evidence(weighed.evidence)
+    return (found if active is None else found * active).reshape(len(elastic.modes), 2, -1).sum(1)
+
+
+def _no_shape(
+    families: Sequence[WeighedFamily], active: Bool[Tensor, " series"] | None = None
+) -> Float64[Tensor, " modes"]:
+    """Return the log evidence that a mode is no shape of a body, that of both parts."""
+    others = [each for each in families if not isinstance(each.family, Elastic)]
+    total = sum(each.family.prior for each in others)
+    logs = [
+        each.evidence.flatten(0, 1) + math.log(each.family.prior / total / each.evidence[:, :, 0].numel())
+        for each in others
+    ]
+    found = torch.logsumexp(torch.cat(logs), dim=0)
+    return (found if active is None else found * active).reshape(2, -1).sum(0)

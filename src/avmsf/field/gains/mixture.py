@@ -240,14 +240,14 @@ def log_evidence(
     return found
 
 
-def posterior_weights(
+def log_joint(
     likelihood: Float64[Tensor, "kernels noises series"], hypotheses: Hypotheses, active: Bool[Tensor, " series"]
 ) -> Float64[Tensor, "kernels noises series"]:
-    """Return the posterior probabilities, negligible ones as zero, with the prior of categories learned.
+    """Return the log evidence of each hypothesis times its prior, that of categories learned.
 
     Each pair of a category and a noise share has a probability of its own.
     """
-    shape, noises = likelihood.shape, likelihood.shape[1]
+    noises = likelihood.shape[1]
     joint = (likelihood + hypotheses.log_prior[:, None]).flatten(0, 1)
     category = (hypotheses.category[:, None] * noises + torch.arange(noises)).flatten()
     start = (hypotheses.category_prior / hypotheses.category_prior.sum() / noises).repeat_interleave(noises)
@@ -257,9 +257,17 @@ def posterior_weights(
         counts = _PSEUDO_COUNT * used.shape[1] * start
         counts = counts.index_add(0, category, weights.sum(1))
         learned = counts / counts.sum()
-    weights = torch.softmax(joint + learned.log()[category, None], dim=0)
+    return (joint + learned.log()[category, None]).reshape(likelihood.shape)
+
+
+def posterior_weights(
+    likelihood: Float64[Tensor, "kernels noises series"], hypotheses: Hypotheses, active: Bool[Tensor, " series"]
+) -> Float64[Tensor, "kernels noises series"]:
+    """Return the posterior probabilities, negligible ones as zero, with the prior of categories learned."""
+    joint = log_joint(likelihood, hypotheses, active)
+    weights = torch.softmax(joint.flatten(0, 1), dim=0)
     weights = torch.where(weights < _NEGLIGIBLE * weights.amax(0), 0.0, weights)
-    return (weights / weights.sum(0)).reshape(shape)
+    return (weights / weights.sum(0)).reshape(joint.shape)
 
 
 def active_series(values: Float64[Tensor, "contacts series"]) -> Bool[Tensor, " series"]:

@@ -314,9 +314,11 @@ class MixtureGains:
         _expect_sound(tensors, len(record["bodies"]))
         bodies = iter(
             ElasticModes(
-                **{name: tensors[f"bodies.{row}.{name}"] for name in ("frequency", "nodes", "triangles")},
-                shapes=tensors[f"bodies.{row}.shapes"].double(),
-                material=NOMINAL,
+                tensors[f"bodies.{row}.frequency"],
+                tensors[f"bodies.{row}.nodes"],
+                tensors[f"bodies.{row}.triangles"],
+                tensors[f"bodies.{row}.shapes"].double(),
+                NOMINAL,
                 mass=0.0,
             )
             for row in range(len(record["bodies"]))

@@ -1,0 +1,181 @@
+"""Model updating: a body's stiffness and density as its measured frequencies and gains have them.
+
+A nominal body is uniform; a real one varies in stiffness, density and thickness, which moves its frequencies and mixes
+its mode shapes. With the first-order changes of `avmsf.fem.perturbation` on the basis of the nominal shapes,
+
+    (Lambda + sum_l theta_l A_l + theta_nu N) v = lambda (I + sum_l theta'_l T_l) v,
+
+has the updated shapes Phi V and frequencies. The coefficients are normal a priori and are found by Gauss and Newton's
+method from the modes whose shape is known with some certainty: to first order
+
+    d log f_k / d theta_l = v_k' A_l v_k / (2 lambda_k),   d log f_k / d theta'_l = -v_k' T_l v_k / 2,
+    d phi_k = sum_(j != k) phi_j v_j' (dK - lambda_k dM) v_k / (lambda_k - lambda_j)
+
+(Fox and Kapoor, AIAA Journal 6, 1968). Rounds of matching and solving follow each other; the one with the highest
+evidence is kept, with the coefficients' prior in it, and round 0 is the nominal body. Rounds end where the coefficients
+are larger than their prior expects, the sum of their squares over their variances exceeding their number: the object is
+then another body, not a perturbed one, and first order says nothing of it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from avmsf.fem.perturbation import Perturbations
+from avmsf.field.gains.family import Sites
+from avmsf.simulate.elastic import ElasticModes
+
+STIFFNESS, DENSITY, POISSON, FACTOR = 0.10, 0.04, 1.0, 0.5
+"""Prior standard deviations of the coefficients: of Young's modulus and density over their nominal values, of Poisson's
+ratio over a change of .05, and of the log factor on all frequencies over one round."""
+_POISSON_STEP = 0.05
+_ROUNDS = 6
+_SURE = 0.7
+"""Probability of a shape from which on a mode is taken for it."""
+_FREQUENCY = 0.02, 0.002
+"""Standard deviation of log frequency at first, and at least."""
+_GAIN_NOISE = 0.02
+"""Least variance of gains that updating cannot explain, over their mean square."""
+_NEAR = 0.01
+"""Relative difference of squared frequencies below which shapes mix freely and first order says nothing."""
+_TOGETHER = 0.02
+"""Relative difference of squared frequencies within which shapes count as one group."""
+_LONGEST = 2.0
+"""Longest step of a coefficient, in prior standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """What measured gains say of a body."""
+
+    evidence: float
+    """Log evidence of all gains with this body among the families."""
+    centers: Float64[Tensor, "shapes modes"]
+    """Probability that a measured mode is a perturbation of each shape."""
+    log_factor: float
+    """Log of the most probable factor on the frequencies."""
+
+
+def update(
+    modes: ElasticModes,
+    sites: Sites,
+    frequency: Float64[Tensor, " modes"],
+    values: Float64[Tensor, "contacts modes"],
+    match: Callable[[ElasticModes], Matched],
+) -> tuple[ElasticModes, float] | None:
+    """Return the updated modes and the log evidence that they gain, or None where the nominal ones have the highest.
+
+    `modes` have `perturbations`; `frequency` (Hz) and `values` are those measured at `sites`, along each mode's common
+    phase. `match` weighs a body, known at least at the sites, against the other families.
+    """
+    assert modes.perturbations is not None
+    local = modes.near(sites.points)
+    known = local.gains(sites.points, sites.directions).numpy()
+    problem = _Problem(modes.frequency.numpy(), modes.perturbations, known, frequency.numpy(), values.numpy())
+    theta, spread, best = np.zeros(len(problem.deviation)), _FREQUENCY[0], None
+    found = match(local)
+    nominal = highest = found.evidence
+    for step in range(_ROUNDS):
+        theta, spread = problem.solved(theta, found, spread, with_gains=step > 0)
+        size = float(np.square(theta / problem.deviation).sum())
+        if size > len(theta):
+            break
+        found = match(problem.changed(local, theta))
+        evidence = found.evidence - 0.5 * size
+        if evidence > highest:
+            highest, best = evidence, theta
+    return None if best is None else (problem.changed(modes, best), highest - nominal)
+
+
+class _Problem:
+    """The linearized problem of one body."""
+
+    def __init__(
+        self,
+        nominal: Float64[np.ndarray, " shapes"],
+        perturbations: Perturbations,
+        known: Float64[np.ndarray, "contacts shapes"],
+        frequency: Float64[np.ndarray, " modes"],
+        values: Float64[np.ndarray, "contacts modes"],
+    ) -> None:
+        self.known, self.frequency, self.values = known, frequency, values
+        self.squares = np.square(2.0 * np.pi * nominal)
+        self.forces = np.concatenate([perturbations.stiffness, _POISSON_STEP * perturbations.poisson[None]])
+        self.masses = perturbations.mass
+        self.deviation = np.repeat([STIFFNESS, POISSON, DENSITY], [len(self.forces) - 1, 1, len(self.masses)])
+
+    def solution(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the squared angular frequencies and the updated shapes over the nominal ones, [nominal, updated]."""
+        forces, masses = np.split(theta, [len(self.forces)])
+        stiff = np.diag(self.squares) + np.tensordot(forces, self.forces, 1)
+        heavy = np.eye(len(self.squares)) + np.tensordot(masses, self.masses, 1)
+        return scipy.linalg.eigh(stiff, heavy)
+
+    def changed(self, modes: ElasticModes, theta: np.ndarray) -> ElasticModes:
+        """Return modes with these coefficients."""
+        squares, shapes = self.solution(theta)
+        # Coefficients far outside of first order could make a square negative.
+        frequency = torch.from_numpy(np.sqrt(np.maximum(squares, 1e-6 * self.squares[0])) / (2.0 * np.pi))
+        mixed = torch.einsum("njd,jk->nkd", modes.shapes, torch.from_numpy(shapes))
+        return replace(modes, frequency=frequency, shapes=mixed, perturbations=None)
+
+    def solved(self, theta: np.ndarray, found: Matched, spread: float, *, with_gains: bool) -> tuple[np.ndarray, float]:
+        """Return the next coefficients and the standard deviation of log frequencies."""
+        squares, shapes = self.solution(theta)
+        centers = found.centers.numpy()
+        together = np.abs(squares[:, None] - squares) <= _TOGETHER * squares[:, None]
+        grouped = together @ centers
+        shape = centers.argmax(0)
+        certainty = grouped[shape, np.arange(len(shape))]
+        mode = np.flatnonzero(certainty > _SURE)
+        shape, certainty = shape[mode], certainty[mode]
+        forces = np.einsum("jk,ljm,mn->lkn", shapes, self.forces, shapes, optimize=True)
+        masses = np.einsum("jk,ljm,mn->lkn", shapes, self.masses, shapes, optimize=True)
+        slopes = np.concatenate([forces[:, shape, shape] / (2.0 * squares[shape]), -0.5 * masses[:, shape, shape]]).T
+        apart = np.log(self.frequency[mode]) - 0.5 * np.log(squares[shape]) + np.log(2.0 * np.pi) - found.log_factor
+        rows = [np.concatenate([slopes, np.ones((len(mode), 1))], axis=1) * (np.sqrt(certainty) / spread)[:, None]]
+        rest = [(apart + slopes @ theta) * np.sqrt(certainty) / spread]
+        if with_gains:
+            along = self.known @ shapes
+            for m, k, sure in zip(mode, shape, certainty, strict=True):
+                row, value = self._gain_rows(along, self.values[:, m], squares, forces, masses, together[k])
+                weight = np.sqrt(sure)
+                rows.append(np.concatenate([row * weight, np.zeros((len(row), 1))], axis=1))
+                rest.append((value + row @ theta) * weight)
+        matrix, right = np.concatenate(rows), np.concatenate(rest)
+        precision = np.append(self.deviation, FACTOR) ** -2.0
+        solution = np.linalg.solve(matrix.T @ matrix + np.diag(precision), matrix.T @ right)
+        step = np.clip(solution[:-1] - theta, -_LONGEST * self.deviation, _LONGEST * self.deviation)
+        left = apart - slopes @ step - solution[-1]
+        if len(mode):
+            spread = float(np.clip(1.5 * np.sqrt(np.average(left**2, weights=certainty)), _FREQUENCY[1], spread))
+        return theta + step, spread
+
+    def _gain_rows(
+        self,
+        along: np.ndarray,
+        values: np.ndarray,
+        squares: np.ndarray,
+        forces: np.ndarray,
+        masses: np.ndarray,
+        group: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return how the gains of a mode of a group of shapes change with the coefficients, and their rest."""
+        own = along[:, group]
+        basis, _ = np.linalg.qr(own)
+        sizes = np.linalg.lstsq(own, values, rcond=1e-3)[0]
+        left = values - basis @ (basis.T @ values)
+        noise = np.sqrt(max(_GAIN_NOISE, 0.5 * (left @ left) / (values @ values)) * np.mean(values**2))
+        moved = np.zeros((len(values), len(self.deviation)))
+        for k, size in zip(np.flatnonzero(group), sizes, strict=True):
+            apart = squares[k] - squares
+            mixing = np.where(group, 0.0, apart / (apart**2 + (_NEAR * squares[k]) ** 2))
+            coefficients = np.concatenate([forces[:, :, k], -squares[k] * masses[:, :, k]]) * mixing
+            moved += size * along @ coefficients.T
+        moved -= basis @ (basis.T @ moved)
+        return moved / noise, left / noise

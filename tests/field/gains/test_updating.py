@@ -1,0 +1,94 @@
+"""Model updating, on bodies whose true departures are known."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from avmsf.fem.perturbation import smooth_fields
+from avmsf.field.gains.elastic import Elastic
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, matched
+from avmsf.field.gains.mixture import NOISE_SHARES
+from avmsf.field.gains.positional import Smooth, Unstructured
+from avmsf.field.gains.updating import DENSITY, STIFFNESS, update
+from avmsf.simulate.block import block
+from avmsf.simulate.elastic import ElasticModes, elastic_modes
+from avmsf.simulate.elements import SecondOrder, elements_of
+from avmsf.simulate.nominal import NOMINAL
+from avmsf.simulate.solid import Solid
+
+MODES = 14
+
+
+@cache
+def body() -> Solid:
+    return block((0.2, 0.13, 0.006), (8, 5, 1))
+
+
+@cache
+def nominal() -> ElasticModes:
+    return elastic_modes(body(), NOMINAL, count=40, perturbed=True)
+
+
+@cache
+def uneven(kind: str) -> ElasticModes:
+    """Return the body as it is: stiffness or density departs by 1.5 or 2 prior deviations."""
+    elements = elements_of(SecondOrder.of(body()))
+    fields = smooth_fields(elements.centers, elements.volumes, length=0.25 * body().size, seed=0)
+    deviation = {"stiffness_factor": 1.5 * STIFFNESS, "density_factor": 2.0 * DENSITY}[kind]
+    drawn = np.random.default_rng(3).normal(0.0, deviation, len(fields))
+    return elastic_modes(body(), NOMINAL, count=MODES, **{kind: torch.from_numpy(np.exp(drawn @ fields))})
+
+
+def sites(seed: int, count: int) -> Sites:
+    drawn = np.random.default_rng(seed).uniform(size=(count, 3)) * [0.2, 0.13, 0.0] + [0.0, 0.0, 0.006]
+    points = torch.from_numpy(drawn)
+    return Sites(points, torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64).expand(count, 3).clone())
+
+
+def updated(true: ElasticModes) -> tuple[ElasticModes, float] | None:
+    known, size = sites(1, 12), 0.24
+    values = true.gains(known.points, known.directions)[:, :MODES]
+    noise = torch.from_numpy(np.random.default_rng(5).normal(size=(2, *values.shape))) * 0.02 * values.std(0)
+    gains = torch.complex(values + noise[0], noise[1])
+    weak = torch.full((MODES,), 1e-12, dtype=torch.float64)
+    measured = MeasuredGains(gains, weak, true.frequency[:MODES], torch.full((MODES,), 5.0, dtype=torch.float64))
+    others = [
+        WeighedFamily.of(family, measured, NOISE_SHARES) for family in (Unstructured(known, size), Smooth(known, size))
+    ]
+    return update(
+        nominal(), known, measured.frequency, values + noise[0],
+        lambda modes: matched(others, Elastic(known, size, modes), measured),
+    )  # fmt: skip
+
+
+def agreement(found: ElasticModes, true: ElasticModes) -> torch.Tensor:
+    """Return the modal assurance criterion of each true shape with the most similar one, at places not struck."""
+    other = sites(2, 60)
+    here, there = (each.gains(other.points, other.directions) for each in (found, true))
+    here, there = here / here.norm(dim=0), there[:, :MODES] / there[:, :MODES].norm(dim=0)
+    return (here.T @ there).square().amax(0)
+
+
+@pytest.mark.parametrize("kind", ["stiffness_factor", "density_factor"])
+def test_shapes_at_places_not_struck_and_frequencies_come_nearer_to_the_true_ones(kind):
+    true = uneven(kind)
+    found = updated(true)
+    assert found is not None
+    modes, nats = found
+    assert nats > 10.0
+    before, after = (1.0 - agreement(each, true) for each in (nominal(), modes))
+    assert after.mean() < 0.5 * before.mean()
+    ratio = [torch.log(each.frequency[:MODES] / true.frequency).std() for each in (nominal(), modes)]
+    assert ratio[1] < 0.4 * ratio[0]
+
+
+def test_a_body_that_is_the_nominal_one_stays_as_it_is():
+    found = updated(replace(nominal(), frequency=1.2 * nominal().frequency))
+    if found is not None:
+        modes, nats = found
+        assert nats < 5.0
+        assert (1.0 - agreement(modes, nominal())).max() < 0.01
