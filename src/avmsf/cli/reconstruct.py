@@ -16,7 +16,7 @@ from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import SceneOptions, features_words
-from avmsf.cli.scores import compare, parts_words, score_table, score_values
+from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import Progress
@@ -132,8 +132,8 @@ def run(options: Options) -> int:
     for words in describe_outliers(fitted):
         screen.print(words, soft_wrap=True)
     screen.print(summary(fitted, len(train)), soft_wrap=True)
-    if fitted.quality is not None:
-        screen.print(str(fitted.quality), soft_wrap=True)
+    for words in quality_words(fitted, options.output or made.field):
+        screen.print(words, soft_wrap=True)
     screen.print(f"the field is {made.field}", soft_wrap=True)
     if options.output is not None:
         screen.print(f"wrote {options.output}", soft_wrap=True)

@@ -17,11 +17,11 @@ from avmsf.capture import CaptureSettings, Impacts, read_capture
 from avmsf.cli.modes import mode_table
 from avmsf.cli.modetable import levels, mode_rows
 from avmsf.cli.printing import console, print_json, say
-from avmsf.cli.scores import score_table, score_values
+from avmsf.cli.scores import quality_words, score_table, score_values
 from avmsf.field.attention import AttentionGains
 from avmsf.field.doubt import gain_doubt, spectrum_band
 from avmsf.field.posterior import has_posterior, training_contacts
-from avmsf.field.soundfield import FieldQuality, SoundField
+from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.scene.points import farthest_points
 
@@ -62,7 +62,7 @@ def run(options: Options) -> int:
     rows = mode_rows(field.bank, level)
     values = describe(field)
     screen = console(errors=options.json)
-    screen.print(_words(values), soft_wrap=True)
+    screen.print(_words(values, quality_words(field, options.field)), soft_wrap=True)
     screen.print(mode_table(f"{len(rows)} modes, levels on average over the object", rows))
     heard = None
     if options.capture is not None:
@@ -178,7 +178,7 @@ def _gains_words(gains: dict[str, Any]) -> str:
     )
 
 
-def _words(values: dict[str, Any]) -> str:
+def _words(values: dict[str, Any], quality: list[str]) -> str:
     extent = " x ".join(f"{side:.3g}" for side in values["extent_metres"])
     report = values["report"]
     lines = [
@@ -191,8 +191,7 @@ def _words(values: dict[str, Any]) -> str:
         f"  gains      {_gains_words(values['gain_field'])}",
         f"  fitted to  {len(values['trained_on'])} recordings",
     ]
-    if isinstance(report.get("quality"), dict) and not report.get("edits"):
-        lines.append(f"  quality    {FieldQuality(**report['quality'])}")
+    lines += [f"  quality    {words}" for words in quality]
     lines += [f"  left out   {words}" for words in report.get("outliers", {}).values()]
     for edit in report.get("edits", []):
         lines.append(f"  edited     {_edit_words(edit)}")
