@@ -13,6 +13,7 @@ from avmsf.bench.evaluation import split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.progress import FitBar
@@ -151,6 +152,7 @@ def run(options: Options) -> int:
     save(fitted, options.output)
     for ending in ("modes", "checkpoint"):
         discard(_beside(options.output, ending))
+    doing("comparing the field with the recordings that it was not fitted to")
     scores = {} if test is None else compare(fitted, train, test, modes)
     screen = console(errors=options.json)
     if test is not None:

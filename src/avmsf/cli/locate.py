@@ -15,6 +15,7 @@ from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.folder import settings_of
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, figure, print_json, say
 from avmsf.cli.writing import OutputError, expect_writable
 from avmsf.errors import AvmsfError, LocationError
@@ -83,6 +84,8 @@ def run(options: Options) -> int:
         screen.print(quality.verdict, soft_wrap=True)
     taken, found, failures = set[str](), list[dict[str, Any]](), list[dict[str, str]]()
     for path in options.recordings:
+        if found:
+            doing(f"locating the impact of {path}")
         try:
             answers = _answers(known, read_recording(path), path, settings, force, options)
         except AvmsfError as error:

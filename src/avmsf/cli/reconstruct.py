@@ -11,6 +11,7 @@ from avmsf.capture import read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.fit import describe_outliers, part_contacts, recipe_of, summary
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
@@ -118,6 +119,7 @@ def run(options: Options) -> int:
     except KeyboardInterrupt:
         say("avmsf reconstruct: interrupted; the same command goes on from where it was")
         return INTERRUPTED
+    doing("comparing the field with the recordings that it was not fitted to")
     scores = {} if test is None else compare(fitted, train, test, made.modes)
     screen = console(errors=options.json)
     for sentence in describe_alignment(made.modes, train):

@@ -14,6 +14,7 @@ from avmsf.bench.doubtpictures import draw_band, draw_doubt
 from avmsf.bench.evaluation import evaluate
 from avmsf.bench.pictures import draw_gains, draw_modes, draw_spectrograms, save_picture
 from avmsf.capture import CaptureSettings, Impacts, read_capture
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.modes import mode_table
 from avmsf.cli.modetable import levels, mode_rows
 from avmsf.cli.printing import console, print_json, say
@@ -67,11 +68,13 @@ def run(options: Options) -> int:
     heard = None
     if options.capture is not None:
         settings = None if options.settings is None else CaptureSettings.read(options.settings)
+        doing("comparing the field with the capture's recordings")
         heard, what = _unheard(read_capture(options.capture, settings).impacts, field)
         scores = {"field": evaluate(Fitted(field, heard.sounds.shape[1]), heard)}
         screen.print(score_table(f"{len(heard)} contacts, {what}; lower is better", scores))
         values |= {"compared_with": {"recordings": list(heard.names), "which": what, "scores": score_values(scores)}}
     if options.output is not None:
+        doing("drawing the pictures")
         draw_field(field, options.output, points=points, gains=gains, level=level, heard=heard)
     if options.json:
         print_json(values | {"modes": [asdict(row) for row in rows]})
