@@ -112,10 +112,8 @@ def test_the_next_contact_is_where_no_contact_is_and_lowers_the_expected_error_m
     assert field.quality.next_contact[0] > 0.5
     contact = torch.tensor(field.quality.next_contact, dtype=torch.float64)
     assert field.quality.next_distance == pytest.approx(float((left.contacts - contact).norm(dim=1).min()))
-    # As good as the best of all points, within the tenth that the coarser choice may cost.
-    best = suggest(field, 1)
-    (here,) = suggest(field, 1, candidates=contact[None]).after
-    assert best.before - here > 0.9 * (best.before - best.after[0])
+    # What `avmsf suggest` names first.
+    assert torch.equal(suggest(field, 1).contacts[0], contact)
     save(field, tmp_path / "field.safetensors")
     assert load(tmp_path / "field.safetensors").quality == field.quality
 

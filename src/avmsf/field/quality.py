@@ -18,10 +18,6 @@ from avmsf.modal.synthesis import synthesise_phased
 MIN_PLACES = 4
 """Places below which leaving one out says nothing of the field of all."""
 
-_PLACES = 150
-"""Points of the surface that the next contact is one of: enough for its neighborhood, at a seventh of the time that
-`avmsf suggest` takes."""
-
 
 def with_quality(field: SoundField, train: Impacts, *, advise: bool = True) -> SoundField:
     """Return a field with the residual that predicts its own contacts best, and its quality in the report.
@@ -53,7 +49,7 @@ def with_quality(field: SoundField, train: Impacts, *, advise: bool = True) -> S
 def _next(field: SoundField, gains: MixtureGains) -> tuple[tuple[float, float, float], float] | tuple[()]:
     """Return the contact that reduces the expected error most and its distance to the nearest one; () for none."""
     try:
-        (contact,) = suggest(field, 1, places=_PLACES).contacts
+        (contact,) = suggest(field, 1).contacts
     except FitError:
         # All points of the object are contacts already.
         return ()

@@ -60,7 +60,6 @@ def suggest(
     *,
     candidates: Float[Tensor, "candidates 3"] | None = None,
     directions: Float[Tensor, "_given 3"] | None = None,
-    places: int = PLACES,
 ) -> Suggestions:
     """Return the `count` contacts that lower the expected error of the whole field most, each given those before it.
 
@@ -69,14 +68,13 @@ def suggest(
     `candidates` are the places to choose from (metres, on the surface; places that have been struck are passed over,
     but for those of strikes whose labels the field holds for wrong), by itself points spread over the surface;
     `directions` the unit vectors along which they can be struck, straight into the surface where not given. Of more
-    than `MOST` candidates as many are weighed, spread as far apart as they go. The expected error is summed over
-    `places` points of the surface; the time grows with their square.
+    than `MOST` candidates as many are weighed, spread as far apart as they go.
 
     Raises FitError for gains that know no doubt, a count below 1, candidates that are not finite or not on the object,
     directions that are not one a candidate, and fewer candidates than contacts asked for.
     """
     gains = unedited_mixture(field)
-    spread = farthest_points(gains.points, min(places, len(gains.points)))
+    spread = farthest_points(gains.points, min(PLACES, len(gains.points)))
     points = gains.points[spread].double()
     chosen_from = points if candidates is None else candidates.double()
     _expect_directions(directions, candidates)
@@ -91,10 +89,10 @@ def suggest(
     kept = _weighed(chosen_from, allowed, max(MOST, count))
     chosen_from, allowed = chosen_from[kept], allowed[kept]
     along = gains.sites(chosen_from, None if directions is None else directions[kept]).directions
-    every = points if candidates is None else torch.cat([points, chosen_from])
+    places = points if candidates is None else torch.cat([points, chosen_from])
     ways = along if candidates is None else torch.cat([gains.sites(points).directions, along])
     ledger = _Ledger(
-        gains.covariances(every, ways), 1.0 / (4.0 * field.bank.damping.double()), len(points), len(chosen_from)
+        gains.covariances(places, ways), 1.0 / (4.0 * field.bank.damping.double()), len(points), len(chosen_from)
     )
     # Contacts that foretell one another perfectly leave nothing open.
     calibration = max((widening(field) / NormalDist().inv_cdf(0.5 + LEVEL / 2.0)) ** 2, torch.finfo(torch.float64).tiny)
