@@ -20,11 +20,14 @@ from avmsf.bench.evaluation import split
 from avmsf.bench.locating import METHODS, LocatingScores, judge_locating
 from avmsf.bench.locatingimages import Images, symmetries_of
 from avmsf.capture import Capture, Surface, read_capture
+from avmsf.capture.audio import read_recording
 from avmsf.capture.impacts import Impacts
+from avmsf.errors import LocationError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention, GainRecipe
+from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract
 from avmsf.modal.residual import Residual
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
@@ -36,9 +39,10 @@ from avmsf.simulate.sim20 import NON_SYMMETRIC, SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.truth import Truth, read_truth
 from avmsf.tasks.listening import Blow, Listener
+from avmsf.tasks.locate import locate
 from avmsf.tasks.locator import Locator
 from benchmarks.look import slab
-from benchmarks.material import STRUCK, capture_in_place, surface_features
+from benchmarks.material import STRUCK, capture_in_place, shared_data, surface_features
 from benchmarks.report import Options, Report, Table, show, tell
 
 AIRCRAFT_COUNT, AIRCRAFT_STARTS = 15, (0, 18, 37)
@@ -46,6 +50,8 @@ SOME = ("mug-ceramic", "blob-polycarbonate", "spoon-wood", "bowl-glass", "pot-st
 """Objects of the set that are judged by default: three without a turn that carries them onto themselves, two with."""
 STREAM_POINTS, STREAM_BLOWS, STREAM_BLOCK = 10_000, 20, 441
 """Points of the streamed field, blows, and samples in a block: 10 ms."""
+STRANGE_POINTS = 1000
+"""Points that refusals are counted with: a tenth of the time, and the same refusals."""
 QUIET = FitConfig(warmup_steps=20, steps=2, damping="shared")
 CONVENTIONS = (
     "rmed: distance between found and true contact over the diagonal of the box around the object's points, mean over "
@@ -255,6 +261,81 @@ def _judged(case: LocatingCase, options: LocatingOptions, seconds: list[float]) 
     return scores
 
 
+def _strangers(options: LocatingOptions) -> Report:
+    """Count what `locate` refuses: of an object's own recordings, and of sounds that are none of its."""
+    names = ("aircraft_response", "tree43", "ruler10")
+    captures = {name: read_capture(shared_data() / name) for name in names}
+    rows: list[list[str | float]] = []
+    found: dict[str, float] = {}
+    for name, counts, starts in zip(names, (15, 20, 5), (AIRCRAFT_STARTS, (0, 15), (0, 5)), strict=True):
+        capture, heard = captures[name], dict[str, list[str | None]]()
+        for start in starts[: 1 if options.quick_look else None]:
+            train, test = split(capture.impacts, count=counts, start=start)
+            # The tree has no mesh: its contacts are points enough.
+            bare = FeatureField.from_points(capture.impacts.contacts.float())
+            wall = 0.0 if name == names[0] else None
+            surface = capture.surface
+            recipe = MixtureEstimator() if surface is None else _estimator(surface, wall, name, options)
+            features = bare if surface is None else surface_features(capture)
+            field = fit(train, features, extract(train), FitConfig(steps=0), gains=recipe)
+            locator = Locator.of(
+                field, points=field.gain_field.points[:: max(1, len(features.points) // STRANGE_POINTS)]
+            )
+            others = {"held out": test.sounds, "trained on": train.sounds}
+            others |= {
+                f"of {other}": captures[other].impacts.sounds[:: max(1, len(captures[other].impacts) // 12)]
+                for other in names
+                if other != name
+            }
+            for kind, sounds in (others | strange_noises(field.samples, field.sample_rate) | _clips()).items():
+                heard.setdefault(kind, []).extend(_refusal(field, locator, sound.float()) for sound in sounds)
+        for kind, refusals in heard.items():
+            share = mean(refusal is not None for refusal in refusals)
+            by_gains = sum(refusal is not None and "log Bayes factor" in refusal for refusal in refusals)
+            found[f"locate.strangers.{name}.{kind.replace(' ', '_')}"] = share
+            rows.append([f"{name}: {kind}", len(refusals), share, by_gains])
+    title = "locate.strangers: sounds at the field's rate, and the part of them that is refused"
+    return Report(tables=(Table(title, ("sounds", "count", "refused", "by their gains"), rows),), figures=found)
+
+
+def _refusal(field: SoundField, locator: Locator, sound: torch.Tensor) -> str | None:
+    try:
+        return locate(field, sound, locator=locator).refusal
+    except LocationError as error:
+        return str(error)
+
+
+def _clips() -> dict[str, list[torch.Tensor]]:
+    """Return recordings of other objects from their loudest sample on, at whatever rate."""
+    folders = ("bowl_clips", "hammer_clips", "realimpact_clips")
+    paths = [path for name in folders for path in sorted((shared_data() / name).glob("*.wav"))]
+    sounds = [torch.from_numpy(read_recording(path).channels[0].copy()).float() for path in paths]
+    return {"clips": [sound[int(sound.abs().argmax()) :] for sound in sounds]}
+
+
+def strange_noises(samples: int, rate: float, count: int = 10) -> dict[str, list[torch.Tensor]]:
+    """Return white noise, the same decaying, bursts of band noise as in speech, and hum with its harmonics."""
+    generator = torch.Generator().manual_seed(0)
+    time, part = torch.arange(samples) / rate, torch.arange(samples) / samples
+    white = torch.randn(3, count, samples, generator=generator)
+    spectrum = torch.fft.rfft(white[1])
+    place = torch.linspace(0.0, 1.0, spectrum.shape[1])
+    middle = 0.04 + 0.8 * torch.rand(count, 3, 1, generator=generator)
+    formants = torch.exp(-(((place - middle) / 0.06) ** 2)).sum(1)
+    speech = torch.fft.irfft(formants * spectrum, n=samples) * torch.sin(10.0 * math.pi * part).clamp_min(0.0)
+    decay = 4.0 * torch.exp(2.0 * torch.rand(count, 1, generator=generator))
+    # A sixteenth of the rate stands for the mains where the rate is as low as the aircraft's.
+    base = min(50.0, rate / 16.0) * (1.0 + 0.01 * torch.randn(count, 1, generator=generator))
+    hum = sum(torch.sin(2.0 * math.pi * base * order * time + order) / order for order in (1, 2, 3, 5, 7))
+    assert isinstance(hum, torch.Tensor)
+    return {
+        "white noise": list(white[0]),
+        "decaying noise": list(white[2] * torch.exp(-decay * part)),
+        "bursts as of speech": list(speech),
+        "hum": list(hum + 0.01 * white[0]),
+    }
+
+
 def _means(scores: Iterable[LocatingScores], method: str) -> dict[str, float]:
     """Return the means over objects, each counting the same."""
     each = [one.figures(method) for one in scores]
@@ -327,6 +408,7 @@ PARTS: dict[str, Callable[[LocatingOptions], Report]] = {
     "aircraft": _aircraft,
     "sim20": _sim20,
     "stream": _stream,
+    "strangers": _strangers,
 }
 
 

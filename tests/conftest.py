@@ -1,11 +1,14 @@
 """Where the tests find measured data, which is not part of the package."""
 
 import gc
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from avmsf.cli import heartbeat
 
 
 @pytest.hookimpl(wrapper=True)
@@ -28,3 +31,9 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no measured data at {folder}: set AVMSF_SHARED to the folder that holds data/")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def _no_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep a busy machine from adding lines to what verbs print."""
+    monkeypatch.setattr(heartbeat, "SILENCE_SECONDS", math.inf)

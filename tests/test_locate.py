@@ -19,7 +19,7 @@ from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise_phased
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 from avmsf.tasks.contactmap import ContactMap
-from avmsf.tasks.locate import DOUBTFUL, STRANGE, UNLIKE, judge_fit, locate
+from avmsf.tasks.locate import DOUBTFUL, STRANGE, UNLIKE, judged, locate
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
 from avmsf.tasks.retune import retune
@@ -257,8 +257,10 @@ def test_another_plate_is_refused_with_the_number(length):
     locator = locator_of()
     for sound in impacts.sounds:
         assert locator.locate(sound).misfit > 1.5 * STRANGE
-        with pytest.raises(LocationError, match=r"explain \d+ % of the sound and, .*a misfit of \d\.\d\d; its own"):
-            locate(true_field(), sound, locator=locator)
+        found = locate(true_field(), sound, locator=locator)
+        assert re.search(r"explain \d+ % of the sound and, .*a misfit of \d\.\d\d; its own", found.refusal)
+        with pytest.raises(LocationError):
+            _ = found.place
 
 
 @pytest.mark.parametrize("noise_db", [-40.0, 0.0])
@@ -272,13 +274,53 @@ def test_its_own_sounds_are_not_taken_for_another_plates(noise_db):
 
 def test_what_falls_between_is_doubted_in_words():
     found = locator_of().locate(struck(1, seed=6).sounds[0])
-    assert judge_fit(found, "it") == []
-    (note,) = judge_fit(replace(found, modal=0.8, detuned=0.5), "it")
+    assert judged(found) is found
+    (note,) = judged(replace(found, modal=0.8, detuned=0.5)).notes
     assert re.search(r"explain 80 % of the sound and, put out of tune, 50 %, a misfit of 0\.40: it may be", note)
-    (note,) = judge_fit(replace(found, explained=0.9 * UNLIKE), "it")
+    (note,) = judged(replace(found, explained=0.9 * UNLIKE)).notes
     assert "a blow at the likeliest place 9 %" in note
     # Where modes out of tune explain all as well, a rounding is no misfit.
-    assert judge_fit(replace(found, modal=1.0 - 1e-4, detuned=1.0 - 1e-5), "it") == []
+    assert judged(replace(found, modal=1.0 - 1e-4, detuned=1.0 - 1e-5)).notes == ()
+
+
+@pytest.mark.parametrize("noise_db", [-40.0, 0.0])
+@pytest.mark.parametrize(("taps", "seed"), [(None, 6), (25, 6), (25, 5)], ids=["true", "held out", "trained on"])
+def test_own_sounds_are_explained_better_than_by_noise(taps, seed, noise_db):
+    for sound in struck(12, seed=seed, noise_db=noise_db).sounds:
+        found = judged(locator_of(taps).locate(sound))
+        assert found.refusal is None
+        assert found.evidence > 0.0
+
+
+def with_the_modes_of_no_place(seed):
+    """Return the sound of the plate's own modes, in a random phase, the louder the weaker they are on the plate."""
+    generator, gains = torch.Generator().manual_seed(seed), locator_of().gains
+    drawn = torch.randn(len(bank()), 2, dtype=torch.float64, generator=generator)
+    values = torch.view_as_complex(drawn) / gains.abs().square().mean(0).sqrt()
+    phase = torch.zeros(len(bank()), dtype=torch.float64)
+    sounds = synthesise_phased(
+        values.real[None], bank().frequency, bank().damping, phase, samples=7200, sample_rate=RATE,
+        quadrature=values.imag[None],
+    )  # fmt: skip
+    return sounds[0].float()
+
+
+@pytest.mark.parametrize("taps", [None, 25])
+def test_a_sound_whose_modes_are_so_strong_at_no_place_has_none(taps):
+    for seed in range(6):
+        found = judged(locator_of(taps).locate(with_the_modes_of_no_place(seed)))
+        # Its frequencies and dampings are the object's: only the strengths tell.
+        assert found.misfit < 0.01
+        assert found.evidence <= 0.0
+        with pytest.raises(LocationError):
+            _ = found.place
+
+
+def test_the_evidence_depends_on_neither_level_nor_force():
+    sound = struck(1, seed=3).sounds[0]
+    expected = locator_of().locate(sound).evidence
+    assert locator_of().locate(-300.0 * sound).evidence == pytest.approx(expected, abs=0.1)
+    assert locator_of().locate(sound, force=Force(1.0)).evidence == pytest.approx(expected, rel=0.01)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from avmsf.errors import LocationError
 from avmsf.tasks.amplitudes import Extractor
 from avmsf.tasks.listening import Listener
 from avmsf.tasks.locate import DOUBTFUL, STRANGE, locate
@@ -27,8 +26,7 @@ def test_broad_modes_explain_a_stranger_and_it_is_refused(material, other, lengt
         found = locator.locate(sound)
         shares.append(found.modal)
         assert found.misfit > STRANGE
-        with pytest.raises(LocationError, match=r"a misfit of \d\.\d\d; its own recordings have 0\.3 at most"):
-            locate(damped_field(material), recorded(sound), locator=locator)
+        assert "a misfit of" in locate(damped_field(material), recorded(sound), locator=locator).refusal
     # What the modes explain tells nothing here: of strangers half and more.
     assert max(shares) > 0.5
 

@@ -11,6 +11,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.soundfield import FieldQuality
 from avmsf.field.store import load, save
+from avmsf.field.suggest import suggest
 from avmsf.modal.extraction.extract import extract
 from avmsf.scene.features import FeatureField
 from delayed_plate import SAMPLES, strikes
@@ -94,3 +95,36 @@ def test_an_edited_field_has_no_quality():
     field = fitted(parted(strikes(20))[0])
     edited = replace(field, origin=replace(field.origin, report={**field.origin.report, "edits": [{"edit": "x"}]}))
     assert edited.quality is None
+
+
+def on_plate(train):
+    """Return a field whose points are those of the whole plate, the unit square."""
+    side = torch.linspace(0.0, 1.0, 30)
+    points = torch.cat([torch.cartesian_prod(side, side), torch.zeros(900, 1)], 1)
+    return fit(train, FeatureField.from_points(points), extract(train), CONFIG)
+
+
+def test_the_next_contact_is_where_no_contact_is_and_lowers_the_expected_error_most(tmp_path):
+    train = parted(strikes(20))[0]
+    # Nothing was recorded on the right half of the plate.
+    left = train.take(torch.nonzero(train.contacts[:, 0] < 0.5).flatten().tolist())
+    field = on_plate(left)
+    assert field.quality.next_contact[0] > 0.5
+    contact = torch.tensor(field.quality.next_contact, dtype=torch.float64)
+    assert field.quality.next_distance == pytest.approx(float((left.contacts - contact).norm(dim=1).min()))
+    # What `avmsf suggest` names first.
+    assert torch.equal(suggest(field, 1).contacts[0], contact)
+    save(field, tmp_path / "field.safetensors")
+    assert load(tmp_path / "field.safetensors").quality == field.quality
+
+
+def test_no_contact_is_advised_where_the_object_is_not_known():
+    # The points fill the box of the contacts: many of them are not on any object.
+    assert fitted(parted(strikes(20))[0]).quality.next_contact is None
+
+
+def test_the_advice_says_where_and_how_far_away():
+    words = str(FieldQuality(9, 0.3, 0.7, (0.0214, -0.013, 0.08), 0.0413))
+    assert "(0.021, -0.013, 0.080) m" in words
+    assert "41 mm" in words
+    assert FieldQuality(9, 0.3, 0.7).advice == ""

@@ -17,6 +17,7 @@ import tyro
 import avmsf
 from avmsf._utils.memory import NO_MEMORY, lacks_memory
 from avmsf._utils.text import printable
+from avmsf.cli.heartbeat import beating
 from avmsf.errors import AvmsfError, AvmsfWarning
 
 VERBS = {
@@ -48,6 +49,8 @@ INTERRUPTED = 130
 """The exit code that shells give a command ended by Ctrl-C."""
 TERMINATED = 143
 """The exit code that shells give a command ended by SIGTERM."""
+_WAITING = frozenset({"studio", "play"})
+"""Verbs that wait for their user most of the time."""
 _AGAIN = 0.05
 """Seconds after which an interruption that was dropped is raised again: a finalizer ends sooner, or it is repeated."""
 
@@ -64,7 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not words or words[0] not in VERBS:
         _explain(words)
         return 2
-    with warnings.catch_warnings(), _interrupting() as received:
+    heart = nullcontext() if words[0] in _WAITING else beating(f"avmsf {words[0]}")
+    with warnings.catch_warnings(), _interrupting() as received, heart:
         try:
             # Only the verb that is asked for is imported: torch takes seconds, and help on the whole needs none of it.
             with _loading():
@@ -150,7 +154,13 @@ def _loading() -> Iterator[None]:
 def _compilation_announced() -> AbstractContextManager[None]:
     """Let the standard error say what is compiled, for it takes seconds; verbs that compile nothing import nothing."""
     module = sys.modules.get("avmsf.compiled")
-    return nullcontext() if module is None else module.announced(lambda words: print(words, file=sys.stderr))
+    if module is None:
+        return nullcontext()
+    # Imports rich, which help on the whole does not need.
+    from avmsf.cli.printing import say
+
+    announced: AbstractContextManager[None] = module.announced(say)
+    return announced
 
 
 def _explain(words: list[str]) -> None:

@@ -13,6 +13,7 @@ from avmsf.capture.folder import SETTINGS
 from avmsf.capture.measure import shared_problems
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
 from avmsf.cli.alignment import AlignmentReport
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.errors import CaptureError, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract
@@ -54,10 +55,12 @@ def run(options: Options) -> int:
     """Print the report; return 2 where the capture cannot be read."""
     settings = None if options.settings is None else CaptureSettings.read(options.settings)
     screen = console(errors=options.json)
+    doing(f"reading {options.capture}")
     proposals = propose_settings(options.capture, settings)
     if proposals and options.write_settings:
         _write(options, proposals, screen)
     report = check(options.capture, settings)
+    doing("finding the modes that align the recordings")
     modes = _modes(options.capture, settings) if report.readable else None
     aligned = None if modes is None else AlignmentReport.of(*modes)
     if report.recordings:

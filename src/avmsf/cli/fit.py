@@ -13,10 +13,11 @@ from avmsf.bench.evaluation import split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.progress import FitBar
-from avmsf.cli.scores import compare, parts_words, score_table, score_values
+from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
 from avmsf.field.config import PAPER, FitConfig
@@ -151,6 +152,7 @@ def run(options: Options) -> int:
     save(fitted, options.output)
     for ending in ("modes", "checkpoint"):
         discard(_beside(options.output, ending))
+    doing("comparing the field with the recordings that it was not fitted to")
     scores = {} if test is None else compare(fitted, train, test, modes)
     screen = console(errors=options.json)
     if test is not None:
@@ -161,8 +163,8 @@ def run(options: Options) -> int:
     for words in describe_outliers(fitted):
         screen.print(words, soft_wrap=True)
     screen.print(summary(fitted, len(train)), soft_wrap=True)
-    if fitted.quality is not None:
-        screen.print(str(fitted.quality), soft_wrap=True)
+    for words in quality_words(fitted, options.output):
+        screen.print(words, soft_wrap=True)
     screen.print(f"wrote {options.output}", soft_wrap=True)
     if options.json:
         print_json(

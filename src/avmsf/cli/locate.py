@@ -15,21 +15,22 @@ from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.folder import settings_of
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, figure, print_json, say
 from avmsf.cli.writing import OutputError, expect_writable
-from avmsf.errors import AvmsfError
+from avmsf.errors import AvmsfError, LocationError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.scene.symmetry import Symmetries
 from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locate import locate
-from avmsf.tasks.located import describe_blow, symmetries_of
+from avmsf.tasks.located import describe_blow, not_located, symmetries_of
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
 from avmsf.tasks.severalblows import locate_blows
 
 UNLOCATED = 2
-"""The exit code where one of several recordings could not be located."""
+"""The exit code where a recording could not be located."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def parse(words: Sequence[str]) -> Options:
 
 
 def run(options: Options) -> int:
-    """Locate, print and draw; return 2 where one of several recordings could not be located."""
+    """Locate, print and draw; return 2 where a recording could not be located."""
     if not options.recordings:
         raise OutputError("expected one recording or more after the field, such as HIT.wav")
     if not 0.0 < options.level < 1.0:
@@ -78,25 +79,30 @@ def run(options: Options) -> int:
     known = _Known(load(options.field))
     say("avmsf locate: preparing gains over the surface and their reliability, once a run (seconds to minutes)")
     screen = console(errors=options.json)
+    quality = known.field.quality
+    if quality is not None:
+        screen.print(quality.verdict, soft_wrap=True)
     taken, found, failures = set[str](), list[dict[str, Any]](), list[dict[str, str]]()
     for path in options.recordings:
+        if found:
+            doing(f"locating the impact of {path}")
         try:
-            blows = _blows(known, read_recording(path), settings, force, several=options.several)
+            answers = _answers(known, read_recording(path), path, settings, force, options)
         except AvmsfError as error:
             if len(options.recordings) == 1:
                 raise
             failures.append({"recording": str(path), "error": " ".join(str(error).split())})
             say(f"avmsf locate: {failures[-1]['error']}")
             continue
-        for seconds, contact in blows:
-            values = _describe(str(path), seconds, contact, known, options.level)
+        for values, contact in answers:
             screen.print(_words(values), soft_wrap=True)
-            if options.output is not None:
+            if contact is not None and options.output is not None:
                 values |= _draw(contact, options.output, _name(path, taken), values)
             found.append(values)
     if options.json:
-        print_json({"field": str(options.field), "blows": found, "failures": failures})
-    return UNLOCATED if failures else 0
+        verdict = None if quality is None else quality.verdict
+        print_json({"field": str(options.field), "quality": verdict, "blows": found, "failures": failures})
+    return UNLOCATED if failures or any(each["place"] is None for each in found) else 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +119,25 @@ class _Known:
     def symmetries(self) -> Symmetries | None:
         """The symmetries of the field's points; None where these are too few to tell."""
         return symmetries_of(self.field)
+
+
+def _answers(
+    known: _Known,
+    recording: Recording,
+    path: Path,
+    settings: CaptureSettings | None,
+    force: Force | None,
+    options: Options,
+) -> list[tuple[dict[str, Any], ContactMap | None]]:
+    """Return what is found out about each blow of a recording, and its map; None for one that has no place."""
+    try:
+        blows = _blows(known, recording, settings, force, several=options.several)
+    except LocationError as error:
+        return [({"recording": str(path), "seconds": None, **not_located(str(error))}, None)]
+    return [
+        (_describe(str(path), seconds, contact, known, options.level), None if contact.refusal else contact)
+        for seconds, contact in blows
+    ]
 
 
 def _blows(
@@ -143,8 +168,10 @@ def _describe(name: str, seconds: float | None, contact: ContactMap, known: _Kno
 
 def _words(values: dict[str, Any]) -> str:
     """Return one line about a blow, and one more for each thing to know besides."""
-    region = values["region"]
     when = "" if values["seconds"] is None else f" at {values['seconds']:.3f} s"
+    if values["place"] is None:
+        return f"{values['recording']}{when}: {values['status']}: {values['reason']}"
+    region = values["region"]
     where = ", ".join(f"{value + 0.0:.4f}" for value in values["place"])
     lines = [
         f"{values['recording']}{when}: struck at ({where}) m; {100 * region['level']:g} % within "

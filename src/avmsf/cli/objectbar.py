@@ -6,6 +6,7 @@ from types import TracebackType
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import SafeColumn, console, say
 
 
@@ -40,4 +41,6 @@ class ObjectBar:
         self.bar.update(self.task, description=words, completed=done, total=total)
         if not self.live and done > self.done:
             say(f"{words} ({done} of {total}, {time.monotonic() - self.begun:.0f} s)")
+        else:
+            doing(f"{words} ({done} of {total})")
         self.done = done

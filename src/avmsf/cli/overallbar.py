@@ -8,6 +8,7 @@ from types import TracebackType
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import SafeColumn, console, say
 from avmsf.field.fit import Progress as FitProgress
 from avmsf.pipeline.scene import Listener
@@ -73,12 +74,15 @@ class OverallBar:
 
     def fitting(self, progress: FitProgress) -> None:
         """Take note of a step of the fit."""
+        doing(f"fit: step {progress.step} of {progress.steps}")
         self._advance(progress.step / progress.steps)
 
     def _splatting(self, progress: SplatProgress) -> None:
+        doing(f"splat: step {progress.step} of {progress.steps}")
         self._advance(progress.step / progress.steps)
 
     def _lifting(self, progress: LiftProgress) -> None:
+        doing(f"lift: {progress.done} of {progress.total} views")
         self._advance(progress.done / progress.total)
 
     def _advance(self, part: float) -> None:

@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from avmsf._utils.text import printable
+from avmsf.cli.heartbeat import printed
 
 _WIDTH = 120
 """Columns of tables that go to a file or a pipe, which have no width of their own."""
@@ -70,6 +71,7 @@ def decimals(value: float | int | None, places: int) -> str:
 def say(text: str) -> None:
     """Print one line of progress or remark to the standard error."""
     print(printable(text), file=sys.stderr, flush=True)
+    printed(text)
 
 
 def print_text(text: str) -> None:

@@ -5,12 +5,13 @@ from types import TracebackType
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, figure, say
 from avmsf.field.fit import Progress as FitProgress
 
 
 class FitBar:
-    """One bar a stage, with its loss and the time it has left; in a file or a pipe, one line a stage."""
+    """One bar a stage, with its loss and the time it has left; in a file or a pipe, a line each few seconds."""
 
     def __init__(self) -> None:
         self.live = sys.stderr.isatty()
@@ -50,3 +51,5 @@ class FitBar:
             self.bar.update(self.task, completed=step, loss=figure(progress.loss))
         elif step == steps:
             say(f"{stage}: {steps} steps, loss {figure(progress.loss)}")
+        else:
+            doing(f"{stage}: step {step} of {steps}, loss {figure(progress.loss)}")

@@ -11,12 +11,13 @@ from avmsf.capture import read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.fit import describe_outliers, part_contacts, recipe_of, summary
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import SceneOptions, features_words
-from avmsf.cli.scores import compare, parts_words, score_table, score_values
+from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import Progress
@@ -118,6 +119,7 @@ def run(options: Options) -> int:
     except KeyboardInterrupt:
         say("avmsf reconstruct: interrupted; the same command goes on from where it was")
         return INTERRUPTED
+    doing("comparing the field with the recordings that it was not fitted to")
     scores = {} if test is None else compare(fitted, train, test, made.modes)
     screen = console(errors=options.json)
     for sentence in describe_alignment(made.modes, train):
@@ -132,8 +134,8 @@ def run(options: Options) -> int:
     for words in describe_outliers(fitted):
         screen.print(words, soft_wrap=True)
     screen.print(summary(fitted, len(train)), soft_wrap=True)
-    if fitted.quality is not None:
-        screen.print(str(fitted.quality), soft_wrap=True)
+    for words in quality_words(fitted, options.output or made.field):
+        screen.print(words, soft_wrap=True)
     screen.print(f"the field is {made.field}", soft_wrap=True)
     if options.output is not None:
         screen.print(f"wrote {options.output}", soft_wrap=True)

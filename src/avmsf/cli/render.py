@@ -13,6 +13,7 @@ from torch import Tensor
 
 from avmsf.capture.audio import MAX_SAMPLES
 from avmsf.cli.contacts import Contacts, contacts_at, read_contacts, refuse_far
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import print_text, say
 from avmsf.cli.writing import Coding, Level, OutputError, expect_writable, write_sound
 from avmsf.field.soundfield import SoundField
@@ -86,6 +87,7 @@ def run(options: Options) -> int:
         say(f"note: the recordings' forces are not known, so {options.force:g} counts in average recorded blows")
     if round(field.sample_rate) != field.sample_rate:
         say(f"note: wav files hold whole sample rates: {round(field.sample_rate)} for {field.sample_rate:g} Hz")
+    doing("rendering")
     pulse = _pulse(options)
     sounds = render_sounds(field, contacts.places, force=options.force, seconds=options.seconds, pulse=pulse)
     if pulse is not None and options.normalise == "none" and options.level_db == 0:

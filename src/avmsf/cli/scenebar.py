@@ -5,6 +5,7 @@ from types import TracebackType
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import SafeColumn, console, figure, say
 from avmsf.pipeline.scene import Listener
 from avmsf.scene.lift import LiftProgress
@@ -53,12 +54,16 @@ class SceneBar:
         words = f"loss {figure(progress.loss)}, {progress.psnr:.1f} dB, {progress.gaussians} Gaussians"
         self._show("splat", progress.step, progress.steps, words)
         part = progress.step * _PARTS // progress.steps
+        line = f"splat: step {progress.step} of {progress.steps}, {words}, {progress.seconds:.0f} s"
         if not self.live and part > self.told:
-            say(f"splat: step {progress.step} of {progress.steps}, {words}, {progress.seconds:.0f} s")
+            say(line)
+        else:
+            doing(line)
         self.told = part
 
     def lifting(self, progress: LiftProgress) -> None:
         """Take note of a view."""
+        doing(f"lift: {progress.view}, {progress.done} of {progress.total}")
         self._show("lift", progress.done, progress.total, progress.view)
 
     def _show(self, stage: str, done: int, total: int, words: str) -> None:

@@ -1,6 +1,8 @@
 """A field beside what it has to beat, on contacts that none of them has heard."""
 
+import shlex
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 from rich.table import Table
@@ -48,6 +50,14 @@ def parts_words(train: Impacts, test: Impacts) -> str:
     heard, left = len(set(owners[: len(train)])), len(set(owners[len(train) :]))
     repeats = "" if (heard, left) == (len(train), len(test)) else f" ({len(test)} and {len(train)} recordings)"
     return f"{counted(left, 'place')} not trained on, {heard} trained on{repeats}"
+
+
+def quality_words(field: SoundField, path: Path) -> list[str]:
+    """Return how good a field in the file `path` is, and which command says where to record more; empty if unknown."""
+    if field.quality is None:
+        return []
+    more = f" More contacts: avmsf suggest {shlex.quote(str(path))}" if field.quality.advice else ""
+    return [f"{field.quality}{more}"]
 
 
 def score_table(title: str, scores: Mapping[str, Scores]) -> Table:

@@ -14,14 +14,15 @@ from avmsf.bench.doubtpictures import draw_band, draw_doubt
 from avmsf.bench.evaluation import evaluate
 from avmsf.bench.pictures import draw_gains, draw_modes, draw_spectrograms, save_picture
 from avmsf.capture import CaptureSettings, Impacts, read_capture
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.modes import mode_table
 from avmsf.cli.modetable import levels, mode_rows
 from avmsf.cli.printing import console, print_json, say
-from avmsf.cli.scores import score_table, score_values
+from avmsf.cli.scores import quality_words, score_table, score_values
 from avmsf.field.attention import AttentionGains
 from avmsf.field.doubt import gain_doubt, spectrum_band
 from avmsf.field.posterior import has_posterior, training_contacts
-from avmsf.field.soundfield import FieldQuality, SoundField
+from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.scene.points import farthest_points
 
@@ -62,16 +63,18 @@ def run(options: Options) -> int:
     rows = mode_rows(field.bank, level)
     values = describe(field)
     screen = console(errors=options.json)
-    screen.print(_words(values), soft_wrap=True)
+    screen.print(_words(values, quality_words(field, options.field)), soft_wrap=True)
     screen.print(mode_table(f"{len(rows)} modes, levels on average over the object", rows))
     heard = None
     if options.capture is not None:
         settings = None if options.settings is None else CaptureSettings.read(options.settings)
+        doing("comparing the field with the capture's recordings")
         heard, what = _unheard(read_capture(options.capture, settings).impacts, field)
         scores = {"field": evaluate(Fitted(field, heard.sounds.shape[1]), heard)}
         screen.print(score_table(f"{len(heard)} contacts, {what}; lower is better", scores))
         values |= {"compared_with": {"recordings": list(heard.names), "which": what, "scores": score_values(scores)}}
     if options.output is not None:
+        doing("drawing the pictures")
         draw_field(field, options.output, points=points, gains=gains, level=level, heard=heard)
     if options.json:
         print_json(values | {"modes": [asdict(row) for row in rows]})
@@ -178,7 +181,7 @@ def _gains_words(gains: dict[str, Any]) -> str:
     )
 
 
-def _words(values: dict[str, Any]) -> str:
+def _words(values: dict[str, Any], quality: list[str]) -> str:
     extent = " x ".join(f"{side:.3g}" for side in values["extent_metres"])
     report = values["report"]
     lines = [
@@ -191,8 +194,7 @@ def _words(values: dict[str, Any]) -> str:
         f"  gains      {_gains_words(values['gain_field'])}",
         f"  fitted to  {len(values['trained_on'])} recordings",
     ]
-    if isinstance(report.get("quality"), dict) and not report.get("edits"):
-        lines.append(f"  quality    {FieldQuality(**report['quality'])}")
+    lines += [f"  quality    {words}" for words in quality]
     lines += [f"  left out   {words}" for words in report.get("outliers", {}).values()]
     for edit in report.get("edits", []):
         lines.append(f"  edited     {_edit_words(edit)}")

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, figure, say
 from avmsf.cli.writing import Level, write_sound
 from avmsf.errors import EditError
@@ -157,6 +158,7 @@ class SteerBar:
     def show(self, progress: SteerProgress) -> None:
         """Take note of one step."""
         loss, pitch = figure(progress.loss), figure(progress.pitch, 4)
+        doing(f"step {progress.step} of {progress.steps}: loss {loss}, pitch x {pitch}")
         self.bar.update(self.task, completed=progress.step, total=progress.steps, loss=loss, pitch=pitch)
         if progress.preview is None:
             return

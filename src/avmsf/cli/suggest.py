@@ -12,6 +12,7 @@ import tyro
 from avmsf.bench.doubtpictures import draw_doubt
 from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings, read_capture
+from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.writing import expect_writable, write_text
 from avmsf.errors import FitError
@@ -63,6 +64,7 @@ def run(options: Options) -> int:
     gains = unedited_mixture(field)
     names: tuple[str, ...] | None = None
     given = False
+    doing("weighing the contacts")
     if options.candidates is None:
         found = suggest(field, options.count)
     else:
@@ -88,6 +90,7 @@ def run(options: Options) -> int:
         screen.print("nx, ny, nz: the way the hammer moves" + ("" if given else ", straight into the surface"))
     if paths:
         write_text(paths[TABLE], _list(rows))
+        doing("drawing the uncertainty")
         step = max(1, len(gains.points) // _DRAWN_POINTS)
         points = gains.points[::step]
         picture = draw_doubt(

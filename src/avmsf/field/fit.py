@@ -110,7 +110,7 @@ def fit(
     used = train.take(run.network.used_rows(len(train)))
     if config.residual and not config.noise_rate and config.steps:
         field = _with_measured_residual(field, used)
-    return with_quality(field, used)
+    return with_quality(field, used, advise=features.on_surface)
 
 
 def _with_measured_residual(field: SoundField, train: Impacts) -> SoundField:

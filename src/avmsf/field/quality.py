@@ -1,4 +1,4 @@
-"""How well a field predicts its own contacts from one another, and the residual that serves it best."""
+"""How well a field predicts its own contacts from each other, where it should be recorded next, and its residual."""
 
 from dataclasses import asdict, replace
 
@@ -7,9 +7,11 @@ from jaxtyping import Complex128, Float
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
+from avmsf.errors import FitError
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.soundfield import FieldQuality, SoundField
+from avmsf.field.suggest import suggest
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise_phased
 
@@ -17,12 +19,13 @@ MIN_PLACES = 4
 """Places below which leaving one out says nothing of the field of all."""
 
 
-def with_quality(field: SoundField, train: Impacts) -> SoundField:
+def with_quality(field: SoundField, train: Impacts, *, advise: bool = True) -> SoundField:
     """Return a field with the residual that predicts its own contacts best, and its quality in the report.
 
     The residual is the stationary noise of the field, or the mean of what the three nearest recordings have beside
     their modes; whichever gives the smaller error at contacts left out. `train` holds the recordings that the gain
-    model uses, row for row. A field of fewer than `MIN_PLACES` places keeps its noise and has no quality.
+    model uses, row for row. A field of fewer than `MIN_PLACES` places keeps its noise and has no quality. `advise`:
+    whether to name the contact to record next, one of the field's points; not if these are not on the object.
     """
     gains = field.gain_field
     if not isinstance(gains, MixtureGains) or gains.place_count < MIN_PLACES:
@@ -37,9 +40,21 @@ def with_quality(field: SoundField, train: Impacts) -> SoundField:
     best = min(errors, key=lambda each: errors[each])
     if best == "recordings":
         field = replace(field, residual=Residual(field.residual.magnitude, recordings))
-    found = FieldQuality(gains.place_count, errors[best], _error(field, averaged, train))
+    advice = _next(field, gains) if advise else ()
+    found = FieldQuality(gains.place_count, errors[best], _error(field, averaged, train), *advice)
     report = {**field.origin.report, "quality": asdict(found), "residual": errors}
     return replace(field, origin=replace(field.origin, report=report))
+
+
+def _next(field: SoundField, gains: MixtureGains) -> tuple[tuple[float, float, float], float] | tuple[()]:
+    """Return the contact that reduces the expected error most and its distance to the nearest one; () for none."""
+    try:
+        (contact,) = suggest(field, 1).contacts
+    except FitError:
+        # All points of the object are contacts already.
+        return ()
+    x, y, z = contact.tolist()
+    return (x, y, z), float((gains.contacts - contact).norm(dim=1).min())
 
 
 def _modes(field: SoundField, gains: Complex128[Tensor, "contacts modes"]) -> Float[Tensor, "contacts samples"]:

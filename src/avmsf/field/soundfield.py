@@ -1,5 +1,6 @@
 """An object's sound at every contact: modes, a gain field, and noise."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,9 +50,24 @@ class FieldQuality:
     """Of the field; modes, and the prior of its gain model's hypotheses, are those of all contacts."""
     averaging: float
     """Of the mean of the three nearest recordings at other places."""
+    next_contact: tuple[float, float, float] | None = None
+    """The contact (object frame, meters) that reduces the field's expected error most; None if there is no other."""
+    next_distance: float | None = None
+    """From there to the nearest contact that was recorded, meters."""
+
+    @classmethod
+    def of(cls, record: Mapping[str, Any]) -> "FieldQuality":
+        """Return it from plain values, as they are in a file."""
+        contact = record.get("next_contact")
+        return cls(**{**record, "next_contact": None if contact is None else tuple(contact)})
 
     def __str__(self) -> str:
-        """Say how good the field is; leaving out overstates the error, for spread contacts are far from each other."""
+        """Return the verdict, and the advice if there is any."""
+        return " ".join(filter(None, [self.verdict, self.advice]))
+
+    @property
+    def verdict(self) -> str:
+        """How good the field is; leaving out overstates the error, for spread contacts are far from each other."""
         if self.error < self.averaging:
             return (
                 f"At contacts left out the relative STFT error of the field is at most about {self.error:.2f}, of "
@@ -60,6 +76,17 @@ class FieldQuality:
         return (
             f"No better than averaging the three nearest recordings: relative STFT errors of {self.error:.2f} and "
             f"{self.averaging:.2f} at contacts left out ({self.places} places). Give a mesh, or record more places."
+        )
+
+    @property
+    def advice(self) -> str:
+        """Where another impact would help most; empty if that is not known."""
+        if self.next_contact is None or self.next_distance is None:
+            return ""
+        where = ", ".join(f"{value + 0.0:.3f}" for value in self.next_contact)
+        return (
+            f"Another impact near ({where}) m, {1000 * self.next_distance:.0f} mm from the nearest contact, would help "
+            "most."
         )
 
 
@@ -88,7 +115,7 @@ class SoundField:
         None for few places, for the attention network, and for an edited field, which nobody recorded.
         """
         found = None if self.origin.report.get("edits") else self.origin.report.get("quality")
-        return FieldQuality(**found) if isinstance(found, dict) else None
+        return FieldQuality.of(found) if isinstance(found, dict) else None
 
     @property
     def audible(self) -> Bool[Tensor, " modes"]:

@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -36,6 +36,8 @@ class FeatureField:
     """About unit size, so that no dimension drowns the others."""
     encoder: str
     """Who made the features; a field keeps it, so that it is never taken for another's."""
+    on_surface: bool = True
+    """Whether the points are on the object's surface; not if they only fill the box of its contacts."""
 
     @classmethod
     def from_mesh(
@@ -73,7 +75,7 @@ class FeatureField:
     def from_contacts(cls, contacts: Float[Tensor, "contacts 3"], *, count: int = 8192) -> "FeatureField":
         """Return points that fill the contacts' bounding box, for an object of which nothing else is known."""
         _expect_extent(contacts)
-        return cls.from_points(lattice(contacts, count))
+        return replace(cls.from_points(lattice(contacts, count)), on_surface=False)
 
     @property
     def half_diagonal(self) -> float:

@@ -1,5 +1,6 @@
 """Where a blow may have fallen: a score and a probability for every point of the surface."""
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -60,6 +61,11 @@ class ContactMap:
     """Strength of that blow, with its sign, relative to one that sounds as the field renders it."""
     notes: tuple[str, ...] = field(default=())
     """What a user should know of the recording, in sentences."""
+    evidence: float = math.inf
+    """Log Bayes factor of a blow somewhere on the object against noise (see `avmsf.tasks.posterior`): 0 where both
+    explain the sound's gains equally well."""
+    refusal: str | None = None
+    """Why the sound has no place, as another object's; None where it has one."""
 
     @property
     def best(self) -> int:
@@ -78,7 +84,9 @@ class ContactMap:
 
     @property
     def place(self) -> Float32[Tensor, " 3"]:
-        """Where the most probable point is, object frame, metres."""
+        """Where the most probable point is, object frame, metres. Raises LocationError after a `refusal`."""
+        if self.refusal is not None:
+            raise LocationError(self.refusal)
         return self.points[self.most_probable]
 
     def region(self, level: float = LEVEL) -> Bool[Tensor, " points"]:

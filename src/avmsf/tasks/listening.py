@@ -20,7 +20,7 @@ from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
 from avmsf.modal.bank import ModalBank
 from avmsf.tasks.contactmap import ContactMap
-from avmsf.tasks.locate import judge_fit
+from avmsf.tasks.locate import judged
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.ringing import Ringing
 
@@ -243,8 +243,9 @@ class Listener:
         start = len(ears.heard) - (ears.clock - pending.onset)
         sound = ears.heard[start : start + length] - self._modes.hear(earlier, length)
         try:
-            found = self.locator.locate(sound.float())
-            found = replace(found, notes=(*found.notes, *judge_fit(found, "the blow")))
+            found = judged(self.locator.locate(sound.float()))
+            if found.refusal is not None:
+                raise LocationError(f"the blow: {found.refusal}")
         except LocationError as error:
             return replace(ears, strangers=ears.strangers + 1, refusal=str(error)), None
         return ears, Blow(pending.onset / self.rate, found, length / self.rate, 0.0, final)

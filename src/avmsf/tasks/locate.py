@@ -5,7 +5,6 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.capture.audio import Recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
@@ -38,8 +37,8 @@ def locate(
     Bare samples are at `sample_rate` Hz, or at the field's rate. `settings` take the place of those of the capture
     that the field was fitted to (see `hear`), `points` and `directions` as for `Locator.of`, `force` as for
     `Locator.locate`; `locator`, made of the field before, saves making one for each recording, and has points of its
-    own. Raises LocationError as `hear` and `Locator.locate`, for a locator of another field or given with points, and
-    for the sound of another object: where its misfit is above `STRANGE`.
+    own. The sound of another object has a `refusal` in place of a place, see `judged`. Raises LocationError as `hear`
+    and `Locator.locate`, and for a locator of another field or given with points.
     """
     if locator is not None and (locator.field is not field or points is not None or directions is not None):
         what = "points or directions" if locator.field is field else "another field"
@@ -47,31 +46,42 @@ def locate(
     heard = hear(recording, field, sample_rate=sample_rate, settings=settings)
     finder = Locator.of(field, points=points, directions=directions) if locator is None else locator
     found = finder.locate(heard.sound, highest=heard.highest, force=force)
-    name = recording.name if isinstance(recording, Recording) else "the recording"
-    return replace(found, notes=(*heard.notes, *found.notes, *judge_fit(found, name)))
+    return judged(replace(found, notes=(*heard.notes, *found.notes)))
 
 
-def judge_fit(found: ContactMap, name: str) -> list[str]:
-    """Return words of doubt where an object's modes, or its gains, fit a sound badly; LocationError where modes do not.
+def judged(found: ContactMap) -> ContactMap:
+    """Return where a blow fell, with a refusal where that cannot be told, and with a note where it is doubtful.
 
-    The thresholds come of simulated plates of wood, plastic, ceramic and steel, a measured aircraft and a recorded
-    bowl: their own sounds have misfits of .3 at most, as long as noise is no louder than they are, and 98 in 100 of
-    others more than .5. Gains decide nothing: of an aircraft's own blows some are explained at no place.
+    A sound is refused where an object's modes do not fit it, and where the field explains its gains, over all places,
+    no better than noise would. The thresholds of the misfit come of simulated plates of wood, plastic, ceramic
+    and steel, a measured aircraft and a recorded bowl: their own sounds have misfits of .3 at most, as long as noise is
+    no louder than they are, and 98 in 100 of others more than .5. `python -m benchmarks.locating --parts strangers`
+    says what is refused of other sounds and of an object's own.
     """
     share = (
         f"the modes of this object explain {100 * found.modal:.0f} % of the sound and, put out of tune, "
         f"{100 * found.detuned:.0f} %"
     )
     if found.misfit > STRANGE:
-        raise LocationError(
-            f"{name}: {share}, a misfit of {found.misfit:.2f}; its own recordings have {DOUBTFUL:g} at most: this is "
+        refusal = (
+            f"{share}, a misfit of {found.misfit:.2f}; its own recordings have {DOUBTFUL:g} at most: this is "
             "another object, no blow, or mostly noise. Record it again, or choose another field"
         )
+        return replace(found, refusal=refusal)
+    if found.evidence <= 0.0:
+        refusal = (
+            f"{share}, but the field explains the strengths of its modes at no place better than noise would (log "
+            f"Bayes factor {found.evidence:.1f}): this is another object, or the field has too few recordings near "
+            "this place. Record it again, or fit to more recordings"
+        )
+        return replace(found, refusal=refusal)
     if found.misfit > DOUBTFUL:
-        return [f"{share}, a misfit of {found.misfit:.2f}: it may be another object's, or hold much else"]
-    if found.explained < UNLIKE:
-        return [
+        doubt = f"{share}, a misfit of {found.misfit:.2f}: it may be another object's, or hold much else"
+    elif found.explained < UNLIKE:
+        doubt = (
             f"{share}, but a blow at the likeliest place {100 * found.explained:.0f} %: the modes are not as strong in "
             "it as the field has them anywhere, so the place may well be wrong"
-        ]
-    return []
+        )
+    else:
+        return found
+    return replace(found, notes=(*found.notes, doubt))

@@ -11,6 +11,8 @@ from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.tasks.contactmap import ContactMap
 
+LOCATED, NOT_LOCATED = "located", "not located"
+"""What became of a recording."""
 _JUDGED = 600
 """Points of the object in which symmetries are looked for."""
 _CLOSED = 0.02
@@ -40,10 +42,20 @@ def enlarged(symmetries: Symmetries, factor: float) -> Symmetries:
 def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: float) -> dict[str, Any]:
     """Return where a blow fell, within which region with a probability of `level`, and what else fits, and why.
 
-    Lengths in metres. Raises LocationError for a level that is not between 0 and 1.
+    Lengths in metres. Of a refused sound the status, the reason and the figures behind it. Raises LocationError for a
+    level that is not between 0 and 1.
     """
+    if contact.refusal is not None:
+        return not_located(contact.refusal) | {
+            "explained": contact.explained,
+            "modes_explain": contact.modal,
+            "misfit": contact.misfit,
+            "log_bayes_factor": contact.evidence,
+            "notes": list(contact.notes),
+        }
     others = contact.counterparts(symmetries, level)
     return {
+        "status": LOCATED,
         "place": contact.place.tolist(),
         "region": {
             "level": level,
@@ -53,6 +65,7 @@ def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: flo
         "explained": contact.explained,
         "modes_explain": contact.modal,
         "misfit": contact.misfit,
+        "log_bayes_factor": contact.evidence,
         "force": contact.force,
         "cosine": {
             "place": contact.points[contact.best].tolist(),
@@ -64,6 +77,11 @@ def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: flo
         ],
         "notes": list(contact.notes),
     }
+
+
+def not_located(reason: str) -> dict[str, Any]:
+    """Return what is said of a recording that has no place."""
+    return {"status": NOT_LOCATED, "reason": " ".join(reason.split()), "place": None}
 
 
 def _radius(contact: ContactMap, level: float) -> float:

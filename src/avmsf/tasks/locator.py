@@ -106,6 +106,8 @@ class Locator:
         values, noise = length.separate(amplitudes)
         _expect_more_than_noise(values, noise)
         found = judge(length.foretold, values, noise, force=length.scaled(force))
+        # How hard the blow was does not say whether it was one on this object.
+        free = found if force is None else judge(length.foretold, values, noise)
         row = int(torch.argmax(found.log_likelihood))
         explained = length.explained(amplitudes, found, row)
         trust = found.trust(explained, heed=self.heed)
@@ -120,6 +122,7 @@ class Locator:
             amplitudes.explained,
             amplitudes.part(float(detuned.mean())),
             float(found.force[row]) / length.unit,
+            evidence=free.evidence(self.areas),
         )
 
     def prepare(self, *samples: int) -> None:

@@ -45,6 +45,9 @@ _CLOSELY = 2000
 _MOST_SHIFTS = 201
 _NEGLIGIBLE = 40.0
 """A point this far below the best in log likelihood has no part in the answer."""
+_LEVEL_STEP, _LEVEL_LIMIT = 0.1, 28.0
+"""Logarithms of the levels that noise is tried at: step, and limit either way. Amplitudes are in units of the largest;
+their errors' variances are at least 1e-10, those expected of modes at least 1e-8 of the largest."""
 _TINY = torch.finfo(torch.float32).tiny
 _BATCH = 512
 """Points judged at once: few enough that what they need stays in a processor's cache."""
@@ -95,6 +98,13 @@ class Judgement:
     """Seconds by which the sound is best taken to begin after the blow."""
     noisy: float
     """Which part of the errors is noise, 0 to 1."""
+    random: float
+    """Log likelihood, with the same constant, of noise in place of a blow; see `_Trial.random`."""
+
+    def evidence(self, areas: Float64[Tensor, " points"]) -> float:
+        """Return the log Bayes factor of a blow at some point, as probable as its area, against noise."""
+        prior = areas.log() - areas.sum().log()
+        return float(torch.logsumexp(self.log_likelihood + prior, 0)) - self.random
 
     def trust(self, explained: float, *, heed: float = 1.0) -> float:
         """Return what the log likelihood counts for, where the likeliest point explains that part of the sound.
@@ -133,7 +143,7 @@ def judge(
     evidence = torch.full((count,), float(logs.min()), dtype=torch.float64)
     forces, shifts = torch.zeros(count, dtype=torch.float64), torch.zeros(count, dtype=torch.float64)
     evidence[rows], forces[rows], shifts[rows] = logs, unit * found[1].double(), found[2]
-    return Judgement(evidence, forces, shifts, trial.noisy)
+    return Judgement(evidence, forces, shifts, trial.noisy, trial.random())
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +200,21 @@ class _Trial:
         weights = 1.0 / (noise + error)
         noisy = float((weights * noise).mean())
         return cls(foretold, values, noise, weights, _Strengths.of(foretold, values, noise), force, noisy)
+
+    def random(self) -> float:
+        """Return the log likelihood of noise, of any level, with the constant of `judge`.
+
+        Noise is one of two, equally probable: errors of the extraction that are louder than they are taken for, or
+        modes of random phase that are as strong relative to each other as the field expects on average over the
+        surface. Its level has no scale, p(level) = 1 / level, as the force has none.
+        """
+        levels = torch.arange(-_LEVEL_LIMIT, _LEVEL_LIMIT, _LEVEL_STEP, dtype=torch.float64).exp()[:, None]
+        noise, usual = self.noise.double(), (self.foretold.usual + self.foretold.variance.mean(0)).double()
+        variance = torch.cat([levels * noise, noise + levels * usual / usual.mean()])
+        logs = -(variance.log() + self.values.abs().square() / variance).sum(1)
+        # The likelihood of a point is a sum over misfits, and leaves a factor of the integral over the force out.
+        constant = math.log(len(MISFITS) + len(BETWEEN)) - 0.5 * math.log(math.pi)
+        return float(torch.logsumexp(logs, 0)) + math.log(_LEVEL_STEP / 2.0) + constant
 
     def alike(self, count: int) -> Int64[Tensor, " rows"]:
         """Return the rows, ascending, of the points whose gains match the amplitudes best, whatever the force."""

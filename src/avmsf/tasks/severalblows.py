@@ -22,7 +22,7 @@ from avmsf.modal.synthesis import synthesise
 from avmsf.tasks.amplitudes import Extractor
 from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.hearing import Sound, as_recording, at_field_rate, describe, own_settings, settings_for
-from avmsf.tasks.locate import judge_fit
+from avmsf.tasks.locate import judged
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
 
@@ -81,11 +81,13 @@ def locate_blows(
         seconds = onset / whole.sample_rate
         try:
             located = finder.locate(own.float(), highest=highest, force=force)
-            doubts = judge_fit(located, f"{whole.name}, the blow at {seconds:.3f} s")
+            located = judged(located)
+            if located.refusal is not None:
+                raise LocationError(f"{whole.name}, the blow at {seconds:.3f} s: {located.refusal}")
         except LocationError as error:
             refused.append((seconds, error))
             continue
-        found.append((seconds, replace(located, notes=(*notes, *remark, *located.notes, *doubts))))
+        found.append((seconds, replace(located, notes=(*notes, *remark, *located.notes))))
     if not found:
         raise refused[0][1]
     if not refused:

@@ -62,6 +62,7 @@ class Elastic(KernelFamily):
         self.modes = replace(modes, shapes=modes.shapes.float().double(), perturbations=None)
         self.factor_weights = torch.softmax(factor_log_prior(), dim=0)
         """Probability of each of `FACTORS`."""
+        self._latest: tuple[Sites, Float64[Tensor, "sites shapes"]] | None = None
         self._reach = torch.tensor([REACH * size], dtype=torch.float64)
         apart = torch.log(modes.frequency[:, None] / modes.frequency)
         profiles = [1.0 / (1.0 + (2.0 * apart / tau).square()) for tau in PERTURBATIONS]
@@ -139,7 +140,13 @@ class Elastic(KernelFamily):
         return self.modes.gains(self.reference.points, self.reference.directions)
 
     def _along(self, sites: Sites) -> Float64[Tensor, "sites shapes"]:
-        return self._known if sites is self.reference else self.modes.gains(sites.points, sites.directions)
+        if sites is self.reference:
+            return self._known
+        # Covariances ask for the same impacts once for each mode.
+        latest = self._latest
+        if latest is None or latest[0] is not sites:
+            self._latest = latest = (sites, self.modes.gains(sites.points, sites.directions))
+        return latest[1]
 
     def _remainder(self, sites: Sites, others: Sites) -> Float64[Tensor, "sites others"]:
         return squared_exponential(sites.points, others.points, self._reach)[0] * sites.cosine(others)

@@ -1,0 +1,68 @@
+"""No verb is silent for long: what it is doing is repeated on the standard error, with the time it has taken so far."""
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+from avmsf._utils.text import printable
+
+SILENCE_SECONDS = 4.0
+"""After which a line is repeated: with the delays of a busy machine no silence is longer than five."""
+_TICK_SECONDS = 0.25
+
+
+class _Activity:
+    """The last line, and when it was printed and repeated."""
+
+    def __init__(self) -> None:
+        self.now("")
+
+    def now(self, text: str) -> None:
+        self.text, self.since = text, time.monotonic()
+        self.printed = self.since
+
+    def repeat(self) -> None:
+        """Print the line again if nothing has been printed for long, unless a progress bar moves on the terminal."""
+        moment, rich = time.monotonic(), sys.modules.get("rich.file_proxy")
+        if moment - self.printed < SILENCE_SECONDS or (rich and isinstance(sys.stderr, rich.FileProxy)):
+            return
+        self.printed = moment
+        # On a terminal the line may begin behind "loading ...".
+        start = "\r" if sys.stderr.isatty() else ""
+        print(f"{start}{printable(self.text)} ... {moment - self.since:.0f} s", file=sys.stderr, flush=True)
+
+
+_activity = _Activity()
+
+
+def printed(text: str) -> None:
+    """Take note of a line that was printed and says what begins."""
+    _activity.now(text)
+
+
+def doing(text: str) -> None:
+    """Take note of what is going on, to be printed after a silence; costs next to nothing."""
+    _activity.text = text
+
+
+@contextmanager
+def beating(text: str) -> Iterator[None]:
+    """Print something every few seconds while the block runs; `text` until `printed` or `doing` say what goes on."""
+    ended = threading.Event()
+
+    def beat() -> None:
+        # A standard error that was closed costs the lines alone.
+        with suppress(OSError, ValueError):
+            while not ended.wait(_TICK_SECONDS):
+                _activity.repeat()
+
+    _activity.now(text)
+    thread = threading.Thread(target=beat, name="avmsf-heartbeat", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()

@@ -1,0 +1,39 @@
+"""The verdict on a field in a file names the command that lists more contacts."""
+
+import shlex
+from pathlib import Path
+
+import torch
+
+from avmsf.cli import suggest
+from avmsf.cli.scores import quality_words
+from avmsf.field.soundfield import Origin, SoundField
+from avmsf.modal.residual import Residual
+from made_fields import BANK, positional
+
+FOUND = {"places": 9, "error": 0.3, "averaging": 0.7, "next_contact": [0.02, -0.01, 0.08], "next_distance": 0.041}
+
+
+def field_with(report: dict[str, object]) -> SoundField:
+    zero = torch.zeros(len(BANK), dtype=torch.float64)
+    return SoundField(BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), 8000.0, 400, Origin(report=report))
+
+
+def test_the_command_can_be_given_as_it_stands(tmp_path: Path) -> None:
+    path = tmp_path / "my bowl.safetensors"
+    (words,) = quality_words(field_with({"quality": FOUND}), path)
+    assert "41 mm" in words
+    program, verb, *arguments = shlex.split(words[words.index("avmsf suggest") :])
+    assert (program, verb) == ("avmsf", "suggest")
+    assert suggest.parse(arguments).field == path
+
+
+def test_without_a_contact_no_command_is_named() -> None:
+    found = {name: FOUND[name] for name in ("places", "error", "averaging")}
+    (words,) = quality_words(field_with({"quality": found}), Path("f"))
+    assert "suggest" not in words
+
+
+def test_an_edited_or_unjudged_field_gets_no_words() -> None:
+    assert quality_words(field_with({}), Path("f")) == []
+    assert quality_words(field_with({"quality": FOUND, "edits": [{"edit": "x"}]}), Path("f")) == []
