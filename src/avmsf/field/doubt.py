@@ -52,33 +52,16 @@ class Coverage:
     """The same, each counted by its mode's energy."""
 
 
-def widening(field: SoundField, *, level: float = LEVEL) -> float:
-    """Return how many of a field's deviations lie on either side of its mean in an interval of this level.
-
-    Told by the training contacts alone: each one's gains are foretold by all others', and the interval is made so wide
-    that it would have held `level` of them. A normal distribution would need 1.64 for .9; bodies are never quite what
-    they are taken for, and few contacts tell little of a mode's strength. Raises FitError for gains that know no doubt,
-    and for fewer than two contacts.
-    """
-    _expect_level(level)
-    scores = fitted_mixture(field).standardized_errors().abs()
-    if len(scores) < 2:
-        raise FitError(f"{len(scores)} contacts cannot foretell one another: fit to two or more")
-    return float(torch.nanquantile(scores.flatten(), level))
-
-
 def gain_doubt(field: SoundField, points: Float[Tensor, "points 3"]) -> Float64[Tensor, " points"]:
     """Return how unsure the gains at points are (metres), over their size on the mean over the object.
 
-    The root of all modes' variances as energy, calibrated as `widening`, over the root of the mean energy of gains: 0
-    is certainty; places that may ring louder than the mean can have more than 1. Raises FitError for gains that know
-    no doubt.
+    The root of all modes' variances as energy over the root of the mean energy of gains: 0 is certainty; places that
+    may ring louder than the mean can have more than 1. Raises FitError for gains that know no doubt.
     """
-    factor = widening(field) / _normal(LEVEL)
     surface = field.gain_field.points
     step = max(1, len(surface) // _MAPPED)
     energy = energy_of(field, parts_of(field, surface[::step])).mean()
-    doubt = factor**2 * energy_of(field, std_of(field, points))
+    doubt = energy_of(field, std_of(field, points))
     return (doubt / energy.clamp_min(torch.finfo(torch.float64).tiny)).sqrt()
 
 
@@ -92,14 +75,13 @@ def spectrum_band(
 ) -> SpectrumBand:
     """Return where the spectrum of a blow's sound lies with a probability of `level`, in each band for itself.
 
-    By drawing sounds: gains about their mean as unsure as they are, calibrated as `widening`, and the noise's energy
-    beside them. `contact` in metres, `direction` as in `SoundField.render`, `seed` for the draws. Raises FitError for
-    gains that know no doubt, and for a level that is not between 0 and 1.
+    By drawing sounds: gains about their mean as unsure as they are, and the noise's energy beside them. `contact` in
+    metres, `direction` as in `SoundField.render`, `seed` for the draws. Raises FitError for gains that know no doubt,
+    and for a level that is not between 0 and 1.
     """
     _expect_level(level)
     contacts, along = contact[None], None if direction is None else direction[None]
-    factor = widening(field, level=level) / _normal(level)
-    mean, spread = parts_of(field, contacts, along)[0], factor * std_of(field, contacts, along)[0]
+    mean, spread = parts_of(field, contacts, along)[0], std_of(field, contacts, along)[0]
     generator = torch.Generator().manual_seed(seed)
     drawn = mean + spread * torch.randn(_DRAWS, *mean.shape, generator=generator, dtype=torch.float64)
     spectra = torch.zeros(_DRAWS, field.samples // 2 + 1, dtype=torch.complex128)
@@ -131,10 +113,10 @@ def coverage(
 
     `parts` as `GainCase.parts`: amplitudes along each of the field's modes' phases and a quarter of a period ahead, of
     each mode up to a phase that all contacts share, of each contact up to their common sign where the field knows no
-    directions of blows. The interval is that of a measured gain, so it holds the scatter of a blow as well as the
-    field's doubt, and is as wide as `widening` says. Raises FitError for gains that know no doubt and for gains of
-    other modes.
+    directions of blows. The interval is normal, with the posterior standard deviation of a measured gain, so it holds
+    the scatter of an impact as well. Raises FitError for gains without a posterior and for gains of other modes.
     """
+    _expect_level(level)
     gains, scale = fitted_mixture(field), scale_of(field).square()[:, None]
     if parts.shape != (len(contacts), len(field.bank), 2):
         raise FitError(
@@ -145,7 +127,7 @@ def coverage(
     spread = (deviation.square() + scale * gains.noise().square()).sqrt()
     foretold = parts_of(field, contacts, directions)
     parts = turned_like(parts, foretold)
-    within = (parts - foretold).abs() <= widening(field, level=level) * spread
+    within = (parts - foretold).abs() <= _normal(level) * spread
     energy = (
         scale * torch.view_as_real(gains.values).square().mean(0) / (4.0 * field.bank.damping.double())[:, None]
     ).expand_as(parts)

@@ -3,14 +3,12 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from statistics import NormalDist
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import FitError
-from avmsf.field.doubt import LEVEL, widening
 from avmsf.field.gains.model import PlaceCovariance
 from avmsf.field.posterior import energy_of, parts_of, unedited_mixture
 from avmsf.field.soundfield import SoundField
@@ -31,8 +29,7 @@ class Suggestions:
     """Where to strike next, in this order, and what that is expected to bring.
 
     Errors are relative: the square root of the expected squared error of the gains, as energy, over the energy that is
-    expected on the mean over the surface. 0 is certainty, 1 as wrong as silence. They are calibrated as `widening`, by
-    how well the contacts that have been struck foretell one another.
+    expected on the mean over the surface. 0 is certainty, 1 as wrong as silence.
     """
 
     contacts: Float64[Tensor, "contacts 3"]
@@ -94,9 +91,7 @@ def suggest(
     ledger = _Ledger(
         gains.covariances(places, ways), 1.0 / (4.0 * field.bank.damping.double()), len(points), len(chosen_from)
     )
-    # Contacts that foretell one another perfectly leave nothing open.
-    calibration = max((widening(field) / NormalDist().inv_cdf(0.5 + LEVEL / 2.0)) ** 2, torch.finfo(torch.float64).tiny)
-    energy = float(energy_of(field, parts_of(field, points.float())).mean()) / calibration + float(ledger.open.mean())
+    energy = float(energy_of(field, parts_of(field, points.float())).mean()) + float(ledger.open.mean())
     before, rows, after = ledger.open, [], []
     for _ in range(count):
         row = int(torch.where(allowed, ledger.worth(), -math.inf).argmax())

@@ -7,7 +7,6 @@ from jaxtyping import Complex64, Float, Float32
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.field.doubt import LEVEL, widening
 from avmsf.field.posterior import fitted_mixture, has_posterior
 from avmsf.field.soundfield import SoundField
 
@@ -17,6 +16,8 @@ _NEIGHBOURS = 8
 """Of a point, by which it is told how gains vary about it."""
 _PATCH = 1.0 / 9.0
 """Variance over a square of surface around a point, over the mean square difference from the squares about it."""
+_LEVEL = 0.9
+"""Part of the gains that intervals are to hold."""
 _TOLD = 3
 """Contacts that a field needs to say how wrong it is."""
 
@@ -27,8 +28,15 @@ def judges_itself(field: SoundField) -> bool:
 
 
 def widened(field: SoundField) -> float:
-    """Return the factor on a field's deviations with which they hold what it does not know; 1 where that is unknown."""
-    return widening(field) / NormalDist().inv_cdf(0.5 + LEVEL / 2.0) if judges_itself(field) else 1.0
+    """Return the factor on a field's deviations with which they hold what it does not know; 1 where that is unknown.
+
+    With it intervals of 90 % hold so many of the gains at contacts left out, each part of each mode counted alike: weak
+    modes, whose deviations are too small, count as much in a place's likelihood as strong ones.
+    """
+    if not judges_itself(field):
+        return 1.0
+    errors = fitted_mixture(field).standardized_errors().abs()
+    return float(torch.nanquantile(errors.flatten(), _LEVEL)) / NormalDist().inv_cdf(0.5 + _LEVEL / 2.0)
 
 
 def foretell(
