@@ -131,6 +131,17 @@ def test_phases_without_anything_in_common_leave_all_starts() -> None:
     assert found.coherence_before < 0.7
 
 
+def test_the_common_start_does_not_depend_on_where_between_samples_impacts_fall() -> None:
+    starts, amplitudes = jitter(10, 2.0), gains(10, 6)
+    found = []
+    for common in (0.0, 0.3, 0.6):
+        # Without phases sounds begin without a jump, which would not be limited to half the rate.
+        each = align(damped(amplitudes, starts + common, phase=torch.zeros_like(PHASE), noise_db=-50.0))
+        assert each is not None
+        found.append(float((each.delays - starts).median()) - common)
+    assert max(found) - min(found) < 0.15
+
+
 def test_files_that_begin_within_the_sound_start_with_the_latest() -> None:
     cut = torch.tensor([0.0, 3.0, 7.0, 1.0, 12.0, 5.0, 2.0, 9.0], dtype=torch.float64)
     whole = damped(gains(8, 6), torch.zeros(8, dtype=torch.float64))

@@ -60,6 +60,8 @@ _LEAST_JITTER = 0.5
 """Least scale of the delays, samples: an onset that is found at a sample is off by a part of one."""
 _SETTLING = 4
 """Passes before the delays' own scale counts."""
+_FRACTIONS = 16
+"""Places between two samples where the common start is looked for."""
 _CONVERGED = 1e-3
 """Samples by which delays still move when the search ends."""
 
@@ -194,16 +196,20 @@ def _common_onset(impacts: Impacts, delays: Float64[Tensor, " contacts"], agrees
     """Return how much later than their common start aligned recordings leave the noise, all together, samples.
 
     That is where the mean power of sounds of equal energy first reaches a hundredth of its maximum, and ten times the
-    noise before. The median of single onsets is off by what these are, over the square root of their number.
+    noise before. The median of single onsets is off by what these are, over the square root of their number. Between
+    samples, too: else it would depend on where between two samples the impacts fall.
     """
     assert impacts.before is not None
     assert impacts.after is not None
     lead = impacts.before.shape[1]
     early = replace(impacts, sounds=impacts.sounds[:, : 3 * lead], after=impacts.after[:, :0])
-    power = early.delayed(delays - lead).sounds[agrees, : 2 * lead].double().square()
+    fractions = torch.arange(_FRACTIONS, dtype=torch.float64) / _FRACTIONS
+    power = torch.stack(
+        [early.delayed(delays - lead + each).sounds[agrees, : 2 * lead].double().square() for each in fractions], dim=2
+    ).flatten(1)
     mean = (power / power.sum(1, keepdim=True).clamp_min(1e-300)).mean(0)
-    threshold = max(0.01 * float(mean.max()), 10 * float(mean[: lead // 2].median()))
-    return float((mean >= threshold).nonzero()[0, 0]) - lead
+    threshold = max(0.01 * float(mean.max()), 10 * float(mean[: _FRACTIONS * lead // 2].median()))
+    return float((mean >= threshold).nonzero()[0, 0]) / _FRACTIONS - lead
 
 
 def _has_lead(impacts: Impacts) -> bool:
