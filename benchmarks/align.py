@@ -208,10 +208,12 @@ def _jitter_with(options: Options, cache: Path) -> Report:
 
 
 def _ratio(errors: Float64[Tensor, " draws"], still: Float64[Tensor, " draws"]) -> tuple[float, float]:
-    """Return the ratio of two mean errors and its standard error, from the scatter of the draws."""
-    relative = [each.std() / each.mean() / math.sqrt(len(each)) for each in (errors, still) if len(each) > 1]
+    """Return the ratio of two mean errors and its standard error, from the scatter of the draws; NaN for one draw."""
     ratio = float(errors.mean() / still.mean())
-    return ratio, ratio * math.hypot(*(float(each) for each in relative))
+    if len(errors) < 2:
+        return ratio, math.nan
+    relative = (float(each.std() / each.mean()) / math.sqrt(len(each)) for each in (errors, still))
+    return ratio, ratio * math.hypot(*relative)
 
 
 def _modes(options: Options) -> Report:
