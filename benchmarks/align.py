@@ -23,9 +23,8 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention, GainRecipe
-from avmsf.modal.extraction.alignment import Alignment, align, coherence
+from avmsf.modal.extraction.alignment import Alignment, align, coherence, strongest_modes
 from avmsf.modal.extraction.extract import Extraction, extract
-from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.scene.features import FeatureField
@@ -42,6 +41,8 @@ COUNTS = {"aircraft_response": (8, 15, 28), "ruler10": (5, 7), "tree43": (12, 20
 """Training contacts of each measured capture."""
 JITTERS = ("0", "1", "3", "1 ms")
 """Standard deviations of the starts, samples unless in ms."""
+DRAWS = 3
+"""Draws of the jitter."""
 NOISES = (-20.0, -40.0, -60.0)
 """Levels of noise beneath synthetic recordings, dB."""
 CONVENTIONS = (
@@ -52,7 +53,8 @@ CONVENTIONS = (
     "error: relative STFT error at held-out contacts, mean of farthest-point splits from contacts 0, 18 and 37 (as "
     "far as there are so many), all settings CaptureSettings().",
     "rms: root mean square error of the delays against known ones, samples, but for what all have in common; refused: "
-    "recordings that are named as not aligned.",
+    "recordings that are named as not aligned. With jitter: errors are means over draws, the rms the "
+    "worst draw's, refused the sum; the ratio is of mean errors, its standard error from their scatter.",
 )
 
 Figures = dict[str, float]
@@ -172,30 +174,46 @@ def _jitter_with(options: Options, cache: Path) -> Report:
         ),
     }
     config = QUICK_LOOK if options.quick_look else FitConfig()
+    draws = 1 if options.quick_look else DRAWS
     for name, (files, features, estimator) in cases.items():
-        base: tuple[Figures, Float64[Tensor, " contacts"]] | None = None
+        still: dict[str, Float64[Tensor, " draws"]] | None = None
+        exact: Float64[Tensor, " contacts"] | None = None
         for jitter in JITTERS:
-            moved, starts = jittered(files, jitter)
-            train, test = split(moved, count=12)
-            modes, found = extract(train), align(moved)
-            assert found is not None
-            train, test = modes.aligned(train), modes.aligned(test)
-            recipes: dict[str, GainRecipe] = {"no_body": MixtureEstimator(), "auto": estimator}
-            errors = {
-                method: evaluate(fit(train, features, modes, config, gains=recipe), test).mean()["relative_stft"]
-                for method, recipe in recipes.items()
-            }
-            # Contact times differ, and with them the delays even of recordings that start with their impacts.
-            base = base or (errors, found.delays)
-            rms, refused = _rms(found, starts + base[1])
-            worst = max(errors[method] / base[0][method] for method in errors)
-            rows.append([f"{name}, jitter {jitter}", *errors.values(), worst, rms, refused])
+            errors: dict[str, list[float]] = {"no_body": [], "auto": []}
+            away = []
+            for seed in range(draws):
+                moved, starts = jittered(files, jitter, seed=seed)
+                train, test = split(moved, count=12)
+                modes, found = extract(train), align(moved)
+                assert found is not None
+                train, test = modes.aligned(train), modes.aligned(test)
+                for method, recipe in (("no_body", MixtureEstimator()), ("auto", estimator)):
+                    scores = evaluate(fit(train, features, modes, config, gains=recipe), test)
+                    errors[method].append(scores.mean()["relative_stft"])
+                # Contact times differ, and with them the delays even of recordings that start with their impacts.
+                exact = found.delays - starts if exact is None else exact
+                away.append(_rms(found, starts + exact))
+            drawn = {method: torch.tensor(values, dtype=torch.float64) for method, values in errors.items()}
+            still = still or drawn
+            ratio, uncertainty = max(_ratio(drawn[method], still[method]) for method in drawn)
+            means = {method: float(values.mean()) for method, values in drawn.items()}
+            rms, refused = max(each[0] for each in away), sum(each[1] for each in away)
+            rows.append([f"{name}, jitter {jitter}", *means.values(), ratio, uncertainty, rms, refused])
             key = f"align.{name}.jitter {jitter}"
-            figures |= {f"{key}.{method}": error for method, error in errors.items()}
-            figures |= {f"{key}.rms": rms, f"{key}.ratio": worst}
-            tell(f"{name}, jitter {jitter}: {errors}, rms {rms:.3f}, refused {refused:g}")
-    columns = ("object and jitter", "no_body", "auto", "worst ratio to jitter 0", "rms", "refused")
+            figures |= {f"{key}.{method}": error for method, error in means.items()}
+            figures |= {f"{key}.rms": rms, f"{key}.ratio": ratio, f"{key}.ratio_uncertainty": uncertainty}
+            tell(f"{name}, jitter {jitter}: {errors}, ratio {ratio:.3f} +- {uncertainty:.3f}, rms {rms:.3f}")
+    columns = ("object and jitter", "no_body", "auto", "worst ratio to jitter 0", "standard error", "rms", "refused")
     return Report(tables=(Table("held-out error with artificial jitter", columns, rows),), figures=figures)
+
+
+def _ratio(errors: Float64[Tensor, " draws"], still: Float64[Tensor, " draws"]) -> tuple[float, float]:
+    """Return the ratio of two mean errors and its standard error, from the scatter of the draws; NaN for one draw."""
+    ratio = float(errors.mean() / still.mean())
+    if len(errors) < 2:
+        return ratio, math.nan
+    relative = (float(each.std() / each.mean()) / math.sqrt(len(each)) for each in (errors, still))
+    return ratio, ratio * math.hypot(*relative)
 
 
 def _modes(options: Options) -> Report:
@@ -240,11 +258,11 @@ def _delays(options: Options) -> Report:
     align(many)
     seconds = time.perf_counter() - begun
     begun = time.perf_counter()
-    HighResolution(modes=32, range_db=40.0).find(many.sounds, many.sample_rate)
+    strongest_modes(many)
     extracting = time.perf_counter() - begun
     figures = {"align.delay_rms": worst, "align.delay_refused": refusals, "align.seconds_100": seconds}
     figures["align.seconds_100_without_modes"] = seconds - extracting
-    rows.append(["100 recordings of 1 s: seconds, and without extraction", seconds, seconds - extracting])
+    rows.append(["100 recordings of 1 s: seconds, and without the search for modes", seconds, seconds - extracting])
     return Report(
         tables=(Table("delays, samples: mean and worst rms", ("case", "mean", "worst"), rows),), figures=figures
     )
@@ -282,11 +300,16 @@ def synthetic(
     return impacts, starts
 
 
-def jittered(files: Impacts, jitter: str) -> tuple[Impacts, Float64[Tensor, " contacts"]]:
-    """Return recordings read at starts that are off by a normal number, with margins, and how much earlier that is."""
+def jittered(files: Impacts, jitter: str, *, seed: int = 0) -> tuple[Impacts, Float64[Tensor, " contacts"]]:
+    """Return recordings read at starts that are off by a normal number, with margins, and how much earlier that is.
+
+    All of them by the same part of a sample more, except in the first draw: impacts do not fall on samples.
+    """
     deviation = float(jitter.removesuffix(" ms")) * (1e-3 * files.sample_rate if jitter.endswith("ms") else 1.0)
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(seed)
     delays = deviation * torch.randn(len(files), dtype=torch.float64, generator=generator)
+    if seed:
+        delays = delays + torch.rand(1, dtype=torch.float64, generator=generator)
     assert files.before is not None
     assert files.after is not None
     lead, tail, samples = files.before.shape[1] // 2, files.after.shape[1] // 2, files.sounds.shape[1]

@@ -9,7 +9,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.modal.extraction.extract import Extraction
 
 RATE, SAMPLES, LEAD = 8000.0, 2000, 160
-ALIGNED = 0.015
+ALIGNED = 0.02
 """Relative error of a sound that is aligned: sines that start suddenly are not limited to half the rate."""
 FREQUENCY = torch.tensor([331.0, 502.5, 770.0, 1004.0, 1317.0], dtype=torch.float64)
 DAMPING = torch.tensor([18.0, 22.0, 25.0, 30.0, 40.0], dtype=torch.float64)

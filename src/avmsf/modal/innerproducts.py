@@ -122,9 +122,7 @@ def project(
     leave only rounding of the rest. A mode is followed until it has fallen below 1e-12 of its beginning: most die
     long before the sound ends.
     """
-    samples = sounds.shape[1]
-    padded = torch.nn.functional.pad(sounds.to(torch.float64), (0, -samples % _BLOCK))
-    padded = padded.reshape(len(sounds), padded.shape[1] // _BLOCK, _BLOCK)
+    samples, wide = sounds.shape[1], sounds.to(torch.float64)
     needed = math.log(_DEAD) / torch.log(poles.abs()).clamp_max(-1e-300)
     inner = torch.zeros(len(sounds), len(poles), dtype=torch.complex128)
     outer = torch.zeros_like(inner)
@@ -133,14 +131,16 @@ def project(
         lower = length // 2 if length > 2 * _BLOCK else 0
         group = torch.nonzero((needed > lower) & (needed <= upper)).flatten()
         if len(group):
-            inner[:, group], outer[:, group] = _project(padded[:, : math.ceil(length / _BLOCK)], poles[group], weighted)
+            inner[:, group], outer[:, group] = _project(
+                wide[:, : math.ceil(length / _BLOCK) * _BLOCK], poles[group], weighted
+            )
         upper, length = lower, lower
     products = torch.cat([inner.imag, inner.real], dim=1)
     return products, torch.cat([outer.imag, outer.real], dim=1) if weighted else None
 
 
 def _project(
-    sounds: Float64[Tensor, "contacts blocks block"], poles: Complex128[Tensor, " modes"], weighted: bool
+    sounds: Float64[Tensor, "contacts samples"], poles: Complex128[Tensor, " modes"], weighted: bool
 ) -> tuple[Complex128[Tensor, "contacts modes"], Complex128[Tensor, "contacts modes"]]:
     """Return the sums over n of sound z^n and, if `weighted`, of n sound z^n (zero if not).
 
@@ -151,8 +151,14 @@ def _project(
     if weighted:
         steps = torch.arange(_BLOCK, dtype=torch.float64)[:, None]
         tables += [steps * within.real, steps * within.imag]
-    summed = sounds @ torch.cat(tables, dim=1)
-    starts = _powers(poles**_BLOCK, sounds.shape[1])
+    table = torch.cat(tables, dim=1)
+    whole, rest = divmod(sounds.shape[1], _BLOCK)
+    # A view of the whole blocks and the rest apart: padding would copy all sounds.
+    blocks = sounds[:, : whole * _BLOCK].unfold(1, _BLOCK, _BLOCK)
+    summed = blocks @ table
+    if rest:
+        summed = torch.cat([summed, (sounds[:, whole * _BLOCK :] @ table[:rest])[:, None]], dim=1)
+    starts = _powers(poles**_BLOCK, summed.shape[1])
     plain = torch.zeros(2, len(sounds), len(poles), dtype=torch.float64)
     outer = torch.zeros_like(plain)
     _over_blocks(

@@ -175,7 +175,9 @@ def _frame_power(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Fl
     padded = torch.nn.functional.pad(sounds, (0, max(0, fft_size - sounds.shape[1])))
     window = torch.hann_window(fft_size, dtype=sounds.dtype, device=sounds.device)
     frames = padded.unfold(1, fft_size, fft_size // 2)
-    return torch.fft.rfft(frames * window).abs().square() / window.square().sum()
+    spectrum = torch.fft.rfft(frames * window)
+    # Faster than the square of abs(), which takes a root first.
+    return (spectrum.real.square() + spectrum.imag.square()) / window.square().sum()
 
 
 def _even_length(samples: int) -> int:

@@ -12,9 +12,11 @@ from torch import Tensor
 from avmsf.capture.audio import read_recording
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.onset import find_onset
-from avmsf.modal.extraction.alignment import align, coherence
+from avmsf.modal.extraction import alignment
+from avmsf.modal.extraction.alignment import align, coherence, strongest_modes
 from avmsf.modal.extraction.extract import extract, extract_once
 from avmsf.modal.extraction.finders import HighResolution
+from avmsf.modal.extraction.phase_likelihood import MeasuredPhases, background_power
 
 RATE, SAMPLES, LEAD = 16000.0, 6000, 320
 FREQUENCY = torch.tensor([431.0, 902.5, 1370.0, 2204.0, 3317.0, 4750.0], dtype=torch.float64)
@@ -129,6 +131,17 @@ def test_phases_without_anything_in_common_leave_all_starts() -> None:
     assert found.coherence_before < 0.7
 
 
+def test_the_common_start_does_not_depend_on_where_between_samples_impacts_fall() -> None:
+    starts, amplitudes = jitter(10, 2.0), gains(10, 6)
+    found = []
+    for common in (0.0, 0.3, 0.6):
+        # Without phases sounds begin without a jump, which would not be limited to half the rate.
+        each = align(damped(amplitudes, starts + common, phase=torch.zeros_like(PHASE), noise_db=-50.0))
+        assert each is not None
+        found.append(float((each.delays - starts).median()) - common)
+    assert max(found) - min(found) < 0.15
+
+
 def test_files_that_begin_within_the_sound_start_with_the_latest() -> None:
     cut = torch.tensor([0.0, 3.0, 7.0, 1.0, 12.0, 5.0, 2.0, 9.0], dtype=torch.float64)
     whole = damped(gains(8, 6), torch.zeros(8, dtype=torch.float64))
@@ -160,6 +173,34 @@ def test_extraction_aligns_first_and_its_file_keeps_the_alignment(tmp_path: Path
     assert torch.equal(once.aligned(impacts.take([3])).sounds, again.aligned(impacts).sounds[3:4])
     amplitude = torch.complex(found.quadrature.double(), -found.gains.double())
     assert coherence(amplitude, found.bank.damping) > 0.99
+
+
+def test_many_recordings_are_aligned_by_the_modes_of_some(monkeypatch: pytest.MonkeyPatch) -> None:
+    starts, amplitudes = jitter(40, 2.0), gains(40, 6)
+    # Recordings are often ordered by place: these lie on nodal lines of the highest modes.
+    amplitudes[:32, 4:] = 0
+    impacts = damped(amplitudes, starts, noise_db=-40.0)
+    every = align(impacts)
+    monkeypatch.setattr(alignment, "_SEARCHED_SAMPLES", 0)
+    some = align(impacts)
+    assert every is not None
+    assert some is not None
+    assert not torch.equal(every.phases.bank.frequency, some.phases.bank.frequency)
+    assert torch.allclose(some.phases.bank.frequency, FREQUENCY, rtol=1e-3)
+    assert error(some.delays, starts) < 0.02
+    assert torch.allclose(some.delays, every.delays, rtol=0, atol=0.02)
+
+
+def test_amplitudes_at_a_later_start_are_those_of_the_sounds_cut_there() -> None:
+    delays = torch.tensor([3.0, -2.0, 0.5, 7.25, 0.0, -5.0], dtype=torch.float64)
+    impacts = damped(gains(6, 6), torch.full((6,), -8.0, dtype=torch.float64))
+    bank = strongest_modes(impacts)
+    noise = background_power(impacts, bank)
+    read, cut = (
+        MeasuredPhases.of(each, bank, reach=1.0, background=noise) for each in (impacts, impacts.delayed(delays))
+    )
+    assert len(bank) == 6
+    assert torch.allclose(read.turned(delays), cut.amplitude, rtol=0, atol=1e-3 * float(read.amplitude.abs().max()))
 
 
 def test_coherence_is_one_for_one_phase_modulo_pi_and_small_for_any() -> None:

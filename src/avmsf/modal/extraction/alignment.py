@@ -20,6 +20,7 @@ several starting recordings, each of which the others are first aligned with, th
 """
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -30,10 +31,13 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.prepare import margin_length
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.finders import HighResolution
-from avmsf.modal.extraction.phase_likelihood import DelayPrior, MeasuredPhases, occam_factor
+from avmsf.modal.extraction.phase_likelihood import DelayPrior, MeasuredPhases, background_power, occam_factor
 
 _MODES = 32
 """Modes to align by, the strongest: more cost time and hardly narrow the posterior."""
+_LEAST_SEARCHED, _SEARCHED_SAMPLES = 32, 1_400_000
+"""Recordings, and samples of all together, at the most, in which modes are looked for. Where this leaves recordings out
+the delays differ by less than .02 samples."""
 _RANGE_DB = 40.0
 """Modes this far below the strongest, in energy, are left out."""
 _REFERENCES = 6
@@ -56,6 +60,8 @@ _LEAST_JITTER = 0.5
 """Least scale of the delays, samples: an onset that is found at a sample is off by a part of one."""
 _SETTLING = 4
 """Passes before the delays' own scale counts."""
+_FRACTIONS = 16
+"""Places between two samples where the common start is looked for."""
 _CONVERGED = 1e-3
 """Samples by which delays still move when the search ends."""
 
@@ -125,32 +131,39 @@ def align(impacts: Impacts) -> Alignment | None:
     """
     if len(impacts) < 2:
         return None
-    bank = HighResolution(modes=_MODES, range_db=_RANGE_DB).find(impacts.sounds, impacts.sample_rate)
+    bank = strongest_modes(impacts)
     if len(bank) == 0:
         return None
-    reach = _reach(impacts)
-    measured = MeasuredPhases.of(impacts, bank, reach=reach)
-    before = coherence(measured.amplitude, bank.damping)
+    reach, background = _reach(impacts), background_power(impacts, bank)
+    measured = MeasuredPhases.of(impacts, bank, reach=reach, background=background)
+    before = after = coherence(measured.amplitude, bank.damping)
     delays, agrees, phases = _estimate(measured, exact=0.0 if _has_lead(impacts) else _EXACT)
     if bool((delays != 0).any()):
         # Once more, from sounds that start where the first estimate says; then closely, with the spreads found.
-        measured = MeasuredPhases.of(impacts.delayed(delays), bank, reach=reach)
+        measured = MeasuredPhases.of(impacts.delayed(delays), bank, reach=reach, background=background)
         further, agrees, phases = _estimate(measured, earlier=delays)
         delays = torch.where(agrees, delays + further, 0.0)
-        measured = MeasuredPhases.of(impacts.delayed(delays), bank, reach=_CLOSE)
+        measured = MeasuredPhases.of(impacts.delayed(delays), bank, reach=_CLOSE, background=background)
         further, agrees, phases = _estimate(measured, earlier=delays, agreeing=agrees)
-        delays = torch.where(agrees, delays + further, 0.0)
         # The phases are those at the recordings' common start, which moves with the offset.
-        offset = _offset(delays, agrees, impacts)
-        delays = torch.where(agrees, delays + offset, 0.0)
+        offset = _offset(torch.where(agrees, delays + further, 0.0), agrees, impacts)
+        further = torch.where(agrees, further + offset, 0.0)
+        delays = delays + further
         phases = replace(
             phases,
             start=float(delays[agrees].median()) if bool(agrees.any()) else 0.0,
             doubled=phases.doubled * torch.exp(1j * offset * measured.turn),
         )
-        measured = MeasuredPhases.of(impacts.delayed(delays), bank, reach=reach)
-    after = coherence(measured.amplitude, bank.damping)
+        after = coherence(measured.turned(further), bank.damping)
     return Alignment(impacts.names, delays, agrees, before, after, phases, recording_keys(impacts))
+
+
+def strongest_modes(impacts: Impacts) -> ModalBank:
+    """Return the modes to align by, found in some of the recordings: they are the same in all."""
+    # Drawn at random: rows may be ordered by place, in which every third may lie on the same nodal lines.
+    count = max(_LEAST_SEARCHED, _SEARCHED_SAMPLES // impacts.sounds.shape[1])
+    drawn = torch.randperm(len(impacts), generator=torch.Generator().manual_seed(0))[:count].sort().values
+    return HighResolution(modes=_MODES, range_db=_RANGE_DB).find(impacts.sounds[drawn], impacts.sample_rate)
 
 
 def recording_keys(impacts: Impacts) -> tuple[str, ...]:
@@ -183,16 +196,20 @@ def _common_onset(impacts: Impacts, delays: Float64[Tensor, " contacts"], agrees
     """Return how much later than their common start aligned recordings leave the noise, all together, samples.
 
     That is where the mean power of sounds of equal energy first reaches a hundredth of its maximum, and ten times the
-    noise before. The median of single onsets is off by what these are, over the square root of their number.
+    noise before. The median of single onsets is off by what these are, over the square root of their number. Between
+    samples, too: else it would depend on where between two samples the impacts fall.
     """
     assert impacts.before is not None
     assert impacts.after is not None
     lead = impacts.before.shape[1]
     early = replace(impacts, sounds=impacts.sounds[:, : 3 * lead], after=impacts.after[:, :0])
-    power = early.delayed(delays - lead).sounds[agrees, : 2 * lead].double().square()
+    fractions = torch.arange(_FRACTIONS, dtype=torch.float64) / _FRACTIONS
+    power = torch.stack(
+        [early.delayed(delays - lead + each).sounds[agrees, : 2 * lead].double().square() for each in fractions], dim=2
+    ).flatten(1)
     mean = (power / power.sum(1, keepdim=True).clamp_min(1e-300)).mean(0)
-    threshold = max(0.01 * float(mean.max()), 10 * float(mean[: lead // 2].median()))
-    return float((mean >= threshold).nonzero()[0, 0]) - lead
+    threshold = max(0.01 * float(mean.max()), 10 * float(mean[: _FRACTIONS * lead // 2].median()))
+    return float((mean >= threshold).nonzero()[0, 0]) / _FRACTIONS - lead
 
 
 def _has_lead(impacts: Impacts) -> bool:
@@ -207,10 +224,11 @@ def _reach(impacts: Impacts) -> float:
 
 def _delays_alone(impacts: Impacts, phases: Phases, *, usual: float, reach: float) -> Float64[Tensor, " contacts"]:
     """Return the delays, near `usual`, by which recordings agree with known phases; zero for one that does not."""
-    measured = MeasuredPhases.of(impacts, phases.bank, reach=reach)
+    background = background_power(impacts, phases.bank)
+    measured = MeasuredPhases.of(impacts, phases.bank, reach=reach, background=background)
     weights = measured.concentration(phases.power, phases.spread)
     doubled = phases.doubled.expand(len(impacts), -1)
-    prior = DelayPrior(torch.full((len(impacts),), usual, dtype=torch.float64), phases.jitter)
+    prior = DelayPrior(torch.tensor([usual], dtype=torch.float64), phases.jitter)
     delays, odds = measured.search(weights, doubled, prior)
     return torch.where(odds > 0, delays, 0.0)
 
@@ -242,14 +260,15 @@ def _estimate(
     recording. With `agreeing`, which recordings agree is known, and the modes' spreads are those found, however few the
     recordings.
     """
-    none = torch.zeros(len(measured.scaled), dtype=torch.float64)
     if earlier is None:
-        prior = DelayPrior(none, _FIRST_JITTER)
+        prior = DelayPrior(torch.zeros(1, dtype=torch.float64), _FIRST_JITTER)
         energy = measured.scaled.abs().square() / measured.bank.damping
         broadest = torch.argsort((energy / energy.sum(0)).sum(1), descending=True)[:_REFERENCES]
-        fits = [_climb(measured, prior, reference=int(row)) for row in broadest]
+        fits: list[_Fit] = []
+        for reference in broadest.tolist():
+            fits.append(_climb(measured, prior, reference=reference, known=fits))
         still = _unmoved(measured)
-        fits += [_climb(measured, prior), replace(still, log_posterior=still.log_posterior + exact * len(none))]
+        fits += [_climb(measured, prior), replace(still, log_posterior=still.log_posterior + exact * len(still.delays))]
         fit = max(fits, key=lambda each: each.log_posterior)
     else:
         fit = _climb(measured, DelayPrior(-earlier, _FIRST_JITTER), vague=_VAGUE if agreeing is None else 0.0)
@@ -261,11 +280,21 @@ def _estimate(
     return torch.where(agrees, fit.delays, 0.0), agrees, phases
 
 
-def _climb(measured: MeasuredPhases, prior: DelayPrior, *, reference: int | None = None, vague: float = _VAGUE) -> _Fit:
-    """Return the delays of a highest posterior, climbed from all recordings aligned with one, or as they are."""
+def _climb(
+    measured: MeasuredPhases,
+    prior: DelayPrior,
+    *,
+    reference: int | None = None,
+    vague: float = _VAGUE,
+    known: Sequence[_Fit] = (),
+) -> _Fit:
+    """Return the delays of a highest posterior, climbed from all recordings aligned with one, or as they are.
+
+    One of `known` as soon as no delay is farther from it than a step of the grid: the climb would end there as well.
+    """
     power, spread = measured.power, torch.full_like(measured.power, _FIRST_SPREAD)
     weights = measured.concentration(power, spread)
-    delays = torch.zeros_like(prior.middle)
+    delays = torch.zeros(len(weights), dtype=torch.float64)
     if reference is not None:
         alone = (weights[reference] * measured.doubled(delays)[reference]).expand(len(weights), -1)
         delays, _ = measured.search(weights, alone, prior)
@@ -274,6 +303,9 @@ def _climb(measured: MeasuredPhases, prior: DelayPrior, *, reference: int | None
         found, _ = measured.search(weights, turned.sum(0) - turned, prior)
         if reference is not None:
             found = found - found.median()
+        for fit in known:
+            if float((found - fit.delays).abs().max()) < measured.step:
+                return fit
         moved = float((found - delays).abs().max())
         delays, spread = found, measured.spread(weights, found, vague=vague)
         weights = measured.concentration(power, spread)
@@ -297,5 +329,5 @@ def _unmoved(measured: MeasuredPhases) -> _Fit:
         spread = measured.spread(weights, delays, vague=_VAGUE)
         weights = measured.concentration(measured.power, spread)
     total = (weights * measured.doubled(delays)).sum(0)
-    prior = DelayPrior(delays, _LEAST_JITTER)
+    prior = DelayPrior(delays[:1], _LEAST_JITTER)
     return _Fit(delays, weights, spread, prior, measured.log_likelihood(weights, spread, total))

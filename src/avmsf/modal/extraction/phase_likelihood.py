@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Complex128, Float64
+from jaxtyping import Complex128, Float32, Float64
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
@@ -17,6 +17,8 @@ _CANDIDATES = 8
 """Highest peaks of the density among which a delay is chosen."""
 _NEWTON_STEPS = 8
 """Of each search, at most one grid step long each."""
+_EXACT = 1e-6
+"""They end earlier where all delays move by less than this, samples."""
 _GRID_PER_PERIOD = 10
 """Grid points in half a period of the highest mode, after which its doubled phase repeats."""
 _RELATIVE = 0.05
@@ -33,8 +35,8 @@ _MEDIAN_OF_SQUARE = 0.455
 class DelayPrior:
     """Delays have Cauchy distributions about these middles."""
 
-    middle: Float64[Tensor, " contacts"]
-    """Samples."""
+    middle: Float64[Tensor, " #contacts"]
+    """Samples; one where all have the same."""
     scale: float
     """Median distance from it, samples."""
 
@@ -59,18 +61,25 @@ class MeasuredPhases:
     noise: Float64[Tensor, "contacts modes"]
     """Variance of `scaled` across its phase that the background noise makes."""
     bank: ModalBank
+    sample_rate: float
     turn: Float64[Tensor, " modes"]
     """Radians by which a delay of one sample turns a doubled phase."""
     grid: Float64[Tensor, " steps"]
     """Delays that are searched, samples."""
+    table: Float32[Tensor, "two_modes steps"]
+    """Cosines of the angles by which the delays of `grid` turn the modes' doubled phases, and their sines, negated."""
 
     @classmethod
-    def of(cls, impacts: Impacts, bank: ModalBank, *, reach: float) -> "MeasuredPhases":
-        """Return the amplitudes, to be aligned by delays of at most `reach` samples."""
+    def of(
+        cls, impacts: Impacts, bank: ModalBank, *, reach: float, background: Float64[Tensor, "contacts modes"]
+    ) -> "MeasuredPhases":
+        """Return the amplitudes, to be aligned by delays of at most `reach` samples.
+
+        `background` is the noise's power at each mode (`background_power`).
+        """
         rate, samples = impacts.sample_rate, impacts.sounds.shape[1]
         gains, quadrature = fit_gains(impacts.sounds.double(), bank, sample_rate=rate)
         amplitude = torch.complex(quadrature, -gains)
-        power = noise_at(noise_power(impacts.sounds, bins=noise_bins(samples)), bank, rate)
         # The squared samples of exp(-d t) cos(2 pi f t) add up to this.
         energy = rate * -torch.expm1(-2 * bank.damping * samples / rate) / (4 * bank.damping)
         scale = (amplitude.abs().square() / bank.damping).sum(1, keepdim=True).sqrt()
@@ -79,7 +88,15 @@ class MeasuredPhases:
         steps = math.ceil(reach / step)
         grid = step * torch.arange(-steps, steps + 1, dtype=torch.float64)
         turn = 4 * math.pi * bank.frequency / rate
-        return cls(amplitude, amplitude / scale, power / energy / scale.square(), bank, turn, grid)
+        angles = turn[:, None] * grid
+        table = torch.cat([angles.cos(), -angles.sin()]).float()
+        noise = background / energy / scale.square()
+        return cls(amplitude, amplitude / scale, noise, bank, rate, turn, grid, table)
+
+    @property
+    def step(self) -> float:
+        """Distance of two delays of the grid, samples."""
+        return float(self.grid[1] - self.grid[0])
 
     @property
     def power(self) -> Float64[Tensor, " modes"]:
@@ -99,6 +116,11 @@ class MeasuredPhases:
     ) -> Float64[Tensor, "contacts modes"]:
         """Return the concentrations of the doubled phases."""
         return self.scaled.abs().square() / (4 * self.variance(power, spread))
+
+    def turned(self, delays: Float64[Tensor, " contacts"]) -> Complex128[Tensor, "contacts modes"]:
+        """Return the amplitudes with each recording starting later by its delay, samples."""
+        exponent = torch.complex(-self.bank.damping, 2 * math.pi * self.bank.frequency) / self.sample_rate
+        return self.amplitude * torch.exp(exponent * delays[:, None])
 
     def doubled(self, delays: Float64[Tensor, " contacts"]) -> Complex128[Tensor, "contacts modes"]:
         """Return exp(2 i phase) with each recording starting later by its delay."""
@@ -145,45 +167,64 @@ class MeasuredPhases:
         # lengths.
         pull = weights * torch.special.i1e(strength) / torch.special.i0e(strength)
         toward = pull * torch.exp(1j * (2 * self.scaled.angle() - doubled.angle()))
-        angles = self.turn[:, None] * self.grid
-        parts = torch.cat([toward.real, toward.imag], dim=1).float()
-        score = (parts @ torch.cat([angles.cos(), -angles.sin()]).float()).double()
-        score = score + prior.log_density(self.grid[:, None]).T
-        # Many modes that agree outweigh a strong one that does not, which a product of densities would follow.
-        edge = torch.full_like(score[:, :1], -math.inf)
-        padded = torch.cat([edge, score, edge], dim=1)
-        peaks = torch.where((score >= padded[:, :-2]) & (score >= padded[:, 2:]), score, -math.inf)
-        candidates = self.grid[torch.topk(peaks, min(_CANDIDATES, len(self.grid)), dim=1).indices]
+        # In single precision: this only finds the peaks' places on the grid.
+        candidates = self._candidates(toward, prior)
+        level = log_i0(pull)
         turned = toward[:, None] * torch.exp(1j * self.turn * candidates[:, :, None])
-        robust = _agreement(turned, pull[:, None]) + prior.log_density(candidates.T).T
+        robust = _agreement(turned, level[:, None]) + prior.log_density(candidates.T).T
         delays = candidates.gather(1, robust.argmax(1, keepdim=True))[:, 0]
-        step = float(self.grid[1] - self.grid[0])
         for _ in range(_NEWTON_STEPS):
             turned = toward * torch.exp(1j * self.turn * delays[:, None])
-            turned = turned * _inlier_probability(turned, pull)
-            slope = prior.slope(delays) - (self.turn * turned.imag).sum(1)
-            bend = (self.turn.square() * turned.real).sum(1)
-            delays = delays + torch.where(bend > 0, slope / bend, 0.0).clamp(-step, step)
+            likely = turned * _inlier_probability(turned, level)
+            slope = prior.slope(delays) - (self.turn * likely.imag).sum(1)
+            bend = (self.turn.square() * likely.real).sum(1)
+            step = torch.where(bend > 0, slope / bend, 0.0).clamp(-self.step, self.step)
+            delays = delays + step
+            if float(step.abs().max()) < _EXACT:
+                break
         turned = toward * torch.exp(1j * self.turn * delays[:, None])
-        bend = (self.turn.square() * (turned * _inlier_probability(turned, pull)).real).sum(1)
-        return delays, _agreement(turned, pull) + occam_factor(prior, delays, bend)
+        bend = (self.turn.square() * (turned * _inlier_probability(turned, level)).real).sum(1)
+        return delays, _agreement(turned, level) + occam_factor(prior, delays, bend)
+
+    def _candidates(
+        self, toward: Complex128[Tensor, "contacts modes"], prior: DelayPrior
+    ) -> Float64[Tensor, "contacts candidates"]:
+        """Return delays of the grid at which the product of the densities has its highest peaks.
+
+        Many modes that agree outweigh a strong one that does not, which the product would follow: the choice is made
+        among these. In single precision, for only places on the grid are asked for.
+        """
+        away = (self.grid - prior.middle[:, None]).float() / prior.scale
+        parts = torch.cat([toward.real, toward.imag], dim=1).float()
+        score = torch.addmm(torch.log1p(away.square()), parts, self.table, beta=-1)
+        rises = torch.nn.functional.pad(score[:, 1:] >= score[:, :-1], (1, 0), value=True)
+        falls = torch.nn.functional.pad(score[:, :-1] >= score[:, 1:], (0, 1), value=True)
+        peaks = torch.where(rises & falls, score, -math.inf)
+        return self.grid[torch.topk(peaks, min(_CANDIDATES, len(self.grid)), dim=1).indices]
+
+
+def background_power(impacts: Impacts, bank: ModalBank) -> Float64[Tensor, "contacts modes"]:
+    """Return the power of each recording's background noise at each mode, in the recordings' unit."""
+    noise = noise_power(impacts.sounds, bins=noise_bins(impacts.sounds.shape[1]))
+    return noise_at(noise, bank, impacts.sample_rate)
 
 
 def _agreement(
-    toward: Complex128[Tensor, "*delays modes"], pull: Float64[Tensor, "*#delays modes"]
+    toward: Complex128[Tensor, "*delays modes"], level: Float64[Tensor, "*#delays modes"]
 ) -> Float64[Tensor, "*delays"]:
-    """Return the log odds that phases lie about the others' mean with concentrations `pull`, against anywhere.
+    """Return the log odds that phases lie about the others' mean, against anywhere.
 
-    `toward` is the concentration times exp(2 i error). A part `_OUTLIER_SHARE` of the phases lies anywhere in any case.
+    `toward` is the concentration times exp(2 i error), `level` the concentration's `log_i0`. A part `_OUTLIER_SHARE` of
+    the phases lies anywhere in any case.
     """
-    return torch.log(_OUTLIER_SHARE + (1 - _OUTLIER_SHARE) * (toward.real - log_i0(pull)).exp()).sum(-1)
+    return torch.log(_OUTLIER_SHARE + (1 - _OUTLIER_SHARE) * (toward.real - level).exp()).sum(-1)
 
 
 def _inlier_probability(
-    toward: Complex128[Tensor, "contacts modes"], pull: Float64[Tensor, "contacts modes"]
+    toward: Complex128[Tensor, "contacts modes"], level: Float64[Tensor, "contacts modes"]
 ) -> Float64[Tensor, "contacts modes"]:
     """Return the probability of each phase to be none of those that lie anywhere."""
-    about = (1 - _OUTLIER_SHARE) * (toward.real - log_i0(pull)).exp()
+    about = (1 - _OUTLIER_SHARE) * (toward.real - level).exp()
     return about / (about + _OUTLIER_SHARE)
 
 
