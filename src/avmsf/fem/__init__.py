@@ -1,0 +1,1 @@
+"""Finite elements of an object's body."""
