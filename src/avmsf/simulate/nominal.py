@@ -2,19 +2,22 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from jaxtyping import Int
 
 from avmsf._utils.caching import source_digest
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
+from avmsf.fem.supports import FREE, supports_of
 from avmsf.simulate.elasticstore import modes_once
+from avmsf.simulate.elements import SecondOrder
 from avmsf.simulate.material import Material
 from avmsf.simulate.nominalcheck import CheckedSurface, checked
 from avmsf.simulate.nominalsolid import FEWEST, expect_memory, filled_solid, freedoms_of, wall_solids
@@ -44,14 +47,16 @@ class NominalBody:
     wall: float | None
     """Thickness of its wall, metres; None for a filled body."""
     elastic: ElasticModes
-    """Free boundary, nominal material."""
+    """Nominal material."""
     fine: bool = True
     """Whether its elements are as many as were asked for; `refined` makes those finer that were made to be compared."""
+    support: str = FREE
+    """Where it is held, such as "held at its lowest face"."""
 
     @property
     def name(self) -> str:
         """What it is, for people."""
-        return body_name(self.wall)
+        return body_name(self.wall) if self.support == FREE else f"{body_name(self.wall)}, {self.support}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,10 +140,36 @@ def refined(
     told = tell or (lambda words: None)
     _expect_settings(len(body.elastic), freedoms, [body.wall])
     try:
-        return _Maker(surface, len(body.elastic), cache, told).body(body.wall, freedoms, fine=True)
+        maker = _Maker(surface, len(body.elastic), cache, told)
+        if body.support == FREE:
+            return maker.body(body.wall, freedoms, fine=True)
+        return replace(body, elastic=maker.held(body.wall, freedoms)[body.support], fine=True)
     except SimulationError as error:
         told(f"{body.name} stays coarse: {error}")
         return body
+
+
+def supported(
+    surface: Surface,
+    body: NominalBody,
+    *,
+    freedoms: int = 40_000,
+    cache: Path | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> tuple[NominalBody, ...]:
+    """Return a free body of `nominal_bodies` held where an object may be: at its lowest face or point, or at an edge.
+
+    `TRIAL` degrees of freedom at most, enough to choose by; `refined` makes the chosen one fine. Without those whose
+    modes cannot be computed, of which `tell` hears.
+    """
+    told = tell or (lambda words: None)
+    few = min(freedoms, TRIAL)
+    try:
+        held = _Maker(surface, len(body.elastic), cache, told).held(body.wall, few)
+    except SimulationError as error:
+        told(f"{body.name}: no supports are tried ({error})")
+        return ()
+    return tuple(NominalBody(body.wall, each, freedoms <= TRIAL, name) for name, each in held.items())
 
 
 class _Maker:
@@ -184,19 +215,27 @@ class _Maker:
             )
         return modes
 
+    def held(self, wall: float | None, freedoms: int) -> dict[str, ElasticModes]:
+        """Return the modes of one body held in several ways, by their names; its tetrahedra are made once."""
+        expect_memory(freedoms)
+        solid = self._solid(wall, freedoms)
+        return {each.name: self._solved(solid, freedoms, each.nodes) for each in supports_of(SecondOrder.of(solid))}
+
     def _modes(self, wall: float | None, freedoms: int) -> ElasticModes:
-        """Return the modes of one body, read from where they are kept."""
+        """Return the modes of one free body, read from where they are kept."""
         kept = self._kept(wall, freedoms)
         return modes_once(kept, lambda: self._computed(wall, freedoms), tell=self._tell)
 
     def _computed(self, wall: float | None, freedoms: int) -> ElasticModes:
         expect_memory(freedoms)
         self._tell(f"tetrahedra of the body, {body_name(wall)}")
-        solid = self._solid(wall, freedoms)
+        return self._solved(self._solid(wall, freedoms), freedoms, None)
+
+    def _solved(self, solid: Solid, freedoms: int, fixed: Int[np.ndarray, " fixed"] | None) -> ElasticModes:
         size = freedoms_of(solid)
         self._tell(f"{self._count} elastic modes of {size} degrees of freedom")
         try:
-            return elastic_modes(solid, NOMINAL, count=self._count)
+            return elastic_modes(solid, NOMINAL, count=self._count, fixed=fixed)
         except MemoryError as error:
             raise SimulationError(
                 f"the modes of {size} degrees of freedom do not fit into the memory: ask for fewer, as "
