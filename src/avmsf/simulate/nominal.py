@@ -14,8 +14,8 @@ from jaxtyping import Int
 from avmsf._utils.caching import source_digest
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
-from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.fem.supports import FREE, supports_of
+from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.elasticstore import modes_once
 from avmsf.simulate.elements import SecondOrder
 from avmsf.simulate.material import Material

@@ -67,13 +67,14 @@ def fit_mixture(
     evidence = [log_evidence(each, values, floor, noise_shares) for each in kernels]
     pairs = list(zip(families, evidence, strict=True))
     weigh_factors(pairs, measured)
-    kinds = [family.kind for family in families]
+    bodies = sum(family.share for family in families if isinstance(family, Elastic))
     category, prior, first = [], [], 0
     for family in families:
         own = family.categories() + first
         count = int(own.max()) + 1 - first
         category.append(own)
-        prior.append(torch.full((count,), family.prior / kinds.count(family.kind) / count, dtype=torch.float64))
+        share = family.share / bodies if isinstance(family, Elastic) else 1.0
+        prior.append(torch.full((count,), family.prior * share / count, dtype=torch.float64))
         first += count
     log_frequency = torch.log(measured.frequency)
     log_prior = torch.cat([family.log_prior(log_frequency) for family in families]).repeat(1, 2)
