@@ -30,8 +30,8 @@ class BodyConfig:
     """Degrees of freedom of the finite elements, about."""
     supports: Literal["auto", "free", "try"] = "auto"
     """Whether the object may have been held at its lowest face or point, or along a lower edge (z is upwards). auto:
-    tried if the free body explains the recordings poorly. free: it lay on foam or hung. try: always tried, which takes
-    some seconds more."""
+    tried if the free body does not predict recordings left out. free: it lay on foam or hung. try: always tried, which
+    takes some seconds more."""
 
     def __post_init__(self) -> None:
         if self.wall is not None and not 0 <= self.wall < float("inf"):

@@ -56,10 +56,8 @@ class Elastic(KernelFamily):
 
     kind: ClassVar[str] = "elastic"
 
-    def __init__(self, reference: Sites, size: float, modes: ElasticModes, *, share: float = 1.0) -> None:
+    def __init__(self, reference: Sites, size: float, modes: ElasticModes) -> None:
         super().__init__(reference, size)
-        self.share = share
-        """Prior probability of the body, up to a factor that all bodies have in common."""
         # As a file keeps them, so that a field that was read renders what the saved one does.
         self.modes = replace(modes, shapes=modes.shapes.float().double())
         self.factor_weights = torch.softmax(factor_log_prior(), dim=0)
@@ -69,8 +67,8 @@ class Elastic(KernelFamily):
         profiles = [1.0 / (1.0 + (2.0 * apart / tau).square()) for tau in PERTURBATIONS]
         profiles += [torch.exp(-0.5 * (apart / width).square()) + _FAR for width in WIDTHS]
         elastic = scaled(torch.stack(profiles).flatten(0, 1), self._known.square().T)
-        rest = torch.tensor(REMAINDERS, dtype=torch.float64)[None, :, None]
-        both = [(1.0 - rest) * elastic[:, None], rest.expand(len(elastic), -1, 1)]
+        share = torch.tensor(REMAINDERS, dtype=torch.float64)[None, :, None]
+        both = [(1.0 - share) * elastic[:, None], share.expand(len(elastic), -1, 1)]
         self.shares = torch.cat(both, dim=2).flatten(0, 1)
 
     def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:

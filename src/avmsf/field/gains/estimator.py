@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -15,12 +16,12 @@ from torch import Tensor
 from avmsf.capture.placement import surface_points
 from avmsf.capture.surface import Surface
 from avmsf.errors import AvmsfError, FitError
-from avmsf.fem.supports import FREE, FREE_PRIOR
+from avmsf.fem.supports import FREE_PRIOR
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import FACTORS, Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
-from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture, total_evidence
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.outliers import Fit, Judgment, judge_contacts, predicts_better
@@ -46,8 +47,6 @@ FAMILIES = (*POSITIONAL, Symmetric.kind, Elastic.kind)
 KNOWN = (*FAMILIES, Visual.kind)
 """All families. Looks must be asked for by name: with the built-in descriptors of four simulated objects they made the
 errors between 0.4 % smaller and 1.7 % larger without a body, and changed nothing beside one."""
-_EXPLAINED = 0.8
-"""Posterior probability of all free bodies, mean over modes by their energy, below which supports are tried."""
 _PLACES = 500
 """Points of the surface where the contacts that contradict the others may have been."""
 
@@ -110,8 +109,8 @@ class MixtureEstimator:
         """Return the gain model and the rows of the contacts that it is fitted to. Raises as `start`.
 
         Of several coarse bodies the most probable one is computed with finer elements, and the model is fitted again,
-        until the most probable one is fine. Contacts that the others contradict are left out where these are predicted
-        better from each other without them.
+        until the most probable one is fine. Where it is not credible it is tried whether the object was held. Contacts
+        that the others contradict are left out where these are predicted better from each other without them.
         """
         bodies, missing = self._usable_bodies(case)
         directional, every = bool(bodies) or _has_directions(case), torch.arange(len(case.train))
@@ -131,11 +130,14 @@ class MixtureEstimator:
             if best is not None and fine is not None:
                 bodies[best] = fine
                 continue
-            if best is None or hold is None or not self._may_be_held(weights):
+            judgment, used = _judged(fit, model, None if best is None else bodies[best]), every
+            if best is None or hold is None or not self._may_be_held(judgment):
                 break
-            held, hold = hold(bodies[best]), None
-            bodies += held
-        judgment, used = _judged(fit, model, None if best is None else bodies[best]), every
+            held, hold = _more_probable(fit, bodies[best], hold(bodies[best])), None
+            if held is None:
+                break
+            # All modes have the support in common, so free bodies are no hypotheses any more.
+            bodies = [held]
         if judgment.outliers:
             rows = torch.tensor([row for row in every.tolist() if row not in {each.row for each in judgment.outliers}])
             fewer_families = fit.families(rows, bodies)
@@ -165,9 +167,10 @@ class MixtureEstimator:
             return [], {Elastic.kind: str(error)}
         return list(self.bodies.bodies.bodies), missing
 
-    def _may_be_held(self, weights: Sequence[float]) -> bool:
-        """Return whether supports are tried: where they are asked for, and where free bodies explain little."""
-        return self.bodies is not None and (self.bodies.always_hold or sum(weights) < _EXPLAINED)
+    def _may_be_held(self, judgment: Judgment) -> bool:
+        """Return whether supports are tried: where they are asked for, or the free body predicts little."""
+        credible = judgment.credibility is not None and judgment.credibility.credible
+        return self.bodies is not None and (self.bodies.always_hold or not credible)
 
     def _refined(self, body: NominalBody) -> NominalBody | None:
         """Return a body with finer elements; None where it has been computed as finely as it can."""
@@ -233,12 +236,7 @@ class _Fit:
         features = self.case.features
         if Visual.kind in self.kinds and features.encoder != GEOMETRY:
             found.append(Visual(sites, size, features.points, features.features))
-        free = sum(body.support == FREE for body in bodies)
-        shares = [
-            FREE_PRIOR / free if body.support == FREE else (1.0 - FREE_PRIOR) / (len(bodies) - free) for body in bodies
-        ]
-        elastic = (Elastic(sites, size, body.elastic, share=each) for body, each in zip(bodies, shares, strict=True))
-        return [*found, *elastic]
+        return [*found, *(Elastic(sites, size, body.elastic) for body in bodies)]
 
     def __call__(
         self,
@@ -312,6 +310,17 @@ def _judged(fit: _Fit, model: MixtureGains, body: NominalBody | None) -> Judgmen
 
     elastic = None if body is None else fitted([body])
     return judge_contacts(fitted([]), elastic, fit.sites, model.sites(points), fit.measured)
+
+
+def _more_probable(fit: _Fit, free: NominalBody, held: Sequence[NominalBody]) -> NominalBody | None:
+    """Return the most probable held body by the evidence of all modes, or None where the free one is more probable."""
+    if not held:
+        return None
+    every = torch.arange(len(fit.case.train))
+    evidence = [total_evidence(fit.families(every, [body]), fit.measured) for body in (free, *held)]
+    best = max(range(len(held)), key=lambda row: evidence[1 + row])
+    odds = math.log(FREE_PRIOR / (1.0 - FREE_PRIOR) * len(held))
+    return held[best] if evidence[1 + best] - evidence[0] > odds else None
 
 
 def _body_weights(model: MixtureGains, families: Sequence[KernelFamily], measured: MeasuredGains) -> list[float]:

@@ -67,14 +67,13 @@ def fit_mixture(
     evidence = [log_evidence(each, values, floor, noise_shares) for each in kernels]
     pairs = list(zip(families, evidence, strict=True))
     weigh_factors(pairs, measured)
-    bodies = sum(family.share for family in families if isinstance(family, Elastic))
+    kinds = [family.kind for family in families]
     category, prior, first = [], [], 0
     for family in families:
         own = family.categories() + first
         count = int(own.max()) + 1 - first
         category.append(own)
-        share = family.share / bodies if isinstance(family, Elastic) else 1.0
-        prior.append(torch.full((count,), family.prior * share / count, dtype=torch.float64))
+        prior.append(torch.full((count,), family.prior / kinds.count(family.kind) / count, dtype=torch.float64))
         first += count
     log_frequency = torch.log(measured.frequency)
     log_prior = torch.cat([family.log_prior(log_frequency) for family in families]).repeat(1, 2)
@@ -89,6 +88,25 @@ def fit_mixture(
     some = [(family, each) for family, each in zip(families, rows, strict=True) if len(each)]
     kept_families, kept = zip(*some, strict=True)
     return MixtureGains(points, families[0].reference, kept_families, kept, mixture, directional)
+
+
+def total_evidence(families: Sequence[KernelFamily], measured: MeasuredGains) -> float:
+    """Return the log evidence of the gains of all modes, up to a constant of the gains, nats.
+
+    What all modes have in common, such as an object's support, is found by this: a mixture weighs kernels for each mode
+    by itself, and mixes wrong bodies where a mode has few gains. Probabilities within families are not learned.
+    """
+    values, floor = series_of(measured.values), measured.floor
+    evidence = [log_evidence(family.kernels(), values, floor, NOISE_SHARES) for family in families]
+    weigh_factors(list(zip(families, evidence, strict=True)), measured)
+    log_frequency = torch.log(measured.frequency)
+    terms = []
+    for family, each in zip(families, evidence, strict=True):
+        categories = int(family.categories().max()) + 1
+        prior = family.log_prior(log_frequency).repeat(1, 2) + math.log(family.prior / categories / each.shape[1])
+        terms.append((each + prior[:, None]).flatten(0, 1))
+    active = active_series(values) & measured.substantial
+    return float(torch.logsumexp(torch.cat(terms), dim=0)[active].sum())
 
 
 def weigh_factors(families: Sequence[tuple[KernelFamily, Tensor]], measured: MeasuredGains) -> None:
