@@ -120,6 +120,40 @@ def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> No
     assert (second["wall"], second["fine"]) == (0.00404, False)
 
 
+@dataclass
+class Held:
+    """Returns a known body as the free one held."""
+
+    body: NominalBody
+    asked: list[NominalBody] = field(default_factory=list)
+
+    def __call__(self, body: NominalBody) -> tuple[NominalBody, ...]:
+        self.asked.append(body)
+        return (replace(self.body, support="held at its lowest face"),)
+
+    def digest(self) -> str:
+        return ""
+
+
+@pytest.mark.parametrize("free", [0, 1])
+def test_a_held_body_is_named_if_it_is_more_probable_than_the_free_one(free: int) -> None:
+    held = Held(bodies()[1 - free])
+    candidates = CandidateBodies(NominalBodies((bodies()[free],), {}), None, held, always_hold=True)
+    [found] = MixtureEstimator(bodies=candidates).start(case(), "shared").report["bodies"]
+    assert held.asked == [bodies()[free]]
+    assert found["support"] == ("free" if free else "held at its lowest face")
+    assert found["body"] == bodies()[1].name + ("" if free else ", held at its lowest face")
+
+
+def test_supports_are_not_tried_where_the_free_body_predicts_the_gains() -> None:
+    held = Held(bodies()[0])
+    candidates = CandidateBodies(NominalBodies((bodies()[1],), {}), None, held)
+    assert MixtureEstimator(bodies=candidates).start(case(), "shared").report["credibility"]["credible"]
+    assert not held.asked
+    MixtureEstimator(bodies=replace(candidates, always_hold=True)).start(case(), "shared")
+    assert held.asked
+
+
 def test_a_fine_body_is_not_computed_again() -> None:
     finer = Finer()
     estimator(finer=finer).start(case(), "shared")

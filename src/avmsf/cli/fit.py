@@ -239,6 +239,8 @@ def summary(fitted: SoundField, contacts: int) -> str:
     report = fitted.origin.report
     how = "chosen on validation contacts" if report.get("validated") else "as set"
     gains = report.get("gains", "attention")
+    if (report.get("credibility") or {}).get("credible"):
+        gains += f" (most probable body: {report['bodies'][0]['body']})"
     return (
         f"field of {fitted.origin.capture}: {len(fitted.bank)} modes from {contacts} recordings, gains by {gains}, "
         f"{report.get('damping', 'shared')} damping ({how}), {report.get('steps', fitted.origin.config.steps)} steps "

@@ -1,1 +1,1 @@
-"""Finite elements."""
+"""Finite elements of an object's body."""

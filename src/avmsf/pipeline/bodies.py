@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.placed import expect_placed
-from avmsf.simulate.nominal import NominalBody, nominal_bodies, refined
+from avmsf.simulate.nominal import NominalBody, nominal_bodies, refined, supported
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,10 @@ class BodyConfig:
     """Lowest elastic mode shapes that gains are made of, and on which stiffness and density are updated."""
     freedoms: int = 40_000
     """Degrees of freedom of the finite elements, about."""
+    supports: Literal["auto", "free", "try"] = "auto"
+    """Whether the object may have been held at its lowest face or point, or along a lower edge (z is upwards). auto:
+    tried if the free body does not predict recordings left out. free: it lay on foam or hung. try: always tried, which
+    takes some seconds more."""
 
     def __post_init__(self) -> None:
         if self.wall is not None and not 0 <= self.wall < float("inf"):
@@ -46,13 +51,41 @@ class FinerBodies:
     """Folder that keeps elastic modes by content."""
     tell: Callable[[str], None]
     """Told what is done, in words."""
-    made: dict[float | None, NominalBody] = field(default_factory=dict)
-    """Those that are done, by their walls: names of two may be alike."""
+    made: dict[tuple[float | None, str], NominalBody] = field(default_factory=dict)
+    """Those that are done, by their walls and supports: names of two may be alike."""
 
     def __call__(self, body: NominalBody) -> NominalBody:
         """Return the body with finer elements, or as it is where that fails: it was good enough to choose by."""
+        key = body.wall, body.support
+        if key not in self.made:
+            self.made[key] = refined(self.surface, body, freedoms=self.freedoms, cache=self.cache, tell=self.tell)
+        return self.made[key]
+
+    def digest(self) -> str:
+        """Return what tells these bodies from those of other settings."""
+        return f"{self.freedoms}"
+
+
+@dataclass(frozen=True, eq=False)
+class HeldBodies:
+    """Holds bodies of a surface at what may have supported them, each once."""
+
+    surface: Surface
+    freedoms: int
+    """Degrees of freedom at most."""
+    cache: Path | None
+    """Folder that keeps elastic modes by content."""
+    tell: Callable[[str], None]
+    """Told what is done, in words."""
+    made: dict[float | None, tuple[NominalBody, ...]] = field(default_factory=dict)
+    """Those that are done, by their walls."""
+
+    def __call__(self, body: NominalBody) -> tuple[NominalBody, ...]:
+        """Return the body with each support that it may have."""
         if body.wall not in self.made:
-            self.made[body.wall] = refined(self.surface, body, freedoms=self.freedoms, cache=self.cache, tell=self.tell)
+            self.made[body.wall] = supported(
+                self.surface, body, freedoms=self.freedoms, cache=self.cache, tell=self.tell
+            )
         return self.made[body.wall]
 
     def digest(self) -> str:
@@ -78,8 +111,10 @@ def candidate_bodies(
         expect_placed(impacts.contacts, surface_points(surface), names=impacts.names)
     walls = None if config.wall is None else [config.wall or None]
     bodies = nominal_bodies(surface, walls=walls, count=config.shapes, freedoms=config.freedoms, cache=cache, tell=tell)
-    finer = FinerBodies(surface, config.freedoms, cache, tell or (lambda words: None))
-    return CandidateBodies(bodies, None if len(bodies.bodies) == 1 else finer)
+    made = surface, config.freedoms, cache, tell or (lambda words: None)
+    hold = None if config.supports == "free" else HeldBodies(*made)
+    refine = None if len(bodies.bodies) == 1 and hold is None else FinerBodies(*made)
+    return CandidateBodies(bodies, refine, hold, always_hold=config.supports == "try")
 
 
 def roughened(surface: Surface, part: float, *, seed: int) -> Surface:

@@ -14,11 +14,13 @@ from torch import Tensor
 from avmsf.errors import SimulationError
 from avmsf.fem.perturbation import Perturbations, perturbations
 from avmsf.simulate.closest import Closest, ClosestPoints
-from avmsf.simulate.eigen import lowest_vibrations, rigid_motions
+from avmsf.simulate.eigen import Vibrations, lowest_vibrations, rigid_motions
 from avmsf.simulate.elements import SecondOrder, elements_of, mass, stiffness
 from avmsf.simulate.material import Material
 from avmsf.simulate.solid import Solid
 
+_PENDULUM = 1e-9
+"""Squared frequency over the largest, below which a body turns about the nodes that it is held at: rounding alone."""
 _SHIFT = 1e-5
 """Shift of the eigenvalues over E / (density size^2), which is a tenth of the squared angular frequency of a bar."""
 
@@ -124,6 +126,7 @@ def elastic_modes(
     density_factor: Float[Tensor, " cells"] | None = None,
     springs: Sequence[tuple[Float[Tensor, " 3"], float]] | None = None,
     highest: float | None = None,
+    fixed: Int[np.ndarray, " fixed"] | None = None,
     perturbed: bool = False,
 ) -> ElasticModes:
     """Return the lowest `count` elastic modes of a body by second-order finite elements, none above `highest` Hz.
@@ -132,8 +135,8 @@ def elastic_modes(
     on its surface and their stiffness in newtons per metre, the same in all directions. A free body's six rigid
     motions are no modes of it. On soft springs they are slow modes, and every mode that has more than half of its
     kinetic energy in a rigid motion is left out. Springs so stiff that the body bends before it moves as a whole
-    leave no such mode, and then none is left out. With `perturbed` the modes come with the first-order changes of
-    their matrices, for a body without factors.
+    leave no such mode, and then none is left out. `fixed` names nodes of `SecondOrder.of(solid)` that do not move. With
+    `perturbed` the modes come with the first-order changes of their matrices, for a body without factors.
 
     Raises SimulationError for a body of several parts or too few nodes, factors and springs that are not positive,
     and where no mode lies below `highest`.
@@ -150,14 +153,24 @@ def elastic_modes(
     forces = stiffness(mesh, material, stiff)
     if springs:
         forces = forces + _support(mesh, springs)
+    rigid = rigid_motions(mesh.nodes, weights)
+    free = np.arange(len(mesh.nodes)) if fixed is None else np.setdiff1d(np.arange(len(mesh.nodes)), fixed)
+    moving = (3 * free[:, None] + np.arange(3)).ravel()
+    if fixed is not None:
+        forces, weights = forces.tocsr()[moving][:, moving], weights[free][:, free]
+        # A cantilever's lowest mode is mostly a turn, and yet none of a rigid body.
+        rigid = np.zeros_like(rigid)
     found = lowest_vibrations(
         forces,
         weights,
-        rigid_motions(mesh.nodes, weights),
+        rigid[moving],
         count=count,
         shift=_SHIFT * material.young / (material.density * solid.size**2),
-        supported=bool(springs),
+        supported=bool(springs) or fixed is not None,
     )
+    if fixed is not None:
+        bending = found.squares > _PENDULUM * found.squares.max()
+        found = Vibrations(found.squares[bending], found.shapes[:, bending])
     frequency = torch.from_numpy(np.sqrt(found.squares) / (2.0 * math.pi))
     kept = len(frequency) if highest is None else int((frequency <= highest).sum())
     if not kept:
@@ -165,7 +178,9 @@ def elastic_modes(
             f"no mode up to {highest:g} Hz, the lowest is at {float(frequency[0]):g} Hz: raise `highest`, or make the "
             "body larger or thinner"
         )
-    whole = found.shapes.reshape(len(mesh.nodes), 3, -1)[:, :, :kept]
+    motions = np.zeros((3 * len(mesh.nodes), kept))
+    motions[moving] = found.shapes[:, :kept]
+    whole = motions.reshape(len(mesh.nodes), 3, -1)
     changes = None
     if perturbed:
         changes = perturbations(

@@ -2,19 +2,22 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from jaxtyping import Int
 
 from avmsf._utils.caching import source_digest
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
+from avmsf.fem.supports import FREE, supports_of
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.elasticstore import modes_once
+from avmsf.simulate.elements import SecondOrder
 from avmsf.simulate.material import Material
 from avmsf.simulate.nominalcheck import CheckedSurface, checked
 from avmsf.simulate.nominalsolid import FEWEST, expect_memory, filled_solid, freedoms_of, wall_solids
@@ -28,6 +31,11 @@ WALLS = tuple(float(part) for part in np.geomspace(0.003, 0.05, 6))
 """Thickness of walls that are tried, over the diagonal of the box around the surface."""
 TRIAL = 12_000
 """Degrees of freedom at most of each of several bodies."""
+LARGEST_ERROR = 0.05
+"""Relative error of the lowest frequencies beyond which a body is made finer: about that by which frequencies of real
+walls differ from those of even ones (imperfections of 3 to 5 % in the simulated objects)."""
+_LOWEST = 8
+"""Frequencies that are compared."""
 _FORMAT = 3
 """Number of the way in which bodies are made; kept files of another are not read."""
 
@@ -39,16 +47,20 @@ class NominalBody:
     wall: float | None
     """Thickness of its wall, metres; None for a filled body."""
     elastic: ElasticModes
-    """Free boundary, nominal material."""
+    """Nominal material."""
     fine: bool = True
     """Whether its elements are as many as were asked for; `refined` makes those finer that were made to be compared."""
+    support: str = FREE
+    """Where it is held, such as "held at its lowest face"."""
     updated: float | None = None
     """Log evidence that it gained from measured gains by departures of its stiffness and density; None without."""
 
     @property
     def name(self) -> str:
         """What it is, for people."""
-        return body_name(self.wall) + ("" if self.updated is None else ", stiffness and density updated")
+        parts = [body_name(self.wall), "" if self.support == FREE else self.support]
+        parts.append("" if self.updated is None else "stiffness and density updated")
+        return ", ".join(filter(None, parts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,10 +144,36 @@ def refined(
     told = tell or (lambda words: None)
     _expect_settings(len(body.elastic), freedoms, [body.wall])
     try:
-        return _Maker(surface, len(body.elastic), cache, told).body(body.wall, freedoms, fine=True)
+        maker = _Maker(surface, len(body.elastic), cache, told)
+        if body.support == FREE:
+            return maker.body(body.wall, freedoms, fine=True)
+        return replace(body, elastic=maker.held(body.wall, freedoms)[body.support], fine=True)
     except SimulationError as error:
         told(f"{body.name} stays coarse: {error}")
         return body
+
+
+def supported(
+    surface: Surface,
+    body: NominalBody,
+    *,
+    freedoms: int = 40_000,
+    cache: Path | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> tuple[NominalBody, ...]:
+    """Return a free body of `nominal_bodies` held where an object may be: at its lowest face or point, or at an edge.
+
+    `TRIAL` degrees of freedom at most, enough to choose by; `refined` makes the chosen one fine. Without those whose
+    modes cannot be computed, of which `tell` hears.
+    """
+    told = tell or (lambda words: None)
+    few = min(freedoms, TRIAL)
+    try:
+        held = _Maker(surface, len(body.elastic), cache, told).held(body.wall, few)
+    except SimulationError as error:
+        told(f"{body.name}: no supports are tried ({error})")
+        return ()
+    return tuple(NominalBody(body.wall, each, freedoms <= TRIAL, name) for name, each in held.items())
 
 
 class _Maker:
@@ -158,21 +196,53 @@ class _Maker:
             except SimulationError as error:
                 # Thin walls are lost in few tetrahedra.
                 self._tell(f"again with more tetrahedra ({error})")
-        return NominalBody(wall, self._modes(wall, freedoms, perturbed=True))
+        return NominalBody(wall, self._converged(wall, freedoms))
+
+    def _converged(self, wall: float | None, freedoms: int) -> ElasticModes:
+        """Return modes of one body, of twice as many degrees of freedom where their frequencies still change much."""
+        modes = self._modes(wall, freedoms, perturbed=True)
+        if freedoms <= TRIAL:
+            return modes
+        try:
+            error = _frequency_error(self._modes(wall, TRIAL, perturbed=False), modes)
+            if error > LARGEST_ERROR:
+                finer = self._modes(wall, 2 * freedoms, perturbed=True)
+                modes, error = finer, _frequency_error(modes, finer)
+        except SimulationError as failure:
+            # No coarser one to compare with, or no room for a finer one.
+            self._tell(f"{body_name(wall)}: whether its elements are fine enough is not known ({failure})")
+            return modes
+        if error > LARGEST_ERROR:
+            self._tell(
+                f"{body_name(wall)}: elements too coarse, the lowest frequencies are wrong by about {error:.0%}: allow "
+                f"freedoms={4 * freedoms}"
+            )
+        return modes
+
+    def held(self, wall: float | None, freedoms: int) -> dict[str, ElasticModes]:
+        """Return the modes of one body held in several ways, by their names; its tetrahedra are made once."""
+        expect_memory(freedoms)
+        solid = self._solid(wall, freedoms)
+        found = supports_of(SecondOrder.of(solid))
+        return {each.name: self._solved(solid, freedoms, each.nodes, perturbed=True) for each in found}
 
     def _modes(self, wall: float | None, freedoms: int, *, perturbed: bool) -> ElasticModes:
-        """Return the modes of one body, read from where they are kept."""
+        """Return the modes of one free body, read from where they are kept."""
         kept = self._kept(wall, freedoms, perturbed=perturbed)
         return modes_once(kept, lambda: self._computed(wall, freedoms, perturbed=perturbed), tell=self._tell)
 
     def _computed(self, wall: float | None, freedoms: int, *, perturbed: bool) -> ElasticModes:
         expect_memory(freedoms)
         self._tell(f"tetrahedra of the body, {body_name(wall)}")
-        solid = self._solid(wall, freedoms)
+        return self._solved(self._solid(wall, freedoms), freedoms, None, perturbed=perturbed)
+
+    def _solved(
+        self, solid: Solid, freedoms: int, fixed: Int[np.ndarray, " fixed"] | None, *, perturbed: bool
+    ) -> ElasticModes:
         size = freedoms_of(solid)
         self._tell(f"{self._count} elastic modes of {size} degrees of freedom")
         try:
-            return elastic_modes(solid, NOMINAL, count=self._count, perturbed=perturbed)
+            return elastic_modes(solid, NOMINAL, count=self._count, fixed=fixed, perturbed=perturbed)
         except MemoryError as error:
             raise SimulationError(
                 f"the modes of {size} degrees of freedom do not fit into the memory: ask for fewer, as "
@@ -209,6 +279,17 @@ class _Maker:
         content.update(vertices.tobytes())
         content.update(faces.tobytes())
         return content.hexdigest()
+
+
+def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:
+    """Return an estimate of the largest relative error of the finer body's lowest frequencies (Richardson's).
+
+    Errors go with the second power of the edges' length where facets cut off cross-section, and with the fourth where
+    they lock; taken is the third. The number of nodes on the surface goes with the inverse of the second.
+    """
+    count = min(_LOWEST, len(coarse), len(fine))
+    change = float((coarse.frequency[:count] / fine.frequency[:count] - 1.0).abs().max())
+    return change / max((len(fine.nodes) / len(coarse.nodes)) ** 1.5 - 1.0, 1.0)
 
 
 def _guesses(checked: CheckedSurface) -> list[float | None]:

@@ -59,22 +59,30 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
         raise SimulationError(
             f"a wall of {thickness:g} m folds over itself where the surface bends more tightly than that: {hint}"
         )
-    offsets = _offsets(coarse, thickness)
-    if offsets is not None:
-        points = np.concatenate([coarse.points, coarse.points + offsets])
-        return Solid.build(torch.from_numpy(points), torch.from_numpy(_prisms(coarse.faces, len(coarse.points))))
-    return fill(_both_sides(coarse, thickness), detail=detail)
+    solid = prisms(coarse, np.full(len(coarse.points), thickness))
+    return solid if solid is not None else fill(_both_sides(coarse, thickness), detail=detail)
 
 
-def _offsets(skin: Skin, thickness: float) -> Float64[np.ndarray, "points 3"] | None:
+def prisms(skin: Skin, thickness: Float64[np.ndarray, " points"], *, layers: int = 1) -> Solid | None:
+    """Return a wall of this thickness at each point inwards of a skin, or None where some prisms stay folded."""
+    offsets = _offsets(skin, thickness)
+    if offsets is None:
+        return None
+    count = len(skin.points)
+    points = np.concatenate([skin.points + layer / layers * offsets for layer in range(layers + 1)])
+    cells = np.concatenate([_prisms(skin.faces, count) + layer * count for layer in range(layers)])
+    return Solid.build(torch.from_numpy(points), torch.from_numpy(cells))
+
+
+def _offsets(skin: Skin, thickness: Float64[np.ndarray, " points"]) -> Float64[np.ndarray, "points 3"] | None:
     """Return the way from each point through the wall, or None where some prisms stay folded."""
-    directions, lengths = -skin.normals, np.full(len(skin.points), thickness)
+    directions, lengths = -skin.normals, thickness.copy()
     ends = skin.faces[:, [[0, 1], [1, 2], [2, 0], [1, 0], [2, 1], [0, 2]]].reshape(-1, 2)
     slack = _SLOPE * np.linalg.norm(skin.points[ends[:, 0]] - skin.points[ends[:, 1]], axis=1)
     for _ in range(_STEPS):
         folded = _folded(skin, lengths[:, None] * directions)
         if not folded.any():
-            thin = lengths[skin.faces].mean(axis=1) < 0.5 * thickness
+            thin = lengths[skin.faces].mean(axis=1) < 0.5 * thickness[skin.faces].mean(axis=1)
             return lengths[:, None] * directions if thin @ skin.areas <= _SPARED * skin.areas.sum() else None
         directions = _leaned(skin, directions, folded)
         lengths[np.unique(skin.faces[folded])] *= _THINNING

@@ -74,6 +74,15 @@ class Skin:
         np.add.at(total, self.faces, angles[..., None] * unit(_doubled(corners))[:, None])
         return unit(total)
 
+    def spread(self, samples: int = 2000) -> Float64[np.ndarray, "samples 3"]:
+        """Return places of even density on the skin."""
+        reached = np.cumsum(self.areas)
+        rows = np.searchsorted(reached, (np.arange(samples) + 0.5) / samples * reached[-1])
+        # In a triangle, places from a sequence that fills the square evenly (Roberts' R2).
+        u, v = (np.arange(1, samples + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532]) % 1.0).T
+        weights = np.stack([1.0 - np.sqrt(u), np.sqrt(u) * (1.0 - v), np.sqrt(u) * v], axis=1)
+        return np.einsum("pc,pcd->pd", weights, self.points[self.faces[rows]])
+
     @classmethod
     def of(cls, surface: Surface) -> "Skin":
         """Return a surface's triangles with vertices in one place made one, without those that have no area.

@@ -106,7 +106,7 @@ def _largest(solid: Solid) -> Solid:
 def _expect_likeness(solid: Solid, skin: Skin, *, tolerance: float, advice: str) -> None:
     """Raise SimulationError where much of the mesh is not the solid's surface, or much of that surface is no mesh."""
     outside = Skin(solid.points.numpy(), solid.boundary.numpy())
-    places = _spread(skin)
+    places = skin.spread()
     found = ClosestPoints(outside.points[outside.faces])(places)
     # Where bodies cross, the mesh runs inside; only what lies outside was lost.
     lost = float(((found.distances > tolerance) & ~_behind(outside, found, places)).mean())
@@ -116,22 +116,12 @@ def _expect_likeness(solid: Solid, skin: Skin, *, tolerance: float, advice: str)
             f"the detail, which may be off by {tolerance:.2g} m: ask for finer tetrahedra, by a "
             f"smaller detail or more freedoms, close the mesh, or {advice}"
         )
-    lids = float((ClosestPoints(skin.points[skin.faces])(_spread(outside)).distances > tolerance).mean())
+    lids = float((ClosestPoints(skin.points[skin.faces])(outside.spread()).distances > tolerance).mean())
     if lids > _LID:
         raise SimulationError(
             f"{lids:.0%} of the surface would be lids over holes ({skin.open_edges} edges of the mesh are open): close "
             f"the mesh, or {advice}"
         )
-
-
-def _spread(skin: Skin, samples: int = 2000) -> Float64[np.ndarray, "samples 3"]:
-    """Return places of even density on a skin."""
-    reached = np.cumsum(skin.areas)
-    rows = np.searchsorted(reached, (np.arange(samples) + 0.5) / samples * reached[-1])
-    # In a triangle, places from a sequence that fills the square evenly (Roberts' R2).
-    u, v = (np.arange(1, samples + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532]) % 1.0).T
-    weights = np.stack([1.0 - np.sqrt(u), np.sqrt(u) * (1.0 - v), np.sqrt(u) * v], axis=1)
-    return np.einsum("pc,pcd->pd", weights, skin.points[skin.faces[rows]])
 
 
 def _behind(skin: Skin, found: Closest, places: Float64[np.ndarray, "places 3"]) -> Bool[np.ndarray, " places"]:

@@ -1,6 +1,7 @@
 """The bodies that may lie behind an object's surface, as the elastic family takes them."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -20,6 +21,19 @@ class Refine(Protocol):
         ...
 
 
+@runtime_checkable
+class Hold(Protocol):
+    """Computes the modes of a free body where it is held."""
+
+    def __call__(self, body: NominalBody) -> Sequence[NominalBody]:
+        """Return the body with each support that it may have; none where it cannot be computed."""
+        ...
+
+    def digest(self) -> str:
+        """Return what tells its bodies from another's."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class CandidateBodies:
     """Bodies of which each is a hypothesis."""
@@ -28,10 +42,16 @@ class CandidateBodies:
     """Coarse ones where there are several."""
     refine: Refine | None = None
     """Makes the elements of the most probable one finer."""
+    hold: Hold | None = None
+    """Holds the most probable free one."""
+    always_hold: bool = False
+    """Whether that is tried even if the free body's evidence is good."""
 
     def digest(self) -> str:
         """Return a digest of the bodies."""
         digest = hashlib.sha256(("" if self.refine is None else self.refine.digest()).encode())
+        if self.hold is not None:
+            digest.update(f"{self.hold.digest()} {self.always_hold}".encode())
         for body in self.bodies.bodies:
             digest.update(body.name.encode())
             for tensor in (body.elastic.frequency, body.elastic.nodes, body.elastic.shapes):

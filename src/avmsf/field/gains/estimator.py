@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -15,11 +16,12 @@ from torch import Tensor
 from avmsf.capture.placement import surface_points
 from avmsf.capture.surface import Surface
 from avmsf.errors import AvmsfError, FitError
+from avmsf.fem.supports import FREE_PRIOR
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import FACTORS, Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
-from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched
+from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.outliers import Fit, Judgment, judge_contacts, predicts_better
@@ -110,9 +112,9 @@ class MixtureEstimator:
         """Return the gain model and the rows of the contacts that it is fitted to. Raises as `start`.
 
         Of several coarse bodies the most probable one is computed with finer elements, and the model is fitted again,
-        until the most probable one is fine. Contacts that the others contradict are left out where these are predicted
-        better from each other without them. Last, the most probable body with its
-        stiffness and density updated becomes one more hypothesis.
+        until the most probable one is fine. Where it is not credible it is tried whether the object was held. Contacts
+        that the others contradict are left out where these are predicted better from each other without them. Last, the
+        most probable body with its stiffness and density updated becomes one more hypothesis.
         """
         bodies, missing = self._usable_bodies(case)
         directional, every = bool(bodies) or _has_directions(case), torch.arange(len(case.train))
@@ -122,16 +124,24 @@ class MixtureEstimator:
         if self.name == Visual.kind and case.features.encoder == GEOMETRY:
             raise FitError("visual: expected visual features, found positions alone: give --features, or take another")
         fit = _Fit(case, self.kinds, _sites(case, bodies), directional, groups)
+        hold = None if self.bodies is None else self.bodies.hold
         while True:
             families = fit.families(every, bodies)
             model = fit(every, families)
             weights = _body_weights(model, families, fit.measured)
             best = max(range(len(bodies)), key=weights.__getitem__, default=None)
             fine = None if best is None else self._refined(bodies[best])
-            if best is None or fine is None:
+            if best is not None and fine is not None:
+                bodies[best] = fine
+                continue
+            judgment, used = _judged(fit, model, None if best is None else bodies[best]), every
+            if best is None or hold is None or not self._may_be_held(judgment):
                 break
-            bodies[best] = fine
-        judgment, used = _judged(fit, model, None if best is None else bodies[best]), every
+            held, hold = _more_probable(fit, bodies[best], hold(bodies[best])), None
+            if held is None:
+                break
+            # All modes have the support in common, so free bodies are no hypotheses any more.
+            bodies = [held]
         if judgment.outliers:
             rows = torch.tensor([row for row in every.tolist() if row not in {each.row for each in judgment.outliers}])
             fewer_families = fit.families(rows, bodies)
@@ -164,6 +174,11 @@ class MixtureEstimator:
                 raise
             return [], {Elastic.kind: str(error)}
         return list(self.bodies.bodies.bodies), missing
+
+    def _may_be_held(self, judgment: Judgment) -> bool:
+        """Return whether supports are tried: where they are asked for, or the free body predicts little."""
+        credible = judgment.credibility is not None and judgment.credibility.credible
+        return self.bodies is not None and (self.bodies.always_hold or not credible)
 
     def _refined(self, body: NominalBody) -> NominalBody | None:
         """Return a body with finer elements; None where it has been computed as finely as it can."""
@@ -241,6 +256,12 @@ class _Fit:
         measured = replace(self.measured, values=self.measured.values[rows])
         points = self.case.features.points
         return fit_mixture(families, measured, points, directional=self.directional, noise_shares=noise_shares)
+
+    def evidence(self, body: NominalBody) -> float:
+        """Return the log evidence of all gains with one body."""
+        families = self.families(torch.arange(len(self.sites)), [body])
+        weighed = [WeighedFamily.of(each, self.measured, NOISE_SHARES) for each in families]
+        return total_evidence(weighed, self.measured)
 
     def updated(self, rows: Int[Tensor, " rows"], body: NominalBody) -> NominalBody | None:
         """Return the body with its stiffness and density updated; None where that has no higher evidence."""
@@ -320,6 +341,16 @@ def _judged(fit: _Fit, model: MixtureGains, body: NominalBody | None) -> Judgmen
     return judge_contacts(fitted([]), elastic, fit.sites, model.sites(points), fit.measured)
 
 
+def _more_probable(fit: _Fit, free: NominalBody, held: Sequence[NominalBody]) -> NominalBody | None:
+    """Return the most probable held body by the evidence of all modes, or None where the free one is more probable."""
+    if not held:
+        return None
+    evidence = [fit.evidence(body) for body in (free, *held)]
+    best = max(range(len(held)), key=lambda row: evidence[1 + row])
+    odds = math.log(FREE_PRIOR / (1.0 - FREE_PRIOR) * len(held))
+    return held[best] if evidence[1 + best] - evidence[0] > odds else None
+
+
 def _body_weights(model: MixtureGains, families: Sequence[KernelFamily], measured: MeasuredGains) -> list[float]:
     """Return each body's posterior probability, mean over modes by their energy."""
     share = measured.energy / measured.energy.sum().clamp_min(torch.finfo(torch.float64).tiny)
@@ -335,6 +366,7 @@ def _report(
         {
             "body": body.name,
             "wall": body.wall,
+            "support": body.support,
             "fine": body.fine,
             "weight": weight,
             "factor": float(FACTORS[family.factor_weights.argmax()]),

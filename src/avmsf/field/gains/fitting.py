@@ -121,6 +121,18 @@ def hypotheses_of(families: Sequence[WeighedFamily], measured: MeasuredGains) ->
     return Hypotheses(torch.cat([each.kernels for each in families]), torch.cat(category), torch.cat(prior), log_prior)
 
 
+def total_evidence(families: Sequence[WeighedFamily], measured: MeasuredGains) -> float:
+    """Return the log evidence of the gains of all modes, up to a constant of the gains, nats.
+
+    What all modes have in common, such as an object's support, is found by this: a mixture weighs kernels for each mode
+    by itself, and mixes wrong bodies where a mode has few gains.
+    """
+    weigh_factors(families, measured)
+    evidence, active = torch.cat([each.evidence for each in families]), measured.informative
+    joint = log_joint(evidence, hypotheses_of(families, measured), active)[..., active]
+    return float(torch.logsumexp(joint.flatten(0, 1), dim=0).sum())
+
+
 def weigh_factors(families: Sequence[WeighedFamily], measured: MeasuredGains) -> None:
     """Give each elastic family the probabilities of the factors on its frequencies, from the strongest modes.
 
@@ -140,17 +152,14 @@ def weigh_factors(families: Sequence[WeighedFamily], measured: MeasuredGains) ->
 def matched(families: Sequence[WeighedFamily], elastic: Elastic, measured: MeasuredGains) -> Matched:
     """Return what gains say of a body: of its shapes and of all gains, with it among the families."""
     weighed = [*families, WeighedFamily.of(elastic, measured, NOISE_SHARES)]
-    weigh_factors(weighed, measured)
-    active = measured.informative
-    joint = log_joint(torch.cat([each.evidence for each in weighed]), hypotheses_of(weighed, measured), active)
-    total = torch.logsumexp(joint[..., active].flatten(0, 1), dim=0).sum()
+    total, active = total_evidence(weighed, measured), measured.informative
     # Parts that say nothing of their mode's shape are left out, and each mode counts its frequency once.
     prior = torch.logsumexp(
         elastic.match(torch.log(measured.frequency)) + elastic.factor_weights.log()[:, None, None], dim=0
     )
     joined = torch.cat([prior + _shape(weighed[-1], elastic, active), _no_shape(families, active)[None]])
     factor = float(FACTORS[elastic.factor_weights.argmax()])
-    return Matched(float(total), torch.softmax(joined, dim=0)[:-1], math.log(factor))
+    return Matched(total, torch.softmax(joined, dim=0)[:-1], math.log(factor))
 
 
 def _shape(

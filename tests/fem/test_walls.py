@@ -1,0 +1,136 @@
+"""Meshes that show both sides of a wall, against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from avmsf.capture.surface import Surface
+from avmsf.errors import SimulationError
+from avmsf.fem.walls import wall_of
+from avmsf.simulate.elastic import ElasticModes, elastic_modes
+from avmsf.simulate.material import STEEL
+from avmsf.simulate.nominal import NOMINAL, nominal_bodies
+from avmsf.simulate.nominalcheck import checked
+from avmsf.simulate.nominalsolid import filled_solid, freedoms_of
+from avmsf.simulate.shapes import make_shape
+from avmsf.simulate.skin import Skin
+
+
+def box(*sides: float) -> Surface:
+    """Twelve triangles."""
+    corners = torch.cartesian_prod(*(torch.tensor([0.0, side]) for side in sides))
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
+    faces += [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+    return Surface(corners, torch.tensor(faces))
+
+
+def tube(radius: float, wall: float, length: float, *, sides: int = 48, rings: int = 8) -> Surface:
+    """A tube open at both ends, its wall's two sides and its rims meshed."""
+    radii = [radius + wall / 2] * rings + [radius - wall / 2] * rings
+    heights = np.linspace(0.0, length, rings)
+    profile = np.stack([radii, np.concatenate([heights, heights[::-1]])], axis=1)
+    angles = 2 * math.pi * np.arange(sides) / sides
+    points = np.stack(
+        [
+            np.outer(profile[:, 0], np.cos(angles)),
+            np.outer(profile[:, 0], np.sin(angles)),
+            np.outer(profile[:, 1], np.ones(sides)),
+        ],
+        axis=-1,
+    )
+    a = np.arange(2 * rings * sides).reshape(2 * rings, sides)
+    b, c = np.roll(a, -1, axis=1), np.roll(a, -1, axis=0)
+    d = np.roll(b, -1, axis=0)
+    faces = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(-1, 3)
+    return Surface(torch.from_numpy(points.reshape(-1, 3)).float(), torch.from_numpy(faces))
+
+
+def silent(words: str) -> None:
+    """Nobody listens."""
+
+
+def test_a_thin_tube_bends_like_a_ring():
+    radius, wall = 0.05, 0.002
+    solid = filled_solid(checked(tube(radius, wall, 0.15), tell=silent), 15_000)
+    lowest = float(elastic_modes(solid, STEEL, count=1).frequency[0])
+    # Inextensional bending in two waves (Love, Mathematical Theory of Elasticity, art. 293, in plane strain).
+    speed = math.sqrt(STEEL.young / (12 * STEEL.density * (1 - STEEL.poisson**2)))
+    ring = 6 / math.sqrt(5) * wall / radius**2 * speed / (2 * math.pi)
+    assert lowest == pytest.approx(ring, rel=0.04)
+
+
+def test_prisms_fill_a_wall_of_uneven_thickness():
+    shape = make_shape("tray", seed=14)
+    skin = Skin.of(shape.surface)
+    wall = wall_of(skin)
+    assert wall is not None
+    assert wall.thickness == pytest.approx(shape.thickness, rel=0.1)
+    solid = wall.solid(wall.length(12_000))
+    assert solid.volume == pytest.approx(skin.volume, rel=0.02)
+    assert freedoms_of(solid) == pytest.approx(12_000, rel=0.35)
+
+
+def test_prisms_of_a_thick_block_have_several_layers():
+    skin = Skin.of(box(0.1, 0.06, 0.04))
+    wall = wall_of(skin)
+    assert wall is not None
+    length = wall.length(12_000)
+    solid = wall.solid(length)
+    assert solid.volume == pytest.approx(0.1 * 0.06 * 0.04)
+    assert len(torch.unique(solid.points[:, 2].round(decimals=6))) == 1 + math.ceil(0.04 / length)
+
+
+@pytest.mark.parametrize("kind", ["blob", "mug"])
+def test_lumps_and_walls_with_handles_are_not_filled_by_prisms(kind: str):
+    wall = wall_of(Skin.of(make_shape(kind, seed=1).surface))
+    if wall is not None:
+        with pytest.raises(SimulationError):
+            wall.solid(wall.length(12_000))
+
+
+def test_a_plate_of_twelve_triangles_has_leissas_frequencies():
+    side, thickness = 0.2, 0.002
+    body = nominal_bodies(box(side, side, thickness), walls=[None], count=3, freedoms=12_000).bodies[0]
+    rigidity = NOMINAL.young * thickness**3 / (12 * (1 - NOMINAL.poisson**2))
+    found = 2 * math.pi * body.elastic.frequency * side**2 * math.sqrt(NOMINAL.density * thickness / rigidity)
+    assert found.tolist() == pytest.approx([13.489, 19.789, 24.432], rel=0.01)
+
+
+def test_a_body_of_too_coarse_elements_is_made_finer_and_its_error_told(monkeypatch: pytest.MonkeyPatch):
+    def modes(freedoms: int, error: float) -> ElasticModes:
+        """Frequencies whose error falls with the third power of the edges' length."""
+        frequency = 100.0 * (1.0 + error * (40_000 / freedoms) ** 1.5) * torch.arange(1, 9, dtype=torch.float64)
+        nodes, none = torch.zeros(freedoms, 3, dtype=torch.float64), torch.zeros(0, 6, dtype=torch.int64)
+        return ElasticModes(frequency, nodes, none, torch.zeros(freedoms, 8, 3, dtype=torch.float64), NOMINAL, 1.0)
+
+    def made(error: float) -> tuple[list[int], list[str]]:
+        asked: list[int] = []
+        heard: list[str] = []
+
+        def found(maker: object, wall: float | None, freedoms: int, *others: object) -> ElasticModes:
+            asked.append(freedoms)
+            return modes(freedoms, error)
+
+        monkeypatch.setattr("avmsf.simulate.nominal._Maker._modes", found)
+        nominal_bodies(box(0.1, 0.1, 0.1), walls=[None], count=8, freedoms=40_000, tell=heard.append)
+        return asked, heard
+
+    assert max(made(0.03)[0]) == 40_000
+    asked, heard = made(0.08)
+    assert max(asked) == 80_000
+    assert not heard
+    # A third of .3 and more is left with twice as many.
+    [words] = made(0.3)[1]
+    assert f"{0.3 / 2**1.5 / (1 + 0.3 / 2**1.5):.0%}" in words
+
+
+@pytest.mark.slow
+def test_the_stem_of_a_goblet_keeps_its_cross_section():
+    shape = make_shape("goblet", seed=6)
+    found, expected = (
+        float(elastic_modes(solid, STEEL, count=1).frequency[0])
+        for solid in (filled_solid(checked(shape.surface, tell=silent), 20_000), shape.solid)
+    )
+    assert found == pytest.approx(expected, rel=0.08)
