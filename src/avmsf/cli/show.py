@@ -156,6 +156,7 @@ def draw_field(
         pictures["spectrum"] = draw_band(spectrum_band(field, points[0]), title=f"{name}: one blow, and its doubt")
     for stem, picture in pictures.items():
         path = folder / f"{stem}.png"
+        doing(f"drawing {path}")
         save_picture(picture, path)
         say(f"wrote {path}")
 
