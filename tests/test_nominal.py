@@ -218,12 +218,12 @@ def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(m
     """A wall that does not fit is refused once it is made, so that a single one of several is left."""
     made, told = nominal.elastic_modes, []
 
-    def fail(solid: object, *material: object, count: int, perturbed: bool) -> object:
+    def fail(solid: object, *material: object, count: int, **kept: object) -> object:
         if nominal.freedoms_of(solid) > 3000:  # type: ignore[arg-type]
             raise MemoryError
         if abs(solid.volumes.sum() - 0.24 * 0.17 * 0.004) > 1e-5:  # type: ignore[attr-defined]
             raise SimulationError("of no use")
-        return made(solid, *material, count=count, perturbed=perturbed)  # type: ignore[arg-type]
+        return made(solid, *material, count=count, **kept)  # type: ignore[arg-type]
 
     monkeypatch.setattr(nominal, "elastic_modes", fail)
     monkeypatch.setattr(nominal, "TRIAL", 2000)

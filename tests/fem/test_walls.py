@@ -109,7 +109,7 @@ def test_a_body_of_too_coarse_elements_is_made_finer_and_its_error_told(monkeypa
         asked: list[int] = []
         heard: list[str] = []
 
-        def found(maker: object, wall: float | None, freedoms: int, *others: object) -> ElasticModes:
+        def found(maker: object, wall: float | None, freedoms: int, **others: object) -> ElasticModes:
             asked.append(freedoms)
             return modes(freedoms, error)
 

@@ -9,7 +9,8 @@ import torch
 from avmsf.fem.supports import FREE, supports_of
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Sites
-from avmsf.field.gains.fitting import MeasuredGains, total_evidence
+from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, total_evidence
+from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
@@ -49,9 +50,10 @@ def recorded(support: str, count: int = 12) -> tuple[Sites, MeasuredGains]:
 def test_the_support_of_a_plate_is_the_most_probable(support: str):
     sites, gains = recorded(support)
     size = float(np.linalg.norm(SIDES))
-    others = [kind(sites, size) for kind in (Unstructured, Smooth, ThinPlate)]
+    others = [WeighedFamily.of(kind(sites, size), gains, NOISE_SHARES) for kind in (Unstructured, Smooth, ThinPlate)]
     evidence = {
-        name: total_evidence([*others, Elastic(sites, size, modes)], gains) for name, modes in candidates().items()
+        name: total_evidence([*others, WeighedFamily.of(Elastic(sites, size, modes), gains, NOISE_SHARES)], gains)
+        for name, modes in candidates().items()
     }
     true = evidence.pop(support)
     # Two nats a mode.
