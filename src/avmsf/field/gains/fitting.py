@@ -56,8 +56,22 @@ class MeasuredGains:
 
     @property
     def informative(self) -> Bool[Tensor, " series"]:
-        """Which series the prior is learned from: those that are substantial and not of a silent mode."""
-        return active_series(series_of(self.values)) & self.substantial
+        """Which series the prior is learned from: those that are substantial and not of a silent or doubled mode."""
+        return active_series(series_of(self.values)) & self.substantial & self.distinct.repeat(2)
+
+    @property
+    def distinct(self) -> Bool[Tensor, " modes"]:
+        """Which modes are the strongest within their half-power bandwidth, the mean of damping / pi of two modes.
+
+        Extraction may give one mode as two of nearly the same frequency, which are to count as one.
+        """
+        width = (self.damping[:, None] + self.damping) / (2.0 * math.pi)
+        near = (self.frequency[:, None] - self.frequency).abs() < width
+        order = torch.argsort(self.energy, descending=True)
+        kept = torch.zeros(len(order), dtype=torch.bool)
+        for row in order.tolist():
+            kept[row] = not bool((kept & near[row]).any())
+        return kept
 
     @property
     def floor(self) -> Float64[Tensor, " series"]:
@@ -140,7 +154,8 @@ def weigh_factors(families: Sequence[WeighedFamily], measured: MeasuredGains) ->
     shape. Given a factor the modes are independent of each other.
     """
     unknown = _no_shape(families)
-    rows = torch.topk(measured.energy, min(_STRONGEST, len(measured.energy))).indices
+    energy = measured.energy * measured.distinct
+    rows = torch.topk(energy, min(_STRONGEST, int(measured.distinct.sum()))).indices
     for each in families:
         if isinstance(each.family, Elastic):
             density = each.family.match(torch.log(measured.frequency))
