@@ -218,7 +218,7 @@ def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(m
     """A wall that does not fit is refused once it is made, so that a single one of several is left."""
     made, told = nominal.elastic_modes, []
 
-    def fail(solid: object, *material: object, count: int) -> object:
+    def fail(solid: object, *material: object, count: int, fixed: object) -> object:
         if nominal.freedoms_of(solid) > 3000:  # type: ignore[arg-type]
             raise MemoryError
         if abs(solid.volumes.sum() - 0.24 * 0.17 * 0.004) > 1e-5:  # type: ignore[attr-defined]
