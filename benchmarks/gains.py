@@ -16,7 +16,7 @@ from torch import Tensor
 from avmsf.bench.baselines import MeanWaveform
 from avmsf.bench.evaluation import evaluate, score, split
 from avmsf.bench.knowntruth import truth_at, truth_from_first_sample
-from avmsf.capture import Capture, CaptureSettings, CaptureWarning, Impacts, read_capture
+from avmsf.capture import Capture, CaptureSettings, CaptureWarning, Impacts, Surface, read_capture
 from avmsf.field.config import FitConfig
 from avmsf.field.doubt import coverage
 from avmsf.field.fit import fit
@@ -31,7 +31,7 @@ from avmsf.modal.extraction.extract import Extraction, extract
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise, synthesise_phased
-from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
+from avmsf.pipeline.bodies import BodyConfig, candidate_bodies, roughened
 from avmsf.scene.features import GEOMETRY, FeatureField
 from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.simulate.elastic import ElasticModes
@@ -71,6 +71,7 @@ class SplitCase:
     modes: Extraction
     features: FeatureField
     bodies: CandidateBodies | None
+    surface: Surface | None
 
     def fit(self, estimator: MixtureEstimator, *, quick: bool) -> SoundField:
         """Return the field of an estimator, refined unless it should be quick."""
@@ -189,7 +190,7 @@ def _ablation(options: Options) -> Report:
     figures = {}
     found: dict[str, list[float]] = defaultdict(list)
     for name, case in cases.items():
-        for variant, error in _variants(case):
+        for variant, error in _variants(case, options):
             found[variant].append(error)
             tell(f"{name}, {variant}: {error:.4f}")
     for variant, errors in found.items():
@@ -212,7 +213,7 @@ def _ablated(options: Options) -> Iterator[tuple[str, SplitCase]]:
             yield name, _case(*split(capture.impacts, fraction=0.2), capture, bodies)
 
 
-def _variants(case: SplitCase) -> Iterator[tuple[str, float]]:
+def _variants(case: SplitCase, options: Options) -> Iterator[tuple[str, float]]:
     """Yield names of variants of the default model and their errors."""
     field = case.fit(MixtureEstimator(bodies=case.bodies), quick=False)
     yield "default", case.error(field)
@@ -230,6 +231,9 @@ def _variants(case: SplitCase) -> Iterator[tuple[str, float]]:
         ]
         bodies = CandidateBodies(replace(case.bodies.bodies, bodies=tuple(nominal)), case.bodies.refine)
         yield "no updating", case.error(case.fit(MixtureEstimator(bodies=bodies), quick=False))
+    if case.surface is not None:
+        rough = _bodies_of(roughened(case.surface, _ROUGH, seed=0), options)
+        yield "noisy mesh", case.error(case.fit(MixtureEstimator(bodies=rough), quick=False))
     if case.features.encoder != GEOMETRY:
         yield "visual features", case.error(case.fit(MixtureEstimator(KNOWN, bodies=case.bodies), quick=False))
 
@@ -365,13 +369,17 @@ def _case(train: Impacts, test: Impacts, capture: Capture, bodies: CandidateBodi
     modes = extract(train)
     contacts = capture.impacts.contacts
     features = FeatureField.from_contacts(contacts) if capture.surface is None else surface_features(capture)
-    return SplitCase(modes.aligned(train), modes.aligned(test), modes, features, bodies)
+    return SplitCase(modes.aligned(train), modes.aligned(test), modes, features, bodies, capture.surface)
 
 
 def _bodies(capture: Capture, options: Options, *, cache: Path | None = None) -> CandidateBodies:
-    config = BodyConfig(shapes=12, freedoms=3000) if options.quick_look else BodyConfig()
     assert capture.surface is not None
-    return candidate_bodies(capture.surface, config, cache=cache, tell=tell)
+    return _bodies_of(capture.surface, options, cache)
+
+
+def _bodies_of(surface: Surface, options: Options, cache: Path | None = None) -> CandidateBodies:
+    config = BodyConfig(shapes=12, freedoms=3000) if options.quick_look else BodyConfig()
+    return candidate_bodies(surface, config, cache=cache, tell=tell)
 
 
 def _read(name: str) -> Capture:
@@ -395,6 +403,8 @@ def _simulated(name: str, options: Options, cache: Path, *, tidy: bool = False) 
     return made.capture, made.truth
 
 
+_ROUGH = 0.003
+"""Standard deviation of a noisy mesh's vertices along each axis, over the object's size."""
 _TIDY = {"speed": 0.15, "contact_time": 0.0, "pretrigger": 0.0, "jitter": 0.0, "propagation": 0.0}
 
 
