@@ -6,7 +6,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, KNOWN, POSITIONAL, MixtureEstimator
+from avmsf.field.gains.symmetry import Symmetric, groups_of
 from avmsf.field.posterior import parts_of, std_of
 from avmsf.field.recipes import GainCase, along_phase
 from avmsf.field.soundfield import SoundField
@@ -33,6 +34,7 @@ from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise, synthesise_phased
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies, roughened
 from avmsf.scene.features import GEOMETRY, FeatureField
+from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.example import EXAMPLE_FOLDER
@@ -78,6 +80,14 @@ class SplitCase:
         steps = 1 if quick else FitConfig().steps
         config = FitConfig(warmup_steps=0, steps=steps)
         return fit(self.train, self.features, self.modes, config, gains=estimator)
+
+    @cached_property
+    def symmetries(self) -> Symmetries | None:
+        """Of the mesh's points; None without a mesh, or where they have none."""
+        if self.surface is None:
+            return None
+        found = find_symmetries(self.features.points, generator=torch.Generator().manual_seed(0))
+        return found if groups_of(found) else None
 
     def coverage(self, field: SoundField) -> float:
         """Return the part of the held-out gains, by energy, in their intervals of 90 %."""
@@ -136,9 +146,11 @@ def _errors(case: SplitCase, options: Options) -> tuple[dict[str, float], float]
         for method, make in SIMPLE.items()
         if make.keywords["count"] <= len(case.train)
     }
+    needed = {Elastic.kind: case.bodies, Symmetric.kind: case.symmetries}
     for kind in FAMILIES:
-        if kind != Elastic.kind or case.bodies is not None:
-            single[kind] = case.error(case.fit(MixtureEstimator((kind,), case.bodies), quick=True))
+        if needed.get(kind, kind):
+            alone = MixtureEstimator((kind,), case.bodies, symmetries=case.symmetries)
+            single[kind] = case.error(case.fit(alone, quick=True))
     mixture = MixtureEstimator(bodies=case.bodies)
     single[UNREFINED] = case.error(case.fit(mixture, quick=True))
     field = case.fit(mixture, quick=options.quick_look)
@@ -222,9 +234,8 @@ def _variants(case: SplitCase, options: Options) -> Iterator[tuple[str, float]]:
     origin = replace(field.origin, config=replace(field.origin.config, residual_noise="gaussian"))
     yield "Gaussian noise", case.error(replace(field, origin=origin))
     yield "magnitudes lifted half way", case.error(_Lifted(field))  # type: ignore[arg-type]
-    symmetries = find_symmetries(case.features.points, generator=torch.Generator().manual_seed(0))
     yield "positions alone", case.error(case.fit(MixtureEstimator(tuple(POSITIONAL)), quick=False))
-    yield "positions and symmetry", case.error(case.fit(MixtureEstimator(symmetries=symmetries), quick=False))
+    yield "positions and symmetry", case.error(case.fit(MixtureEstimator(symmetries=case.symmetries), quick=False))
     if case.bodies is not None:
         nominal = [
             replace(body, elastic=replace(body.elastic, perturbations=None)) for body in case.bodies.bodies.bodies
