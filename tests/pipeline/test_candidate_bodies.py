@@ -10,6 +10,7 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import Surface
 from avmsf.errors import FitError
+from avmsf.fem.supports import Support
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit, gain_case
 from avmsf.field.gains.bodies import CandidateBodies
@@ -129,7 +130,7 @@ class Held:
 
     def __call__(self, body: NominalBody) -> tuple[NominalBody, ...]:
         self.asked.append(body)
-        return (replace(self.body, support="held at its lowest face"),)
+        return body, replace(self.body, support=Support("held at its lowest face"))
 
     def digest(self) -> str:
         return ""

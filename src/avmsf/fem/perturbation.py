@@ -61,10 +61,9 @@ def perturbations(
     young: float,
     poisson: float,
     density: float,
-    seed: int = 0,
 ) -> Perturbations:
     """Return the changes on the basis of some mode shapes, 1 / sqrt(kg)."""
-    fields = smooth_fields(elements.centers, elements.volumes, length=_LENGTH * size, seed=seed)
+    fields = smooth_fields(elements.centers, elements.volumes, length=_LENGTH * size, seed=0)
     modes = shapes.shape[2]
     shear, squeeze = young / (2.0 * (1.0 + poisson)), young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
     by_poisson = (

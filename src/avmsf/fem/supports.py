@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int
 from scipy.spatial import ConvexHull, QhullError
 
+from avmsf.errors import SimulationError
 from avmsf.simulate.elements import SecondOrder
 
 FREE = "free"
@@ -32,14 +33,28 @@ _MOST = 0.4
 """Part of the surface's nodes that may be held: what is left would not ring."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Support:
-    """Nodes that are held."""
+    """Where a body is held, the same on every mesh of it."""
 
     name: str
     """In words, such as "held at its lowest face"."""
-    nodes: Int[np.ndarray, " nodes"]
-    """Rows of the mesh's nodes."""
+    edge: tuple[tuple[float, float], tuple[float, float]] | None = None
+    """Ends of the lower edge, seen from above, meters; None for the lowest nodes."""
+
+    def nodes(self, mesh: SecondOrder) -> Int[np.ndarray, " nodes"]:
+        """Return the rows of the nodes that are held. Raises SimulationError where there are none."""
+        outer = np.unique(mesh.boundary)
+        places, size = mesh.nodes[outer], mesh.solid.size
+        heights = places[:, 2] - places[:, 2].min()
+        if self.edge is None:
+            return outer[heights <= _NEAR * size]
+        start, end = np.array(self.edge)
+        along = (end - start) / np.linalg.norm(end - start)
+        near = (np.abs(_cross(along, places[:, :2] - start)) <= _NEAR * size) & (heights <= _LOW * size)
+        if not near.any():
+            raise SimulationError(f"{self.name}: expected nodes within {1000 * _NEAR * size:.2g} mm of it, found none")
+        return outer[near]
 
 
 def supports_of(mesh: SecondOrder) -> list[Support]:
@@ -47,15 +62,12 @@ def supports_of(mesh: SecondOrder) -> list[Support]:
     outer = np.unique(mesh.boundary)
     places, size = mesh.nodes[outer], mesh.solid.size
     heights = places[:, 2] - places[:, 2].min()
-    lowest = heights <= _NEAR * size
-    extent = float(np.linalg.norm(np.ptp(places[lowest, :2], axis=0)))
-    found = [Support(f"held at its lowest {'point' if extent < _POINT * size else 'face'}", outer[lowest])]
+    extent = float(np.linalg.norm(np.ptp(places[heights <= _NEAR * size, :2], axis=0)))
+    found = [Support(f"held at its lowest {'point' if extent < _POINT * size else 'face'}")]
     for number, (start, end) in enumerate(_lower_edges(places[heights <= _LOW * size, :2], size), start=1):
-        along = (end - start) / np.linalg.norm(end - start)
-        apart = np.abs(_cross(along, places[:, :2] - start))
-        near = (apart <= _NEAR * size) & (heights <= _LOW * size)
-        found.append(Support(f"held along lower edge {number}", outer[near]))
-    return [each for each in found if len(each.nodes) <= _MOST * len(outer)]
+        edge = (float(start[0]), float(start[1])), (float(end[0]), float(end[1]))
+        found.append(Support(f"held along lower edge {number}", edge))
+    return [each for each in found if len(each.nodes(mesh)) <= _MOST * len(outer)]
 
 
 def _lower_edges(

@@ -12,6 +12,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.placement import surface_points
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
+from avmsf.fem.supports import Support
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.placed import expect_placed
 from avmsf.simulate.nominal import NominalBody, nominal_bodies, refined, supported
@@ -30,8 +31,8 @@ class BodyConfig:
     """Degrees of freedom of the finite elements, about."""
     supports: Literal["auto", "free", "try"] = "auto"
     """Whether the object may have been held at its lowest face or point, or along a lower edge (z is upwards). auto:
-    tried if the free body does not predict recordings left out. free: it lay on foam or hung. try: always tried, which
-    takes some seconds more."""
+    tried if the free body predicts recordings left out little better than no body. free: it lay on foam or hung. try:
+    always tried, which takes 10 to 30 s more."""
 
     def __post_init__(self) -> None:
         if self.wall is not None and not 0 <= self.wall < float("inf"):
@@ -51,7 +52,7 @@ class FinerBodies:
     """Folder that keeps elastic modes by content."""
     tell: Callable[[str], None]
     """Told what is done, in words."""
-    made: dict[tuple[float | None, str], NominalBody] = field(default_factory=dict)
+    made: dict[tuple[float | None, Support | None], NominalBody] = field(default_factory=dict)
     """Those that are done, by their walls and supports: names of two may be alike."""
 
     def __call__(self, body: NominalBody) -> NominalBody:
@@ -81,7 +82,7 @@ class HeldBodies:
     """Those that are done, by their walls."""
 
     def __call__(self, body: NominalBody) -> tuple[NominalBody, ...]:
-        """Return the body with each support that it may have."""
+        """Return the free body, and with each support that it may have."""
         if body.wall not in self.made:
             self.made[body.wall] = supported(
                 self.surface, body, freedoms=self.freedoms, cache=self.cache, tell=self.tell

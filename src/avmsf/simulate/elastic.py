@@ -143,6 +143,8 @@ def elastic_modes(
     """
     if count < 1:
         raise SimulationError(f"count = {count}: expected 1 mode or more")
+    if perturbed and (stiffness_factor is not None or density_factor is not None):
+        raise SimulationError("perturbed: expected a body without factors, got factors: ask for the modes alone")
     _expect_whole(solid)
     stiff, light = (
         _factor(solid, factor, name)

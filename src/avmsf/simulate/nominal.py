@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -14,7 +14,7 @@ from jaxtyping import Int
 from avmsf._utils.caching import source_digest
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
-from avmsf.fem.supports import FREE, supports_of
+from avmsf.fem.supports import Support, supports_of
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.elasticstore import modes_once
 from avmsf.simulate.elements import SecondOrder
@@ -50,15 +50,15 @@ class NominalBody:
     """Nominal material."""
     fine: bool = True
     """Whether its elements are as many as were asked for; `refined` makes those finer that were made to be compared."""
-    support: str = FREE
-    """Where it is held, such as "held at its lowest face"."""
+    support: Support | None = None
+    """Where it is held; None for a free body."""
     updated: float | None = None
-    """Log evidence that it gained from measured gains by departures of its stiffness and density; None without."""
+    """Log evidence (nats) that it gained by departures of its stiffness and density; None without."""
 
     @property
     def name(self) -> str:
         """What it is, for people."""
-        parts = [body_name(self.wall), "" if self.support == FREE else self.support]
+        parts = [body_name(self.wall), "" if self.support is None else self.support.name]
         parts.append("" if self.updated is None else "stiffness and density updated")
         return ", ".join(filter(None, parts))
 
@@ -145,9 +145,10 @@ def refined(
     _expect_settings(len(body.elastic), freedoms, [body.wall])
     try:
         maker = _Maker(surface, len(body.elastic), cache, told)
-        if body.support == FREE:
+        if body.support is None:
             return maker.body(body.wall, freedoms, fine=True)
-        return replace(body, elastic=maker.held(body.wall, freedoms)[body.support], fine=True)
+        modes = maker.held(body.wall, freedoms, maker.solid(body.wall, freedoms), body.support, perturbed=True)
+        return replace(body, elastic=modes, fine=True)
     except SimulationError as error:
         told(f"{body.name} stays coarse: {error}")
         return body
@@ -161,19 +162,28 @@ def supported(
     cache: Path | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> tuple[NominalBody, ...]:
-    """Return a free body of `nominal_bodies` held where an object may be: at its lowest face or point, or at an edge.
+    """Return a free body of `nominal_bodies`, and held where an object may be: at its lowest face or point, or an edge.
 
-    `TRIAL` degrees of freedom at most, enough to choose by; `refined` makes the chosen one fine. Without those whose
-    modes cannot be computed, of which `tell` hears.
+    All have the same tetrahedra, of `TRIAL` degrees of freedom at most: enough to choose by; `refined` makes the chosen
+    one fine, without a check of its convergence. Those whose modes cannot be computed are left out, of which `tell`
+    hears; none are returned if the free one's cannot.
     """
     told = tell or (lambda words: None)
     few = min(freedoms, TRIAL)
+    maker, bodies = _Maker(surface, len(body.elastic), cache, told), []
     try:
-        held = _Maker(surface, len(body.elastic), cache, told).held(body.wall, few)
+        solid = maker.solid(body.wall, few)
+        for support in (None, *supports_of(SecondOrder.of(solid))):
+            try:
+                modes = maker.held(body.wall, few, solid, support, perturbed=freedoms <= TRIAL)
+                bodies.append(NominalBody(body.wall, modes, freedoms <= TRIAL, support))
+            except SimulationError as error:
+                if support is None:
+                    raise
+                told(f"{body.name}, {support.name}: not tried ({error})")
     except SimulationError as error:
         told(f"{body.name}: no supports are tried ({error})")
-        return ()
-    return tuple(NominalBody(body.wall, each, freedoms <= TRIAL, name) for name, each in held.items())
+    return tuple(bodies)
 
 
 class _Maker:
@@ -205,13 +215,15 @@ class _Maker:
             return modes
         try:
             error = _frequency_error(self._modes(wall, TRIAL, perturbed=False), modes)
-            if error > LARGEST_ERROR:
-                finer = self._modes(wall, 2 * freedoms, perturbed=True)
-                modes, error = finer, _frequency_error(modes, finer)
         except SimulationError as failure:
-            # No coarser one to compare with, or no room for a finer one.
             self._tell(f"{body_name(wall)}: whether its elements are fine enough is not known ({failure})")
             return modes
+        if error > LARGEST_ERROR:
+            try:
+                finer = self._modes(wall, 2 * freedoms, perturbed=True)
+                modes, error = finer, _frequency_error(modes, finer)
+            except SimulationError as failure:
+                self._tell(f"{body_name(wall)}: no finer elements ({failure})")
         if error > LARGEST_ERROR:
             self._tell(
                 f"{body_name(wall)}: elements too coarse, the lowest frequencies are wrong by about {error:.0%}: allow "
@@ -219,12 +231,13 @@ class _Maker:
             )
         return modes
 
-    def held(self, wall: float | None, freedoms: int) -> dict[str, ElasticModes]:
-        """Return the modes of one body held in several ways, by their names; its tetrahedra are made once."""
-        expect_memory(freedoms)
-        solid = self._solid(wall, freedoms)
-        found = supports_of(SecondOrder.of(solid))
-        return {each.name: self._solved(solid, freedoms, each.nodes, perturbed=True) for each in found}
+    def held(
+        self, wall: float | None, freedoms: int, solid: Solid, support: Support | None, *, perturbed: bool
+    ) -> ElasticModes:
+        """Return the modes of tetrahedra that are held, or free without a support, read from where they are kept."""
+        fixed = None if support is None else support.nodes(SecondOrder.of(solid))
+        kept = self._kept(wall, freedoms, support, perturbed=perturbed)
+        return modes_once(kept, lambda: self._solved(solid, freedoms, fixed, perturbed=perturbed), tell=self._tell)
 
     def _modes(self, wall: float | None, freedoms: int, *, perturbed: bool) -> ElasticModes:
         """Return the modes of one free body, read from where they are kept."""
@@ -232,9 +245,7 @@ class _Maker:
         return modes_once(kept, lambda: self._computed(wall, freedoms, perturbed=perturbed), tell=self._tell)
 
     def _computed(self, wall: float | None, freedoms: int, *, perturbed: bool) -> ElasticModes:
-        expect_memory(freedoms)
-        self._tell(f"tetrahedra of the body, {body_name(wall)}")
-        return self._solved(self._solid(wall, freedoms), freedoms, None, perturbed=perturbed)
+        return self._solved(self.solid(wall, freedoms), freedoms, None, perturbed=perturbed)
 
     def _solved(
         self, solid: Solid, freedoms: int, fixed: Int[np.ndarray, " fixed"] | None, *, perturbed: bool
@@ -249,14 +260,19 @@ class _Maker:
                 f"freedoms={max(freedoms // 2, FEWEST)}, or end other programs"
             ) from error
 
-    def _solid(self, wall: float | None, freedoms: int) -> Solid:
+    def solid(self, wall: float | None, freedoms: int) -> Solid:
+        """Return tetrahedra with about so many degrees of freedom."""
+        expect_memory(freedoms)
+        self._tell(f"tetrahedra of the body, {body_name(wall)}")
         if wall is None:
             return filled_solid(self.checked, freedoms)
         if freedoms not in self._walls:
             self._walls[freedoms] = wall_solids(self.checked, freedoms)
         return self._walls[freedoms](wall)
 
-    def _kept(self, wall: float | None, freedoms: int, *, perturbed: bool) -> Path | None:
+    def _kept(
+        self, wall: float | None, freedoms: int, support: Support | None = None, *, perturbed: bool
+    ) -> Path | None:
         if self._cache is None:
             return None
         values = {
@@ -268,6 +284,7 @@ class _Maker:
             "count": self._count,
             "freedoms": freedoms,
             "perturbed": perturbed,
+            "support": None if support is None else asdict(support),
         }
         return self._cache / f"nominal-{key_of(values)}.safetensors"
 

@@ -27,14 +27,16 @@ CLAMPED = "held along lower edge 3"
 def candidates() -> dict[str, ElasticModes]:
     """A coarse plate of nominal material, free and held along each of its sides."""
     solid = block(SIDES, (9, 6, 1))
-    fixed = {FREE: None} | {each.name: each.nodes for each in supports_of(SecondOrder.of(solid))}
+    mesh = SecondOrder.of(solid)
+    fixed = {FREE: None} | {each.name: each.nodes(mesh) for each in supports_of(mesh)}
     return {name: elastic_modes(solid, NOMINAL, count=16, fixed=nodes) for name, nodes in fixed.items()}
 
 
 def recorded(support: str, count: int = 12) -> tuple[Sites, MeasuredGains]:
     """Impacts on a finer plate of steel that is stiffer at one end."""
     solid = block(SIDES, (13, 8, 1))
-    fixed = {FREE: None} | {each.name: each.nodes for each in supports_of(SecondOrder.of(solid))}
+    mesh = SecondOrder.of(solid)
+    fixed = {FREE: None} | {each.name: each.nodes(mesh) for each in supports_of(mesh)}
     stiffness = 1.0 + 0.5 * solid.points[solid.cells].mean(1)[:, 0]
     true = elastic_modes(solid, STEEL, count=10, stiffness_factor=stiffness, fixed=fixed[support])
     points = (draw(count, 3, seed=4) + 0.5) * torch.tensor(SIDES, dtype=torch.float64)

@@ -26,7 +26,7 @@ class Hold(Protocol):
     """Computes the modes of a free body where it is held."""
 
     def __call__(self, body: NominalBody) -> Sequence[NominalBody]:
-        """Return the body with each support that it may have; none where it cannot be computed."""
+        """Return the free body and, of the same elements, with each support; none where it cannot be computed."""
         ...
 
     def digest(self) -> str:

@@ -16,7 +16,7 @@ from torch import Tensor
 from avmsf.capture.placement import surface_points
 from avmsf.capture.surface import Surface
 from avmsf.errors import AvmsfError, FitError
-from avmsf.fem.supports import FREE_PRIOR
+from avmsf.fem.supports import FREE, FREE_PRIOR
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import FACTORS, Elastic
@@ -140,13 +140,14 @@ class MixtureEstimator:
             judgment, used = _judged(fit, model, None if best is None else bodies[best]), every
             if best is None or hold is None or not self._may_be_held(judgment):
                 break
-            held, hold = _more_probable(fit, bodies[best], hold(bodies[best])), None
+            rows = _without(every, judgment)
+            held, hold = _more_probable(fit, rows, hold(bodies[best])), None
             if held is None:
                 break
             # All modes have the support in common, so free bodies are no hypotheses any more.
             bodies = [held]
         if judgment.outliers:
-            rows = torch.tensor([row for row in every.tolist() if row not in {each.row for each in judgment.outliers}])
+            rows = _without(every, judgment)
             fewer_families = fit.families(rows, bodies)
             fewer = fit(rows, fewer_families)
             if predicts_better(fewer, model, rows, fit.measured):
@@ -261,11 +262,13 @@ class _Fit:
         points = self.case.features.points
         return fit_mixture(families, measured, points, directional=self.directional, noise_shares=noise_shares)
 
-    def evidence(self, body: NominalBody) -> float:
-        """Return the log evidence of all gains with one body."""
-        families = self.families(torch.arange(len(self.sites)), [body])
-        weighed = [WeighedFamily.of(each, self.measured, NOISE_SHARES) for each in families]
-        return total_evidence(weighed, self.measured)
+    def evidence(self, rows: Int[Tensor, " rows"], bodies: Sequence[NominalBody]) -> list[float]:
+        """Return the log evidence of the gains of some contacts with each body by itself."""
+        sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
+        measured = replace(self.measured, values=self.measured.values[rows])
+        others = [WeighedFamily.of(each, measured, NOISE_SHARES) for each in self.families(rows, [])]
+        elastic = (WeighedFamily.of(Elastic(sites, size, body.elastic), measured, NOISE_SHARES) for body in bodies)
+        return [total_evidence([*others, each], measured) for each in elastic]
 
     def updated(self, rows: Int[Tensor, " rows"], body: NominalBody) -> NominalBody | None:
         """Return the body with its stiffness and density updated; None where that has no higher evidence."""
@@ -277,7 +280,7 @@ class _Fit:
         measured = replace(self.measured, values=self.measured.values[rows])
         others = [WeighedFamily.of(family, measured, NOISE_SHARES) for family in self.families(rows, [])]
         found = update(
-            body.elastic, sites, measured.frequency, measured.values.real,
+            body.elastic, sites, measured.frequency, measured.values.real, measured.informative.chunk(2)[0],
             lambda modes: matched(others, Elastic(sites, size, modes), measured),
         )  # fmt: skip
         return None if found is None else replace(body, elastic=found[0], updated=found[1])
@@ -345,14 +348,19 @@ def _judged(fit: _Fit, model: MixtureGains, body: NominalBody | None) -> Judgmen
     return judge_contacts(fitted([]), elastic, fit.sites, model.sites(points), fit.measured)
 
 
-def _more_probable(fit: _Fit, free: NominalBody, held: Sequence[NominalBody]) -> NominalBody | None:
-    """Return the most probable held body by the evidence of all modes, or None where the free one is more probable."""
-    if not held:
+def _without(rows: Int[Tensor, " rows"], judgment: Judgment) -> Int[Tensor, " kept"]:
+    """Return the rows that are no outliers."""
+    return torch.tensor([row for row in rows.tolist() if row not in {each.row for each in judgment.outliers}])
+
+
+def _more_probable(fit: _Fit, rows: Int[Tensor, " rows"], bodies: Sequence[NominalBody]) -> NominalBody | None:
+    """Return the most probable held body by the evidence of all modes, or None where the first, free, is the best."""
+    if len(bodies) < 2:
         return None
-    evidence = [fit.evidence(body) for body in (free, *held)]
-    best = max(range(len(held)), key=lambda row: evidence[1 + row])
+    free, *held = fit.evidence(rows, bodies)
+    best = max(range(len(held)), key=held.__getitem__)
     odds = math.log(FREE_PRIOR / (1.0 - FREE_PRIOR) * len(held))
-    return held[best] if evidence[1 + best] - evidence[0] > odds else None
+    return bodies[1 + best] if held[best] - free > odds else None
 
 
 def _body_weights(model: MixtureGains, families: Sequence[KernelFamily], measured: MeasuredGains) -> list[float]:
@@ -370,7 +378,8 @@ def _report(
         {
             "body": body.name,
             "wall": body.wall,
-            "support": body.support,
+            "support": FREE if body.support is None else body.support.name,
+            "updating_nats": body.updated,
             "fine": body.fine,
             "weight": weight,
             "factor": float(FACTORS[family.factor_weights.argmax()]),

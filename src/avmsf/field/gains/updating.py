@@ -12,9 +12,9 @@ method from the modes whose shape is known with some certainty: to first order
     d phi_k = sum_(j != k) phi_j v_j' (dK - lambda_k dM) v_k / (lambda_k - lambda_j)
 
 (Fox and Kapoor, AIAA Journal 6, 1968). Rounds of matching and solving follow each other; the one with the highest
-evidence is kept, with the coefficients' prior in it, and round 0 is the nominal body. Rounds end where the coefficients
-are larger than their prior expects, the sum of their squares over their variances exceeding their number: the object is
-then another body, not a perturbed one, and first order says nothing of it.
+evidence is kept, by Laplace's approximation over the coefficients, and round 0 is the nominal body. Rounds end where the
+coefficients are larger than their prior expects, the sum of their squares over their variances exceeding their number:
+the object is then another body, not a perturbed one, and first order says nothing of it.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from avmsf.fem.perturbation import Perturbations
@@ -34,7 +34,9 @@ STIFFNESS, DENSITY, POISSON, FACTOR = 0.10, 0.04, 1.0, 0.5
 """Prior standard deviations of the coefficients: of Young's modulus and density over their nominal values, of Poisson's
 ratio over a change of .05, and of the log factor on all frequencies over one round."""
 _POISSON_STEP = 0.05
+"""Change of Poisson's ratio that a coefficient of 1 stands for."""
 _ROUNDS = 6
+"""Most rounds; on simulated objects the evidence rises for 3 to 6."""
 _SURE = 0.7
 """Probability of a shape from which on a mode is taken for it."""
 _FREQUENCY = 0.02, 0.002
@@ -66,27 +68,30 @@ def update(
     sites: Sites,
     frequency: Float64[Tensor, " modes"],
     values: Float64[Tensor, "contacts modes"],
+    usable: Bool[Tensor, " modes"],
     match: Callable[[ElasticModes], Matched],
 ) -> tuple[ElasticModes, float] | None:
     """Return the updated modes and the log evidence that they gain, or None where the nominal ones have the highest.
 
     `modes` have `perturbations`; `frequency` (Hz) and `values` are those measured at `sites`, along each mode's common
-    phase. `match` weighs a body, known at least at the sites, against the other families.
+    phase; modes that are not `usable`, silent or doubled ones, say nothing of the body. `match` weighs a body, known at
+    least at the sites, against the other families.
     """
     assert modes.perturbations is not None
     local = modes.near(sites.points)
     known = local.gains(sites.points, sites.directions).numpy()
-    problem = _Problem(modes.frequency.numpy(), modes.perturbations, known, frequency.numpy(), values.numpy())
+    measured = frequency[usable].numpy(), values[:, usable].numpy()
+    problem = _Problem(modes.frequency.numpy(), modes.perturbations, known, *measured)
     theta, spread, best = np.zeros(len(problem.deviation)), _FREQUENCY[0], None
     found = match(local)
     nominal = highest = found.evidence
     for step in range(_ROUNDS):
-        theta, spread = problem.solved(theta, found, spread, with_gains=step > 0)
+        theta, spread, volume = problem.solved(theta, found, found.centers[:, usable], spread, with_gains=step > 0)
         size = float(np.square(theta / problem.deviation).sum())
         if size > len(theta):
             break
         found = match(problem.changed(local, theta))
-        evidence = found.evidence - 0.5 * size
+        evidence = found.evidence - 0.5 * size - volume
         if evidence > highest:
             highest, best = evidence, theta
     return None if best is None else (problem.changed(modes, best), highest - nominal)
@@ -124,10 +129,17 @@ class _Problem:
         mixed = torch.einsum("njd,jk->nkd", modes.shapes, torch.from_numpy(shapes))
         return replace(modes, frequency=frequency, shapes=mixed, perturbations=None)
 
-    def solved(self, theta: np.ndarray, found: Matched, spread: float, *, with_gains: bool) -> tuple[np.ndarray, float]:
-        """Return the next coefficients and the standard deviation of log frequencies."""
+    def solved(
+        self, theta: np.ndarray, found: Matched, known: Tensor, spread: float, *, with_gains: bool
+    ) -> tuple[np.ndarray, float, float]:
+        """Return the next coefficients, the standard deviation of log frequencies, and Laplace's log volume.
+
+        `known` has the probabilities of the shapes of the usable modes. The volume is half the log determinant of the
+        coefficients' posterior precision over the prior's, by which their best values overstate the evidence (MacKay,
+        Neural Computation 4, 1992).
+        """
         squares, shapes = self.solution(theta)
-        centers = found.centers.numpy()
+        centers = known.numpy()
         together = np.abs(squares[:, None] - squares) <= _TOGETHER * squares[:, None]
         grouped = together @ centers
         shape = centers.argmax(0)
@@ -149,12 +161,17 @@ class _Problem:
                 rest.append((value + row @ theta) * weight)
         matrix, right = np.concatenate(rows), np.concatenate(rest)
         precision = np.append(self.deviation, FACTOR) ** -2.0
-        solution = np.linalg.solve(matrix.T @ matrix + np.diag(precision), matrix.T @ right)
+        posterior = matrix.T @ matrix + np.diag(precision)
+        solution = np.linalg.solve(posterior, matrix.T @ right)
+        # Of the coefficients alone: the factor is not known of the nominal body either.
+        alone = posterior[:-1, :-1] - np.outer(posterior[:-1, -1], posterior[-1, :-1]) / posterior[-1, -1]
+        volume = 0.5 * np.linalg.slogdet(alone * self.deviation[:, None] * self.deviation)[1]
         step = np.clip(solution[:-1] - theta, -_LONGEST * self.deviation, _LONGEST * self.deviation)
+        # More than the root mean square of the fitted residuals: as many coefficients as modes fit them.
         left = apart - slopes @ step - solution[-1]
         if len(mode):
             spread = float(np.clip(1.5 * np.sqrt(np.average(left**2, weights=certainty)), _FREQUENCY[1], spread))
-        return theta + step, spread
+        return theta + step, spread, float(volume)
 
     def _gain_rows(
         self,
