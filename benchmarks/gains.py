@@ -255,7 +255,7 @@ def _outliers(options: Options) -> Report:
     bodies = {name: None if each.surface is None else _bodies(each, options) for name, each in captures.items()}
     draws = {"found": 0, "false": 0, "exchanged": 0, "clean_false": 0, "clean_fits": 0}
     for case in _splits(captures["aircraft_response"], 15, bodies["aircraft_response"], options):
-        for seed in range(1 if options.quick_look else 3):
+        for seed in range(1 if options.quick_look else 9):
             # Three contacts get the labels of one another, in a circle.
             drawn = np.random.default_rng(seed).choice(len(case.train), 3, replace=False)
             order = torch.arange(len(case.train))

@@ -1,5 +1,6 @@
 """No verb is silent for long: what it is doing is repeated on the standard error, with the time it has taken so far."""
 
+import re
 import sys
 import threading
 import time
@@ -44,7 +45,13 @@ def printed(text: str) -> None:
 
 def doing(text: str) -> None:
     """Take note of what is going on, to be printed after a silence; costs next to nothing."""
+    if _without_numbers(text) != _without_numbers(_activity.text):
+        _activity.since = time.monotonic()
     _activity.text = text
+
+
+def _without_numbers(text: str) -> str:
+    return re.sub(r"[-+.e\d]+", "", text)
 
 
 @contextmanager

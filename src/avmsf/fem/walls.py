@@ -1,4 +1,4 @@
-"""A mesh that shows both sides of a thin wall, filled by one layer of prisms.
+"""A mesh that shows both sides of a thin wall, filled by layers of prisms.
 
 Tetrahedra that fill such a mesh without regard to its sides lock. Their outer and inner facets do not lie opposite to
 each other, so the wall's thickness varies by the distance of the facets from the curved surface, and it cannot bend
@@ -86,9 +86,7 @@ class Wall:
         thickness = self._thickness_at(coarse)
         solid = None if thickness is None else prisms(coarse, thickness, layers=self._layers(length))
         if solid is None or not self._fills(solid):
-            raise SimulationError(
-                f"one layer of prisms of {1000 * length:.2g} mm does not fill the mesh: make them finer"
-            )
+            raise SimulationError(f"prisms of {1000 * length:.2g} mm do not fill the mesh: make them finer")
         return solid
 
     def _thickness_at(self, sheet: Skin) -> Float64[np.ndarray, " points"] | None:

@@ -12,9 +12,9 @@ method from the modes whose shape is known with some certainty: to first order
     d phi_k = sum_(j != k) phi_j v_j' (dK - lambda_k dM) v_k / (lambda_k - lambda_j)
 
 (Fox and Kapoor, AIAA Journal 6, 1968). Rounds of matching and solving follow each other; the one with the highest
-evidence is kept, by Laplace's approximation over the coefficients, and round 0 is the nominal body. Rounds end where the
-coefficients are larger than their prior expects, the sum of their squares over their variances exceeding their number:
-the object is then another body, not a perturbed one, and first order says nothing of it.
+evidence is kept, by Laplace's approximation over the coefficients, and round 0 is the nominal body. Rounds end where
+the coefficients are larger than their prior expects, the sum of their squares over their variances exceeding their
+number: the object is then another body, not a perturbed one, and first order says nothing of it.
 """
 
 from collections.abc import Callable

@@ -36,8 +36,8 @@ from avmsf.modal.extraction.phase_likelihood import DelayPrior, MeasuredPhases, 
 _MODES = 32
 """Modes to align by, the strongest: more cost time and hardly narrow the posterior."""
 _LEAST_SEARCHED, _SEARCHED_SAMPLES = 32, 1_400_000
-"""Recordings, and samples of all together, at the most, in which modes are looked for. Where this leaves recordings out
-the delays differ by less than .02 samples."""
+"""Modes are looked for in so many recordings, or in as many as hold so many samples together, whichever is more. Where
+this leaves recordings out the delays differ by less than .02 samples."""
 _RANGE_DB = 40.0
 """Modes this far below the strongest, in energy, are left out."""
 _REFERENCES = 6
