@@ -148,3 +148,16 @@ def test_bare_samples_are_taken_as_they_are_and_files_as_the_capture_was():
     torch.testing.assert_close(hear(whole.channels[0], like).sound, hear(whole.channels[0], true_field()).sound)
     slow = replace(whole, sample_rate=whole.sample_rate / 2)
     torch.testing.assert_close(hear(slow, like).sound, hear(whole, true_field()).sound)
+
+
+def test_a_recording_that_starts_with_its_impact_is_heard_as_those_of_a_capture_that_was_not_cut():
+    """The first sample of a sine is zero, so that an onset is found behind it, where nothing was cut before."""
+    field = true_field()
+    uncut = replace(field, origin=replace(field.origin, settings=replace(field.origin.settings, align=False)))
+    sound = struck(1, seed=21).sounds[0].double()
+    # Some samples that a threshold does not reach.
+    whole = Recording("hit.wav", torch.cat([1e-4 * sound[:5], sound]).numpy()[None], RATE, "FLOAT")
+    assert len(hear(whole, uncut).sound) == len(sound) + 5
+    assert len(hear(whole, field).sound) < len(sound) + 5
+    later = recorded(sound)
+    assert len(hear(later, uncut).sound) == len(hear(later, field).sound)

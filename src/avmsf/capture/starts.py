@@ -32,6 +32,11 @@ class Sounds:
     """What their common length costs."""
 
 
+def latest_start(rate: float) -> int:
+    """Return the sample before which an onset is found in a recording that starts with its impact, at a rate in Hz."""
+    return max(MIN_MARGIN, round(MAX_START_SECONDS * rate))
+
+
 def start_with_impact(recordings: Sequence[Prepared], *, rate: float) -> bool:
     """Return whether all recordings start with the impact, without anything before it, as impulse responses do.
 
@@ -42,7 +47,7 @@ def start_with_impact(recordings: Sequence[Prepared], *, rate: float) -> bool:
     root mean square frequency. Every single onset has to come within `MAX_START_SECONDS` or `MIN_MARGIN` samples as
     well.
     """
-    latest = max(MIN_MARGIN, round(MAX_START_SECONDS * rate))
+    latest = latest_start(rate)
     if any(each.onset >= latest or len(each.before) < each.onset for each in recordings):
         return False
     size = min(margin_length(rate), *(len(each.before) + len(each.sound) for each in recordings))

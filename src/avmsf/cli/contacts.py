@@ -15,6 +15,8 @@ from avmsf.errors import CaptureError
 from avmsf.field.soundfield import SoundField
 
 _COLUMNS = ("x", "y", "z")
+_NORMALS = ("nx", "ny", "nz")
+"""Direction of an impact, into the object, as in impacts.csv."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,20 +27,29 @@ class Contacts:
     """Object frame, metres."""
     names: tuple[str, ...]
     """Paths of wav files in the output folder."""
+    directions: Float64[Tensor, "contacts 3"] | None = None
+    """Of the impacts, zero where unknown; None if none is known."""
 
 
-def contacts_at(places: Sequence[tuple[float, float, float]], *, metres: float) -> Contacts:
+def contacts_at(
+    places: Sequence[tuple[float, float, float]],
+    *,
+    metres: float,
+    directions: Sequence[tuple[float, float, float]] = (),
+) -> Contacts:
     """Number the contacts that the command line gives, whose coordinates count `metres` each."""
     return Contacts(
         torch.tensor(places, dtype=torch.float64).reshape(-1, 3) * metres,
         tuple(f"{number:03d}.wav" for number in range(1, len(places) + 1)),
+        torch.tensor(directions, dtype=torch.float64) if directions else None,
     )
 
 
 def read_contacts(path: Path, *, metres: float) -> Contacts:
-    """Read a table with the columns x, y, z and perhaps file, such as a capture's impacts.csv; others are ignored.
+    """Read a table with the columns x, y, z and perhaps file, nx, ny and nz, such as a capture's impacts.csv.
 
-    Sounds are called as the column `file` says, else by number. Raises `CaptureError` with the line at fault.
+    Other columns are ignored. Sounds are called as the column `file` says, else by number. Raises `CaptureError` with
+    the line at fault.
     """
     lines, separator = read_cells(path)
     header = [name.lower() for name in lines[0][1]] if lines else []
@@ -48,15 +59,18 @@ def read_contacts(path: Path, *, metres: float) -> Contacts:
         raise CaptureError(
             f"{path}: {lacking}; expected a header line with x,y,z (and perhaps file) and one row a blow"
         )
-    places, names = [], []
+    places, names, normals = [], [], []
     for line, cells in lines[1:]:
         row = dict(zip(header, cells, strict=False))
         places.append([_number(row.get(name, ""), f"{path} line {line}: {name}", separator) for name in _COLUMNS])
+        normals.append([_number(row.get(name) or "0", f"{path} line {line}: {name}", separator) for name in _NORMALS])
         names.append(_wav_name(row["file"], f"{path} line {line}") if "file" in row else f"{len(places):03d}.wav")
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
         raise CaptureError(f"{path}: more than one row is to become {repeated}; each needs a name of its own")
-    return Contacts(torch.tensor(places, dtype=torch.float64) * metres, tuple(names))
+    directions = torch.tensor(normals, dtype=torch.float64)
+    known = directions if bool(directions.any()) else None
+    return Contacts(torch.tensor(places, dtype=torch.float64) * metres, tuple(names), known)
 
 
 def refuse_far(contacts: Contacts, field: SoundField) -> None:

@@ -231,7 +231,12 @@ def part_contacts(
 
 def describe_outliers(fitted: SoundField) -> list[str]:
     """Return a line for each recording whose contact disagrees with all others."""
-    return [f"check its row in impacts.csv: {found}" for found in fitted.origin.report.get("outliers", {}).values()]
+    report = fitted.origin.report
+    excluded = report.get("excluded", [])
+    return [
+        f"check its row in impacts.csv: {found}; {'left out of the fit' if name in excluded else 'used all the same'}"
+        for name, found in report.get("outliers", {}).items()
+    ]
 
 
 def summary(fitted: SoundField, contacts: int) -> str:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -30,8 +31,9 @@ METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 class Options:
     """Write the sounds of blows anywhere on the object as wav files.
 
-    Contacts come from `--at`, once a contact, or from a table with the columns x,y,z and perhaps file, such as a
-    capture's own impacts.csv. Each is heard at the object's point nearest to it.
+    Contacts come from `--at`, once a contact, or from a table with the columns x,y,z and perhaps file and nx,ny,nz,
+    such as a capture's own impacts.csv. Each is heard at the object's point nearest to it. An impact without a
+    direction goes straight into the surface.
     """
 
     field: tyro.conf.Positional[Path]
@@ -42,6 +44,10 @@ class Options:
         tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]], tyro.conf.arg(metavar="X Y Z")
     ] = ()
     """A contact in the object frame."""
+    direction: Annotated[
+        tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]], tyro.conf.arg(metavar="X Y Z")
+    ] = ()
+    """The direction of the impact at each contact of --at, in the same order."""
     contacts: Path | None = None
     """Table of contacts."""
     unit: Literal["m", "cm", "mm", "in", "ft"] = "m"
@@ -72,7 +78,9 @@ def run(options: Options) -> int:
     metres = METRES[options.unit]
     if bool(options.at) == (options.contacts is not None):
         raise OutputError("expected contacts either by --at X Y Z, once or more, or by --contacts TABLE.csv")
-    contacts = contacts_at(options.at, metres=metres)
+    if options.direction and len(options.direction) != len(options.at):
+        raise OutputError(f"expected one --direction for each --at, got {len(options.direction)} for {len(options.at)}")
+    contacts = contacts_at(options.at, metres=metres, directions=options.direction)
     if options.contacts is not None:
         contacts = read_contacts(options.contacts, metres=metres)
     paths = _paths(options.output, contacts)
@@ -89,11 +97,13 @@ def run(options: Options) -> int:
         say(f"note: wav files hold whole sample rates: {round(field.sample_rate)} for {field.sample_rate:g} Hz")
     doing("rendering")
     pulse = _pulse(options)
-    sounds = render_sounds(field, contacts.places, force=options.force, seconds=options.seconds, pulse=pulse)
+    rendered = partial(render_sounds, field, force=options.force, seconds=options.seconds)
+    sounds = rendered(contacts.places, contacts.directions, pulse=pulse)
     if pulse is not None and options.normalise == "none" and options.level_db == 0:
         loudest = int(sounds.abs().amax(1).argmax())
         place = contacts.places[loudest : loudest + 1]
-        hard = render_sounds(field, place, force=options.force, seconds=options.seconds)
+        way = None if contacts.directions is None else contacts.directions[loudest : loudest + 1]
+        hard = rendered(place, way)
         _say_softer(hard[0], sounds[loudest], pulse.contact_time)
     sounds = sounds * Level(options.normalise, options.level_db).factor(sounds)
     peak = float(sounds.abs().max())
@@ -125,6 +135,7 @@ def _say_softer(hard: Float[Tensor, " samples"], soft: Float[Tensor, " samples"]
 def render_sounds(
     field: SoundField,
     places: Float[Tensor, "contacts 3"],
+    directions: Float[Tensor, "contacts 3"] | None = None,
     *,
     force: float,
     seconds: float | None,
@@ -132,13 +143,13 @@ def render_sounds(
 ) -> Float[Tensor, "contacts samples"]:
     """Render blows of `force` for `seconds`; raises `OutputError` for a time that holds no sample."""
     if seconds is None:
-        return field.render(places, force=force, pulse=pulse)
+        return field.render(places, directions=directions, force=force, pulse=pulse)
     samples = round(seconds * field.sample_rate) if math.isfinite(seconds) else 0
     if not 1 <= samples <= MAX_SAMPLES:
         raise OutputError(
             f"--seconds is {seconds:g}; expected a time above 0 and at most {MAX_SAMPLES / field.sample_rate:g} s"
         )
-    return field.render(places, force=force, samples=samples, pulse=pulse)
+    return field.render(places, directions=directions, force=force, samples=samples, pulse=pulse)
 
 
 def _pulse(options: Options) -> ForcePulse | None:

@@ -81,6 +81,10 @@ def fit(
     checkpoint of another fit.
     """
     config = FitConfig() if config is None else config
+    settings = CaptureSettings() if settings is None else settings
+    if train.before is not None and bool(train.before.isnan().all()):
+        # Files that start with their impacts were not cut, and others are to be read alike.
+        settings = replace(settings, align=False)
     expect_fitting(train, modes)
     case = gain_case(train, features, modes, config)
     train = case.train
@@ -105,7 +109,7 @@ def fit(
         Residual(run.residual.magnitude.detach().clone()),
         train.sample_rate,
         train.sounds.shape[1],
-        Origin(capture, train.names, train.forces is not None, config, report, settings or CaptureSettings()),
+        Origin(capture, train.names, train.forces is not None, config, report, settings),
     )
     used = train.take(run.network.used_rows(len(train)))
     if config.residual and not config.noise_rate and config.steps:

@@ -53,8 +53,12 @@ def _next(field: SoundField, gains: MixtureGains) -> tuple[tuple[float, float, f
     except FitError:
         # All points of the object are contacts already.
         return ()
+    distance = float((gains.contacts - contact).norm(dim=1).min())
+    if distance > float((gains.contacts.amax(0) - gains.contacts.amin(0)).norm()):
+        # The points are in another unit or frame than the contacts.
+        return ()
     x, y, z = contact.tolist()
-    return (x, y, z), float((gains.contacts - contact).norm(dim=1).min())
+    return (x, y, z), distance
 
 
 def _modes(field: SoundField, gains: Complex128[Tensor, "contacts modes"]) -> Float[Tensor, "contacts samples"]:

@@ -67,10 +67,10 @@ class FieldQuality:
 
     @property
     def verdict(self) -> str:
-        """How good the field is; leaving out overstates the error, for spread contacts are far from each other."""
+        """How good the field is. Leaving out mostly overstates the error: spread contacts are far from each other."""
         if self.error < self.averaging:
             return (
-                f"At contacts left out the relative STFT error of the field is at most about {self.error:.2f}, of "
+                f"At contacts left out the relative STFT error of the field is about {self.error:.2f}, of "
                 f"averaging the three nearest recordings {self.averaging:.2f} ({self.places} places)."
             )
         return (

@@ -154,7 +154,7 @@ def _project(
     table = torch.cat(tables, dim=1)
     whole, rest = divmod(sounds.shape[1], _BLOCK)
     # A view of the whole blocks and the rest apart: padding would copy all sounds.
-    blocks = sounds[:, : whole * _BLOCK].unfold(1, _BLOCK, _BLOCK)
+    blocks = sounds[:, : whole * _BLOCK].reshape(len(sounds), whole, _BLOCK)
     summed = blocks @ table
     if rest:
         summed = torch.cat([summed, (sounds[:, whole * _BLOCK :] @ table[:rest])[:, None]], dim=1)

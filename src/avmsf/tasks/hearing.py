@@ -15,6 +15,7 @@ from avmsf.capture.blow import clipping, expect_sudden
 from avmsf.capture.onset import Pulse, find_second_blow, find_second_push
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.starts import latest_start
 from avmsf.errors import CaptureError, LocationError
 from avmsf.field.soundfield import SoundField
 
@@ -49,17 +50,21 @@ def hear(
 ) -> Heard:
     """Prepare a recorded blow for a field as the recordings were that it was fitted to.
 
-    By the settings of that capture, which the field keeps, but that the blow is sought wherever it begins; `settings`
-    take their place. Bare samples are at `sample_rate` Hz, or at the field's rate, and taken as they are. Nothing is
-    divided by a force, but a pulse that was divided out of the capture's sounds is divided out here too where the
-    recording holds it; channels that the recording lacks are not asked for. Raises LocationError for recordings that
-    are silent, too short, not finite, or never sudden enough to hold a blow.
+    By the settings of that capture, which the field keeps, but that the blow is sought wherever it begins, unless the
+    capture was not cut and this recording starts with its impact, too; `settings` take their place. Bare samples are at
+    `sample_rate` Hz, or at the field's rate, and taken as they are. Nothing is divided by a force, but a pulse that was
+    divided out of the capture's sounds is divided out here too where the recording holds it; channels that the
+    recording lacks are not asked for. Raises LocationError for recordings that are silent, too short, not finite, or
+    never sudden enough to hold a blow.
     """
     whole = as_recording(recording, field, sample_rate=sample_rate)
     chosen = settings_for(whole, own_settings(recording, field) if settings is None else settings)
     notes = describe(whole, chosen)
     try:
         prepared = prepare(whole, chosen)
+        if settings is None and not field.origin.settings.align and prepared.onset < latest_start(whole.sample_rate):
+            # It starts with its impact as those did that the field was fitted to, which were not cut.
+            prepared = prepare(whole, replace(chosen, align=False))
         # Of one channel all is heard, the quiet before the blow too.
         heard = whole.response() if len(whole.channels) == 1 else prepared.sound
         expect_sudden(heard, sample_rate=whole.sample_rate, name=whole.name)
