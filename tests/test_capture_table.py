@@ -135,6 +135,14 @@ def test_two_blows_at_one_place_are_not_confused_with_two_close_ones(tmp_path: P
         assert len(read_capture(folder).impacts) == 3
 
 
+def test_impacts_at_one_place_along_different_directions_are_no_repetitions(tmp_path: Path) -> None:
+    rows = ("a.wav,0.1,0,0,0,0,-1", "b.wav,0,0.2,0,0,0,-1", "c.wav,0,0.2,0,1,0,0")
+    folder = fill(tmp_path, header=f"{HEADER},nx,ny,nz", rows=rows)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(read_capture(folder).impacts) == 3
+
+
 def test_contacts_far_outside_the_surface_are_refused(tmp_path: Path) -> None:
     folder = fill(tmp_path, rows=("a.wav,15,0,0", "b.wav,0,0.2,0"))
     trimesh.creation.box((0.5, 0.5, 0.5)).export(folder / "surface.ply")

@@ -113,7 +113,9 @@ def judge_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list
     remarks = []
     places = defaultdict(list)
     for strike in strikes:
-        places[tuple(round(value, 6) for value in strike.contact)].append(strike.line)
+        # Impacts along other directions are no repetitions.
+        label = (*strike.contact, *(strike.direction or ()))
+        places[tuple(round(value, 6) for value in label)].append(strike.line)
     repeated = [lines for lines in places.values() if len(lines) > 1]
     if repeated:
         shown = "; ".join(", ".join(map(str, lines)) for lines in repeated[:5])

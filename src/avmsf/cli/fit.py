@@ -37,6 +37,8 @@ from avmsf.scene.symmetrysearch import find_symmetries
 
 _FEW = 8
 """Recordings below which little is told of the gains between contacts."""
+_SHOWN = 8
+"""Names of recordings in a line, at most."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,8 @@ def run(options: Options) -> int:
     screen = console(errors=options.json)
     if test is not None:
         title = f"{parts_words(train, test)}; lower is better"
-        say(f"not trained on: {', '.join(test.names)}")
+        shown = ", ".join(test.names[:_SHOWN]) + f" and {len(test) - _SHOWN} more" * (len(test) > _SHOWN)
+        say(f"not trained on: {shown}")
         screen.print(score_table(title, scores))
     report = fitted.origin.report
     for words in describe_outliers(fitted):

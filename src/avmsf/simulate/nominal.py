@@ -117,7 +117,7 @@ def nominal_bodies(
             refused[wall] = str(error)
     reasons = _grouped(refused)
     for reason in reasons:
-        told(f"not {reason}")
+        told(f"not tried: {reason}")
     if not bodies:
         other = "state its wall in metres if it has one" if guessed else "state another wall, or none"
         raise SimulationError(f"no body can be made of this surface ({'; '.join(reasons)}): mend the mesh, or {other}")
@@ -343,7 +343,8 @@ def _grouped(refused: Mapping[float | None, str]) -> list[str]:
     names: dict[str, list[str]] = {}
     for wall, reason in refused.items():
         names.setdefault(reason, []).append(body_name(wall))
-    return [f"{', '.join(each)}: {reason}" for reason, each in names.items()]
+    shown = {reason: f"{each[0]} to {each[-1]}" if len(each) > 2 else ", ".join(each) for reason, each in names.items()}
+    return [f"{each}: {reason}" for reason, each in shown.items()]
 
 
 def body_name(wall: float | None) -> str:
