@@ -67,10 +67,10 @@ def test_the_demo_as_shipped_uses_elastic_mode_shapes_and_beats_the_nearest_reco
     folder = tmp_path / "demo"
     assert main(["demo", str(folder)]) == 0
     record = json.loads((folder / "demo.json").read_text())
-    # The mug is filled: by far the most of the gains' energy is explained by that body's mode shapes.
-    [body] = record["report"]["bodies"]
-    assert body["body"] == "filled"
-    assert body["weight"] > 0.5
+    # The mug is filled: that body, as it is and updated, is the most probable hypothesis by far.
+    bodies = record["report"]["bodies"]
+    assert {body["body"].split(",")[0] for body in bodies} == {"filled"}
+    assert sum(body["weight"] for body in bodies) > 0.5
     error = {method: each["relative_stft"] for method, each in record["scores"].items()}
     # .22 beside .91 and .86; the held-out recordings' own gains have .13.
     assert error["field"] < 0.3 * min(error["nearest strike"], error["mean waveform of 3 nearest"])

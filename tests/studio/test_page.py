@@ -294,7 +294,7 @@ def test_a_recording_outlives_a_broken_connection_and_a_reload(visit: Open) -> N
     server.broken = False
     page.click("text=Send again")
     page.wait_for_selector("text=1 strike")
-    assert page.locator("text=A recording waits for the server").count() == 0
+    until(page, lambda: page.locator("text=A recording waits for the server").count() == 0)
     assert len({key for _, key in server.asked}) == 1, "sent again under the same key"
     assert len(server.asked) >= 2
     assert len(server.strikes) == 1

@@ -54,9 +54,11 @@ class EditServer:
         self.beside: str | None = None
         """The file in which a lead is kept that another tab has forestalled; None where it is what is heard."""
         self._waiting: list[Callable[[], None]] = []
+        self._let_go = False
+        """Whether a lead's events are told as soon as they are asked for: they may be asked for after `let_go`."""
         page.route("**/manifest.json", lambda route: answer(route, self.manifest()))
         page.route("**/edited.bin", lambda route: route.fulfill(body=edited["content"]))
-        page.route("**/jobs/j9/events", lambda route: self._waiting.append(lambda: self._lead(route)))
+        page.route("**/jobs/j9/events", self._tell)
         for what in ("edit", "undo", "save"):
             page.route(f"**/{what}", self.hear)
         page.route("**/lead?base=*", self.hear_lead)
@@ -73,9 +75,15 @@ class EditServer:
         self.revision += 1
 
     def let_go(self) -> None:
-        self.slow = False
+        self.slow, self._let_go = False, True
         while self._waiting:
             self._waiting.pop(0)()
+
+    def _tell(self, route: "Route") -> None:
+        if self._let_go:
+            self._lead(route)
+        else:
+            self._waiting.append(lambda: self._lead(route))
 
     def hear(self, route: "Route", request: "Request") -> None:
         what, words = request.url.rsplit("/", 1)[1], request.post_data_json
