@@ -150,7 +150,7 @@ class MixtureEstimator:
             rows = _without(every, judgment)
             fewer_families = fit.families(rows, bodies)
             fewer = fit(rows, fewer_families)
-            if predicts_better(fewer, model, rows, fit.measured):
+            if predicts_better(fewer.leave_one_out(), model.leave_one_out()[rows], fit.at(rows)):
                 model, families, used = fewer, fewer_families, rows
         if best is not None and (updated := fit.updated(used, bodies[best])) is not None:
             bodies.append(updated)
@@ -239,6 +239,10 @@ class _Fit:
         """The gains at all contacts."""
         return measured_gains(self.case)
 
+    def at(self, rows: Int[Tensor, " rows"]) -> MeasuredGains:
+        """Return the gains at some contacts."""
+        return replace(self.measured, values=self.measured.values[rows])
+
     def families(self, rows: Int[Tensor, " rows"], bodies: Sequence[NominalBody]) -> list[KernelFamily]:
         """Return the families of these contacts; the elastic ones come last, in the order of the bodies."""
         sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
@@ -258,14 +262,13 @@ class _Fit:
         noise_shares: tuple[float, ...] = NOISE_SHARES,
     ) -> MixtureGains:
         """Return the gain model of families of these contacts."""
-        measured = replace(self.measured, values=self.measured.values[rows])
         points = self.case.features.points
-        return fit_mixture(families, measured, points, directional=self.directional, noise_shares=noise_shares)
+        return fit_mixture(families, self.at(rows), points, directional=self.directional, noise_shares=noise_shares)
 
     def evidence(self, rows: Int[Tensor, " rows"], bodies: Sequence[NominalBody]) -> list[float]:
         """Return the log evidence of the gains of some contacts with each body by itself."""
         sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
-        measured = replace(self.measured, values=self.measured.values[rows])
+        measured = self.at(rows)
         others = [WeighedFamily.of(each, measured, NOISE_SHARES) for each in self.families(rows, [])]
         elastic = (WeighedFamily.of(Elastic(sites, size, body.elastic), measured, NOISE_SHARES) for body in bodies)
         return [total_evidence([*others, each], measured) for each in elastic]
@@ -277,7 +280,7 @@ class _Fit:
         # Spread contacts say enough of a few dozen coefficients, and the cost goes with the cube of their number.
         rows = rows[farthest_points(self.sites.points[rows], min(_UPDATED, len(rows))).sort().values]
         sites, size = self.sites.take(rows), 2.0 * self.case.features.half_diagonal
-        measured = replace(self.measured, values=self.measured.values[rows])
+        measured = self.at(rows)
         others = [WeighedFamily.of(family, measured, NOISE_SHARES) for family in self.families(rows, [])]
         found = update(
             body.elastic, sites, measured.frequency, measured.values.real, measured.informative.chunk(2)[0],
@@ -354,13 +357,19 @@ def _without(rows: Int[Tensor, " rows"], judgment: Judgment) -> Int[Tensor, " ke
 
 
 def _more_probable(fit: _Fit, rows: Int[Tensor, " rows"], bodies: Sequence[NominalBody]) -> NominalBody | None:
-    """Return the most probable held body by the evidence of all modes, or None where the first, free, is the best."""
+    """Return the most probable held body by the evidence of all modes, or None where the first, free, is the best.
+
+    Where both bodies are far from the object, evidence between them means little: the held one also has to predict
+    contacts left out surely better.
+    """
     if len(bodies) < 2:
         return None
     free, *held = fit.evidence(rows, bodies)
     best = max(range(len(held)), key=held.__getitem__)
-    odds = math.log(FREE_PRIOR / (1.0 - FREE_PRIOR) * len(held))
-    return bodies[1 + best] if held[best] - free > odds else None
+    if held[best] - free <= math.log(FREE_PRIOR / (1.0 - FREE_PRIOR) * len(held)):
+        return None
+    new, old = (fit(rows, fit.families(rows, [body])).leave_one_out() for body in (bodies[1 + best], bodies[0]))
+    return bodies[1 + best] if predicts_better(new, old, fit.at(rows)) else None
 
 
 def _body_weights(model: MixtureGains, families: Sequence[KernelFamily], measured: MeasuredGains) -> list[float]:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Complex128, Float, Float64, Int
 from torch import Tensor
 
 from avmsf.field.gains.family import Sites
@@ -159,18 +159,17 @@ def set_aside(ratios: PredictiveRatios, start: frozenset[int] = frozenset()) -> 
 
 
 def predicts_better(
-    fewer: MixtureGains, whole: MixtureGains, rows: Int[Tensor, " rows"], measured: MeasuredGains
+    new: Complex128[Tensor, "contacts modes"], old: Complex128[Tensor, "contacts modes"], measured: MeasuredGains
 ) -> bool:
-    """Return whether contacts are surely predicted better from each other by a model that only they are in.
+    """Return whether gains are surely predicted better, from leave-one-place-out predictions at the same contacts.
 
-    `fewer` is fitted to the contacts `rows` alone, `whole` to all. The leave-one-place-out errors over the gains, each
-    mode by its energy, have to fall by more than two standard errors of the paired differences.
+    The errors over the gains, each mode by its energy, have to fall by more than two standard errors of the paired
+    differences.
     """
-    values = measured.values[rows]
-    power = (values.abs().square() / measured.damping).sum(1)
+    power = (measured.values.abs().square() / measured.damping).sum(1)
     less, more = (
-        ((predicted - values).abs().square() / measured.damping).sum(1).div(power).sqrt()
-        for predicted in (fewer.leave_one_out(), whole.leave_one_out()[rows])
+        ((predicted - measured.values).abs().square() / measured.damping).sum(1).div(power).sqrt()
+        for predicted in (new, old)
     )
     fall = (more - less)[power > 0]
     return float(fall.mean()) > _SURE * float(fall.std()) / len(fall) ** 0.5
