@@ -248,7 +248,10 @@ def summary(fitted: SoundField, contacts: int) -> str:
     how = "chosen on validation contacts" if report.get("validated") else "as set"
     gains = report.get("gains", "attention")
     if (report.get("credibility") or {}).get("credible"):
-        gains += f" (most probable body: {report['bodies'][0]['body']})"
+        best, thickness = report["bodies"][0], report.get("thickness")
+        between = "{low:.2g} to {high:.2g} mm" if thickness and best["wall"] is not None else ""
+        interval = between.format(**{key: 1000 * value for key, value in (thickness or {}).items()})
+        gains += f" (most probable body: {best['body']}{interval and ', 90 % interval of the wall ' + interval})"
     return (
         f"field of {fitted.origin.capture}: {len(fitted.bank)} modes from {contacts} recordings, gains by {gains}, "
         f"{report.get('damping', 'shared')} damping ({how}), {report.get('steps', fitted.origin.config.steps)} steps "

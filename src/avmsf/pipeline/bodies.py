@@ -15,7 +15,7 @@ from avmsf.errors import SimulationError
 from avmsf.fem.supports import Support
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.placed import expect_placed
-from avmsf.simulate.nominal import NominalBody, nominal_bodies, refined, supported
+from avmsf.simulate.nominal import NominalBody, Shape, nominal_bodies, refined, supported, with_wall
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class BodyConfig:
 class FinerBodies:
     """Makes bodies of a surface finer, each once."""
 
-    surface: Surface
+    surface: Surface | Shape
     freedoms: int
     """Degrees of freedom to come near to."""
     cache: Path | None
@@ -71,7 +71,7 @@ class FinerBodies:
 class HeldBodies:
     """Holds bodies of a surface at what may have supported them, each once."""
 
-    surface: Surface
+    surface: Surface | Shape
     freedoms: int
     """Degrees of freedom at most."""
     cache: Path | None
@@ -94,8 +94,37 @@ class HeldBodies:
         return f"{self.freedoms}"
 
 
+@dataclass(frozen=True, eq=False)
+class ThickerBodies:
+    """Gives a surface or shape walls of other thicknesses, each once."""
+
+    surface: Surface | Shape
+    count: int
+    """Elastic modes."""
+    freedoms: int
+    """Degrees of freedom at most."""
+    cache: Path | None
+    """Folder that keeps elastic modes by content."""
+    tell: Callable[[str], None]
+    """Told what is done, in words."""
+    made: dict[float, NominalBody | None] = field(default_factory=dict)
+    """Those that are done, by their walls."""
+
+    def __call__(self, wall: float) -> NominalBody | None:
+        """Return the body with a wall of this thickness, meters; None where that fails."""
+        if wall not in self.made:
+            self.made[wall] = with_wall(
+                self.surface, wall, count=self.count, freedoms=self.freedoms, cache=self.cache, tell=self.tell
+            )
+        return self.made[wall]
+
+    def digest(self) -> str:
+        """Return what tells these bodies from those of other settings."""
+        return f"{self.freedoms}"
+
+
 def candidate_bodies(
-    surface: Surface,
+    surface: Surface | Shape,
     config: BodyConfig | None = None,
     *,
     impacts: Impacts | None = None,
@@ -109,13 +138,16 @@ def candidate_bodies(
     """
     config = BodyConfig() if config is None else config
     if impacts is not None:
-        expect_placed(impacts.contacts, surface_points(surface), names=impacts.names)
+        seen = surface if isinstance(surface, Surface) else surface.as_seen()
+        expect_placed(impacts.contacts, surface_points(seen), names=impacts.names)
     walls = None if config.wall is None else [config.wall or None]
     bodies = nominal_bodies(surface, walls=walls, count=config.shapes, freedoms=config.freedoms, cache=cache, tell=tell)
     made = surface, config.freedoms, cache, tell or (lambda words: None)
+    several = config.wall is None and sum(body.wall is not None for body in bodies.bodies) > 1
+    thicken = ThickerBodies(surface, config.shapes, *made[1:]) if several else None
     hold = None if config.supports == "free" else HeldBodies(*made)
     refine = None if len(bodies.bodies) == 1 and hold is None else FinerBodies(*made)
-    return CandidateBodies(bodies, refine, hold, always_hold=config.supports == "try")
+    return CandidateBodies(bodies, refine, hold, config.supports == "try", thicken)
 
 
 def roughened(surface: Surface, part: float, *, seed: int) -> Surface:

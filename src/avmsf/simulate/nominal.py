@@ -7,13 +7,14 @@ from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int
 
 from avmsf._utils.caching import source_digest
 from avmsf.capture.surface import Surface
-from avmsf.errors import SimulationError
+from avmsf.errors import SceneError, SimulationError
 from avmsf.fem.supports import Support, supports_of
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.elasticstore import modes_once
@@ -38,6 +39,26 @@ _LOWEST = 8
 """Frequencies that are compared."""
 _FORMAT = 3
 """Number of the way in which bodies are made; kept files of another are not read."""
+_THICKNESSES = 5
+"""Thicknesses that are computed at first of a shape whose wall is not known."""
+
+
+@runtime_checkable
+class Shape(Protocol):
+    """An object's shape as seen from outside, which a wall of any thickness may have."""
+
+    @property
+    def thickness_range(self) -> tuple[float, float] | None:
+        """Least and largest thickness of a wall that is worth a trial, meters; None for an object without a cavity."""
+        ...
+
+    def as_seen(self) -> Surface:
+        """Return the closed surface of what was seen, both sides of walls included."""
+        ...
+
+    def shell(self, thickness: float) -> Surface:
+        """Return the closed surface of a wall, meters thick, behind the outer side."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +95,7 @@ class NominalBodies:
 
 
 def nominal_bodies(
-    surface: Surface,
+    surface: Surface | Shape,
     *,
     walls: Sequence[float | None] | None = None,
     count: int = 80,
@@ -85,12 +106,12 @@ def nominal_bodies(
     """Return the bodies that may lie behind a surface, with the lowest `count` modes of each.
 
     `walls` states what to try: thicknesses in metres, None for what the surface encloses. By itself it tries that,
-    and walls of `WALLS` times the surface's size where the surface is a sheet or holds much more than the wall would.
-    Where one body is left, it has about `freedoms` degrees of freedom, at most a fifth more; of several each has at
-    most `TRIAL`, enough to choose by, and `refined` makes the chosen one fine. Dense, noisy and inverted surfaces are
-    mended, and `tell` hears of it; the wall of an open one lies behind its triangles, whichever way they face. Modes
-    are kept by content in the folder `cache`, for filling by tetrahedra comes out a little different each time; a
-    damaged file is made again.
+    and walls of `WALLS` times the surface's size where the surface is a sheet or holds much more than the wall would;
+    of a `Shape`, walls all over its range of thickness. Where one body is left, it has about `freedoms` degrees of
+    freedom, at most a fifth more; of several each has at most `TRIAL`, enough to choose by, and `refined` makes the
+    chosen one fine. Dense, noisy and inverted surfaces are mended, and `tell` hears of it; the wall of an open one lies
+    behind its triangles, whichever way they face. Modes are kept by content in the folder `cache`, for filling by
+    tetrahedra comes out a little different each time; a damaged file is made again.
 
     Raises SimulationError for a surface of points, for what does not fit into memory, and where no body can be had,
     with the reason for each.
@@ -99,12 +120,12 @@ def nominal_bodies(
     maker = _Maker(surface, count, cache, told)
     _expect_settings(count, freedoms, walls)
     guessed = walls is None
-    wanted: list[float | None] = list(_guesses(maker.checked)) if walls is None else list(dict.fromkeys(walls))
+    wanted: list[float | None] = maker.guesses() if walls is None else list(dict.fromkeys(walls))
     refused: dict[float | None, str] = {}
     likely: list[float | None] = []
     for wall in wanted:
         try:
-            _expect_likely(maker.checked, wall, guessed=guessed)
+            maker.expect_likely(wall, guessed=guessed)
             likely.append(wall)
         except SimulationError as error:
             refused[wall] = str(error)
@@ -113,7 +134,7 @@ def nominal_bodies(
     for wall in likely:
         try:
             bodies.append(maker.body(wall, freedoms, fine=fine))
-        except SimulationError as error:
+        except (SimulationError, SceneError) as error:
             refused[wall] = str(error)
     reasons = _grouped(refused)
     for reason in reasons:
@@ -126,8 +147,29 @@ def nominal_bodies(
     return NominalBodies(tuple(bodies), MappingProxyType(refused))
 
 
+def with_wall(
+    surface: Surface | Shape,
+    wall: float,
+    *,
+    count: int = 80,
+    freedoms: int = 40_000,
+    cache: Path | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> NominalBody | None:
+    """Return the body with a wall of this thickness, meters, coarse as those of `nominal_bodies`; None if that fails.
+
+    `tell` hears why.
+    """
+    told = tell or (lambda words: None)
+    try:
+        return _Maker(surface, count, cache, told).body(wall, freedoms, fine=False)
+    except (SimulationError, SceneError) as error:
+        told(f"not tried: {body_name(wall)}: {error}")
+        return None
+
+
 def refined(
-    surface: Surface,
+    surface: Surface | Shape,
     body: NominalBody,
     *,
     freedoms: int = 40_000,
@@ -155,7 +197,7 @@ def refined(
 
 
 def supported(
-    surface: Surface,
+    surface: Surface | Shape,
     body: NominalBody,
     *,
     freedoms: int = 40_000,
@@ -187,16 +229,37 @@ def supported(
 
 
 class _Maker:
-    """Makes the bodies of one surface, and does once what all of them need."""
+    """Makes the bodies of one surface or shape, and does once what all of them need."""
 
-    def __init__(self, surface: Surface, count: int, cache: Path | None, tell: Callable[[str], None]) -> None:
-        self._surface, self._count, self._cache, self._tell = surface, count, cache, tell
+    def __init__(self, surface: Surface | Shape, count: int, cache: Path | None, tell: Callable[[str], None]) -> None:
+        self._shape = surface if isinstance(surface, Shape) else None
+        self._seen = surface if isinstance(surface, Surface) else surface.as_seen()
+        self._count, self._cache, self._tell = count, cache, tell
         self._walls: dict[int, Callable[[float], Solid]] = {}
 
     @cached_property
     def checked(self) -> CheckedSurface:
         """The surface, mended."""
-        return checked(self._surface, tell=self._tell)
+        return checked(self._seen, tell=self._tell)
+
+    def guesses(self) -> list[float | None]:
+        """Return the walls to try; None for what the surface encloses."""
+        if self._shape is None:
+            return [None, *(part * self.checked.skin.size for part in WALLS)]
+        between = self._shape.thickness_range
+        return [None] if between is None else [None, *np.geomspace(*between, _THICKNESSES).tolist()]
+
+    def expect_likely(self, wall: float | None, *, guessed: bool) -> None:
+        """Raise SimulationError where a body is out of the question before tetrahedra are made."""
+        if wall is None:
+            self.checked.expect_filling()
+        elif wall >= self.checked.width:
+            raise SimulationError(
+                f"a wall of {1000 * wall:.3g} mm is thicker than the object, which is "
+                f"{1000 * self.checked.width:.3g} mm wide: state the wall's thickness in metres"
+            )
+        elif guessed and self._shape is None:
+            self.checked.expect_hollow(wall)
 
     def body(self, wall: float | None, freedoms: int, *, fine: bool) -> NominalBody:
         """Return one body with so many degrees of freedom, or with at most `TRIAL` where it need not be fine."""
@@ -266,6 +329,8 @@ class _Maker:
         self._tell(f"tetrahedra of the body, {body_name(wall)}")
         if wall is None:
             return filled_solid(self.checked, freedoms)
+        if self._shape is not None:
+            return filled_solid(checked(self._shape.shell(wall), tell=self._tell), freedoms)
         if freedoms not in self._walls:
             self._walls[freedoms] = wall_solids(self.checked, freedoms)
         return self._walls[freedoms](wall)
@@ -290,8 +355,10 @@ class _Maker:
 
     @cached_property
     def _digest(self) -> str:
-        """Digest of the surface's vertices and triangles."""
-        vertices, faces = self._surface.vertices.double().cpu().numpy(), self._surface.faces.long().cpu().numpy()
+        """Digest of the surface's vertices and triangles, or those of a thin wall."""
+        between = None if self._shape is None else self._shape.thickness_range
+        surface = self._seen if self._shape is None or between is None else self._shape.shell(between[0])
+        vertices, faces = surface.vertices.double().cpu().numpy(), surface.faces.long().cpu().numpy()
         content = hashlib.sha256(f"{vertices.shape} {faces.shape}".encode())
         content.update(vertices.tobytes())
         content.update(faces.tobytes())
@@ -307,23 +374,6 @@ def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:
     count = min(_LOWEST, len(coarse), len(fine))
     change = float((coarse.frequency[:count] / fine.frequency[:count] - 1.0).abs().max())
     return change / max((len(fine.nodes) / len(coarse.nodes)) ** 1.5 - 1.0, 1.0)
-
-
-def _guesses(checked: CheckedSurface) -> list[float | None]:
-    return [None, *(part * checked.skin.size for part in WALLS)]
-
-
-def _expect_likely(checked: CheckedSurface, wall: float | None, *, guessed: bool) -> None:
-    """Raise SimulationError where a body is out of the question before tetrahedra are made."""
-    if wall is None:
-        checked.expect_filling()
-    elif wall >= checked.width:
-        raise SimulationError(
-            f"a wall of {1000 * wall:.3g} mm is thicker than the object, which is {1000 * checked.width:.3g} mm wide: "
-            "state the wall's thickness in metres"
-        )
-    elif guessed:
-        checked.expect_hollow(wall)
 
 
 def _expect_settings(count: int, freedoms: int, walls: Sequence[float | None] | None) -> None:

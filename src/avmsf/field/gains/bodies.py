@@ -34,6 +34,19 @@ class Hold(Protocol):
         ...
 
 
+@runtime_checkable
+class Thicken(Protocol):
+    """Computes a body with a wall of another thickness."""
+
+    def __call__(self, wall: float) -> NominalBody | None:
+        """Return the body with a wall of this thickness, meters; None where that fails."""
+        ...
+
+    def digest(self) -> str:
+        """Return what tells its bodies from another's."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class CandidateBodies:
     """Bodies of which each is a hypothesis."""
@@ -47,9 +60,13 @@ class CandidateBodies:
     always_hold: bool = False
     """Whether that is tried even if the free body's evidence is good."""
 
+    thicken: Thicken | None = None
+    """Gives a body another wall; None where no thickness is searched for."""
+
     def digest(self) -> str:
         """Return a digest of the bodies."""
         digest = hashlib.sha256(("" if self.refine is None else self.refine.digest()).encode())
+        digest.update(("" if self.thicken is None else f"thicken {self.thicken.digest()}").encode())
         if self.hold is not None:
             digest.update(f"{self.hold.digest()} {self.always_hold}".encode())
         for body in self.bodies.bodies:

@@ -5,7 +5,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal
 from weakref import WeakKeyDictionary
 
@@ -28,6 +28,7 @@ from avmsf.field.gains.outliers import Fit, Judgment, judge_contacts, predicts_b
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.symmetry import Group, Symmetric, groups_of
+from avmsf.field.gains.thickness import search_thickness
 from avmsf.field.gains.updating import update
 from avmsf.field.gains.visual import Visual
 from avmsf.field.placed import expect_placed
@@ -114,10 +115,11 @@ class MixtureEstimator:
     def fit(self, case: GainCase) -> tuple[MixtureGains, Int[Tensor, " used"]]:
         """Return the gain model and the rows of the contacts that it is fitted to. Raises as `start`.
 
-        Of several coarse bodies the most probable one is computed with finer elements, and the model is fitted again,
-        until the most probable one is fine. Where it predicts little it is tried whether the object was held. Contacts
-        that the others contradict are left out where these are predicted better from each other without them. Last, the
-        most probable body with its stiffness and density updated becomes one more hypothesis.
+        The thickness of a wall that is not known is searched for. Of several coarse bodies the most probable one is
+        computed with finer elements, and the model is fitted again, until the most probable one is fine. Where it
+        predicts little it is tried whether the object was held. Contacts that the others contradict are left out where
+        these are predicted better from each other without them. Last, the most probable body with its stiffness and
+        density updated becomes one more hypothesis.
         """
         bodies, missing = self._usable_bodies(case)
         directional, every = bool(bodies) or _has_directions(case), torch.arange(len(case.train))
@@ -128,6 +130,9 @@ class MixtureEstimator:
             raise FitError("visual: expected visual features, found positions alone: give --features, or take another")
         fit = _Fit(case, self.kinds, _sites(case, bodies), directional, groups)
         hold = None if self.bodies is None else self.bodies.hold
+        thickness = None
+        if self.bodies is not None and self.bodies.thicken is not None and bodies:
+            bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), self.bodies.thicken)
         while True:
             families = fit.families(every, bodies)
             model = fit(every, families)
@@ -158,6 +163,7 @@ class MixtureEstimator:
             model = fit(used, families)
         weights = _body_weights(model, families, fit.measured)
         report = _report(bodies, families, weights, missing) | _judgment_report(judgment, case, used)
+        report["thickness"] = None if thickness is None else asdict(thickness)
         return replace(model, report=report), used
 
     def _usable_bodies(self, case: GainCase) -> tuple[list[NominalBody], dict[str, str]]:

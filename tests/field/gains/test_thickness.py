@@ -1,0 +1,65 @@
+"""The thickness of a wall by the evidence of gains."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import pytest
+
+from avmsf.field.gains.thickness import search_thickness
+from avmsf.simulate.nominal import NominalBody
+from made_dome import bodies
+
+
+def evidence(known: Sequence[NominalBody], *, of: Callable[[float], float], filled: float) -> list[float]:
+    return [filled if body.wall is None else of(math.log(body.wall)) for body in known]
+
+
+def walled(wall: float | None) -> NominalBody:
+    return replace(bodies()[0], wall=wall)
+
+
+GRID = (0.001, 0.0016, 0.0025, 0.004, 0.0063)
+
+
+@pytest.mark.parametrize(("true", "deviation"), [(0.0029, 0.07), (0.0029, 0.2), (0.0018, 0.1)])
+def test_the_posterior_of_a_normal_evidence_is_that_normal_distribution(true: float, deviation: float) -> None:
+    normal = partial(evidence, of=lambda log: -0.5 * ((log - math.log(true)) / deviation) ** 2, filled=-50.0)
+    found, thickness = search_thickness([walled(each) for each in (None, *GRID)], normal, walled)
+    assert thickness is not None
+    assert thickness.median == pytest.approx(true, rel=0.03)
+    assert math.log(thickness.high / thickness.low) == pytest.approx(2 * 1.645 * deviation, rel=0.25)
+    assert all(body.wall is not None for body in found)
+    assert min(abs(math.log(body.wall / true)) for body in found if body.wall) < 0.04
+
+
+def test_the_range_is_not_left() -> None:
+    asked: list[float] = []
+
+    def wall(thickness: float) -> NominalBody:
+        asked.append(thickness)
+        return walled(thickness)
+
+    rising = partial(evidence, of=lambda log: 20.0 * log, filled=-1000.0)
+    _, thickness = search_thickness([walled(each) for each in GRID], rising, wall)
+    assert thickness is not None
+    assert asked
+    assert GRID[0] < min(asked)
+    assert max(asked) < thickness.high <= GRID[-1]
+
+
+def test_no_thickness_is_looked_for_where_the_filled_body_is_the_most_probable() -> None:
+    flat = partial(evidence, of=lambda log: 0.0, filled=10.0)
+    found, thickness = search_thickness(
+        [walled(each) for each in (None, *GRID)], flat, lambda wall: pytest.fail("made")
+    )
+    assert thickness is None
+    assert [body.wall for body in found] == [None]
+
+
+def test_bodies_that_cannot_be_had_end_the_search() -> None:
+    normal = partial(evidence, of=lambda log: -((log - math.log(0.0029)) ** 2), filled=-50.0)
+    _, thickness = search_thickness([walled(each) for each in GRID], normal, lambda wall: None)
+    assert thickness is not None
+    assert thickness.low < 0.0029 < thickness.high
