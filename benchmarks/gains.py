@@ -200,14 +200,14 @@ def _ablation(options: Options) -> Report:
     cases = dict(_ablated(options))
     rows: list[list[str | float]] = []
     figures = {}
-    found: dict[str, list[float]] = defaultdict(list)
+    found: dict[str, dict[str, float]] = defaultdict(dict)
     for name, case in cases.items():
         for variant, error in _variants(case, options):
-            found[variant].append(error)
+            found[variant][name] = error
             tell(f"{name}, {variant}: {error:.4f}")
     for variant, errors in found.items():
-        ratio = float(np.exp(np.mean(np.log(np.array(errors) / np.array(found["default"])))))
-        rows.append([variant, *errors, ratio])
+        ratio = float(np.exp(np.mean([np.log(error / found["default"][name]) for name, error in errors.items()])))
+        rows.append([variant, *(errors.get(name, "-") for name in cases), ratio])
         figures[f"gains.ablation.{variant.replace(' ', '_')}"] = ratio
     columns = ("model", *cases, "over the default, geometric mean")
     return Report(tables=(Table("held-out error without each part", columns, rows),), figures=figures)
