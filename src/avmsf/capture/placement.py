@@ -103,6 +103,11 @@ class Placement:
         """Whether the contacts lie in a spot so small that their unit must be another."""
         return 0 < self.spread < SPREAD * self.diagonal
 
+    @property
+    def other_unit(self) -> bool:
+        """Whether contacts and surface count different units: undoing that brings the contacts onto the surface."""
+        return self.mistake is not None and self.mistake.factor != 1
+
     @cached_property
     def off(self) -> tuple[int, ...]:
         """Rows of the contacts off the surface, the farthest first."""

@@ -263,11 +263,12 @@ def _mesh(capture: Capture, scene: SceneStages | None) -> tuple[Callable[[], Sur
 def expect_on_object(impacts: Impacts, points: Float[Tensor, "points 3"], *, strict: bool = False) -> None:
     """Say with `CaptureWarning` how far contacts lie off the object's points, and what mistake may explain it.
 
-    Raises `CaptureError` where one lies farther off than the object is large, and, if `strict`, where any lies off.
+    Raises `CaptureError` where they count another unit, where one lies farther off than the object is large, and, if
+    `strict`, where any lies off.
     """
     placement = judge_placement(impacts.contacts, points)
     words = placement.describe(impacts.names)
-    if words and (strict or float(placement.distances.max()) > placement.diagonal):
+    if words and (strict or placement.other_unit or float(placement.distances.max()) > placement.diagonal):
         raise CaptureError(words)
     if words:
         warnings.warn(words, CaptureWarning, stacklevel=2)
