@@ -339,3 +339,15 @@ def test_a_point_that_one_of_many_views_sees_is_left_out() -> None:
     kept = supported(once, views)
     assert kept.dropped == int((lifted.seen == 0).sum()) + 1
     assert not bool((kept.features.points == points[7].float()).all(1).any())
+
+
+def test_points_afloat_before_a_surface_that_the_views_see_are_left_out() -> None:
+    outside = sphere_points()
+    points = torch.cat([outside, torch.tensor([[0.0, 0.0, 1.3 * RADIUS], [1.3 * RADIUS, 0.0, 0.0]])])
+    views = [view_of(camera) for camera in AROUND]
+    lifted = lift_points(points, views, painted_sphere(AROUND), depth_map=sphere_depth)
+    kept = supported(lifted, views)
+    assert bool((lifted.past[500:] > 0).all())
+    # Hardly any of the surface, though depth changes by more than two pixels beside its outlines.
+    assert len(kept.features.points) > 450
+    assert float(kept.features.points.norm(dim=1).max()) == pytest.approx(RADIUS)
