@@ -39,7 +39,8 @@ class Options:
     count: int = 5
     """How many contacts."""
     candidates: Path | None = None
-    """Capture whose contacts are the places that can be struck; all of the surface without it."""
+    """Capture whose contacts are the places that can be struck. Without it: all of the surface that a straight hammer
+    of 10 mm gets to from outside, at most 45 degrees from straight on."""
     settings: Path | None = None
     """A capture.toml to use in place of that capture's own."""
     output: Path | None = None
@@ -86,6 +87,11 @@ def run(options: Options) -> int:
         "left out in turn show it to be",
         soft_wrap=True,
     )
+    if found.unreachable:
+        screen.print(
+            f"left out: {found.unreachable} of {len(found.points)} places, which no hammer reaches from outside",
+            soft_wrap=True,
+        )
     if found.directions is not None:
         screen.print("nx, ny, nz: the way the hammer moves" + ("" if given else ", straight into the surface"))
     if paths:
@@ -105,7 +111,14 @@ def run(options: Options) -> int:
         for path in paths.values():
             say(f"wrote {path}")
     if options.json:
-        print_json({"capture": field.origin.capture, "before": found.before, "suggestions": rows})
+        print_json(
+            {
+                "capture": field.origin.capture,
+                "before": found.before,
+                "unreachable": found.unreachable,
+                "suggestions": rows,
+            }
+        )
     return 0
 
 
