@@ -3,6 +3,7 @@
 import hashlib
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache as cache_result
 from pathlib import Path
@@ -14,6 +15,7 @@ from torch import Tensor
 from avmsf.capture import Capture, Impacts, Surface
 from avmsf.capture.placement import judge_placement
 from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.surface import read_surface, write_surface
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import AvmsfError, CaptureError, SceneError
 from avmsf.field.config import FitConfig
@@ -23,6 +25,7 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import NETWORK, GainModel, estimator_for
 from avmsf.field.gains.visual import Visual
 from avmsf.field.store import load, save
+from avmsf.files import write_whole
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
@@ -36,6 +39,8 @@ from avmsf.scene.symmetry import Symmetries
 
 CACHE = ".avmsf"
 """Folder inside the capture's that keeps what each stage made."""
+SURFACE = "surface.ply"
+"""What the stage of the object's surface calls its output, in metres."""
 MODES, FIELD = "modes.safetensors", "field.safetensors"
 """What the last stages call their outputs."""
 BODIES = "bodies"
@@ -64,6 +69,8 @@ class Reconstruction:
     """What the features' file says of itself; empty where the folder shows nothing of the object."""
     modes: Extraction
     """The modes that the field started from."""
+    surface: Path | None = None
+    """The object's surface in the cache; None where its shape is unknown or the gain model needs none."""
 
 
 @dataclass(frozen=True)
@@ -132,8 +139,9 @@ def _reconstruct(
     @cache_result
     def bodies() -> CandidateBodies:
         listener.tell("bodies: what the object may be behind its surface")
+        surface = read_surface(keep_surface(stages, shape.surface, shape.surface_digest).path)
         cache = stages.folder / BODIES
-        return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, tell=listener.tell)
+        return candidate_bodies(surface, config.body, impacts=train, cache=cache, tell=listener.tell)
 
     def make(path: Path) -> None:
         listener.tell(f"fit: a field of {len(modes.bank)} modes")
@@ -166,9 +174,14 @@ def _reconstruct(
     recipe = {**basis, "modes": found.digest, "gain_model": config.gain_model, "name": capture.name}
     recipe |= {"body": asdict(config.body), "settings": asdict(capture.settings), "surface": shape.surface_digest}
     kept = stages.keep(FIELD, recipe, make, usable=is_final)
-    made = {**shape.made, "modes": found, "fit": kept}
+    surface: dict[str, Kept] = {}
+    if config.gain_model != NETWORK:
+        with suppress(AvmsfError):
+            surface["surface"] = keep_surface(stages, shape.surface, shape.surface_digest)
+    made = {**shape.made, **surface, "modes": found, "fit": kept}
     times = tuple(StageTime(name, each.seconds, each.fresh) for name, each in made.items())
-    return Reconstruction(kept.path, times, shape.report, modes)
+    path = surface["surface"].path if surface else None
+    return Reconstruction(kept.path, times, shape.report, modes, path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +242,7 @@ def _shape(
             features = FeatureField.from_contacts(capture.impacts.contacts)
         else:
             features = FeatureField.from_points(capture.surface.vertices)
-        surface, digest = _mesh(capture, None)
+        surface, digest = object_surface(capture.surface, None)
         return _Shape({"positions": features}, {}, {}, surface, digest)
     features = load_features(scene.features.path)
     candidates = {}
@@ -239,18 +252,20 @@ def _shape(
     found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
     expect_on_object(capture.impacts, features.points, strict=found_frame)
     report = read_report(scene.features.path)
-    surface, digest = _mesh(capture, scene)
+    surface, digest = object_surface(capture.surface, scene)
     return _Shape(candidates, scene.made(), report, surface, digest)
 
 
-def _mesh(capture: Capture, scene: SceneStages | None) -> tuple[Callable[[], Surface], str]:
-    """Return what makes the object's surface, and the digest of what it is made of: its mesh before its Gaussians."""
-    found = capture.surface
+def object_surface(found: Surface | None, scene: SceneStages | None) -> tuple[Callable[[], Surface], str]:
+    """Return what makes the object's surface, and the digest of what it is made of: its mesh before its Gaussians.
+
+    `found` is the surface that the folder holds. What is returned raises SceneError where the shape is unknown.
+    """
     if found is not None and len(found.faces):
         digest = hashlib.sha256(found.vertices.contiguous().numpy().tobytes())
         digest.update(found.faces.contiguous().numpy().tobytes())
         return lambda: found, digest.hexdigest()
-    cloud = scene.made().get("cloud") if scene is not None else None
+    cloud = scene.cloud if scene is not None else None
 
     def from_cloud() -> Surface:
         if cloud is None:
@@ -258,6 +273,16 @@ def _mesh(capture: Capture, scene: SceneStages | None) -> tuple[Callable[[], Sur
         return gaussian_surface(read_splats(cloud.path))
 
     return from_cloud, "" if cloud is None else cloud.digest
+
+
+def keep_surface(stages: StageFolder, make: Callable[[], Surface], digest: str) -> Kept:
+    """Return the file of the object's surface, made where what is kept is of something else. Raises as `make`."""
+
+    def write(path: Path) -> None:
+        surface = make()
+        write_whole(path, lambda place: write_surface(surface, place), raising=SceneError)
+
+    return stages.keep(SURFACE, {"of": digest}, write)
 
 
 def expect_on_object(impacts: Impacts, points: Float[Tensor, "points 3"], *, strict: bool = False) -> None:

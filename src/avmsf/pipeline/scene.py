@@ -22,7 +22,7 @@ from avmsf.scene.encode import Encoder
 from avmsf.scene.featurestore import save_features
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.keep import keep_object
-from avmsf.scene.lift import LEAST_SEEN, Lifted, LiftProgress
+from avmsf.scene.lift import Lifted, LiftProgress
 from avmsf.scene.ply import read_splats, write_splats
 from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
 from avmsf.scene.splat import SplatProgress, splat
@@ -135,7 +135,6 @@ class SceneStages:
         recipe = {
             "views": self.views.digest,
             "cloud": None if on_mesh else self.cloud.digest,
-            "least_seen": None if on_mesh else LEAST_SEEN,
             "encoder": encoder.name,
             "lift": asdict(self.config.lift),
         }
