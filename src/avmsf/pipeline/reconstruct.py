@@ -16,6 +16,7 @@ from avmsf.capture import Capture, Impacts, Surface
 from avmsf.capture.placement import judge_placement
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import read_surface, write_surface
+from avmsf.capture.views import read_views
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import AvmsfError, CaptureError, SceneError
 from avmsf.field.config import FitConfig
@@ -30,6 +31,7 @@ from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages
+from avmsf.pipeline.silhouettes import judge_outlines
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
@@ -244,6 +246,11 @@ def _shape(
             features = FeatureField.from_points(capture.surface.vertices)
         surface, digest = object_surface(capture.surface, None)
         return _Shape({"positions": features}, {}, {}, surface, digest)
+    if capture.surface is not None and scene.source is not None and scene.source.kind == "cameras":
+        # Before Gaussians, which take minutes.
+        words = judge_outlines(capture.surface, read_views(scene.views.path), settings)
+        if words is not None:
+            warnings.warn(words, CaptureWarning, stacklevel=2)
     features = load_features(scene.features.path)
     candidates = {}
     candidates["positions"] = FeatureField.from_points(features.points)
