@@ -3,15 +3,20 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import trimesh
 
-from avmsf.capture import read_surface
+from avmsf.bench.surfacepictures import draw_surface
+from avmsf.capture import Surface, read_surface
 from avmsf.capture.views.write import write_views
 from avmsf.cli import main
 from avmsf.cli.surface import kind_of
 from avmsf.cli.writing import OutputError
+from avmsf.errors import EvaluationError
+from avmsf.field.store import save
+from believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
 from plate_capture import PLATE, TINY, fill_plate
 from small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views, write_surface_file
 
@@ -64,3 +69,30 @@ def test_what_cannot_be_written_is_refused_first(tmp_path: Path, capsys: Streams
     assert main(["surface", str(tmp_path), "--output", str(tmp_path / "surface.obj")]) == 2
     assert "found none of these" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_surface_is_drawn_with_two_cuts_through_its_middle(tmp_path: Path) -> None:
+    whole, *cuts = draw_surface(slab(), title="slab").axes
+    assert len(whole.collections[0].get_paths()) == len(slab().faces)
+    # The slab's sides, in millimeters: each cut is a rectangle.
+    a, b, c = (1000 * side for side in (PLATE.length, PLATE.width, THICKNESS))
+    for axes, width in zip(cuts, (a, b), strict=True):
+        ends = np.concatenate(axes.collections[0].get_segments())
+        assert ends.min(axis=0) == pytest.approx([0, -c], abs=1e-3)
+        assert ends.max(axis=0) == pytest.approx([width, 0], abs=1e-3)
+    with pytest.raises(EvaluationError):
+        draw_surface(Surface(slab().vertices, torch.zeros(0, 3, dtype=torch.int64)), title="points")
+
+
+def test_the_picture_is_written_beside_the_surface_and_with_a_field(tmp_path: Path) -> None:
+    folder = tmp_path / "slab"
+    folder.mkdir()
+    write_surface_file(folder)
+    assert main(["surface", str(folder), "--picture", str(tmp_path / "slab.png")]) == 0
+    assert (tmp_path / "slab.png").read_bytes().startswith(b"\x89PNG")
+    contacts = bar_contacts(6)
+    for name, made in (("with", elastic_field), ("without", positional_field)):
+        save(sound_field(made(contacts, drawn_gains(contacts, seed=1))), tmp_path / f"{name}.safetensors")
+        assert main(["show", str(tmp_path / f"{name}.safetensors"), "--output", str(tmp_path / name)]) == 0
+    assert (tmp_path / "with" / "surface.png").is_file()
+    assert not (tmp_path / "without" / "surface.png").exists()

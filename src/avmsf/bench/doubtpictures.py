@@ -121,8 +121,9 @@ def _number(
     """Draw each mark's number on all sides that show it, or on one of those that do not; return if there are such."""
     faces = np.stack([np.zeros(len(marks)) if away is None else -(away @ frame)[:, 2] for frame in frames])
     shown = np.stack([_in_front(places @ frame, marks @ frame) for frame in frames])
-    shown &= (faces > 0) | (away is None)
-    hidden = ~shown.any(axis=0)
+    if away is not None:
+        shown &= faces > 0
+    hidden: np.ndarray = ~shown.any(axis=0)
     shown[faces.argmax(axis=0)[hidden], np.flatnonzero(hidden)] = True
     for axes, frame, rows in zip(grid, frames, shown, strict=True):
         across, along = (marks @ frame)[:, 0], (marks @ frame)[:, 1]

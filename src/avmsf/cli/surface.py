@@ -8,6 +8,8 @@ from typing import Annotated, get_args
 import trimesh
 import tyro
 
+from avmsf.bench.pictures import expect_format, save_picture
+from avmsf.bench.surfacepictures import draw_surface
 from avmsf.capture.surface import Surface, SurfaceKind, find_surface, read_surface, write_surface
 from avmsf.capture.together import expect_one_unit
 from avmsf.cli import INTERRUPTED
@@ -35,6 +37,8 @@ class Options(SceneOptions):
     """File to write the surface to; surface.ply in the cache holds it anyway."""
     format: SurfaceKind | None = None
     """Format of that file; what its name ends in without it."""
+    picture: Path | None = None
+    """Where to draw the surface, and two cuts through it: a file that ends in .png, .pdf or .svg."""
     views: ViewsConfig = field(default_factory=ViewsConfig)
     splat: SplatConfig = field(default_factory=SplatConfig)
 
@@ -48,6 +52,8 @@ def run(options: Options) -> int:
     """Make and write the surface; return 130 where Ctrl-C stopped it."""
     if options.output is not None:
         expect_writable(options.output)
+    if options.picture is not None:
+        expect_format(options.picture)
     kind = options.format or ("ply" if options.output is None else kind_of(options.output))
     settings = options.read_settings()
     expect_one_unit(options.folder, settings)
@@ -75,8 +81,11 @@ def run(options: Options) -> int:
     print_text(surface_words(surface))
     for name, made in {**scene.made(), "surface": kept}.items():
         print_text(stage_line(name, made))
-    if options.output is not None:
-        print_text(f"wrote {options.output}")
+    if options.picture is not None:
+        save_picture(draw_surface(surface, title=f"{options.folder.resolve().name}: surface"), options.picture)
+    for path in (options.output, options.picture):
+        if path is not None:
+            print_text(f"wrote {path}")
     return 0
 
 
