@@ -107,3 +107,13 @@ def test_an_object_that_cannot_be_struck_is_refused() -> None:
     gains = elastic_field(contacts, drawn_gains(contacts, seed=1))
     with pytest.raises(FitError):
         suggest(sound_field(replace(gains, points=gains.points + torch.tensor([0, 0, 0.1]))), 1)
+
+
+def test_a_side_without_points_is_suggested_on_request_alone() -> None:
+    contacts = bar_contacts(6)
+    gains = elastic_field(contacts, drawn_gains(contacts, seed=1))
+    half = replace(gains, points=gains.points[gains.points[:, 0] < LENGTH / 2])
+    assert float(suggest(sound_field(half), 5).contacts[:, 0].max()) < LENGTH / 2
+    assert float(suggest(sound_field(half), 5, unseen=True).contacts[:, 0].max()) > 0.6 * LENGTH
+    with pytest.raises(FitError):
+        suggest(sound_field(positional_field(contacts, drawn_gains(contacts, seed=1))), 1, unseen=True)

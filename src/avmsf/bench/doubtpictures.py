@@ -123,7 +123,7 @@ def _number(
     shown = np.stack([_in_front(places @ frame, marks @ frame) for frame in frames])
     if away is not None:
         shown &= faces > 0
-    hidden: np.ndarray = ~shown.any(axis=0)
+    hidden = np.logical_not(shown.any(axis=0))
     shown[faces.argmax(axis=0)[hidden], np.flatnonzero(hidden)] = True
     for axes, frame, rows in zip(grid, frames, shown, strict=True):
         across, along = (marks @ frame)[:, 0], (marks @ frame)[:, 1]

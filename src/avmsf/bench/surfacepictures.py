@@ -55,7 +55,7 @@ def _shade(axes: Axes, mesh: trimesh.Trimesh) -> None:
 def _cut(axes: Axes, mesh: trimesh.Trimesh, middle: np.ndarray, *, across: int) -> None:
     """Draw where a plane along z and one other axis cuts the triangles."""
     normal = np.eye(3)[1 - across]
-    lines = trimesh.intersections.mesh_plane(mesh, normal, middle)
+    lines = trimesh.intersections.mesh_plane(mesh, normal, middle)  # type: ignore[no-untyped-call]
     axes.add_collection(LineCollection(list(lines[:, :, [across, 2]]), colors=_INK, linewidths=1.5))
     axes.autoscale_view()
     axes.set_aspect("equal")

@@ -60,6 +60,7 @@ def suggest(
     *,
     candidates: Float[Tensor, "candidates 3"] | None = None,
     directions: Float[Tensor, "_given 3"] | None = None,
+    unseen: bool = False,
 ) -> Suggestions:
     """Return the `count` contacts that lower the expected error of the whole field most, each given those before it.
 
@@ -69,18 +70,23 @@ def suggest(
     but for those of strikes whose labels the field holds for wrong), by itself points spread over the surface that a
     hammer can strike from outside (`hammer_access`); `directions` the unit vectors along which they can be struck,
     straight into the surface where not given. Of more than `MOST` candidates as many are weighed, spread as far apart
-    as they go.
+    as they go. A field made of photographs has points where they show the object; with `unseen`, error and candidates
+    are those of all of the surface of the field's body instead.
 
     Raises FitError for gains that know no doubt, a count below 1, candidates that are not finite or not on the object,
-    directions that are not one a candidate, and fewer candidates than contacts asked for.
+    directions that are not one a candidate, fewer candidates than contacts asked for, places none of which a hammer
+    gets to, and `unseen` without a body.
     """
     gains = unedited_mixture(field)
-    spread = farthest_points(gains.points, min(PLACES, len(gains.points)))
-    points = gains.points[spread].double()
-    chosen_from = reachable(gains, points) if candidates is None else candidates.double()
-    unreachable = len(points) - len(chosen_from) if candidates is None else 0
+    surface = _body_nodes(gains) if unseen else gains.points
+    points = surface[farthest_points(surface, min(PLACES, len(surface)))].double()
+    _expect(gains.points, count, candidates)
     _expect_directions(directions, candidates)
-    _expect(gains.points, count, chosen_from)
+    if candidates is None:
+        chosen_from = reachable(gains, points)
+        unreachable = len(points) - len(chosen_from)
+    else:
+        chosen_from, unreachable = candidates.double(), 0
     size = float((points.amax(0) - points.amin(0)).norm())
     allowed = _apart(chosen_from, gains.contacts, size=size)
     if int(allowed.sum()) < count:
@@ -139,6 +145,16 @@ def reachable(gains: MixtureGains, points: Float64[Tensor, "points 3"]) -> Float
             f"{len(points)}: the object's shape is wrong or closed; give candidates"
         )
     return torch.from_numpy(places[struck])
+
+
+def _body_nodes(gains: MixtureGains) -> Float64[Tensor, "nodes 3"]:
+    """Return places all over the body's surface. Raises FitError without a body."""
+    if gains.body is None:
+        raise FitError(
+            "expected a field that knows the object's surface, of which no view saw a part, got one without a body: "
+            "ask without unseen places, or give candidates"
+        )
+    return gains.body.nodes
 
 
 class _Ledger:
@@ -214,9 +230,12 @@ def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates:
         raise FitError(f"candidate {still[0]}: its direction is a vector of length zero: give the way the hammer moves")
 
 
-def _expect(surface: Float[Tensor, "points 3"], count: int, candidates: Float64[Tensor, "candidates 3"]) -> None:
+def _expect(surface: Float[Tensor, "points 3"], count: int, given: Float[Tensor, "candidates 3"] | None) -> None:
     if count < 1:
         raise FitError(f"count = {count}: expected 1 contact or more")
+    if given is None:
+        return
+    candidates = given.double()
     if len(candidates) == 0:
         raise FitError("candidates is empty: give places on the surface, in metres, or none at all")
     if not bool(torch.isfinite(candidates).all()):
