@@ -4,11 +4,13 @@ import hashlib
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache as cache_result
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -38,6 +40,7 @@ from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.gaussiansurface import gaussian_surface
 from avmsf.scene.ply import read_splats
 from avmsf.scene.symmetry import Symmetries
+from avmsf.simulate.closest import ClosestPoints
 
 CACHE = ".avmsf"
 """Folder inside the capture's that keeps what each stage made."""
@@ -45,6 +48,9 @@ SURFACE = "surface.ply"
 """What the stage of the object's surface calls its output, in metres."""
 MODES, FIELD = "modes.safetensors", "field.safetensors"
 """What the last stages call their outputs."""
+OFF_MESH = 0.02
+"""Distance of a Gaussian from a mesh, over its size, up to which it is of its surface: three pixels of a photograph in
+which the object is 150 pixels wide."""
 BODIES = "bodies"
 """Folder of elastic modes in the cache, kept by content."""
 
@@ -252,6 +258,8 @@ def _shape(
         if words is not None:
             warnings.warn(words, CaptureWarning, stacklevel=2)
     features = load_features(scene.features.path)
+    if capture.surface is not None and "cloud" in scene.made():
+        features = moved_onto(features, capture.surface)
     candidates = {}
     candidates["positions"] = FeatureField.from_points(features.points)
     candidates["visual"] = features
@@ -261,6 +269,26 @@ def _shape(
     report = read_report(scene.features.path)
     surface, digest = object_surface(capture.surface, scene)
     return _Shape(candidates, scene.made(), report, surface, digest)
+
+
+def moved_onto(features: FeatureField, surface: Surface) -> FeatureField:
+    """Return features of Gaussians at the places of a mesh nearest to them, without those farther than `OFF_MESH`.
+
+    As they are where most are farther, for the two are in different frames then, and where there are no triangles.
+    """
+    triangles = surface.vertices.double().numpy()[surface.faces.numpy()]
+    sides = triangles[:, 1:] - triangles[:, :1]
+    triangles = triangles[np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) > 0]
+    if not len(triangles):
+        return features
+    found = ClosestPoints(triangles)(features.points.double().numpy())
+    size = float((surface.vertices.amax(0) - surface.vertices.amin(0)).norm())
+    near = found.distances <= OFF_MESH * size
+    if 2 * near.sum() < len(near):
+        return features
+    places = (triangles[found.rows] * found.weights[:, :, None]).sum(axis=1)[near]
+    rows = torch.from_numpy(near)
+    return replace(features, points=torch.from_numpy(places).to(features.points), features=features.features[rows])
 
 
 def object_surface(found: Surface | None, scene: SceneStages | None) -> tuple[Callable[[], Surface], str]:
