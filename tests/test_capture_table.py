@@ -150,10 +150,10 @@ def test_contacts_far_outside_the_surface_are_refused(tmp_path: Path) -> None:
         read_capture(folder)
 
 
-def test_a_surface_in_millimetres_beside_contacts_in_metres_is_recognised(tmp_path: Path) -> None:
+def test_a_surface_in_millimetres_beside_contacts_in_metres_is_refused_with_its_unit(tmp_path: Path) -> None:
     folder = fill(tmp_path)
     trimesh.creation.box((200, 400, 600)).export(folder / "surface.ply")
-    with pytest.warns(CaptureWarning, match='is the surface.s unit mm. If so, write surface_unit = "mm"'):
+    with pytest.raises(CaptureError, match=r'is the surface.s unit mm\? If so, write surface_unit = "mm"'):
         read_capture(folder)
     (folder / "capture.toml").write_text('surface_unit = "mm"')
     surface = read_capture(folder).surface

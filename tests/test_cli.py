@@ -288,14 +288,14 @@ def test_a_refused_fit_leaves_nothing_behind(tmp_path: Path, capsys: Streams, wr
     assert [each.name for each in output.parent.glob("*") if each.suffix != ".bodies"] == []
 
 
-def test_a_surface_in_another_unit_is_noted_once(tmp_path: Path, capsys: Streams) -> None:
+def test_a_surface_in_another_unit_is_refused_once(tmp_path: Path, capsys: Streams) -> None:
     folder = fill_plate(tmp_path / "plate")
     (surface,) = folder.glob("surface.*")
     trimesh.load(surface, process=False).apply_scale(1000.0).export(surface)
-    assert main(["fit", str(folder), "--output", str(tmp_path / "field"), "--gain-model", "smooth", *TINY]) == 0
-    notes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: ")]
-    assert len(notes) == 1
-    assert "is the surface's unit mm?" in notes[0]
+    assert main(["fit", str(folder), "--output", str(tmp_path / "field"), "--gain-model", "smooth", *TINY]) == 2
+    _, err = capsys.readouterr()
+    assert err.count("is the surface's unit mm?") == 1
+    assert not (tmp_path / "field").exists()
 
 
 def test_a_recipes_settings_hold_where_the_options_say_nothing() -> None:

@@ -155,8 +155,16 @@ def test_a_place_struck_twice_is_warned_of(folder: Path) -> None:
 def test_contacts_off_the_points_are_warned_of(folder: Path) -> None:
     for contact in NAMES:
         path = folder / "contacts/92" / f"{contact}.npy"
-        np.save(path, 1000 * np.load(path))
+        np.save(path, 1 + np.load(path))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         ObjectFolderCompact(folder).capture("92")
     assert "the contacts lie up to" in str(caught[0].message)
+
+
+def test_contacts_in_another_unit_than_the_points_are_refused(folder: Path) -> None:
+    for contact in NAMES:
+        path = folder / "contacts/92" / f"{contact}.npy"
+        np.save(path, 1000 * np.load(path))
+    with pytest.raises(DatasetError, match=r"divided by 1000 .* is their unit mm"):
+        ObjectFolderCompact(folder).capture("92")

@@ -250,3 +250,13 @@ def test_what_cannot_be_said_is_refused() -> None:
         unedited_mixture(retune(field))
     with pytest.raises(FitError, match=r"gains are of shape \(6, 3, 2\): expected 6 contacts, the field's 4 modes"):
         coverage(field, contacts, values[:, :3])
+
+
+def test_a_suggestion_that_no_side_shows_is_drawn_all_the_same() -> None:
+    generator = torch.Generator().manual_seed(0)
+    cube = 2 * torch.rand(6000, 3, generator=generator) - 1
+    marks, ways = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), torch.tensor([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    for directions in (None, ways):
+        shown = _numbers(draw_doubt(cube, torch.ones(6000), title="cube", suggested=marks, directions=directions))
+        assert sum("1" in side for side in shown) > 1
+        assert sum("2" in side for side in shown) == 1

@@ -1,7 +1,7 @@
 """Lifting: what a point is told in the images is what the images show of that very point, and of no other."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from avmsf.capture.surface import Surface
 from avmsf.errors import SceneError
 from avmsf.scene.cpu import NumbaRasteriser
 from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.lift import by_presence, by_visibility, lift, lift_points
+from avmsf.scene.lift import by_presence, by_visibility, lift, lift_points, supported
 from avmsf.scene.rasteriser import Rendering
 from avmsf.scene.visibility import depth_of_cloud, depth_of_surface, depth_reach, look
 
@@ -313,3 +313,41 @@ def test_an_encoder_that_gives_no_map_is_named():
     maps = Painted([torch.zeros(2, 3, 4), torch.zeros(3, 3, 4)])
     with pytest.raises(SceneError, match="a view: expected 2 features as in the views before, found 3"):
         lift_points(sphere_points(50), [view_of(c) for c in AROUND[:2]], maps, depth_map=sphere_depth)
+
+
+def test_points_that_the_views_agree_to_be_hidden_are_left_out() -> None:
+    outside = sphere_points()
+    points = torch.cat([outside, 0.8 * outside])
+    views = [view_of(camera) for camera in AROUND]
+    lifted = lift_points(
+        points, views, painted_sphere(AROUND), depth_map=sphere_depth, reach=lambda _: torch.zeros(1000)
+    )
+    kept = supported(lifted, views)
+    # The inner ones lie 20 mm beneath a surface that the views know to a millimeter.
+    assert bool((lifted.seen[500:] == 0).all())
+    assert torch.equal(kept.features.points, outside[lifted.seen[:500] > 0].float())
+    assert len(kept.features.points) > 450
+    assert kept.dropped == 1000 - len(kept.features.points)
+    assert bool((kept.seen > 0).all())
+
+
+def test_a_point_that_one_of_many_views_sees_is_left_out() -> None:
+    points = sphere_points()
+    views = [view_of(camera) for camera in 10 * AROUND]
+    lifted = lift_points(points, views, painted_sphere(10 * AROUND), depth_map=sphere_depth)
+    once = replace(lifted, seen=torch.where(torch.arange(500) == 7, 1, lifted.seen))
+    kept = supported(once, views)
+    assert kept.dropped == int((lifted.seen == 0).sum()) + 1
+    assert not bool((kept.features.points == points[7].float()).all(1).any())
+
+
+def test_points_afloat_before_a_surface_that_the_views_see_are_left_out() -> None:
+    outside = sphere_points()
+    points = torch.cat([outside, torch.tensor([[0.0, 0.0, 1.3 * RADIUS], [1.3 * RADIUS, 0.0, 0.0]])])
+    views = [view_of(camera) for camera in AROUND]
+    lifted = lift_points(points, views, painted_sphere(AROUND), depth_map=sphere_depth)
+    kept = supported(lifted, views)
+    assert bool((lifted.past[500:] > 0).all())
+    # Hardly any of the surface, though depth changes by more than two pixels beside its outlines.
+    assert len(kept.features.points) > 450
+    assert float(kept.features.points.norm(dim=1).max()) == pytest.approx(RADIUS)

@@ -181,3 +181,18 @@ def test_the_aircrafts_contacts_lie_on_it_and_its_mistakes_are_named(shared: Pat
     assert float(placement.distances.max()) < 0.01
     assert "is their unit mm?" in judge_placement(1000 * contacts, points).describe()
     assert "(x, -z, y)" in judge_placement(contacts @ Y_UP, points).describe()
+
+
+def test_first_impacts_near_the_middle_of_a_plate_are_no_other_unit() -> None:
+    plate = surface_points(
+        Surface(
+            torch.tensor([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]]),
+            torch.tensor([[0, 1, 2], [0, 2, 3]]),
+        )
+    )
+    first = torch.tensor([[0.02, 0.0, 0.0], [-0.02, 0.01, 0.0]])
+    assert not judge_placement(first, plate).other_unit
+    patch = 0.1 * (torch.rand(8, 3, generator=torch.Generator().manual_seed(0)) - 0.5) * torch.tensor([1.0, 1.0, 0.0])
+    assert not judge_placement(patch, plate).other_unit
+    assert judge_placement(0.01 * patch, plate).other_unit
+    assert judge_placement(1000 * patch, plate).other_unit

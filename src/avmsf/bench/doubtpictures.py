@@ -36,7 +36,8 @@ def draw_doubt(
 
     `struck` contacts are marked by crosses, `suggested` ones by their numbers, each where it can be seen: no point is
     in front of it, and the blow, whose `directions` may be given, goes away from the eye, so that the two sides of a
-    wall are not mistaken for each other. What is flat along an axis is drawn once, in its plane.
+    wall are not mistaken for each other. A suggested one that no side shows is drawn in a white disc, on the side that
+    most faces it. What is flat along an axis is drawn once, in its plane.
     """
     places, values = points.double().numpy(), doubt.double().numpy()
     crosses, numbers = (None if each is None else each.double().numpy() for each in (struck, suggested))
@@ -45,18 +46,18 @@ def draw_doubt(
     frames = [view_from(side).T for side in ALL_SIDES] if len(flat) == 0 else [_plane(int(flat[0]))]
     figure = Figure(figsize=(14, 9.5) if len(frames) > 1 else (8, 5), layout="constrained")
     grid = figure.subplots(2, 3).flatten() if len(frames) > 1 else np.array([figure.subplots()])
-    away = None if directions is None else directions.double().numpy()
     for axes, frame in zip(grid, frames, strict=True):
         drawn = _scatter(axes, places @ frame, values)
         name_axes(axes, frame.T)
         if crosses is not None:
-            _mark(axes, places @ frame, crosses @ frame, None)
-        if numbers is not None:
-            faced = None if away is None or len(frames) == 1 else (away @ frame)[:, 2] < 0
-            names = [str(number + 1) for number in range(len(numbers))]
-            _mark(axes, places @ frame, numbers @ frame, names, faced=faced)
+            _cross(axes, (crosses @ frame)[_in_front(places @ frame, crosses @ frame)])
+    hidden = False
+    if numbers is not None:
+        away = None if directions is None or len(frames) == 1 else directions.double().numpy()
+        hidden = _number(grid, frames, places, numbers, away)
     figure.colorbar(drawn, ax=list(grid), shrink=0.7, label="doubt over the mean size of gains (0 = certain)")
     known = [words for words, each in (("× struck", struck), ("numbers: next", suggested)) if each is not None]
+    known += ["white discs: hidden by what is in front"] * hidden
     figure.suptitle("\n".join([title, ", ".join(known)] if known else [title]))
     return figure
 
@@ -100,22 +101,35 @@ def _scatter(axes: Axes, seen: np.ndarray, values: np.ndarray) -> PathCollection
     return drawn
 
 
-def _mark(
-    axes: Axes, seen: np.ndarray, marks: np.ndarray, names: list[str] | None, *, faced: np.ndarray | None = None
-) -> None:
-    """Draw marks that no point hides, of those on the `faced` side: crosses, or names in discs."""
+def _in_front(seen: np.ndarray, marks: np.ndarray) -> np.ndarray:
+    """Return which marks no point hides, both in a side's own frame."""
     size = float(np.linalg.norm(np.ptp(seen, axis=0)))
     apart = np.linalg.norm(seen[None, :, :2] - marks[:, None, :2], axis=2)
     nearer = seen[None, :, 2] - marks[:, None, 2] > _BEHIND * size
-    visible = ~np.any((apart < size / math.sqrt(len(seen))) & nearer, axis=1)
-    if faced is not None:
-        visible &= faced
-    across, along = marks[visible, 0], marks[visible, 1]
-    if names is None:
-        axes.scatter(across, along, c="white", marker="x", s=45, linewidths=3.5)
-        axes.scatter(across, along, c="black", marker="x", s=35, linewidths=1.5)
-        return
-    axes.scatter(across, along, c=_NEXT, s=190, edgecolors="black", linewidths=1)
-    for row in np.flatnonzero(visible).tolist():
-        place = (float(marks[row, 0]), float(marks[row, 1]))
-        axes.annotate(names[row], place, ha="center", va="center", fontsize=9, fontweight="bold")
+    visible: np.ndarray = ~np.any((apart < size / math.sqrt(len(seen))) & nearer, axis=1)
+    return visible
+
+
+def _cross(axes: Axes, marks: np.ndarray) -> None:
+    axes.scatter(marks[:, 0], marks[:, 1], c="white", marker="x", s=45, linewidths=3.5)
+    axes.scatter(marks[:, 0], marks[:, 1], c="black", marker="x", s=35, linewidths=1.5)
+
+
+def _number(
+    grid: np.ndarray, frames: list[np.ndarray], places: np.ndarray, marks: np.ndarray, away: np.ndarray | None
+) -> bool:
+    """Draw each mark's number on all sides that show it, or on one of those that do not; return if there are such."""
+    faces = np.stack([np.zeros(len(marks)) if away is None else -(away @ frame)[:, 2] for frame in frames])
+    shown = np.stack([_in_front(places @ frame, marks @ frame) for frame in frames])
+    if away is not None:
+        shown &= faces > 0
+    hidden = np.logical_not(shown.any(axis=0))
+    shown[faces.argmax(axis=0)[hidden], np.flatnonzero(hidden)] = True
+    for axes, frame, rows in zip(grid, frames, shown, strict=True):
+        across, along = (marks @ frame)[:, 0], (marks @ frame)[:, 1]
+        colors = np.where(hidden[rows], "white", _NEXT)
+        axes.scatter(across[rows], along[rows], c=colors, s=190, edgecolors="black", linewidths=1)
+        for row in np.flatnonzero(rows).tolist():
+            place = (float(across[row]), float(along[row]))
+            axes.annotate(str(row + 1), place, ha="center", va="center", fontsize=9, fontweight="bold")
+    return bool(hidden.any())

@@ -27,6 +27,8 @@ SMALL_SPREAD = 0.15
 """The same, below which it may be."""
 WRONG_ROWS = 0.1
 """Part of the contacts up to which those that lie off count as single mistakes, not as one made with all of them."""
+LEAST_CLOSE = 5
+"""Contacts on the surface from which on their small spread alone shows another unit, as for axes."""
 LEAST_SPREAD = 0.4
 """Diagonal of the contacts over the object's that the undoing of a mistake must leave: what is shrunk enough fits
 anywhere."""
@@ -103,6 +105,22 @@ class Placement:
         """Whether the contacts lie in a spot so small that their unit must be another."""
         return 0 < self.spread < SPREAD * self.diagonal
 
+    @property
+    def other_unit(self) -> bool:
+        """Whether contacts and surface count different units, beyond doubt: another one brings them onto the surface.
+
+        Where they lie on it already, as first impacts near the middle of a plate do, only many that are very close
+        together say so.
+        """
+        if self.mistake is None or self.mistake.factor == 1:
+            return False
+        return self.mostly_off or (self.shrunken and len(self.distances) >= LEAST_CLOSE)
+
+    @property
+    def mostly_off(self) -> bool:
+        """Whether more contacts lie off the surface than are single mistakes."""
+        return len(self.off) > max(1, WRONG_ROWS * len(self.distances))
+
     @cached_property
     def off(self) -> tuple[int, ...]:
         """Rows of the contacts off the surface, the farthest first."""
@@ -167,7 +185,7 @@ def judge_placement(contacts: Float[Tensor, "contacts 3"], points: Float[Tensor,
         tolerance=max(TOLERANCE * diagonal, 2 * spacing),
     )
     small = 0 < placement.spread < SMALL_SPREAD * diagonal
-    if not small and len(placement.off) <= max(1, WRONG_ROWS * len(places)):
+    if not small and not placement.mostly_off:
         return placement
     search = _Search(cKDTree(some), _some(places, MOST_CONTACTS), placement)
     return replace(placement, mistake=search.find())

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -13,6 +14,8 @@ from avmsf.capture.mesh_file import load_parts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError
 
+SurfaceKind = Literal["ply", "obj", "glb"]
+"""Formats that surfaces are written in."""
 SURFACE_FILES = ("surface.obj", "surface.ply", "surface.glb", "surface.stl")
 
 
@@ -60,9 +63,9 @@ def find_surface(folder: Path, settings: CaptureSettings) -> Surface | None:
     return None if path is None else read_surface(path, metres=settings.surface_metres)
 
 
-def write_surface(surface: Surface, path: Path) -> None:
-    """Write a binary PLY in metres, which holds float32 coordinates to the last bit."""
+def write_surface(surface: Surface, path: Path, *, kind: SurfaceKind = "ply") -> None:
+    """Write a surface in metres: as a binary PLY, which holds float32 coordinates to the last bit, as OBJ or as GLB."""
     vertices, faces = surface.vertices.numpy(), surface.faces.numpy()
     cloud = not len(faces)
     shape = trimesh.PointCloud(vertices) if cloud else trimesh.Trimesh(vertices, faces, process=False)  # type: ignore[no-untyped-call]
-    shape.export(path, file_type="ply")
+    shape.export(path, file_type=kind)

@@ -3,6 +3,8 @@
 import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,8 +12,8 @@ import torch
 from avmsf.capture.placement import Mistake, judge_placement, surface_points
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.capture.settings import METRES, CaptureSettings
-from avmsf.capture.surface import Surface
-from avmsf.capture.table import TABLE, Strike, fitting_units
+from avmsf.capture.surface import Surface, find_surface
+from avmsf.capture.table import TABLE, Strike, fitting_units, read_rows, understand
 from avmsf.errors import CaptureError
 from avmsf.wording import counted
 
@@ -138,13 +140,19 @@ def judge_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list
 
 
 def judge_surface(strikes: Sequence[Strike], surface: Surface, *, settings: CaptureSettings) -> list[str]:
-    """Say whether contacts lie off the surface; `CaptureError` where one lies farther off than the surface is large."""
+    """Say whether contacts lie off the surface.
+
+    `CaptureError` where surface and contacts count different units, and where a contact lies farther off than the
+    surface is large.
+    """
     contacts = torch.tensor([strike.contact for strike in strikes], dtype=torch.float64)
     placement = judge_placement(contacts, surface_points(surface))
     if placement.on_surface:
         return []
     found = placement.describe([f"line {strike.line}" for strike in strikes]) + _mending(placement.mistake, settings)
     farthest = float(placement.distances.max())
+    if placement.other_unit:
+        raise CaptureError(f"{TABLE}: expected contacts and surface in one unit; {found}")
     if farthest > placement.diagonal:
         worst = strikes[int(placement.distances.argmax())]
         raise CaptureError(
@@ -152,6 +160,23 @@ def judge_surface(strikes: Sequence[Strike], surface: Surface, *, settings: Capt
             f"{placement.diagonal:.3g} m across: {found}"
         )
     return [f"{TABLE}: {found}"]
+
+
+def expect_one_unit(folder: Path, settings: CaptureSettings) -> None:
+    """Raise `CaptureError` where a folder's surface and the contacts of its table count different units.
+
+    For those who read the surface alone. Rows that cannot be understood are passed over.
+    """
+    if not (folder / TABLE).is_file():
+        return
+    strikes = []
+    with suppress(CaptureError):
+        for row in read_rows(folder)[0]:
+            with suppress(CaptureError):
+                strikes.append(understand(row, settings))
+    surface = find_surface(folder, settings) if strikes else None
+    if surface is not None:
+        judge_surface(strikes, surface, settings=settings)
 
 
 def _mending(mistake: Mistake | None, settings: CaptureSettings) -> str:

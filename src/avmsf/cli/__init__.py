@@ -26,6 +26,7 @@ VERBS = {
     "fit": "Fit a sound field to a capture and write it to one file.",
     "splat": "Turn photographs, a video or a mesh into Gaussians, as a .ply file that any 3DGS viewer opens.",
     "lift": "Describe what each place of an object looks like, and make that obey the object's symmetries.",
+    "surface": "Write an object's surface alone: its mesh, or what encloses its Gaussians.",
     "reconstruct": "Go all the way from a capture folder to a field: views, Gaussians, features, modes, gains.",
     "view-cloud": "Draw Gaussians or features from all sides: colours, features, clusters, symmetries.",
     "render": "Write the sounds of blows anywhere on the object as wav files.",

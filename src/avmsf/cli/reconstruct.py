@@ -136,6 +136,8 @@ def run(options: Options) -> int:
     screen.print(summary(fitted, len(train)), soft_wrap=True)
     for words in quality_words(fitted, options.output or made.field):
         screen.print(words, soft_wrap=True)
+    if made.surface is not None:
+        screen.print(f"the object's surface is {made.surface}", soft_wrap=True)
     screen.print(f"the field is {made.field}", soft_wrap=True)
     if options.output is not None:
         screen.print(f"wrote {options.output}", soft_wrap=True)
@@ -143,6 +145,7 @@ def run(options: Options) -> int:
         print_json(
             {
                 "field": str(options.output or made.field),
+                "surface": None if made.surface is None else str(made.surface),
                 "capture": capture.name,
                 "features_report": made.report,
                 "stages": [asdict(each) for each in made.stages],

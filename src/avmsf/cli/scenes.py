@@ -46,6 +46,8 @@ def features_words(report: Mapping[str, Any]) -> str:
         f"features: {report['encoder']}, on {report['points']} points, {report['unseen']} of which no view sees; views "
         f"agree on {100 * report['agreement']:.0f} % of the features' variance"
     ]
+    if report.get("dropped"):
+        lines.append(f"left out: {report['dropped']} Gaussians inside the object or behind its surface in the views")
     if "symmetries" in report:
         lines.append(Symmetries.from_dict(report["symmetries"]).summary())
     if "orbit_spread" in report:

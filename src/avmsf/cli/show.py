@@ -13,7 +13,8 @@ from torch import Tensor
 from avmsf.bench.doubtpictures import draw_band, draw_doubt
 from avmsf.bench.evaluation import evaluate
 from avmsf.bench.pictures import draw_gains, draw_modes, draw_spectrograms, save_picture
-from avmsf.capture import CaptureSettings, Impacts, read_capture
+from avmsf.bench.surfacepictures import draw_surface
+from avmsf.capture import CaptureSettings, Impacts, Surface, read_capture
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.modes import mode_table
 from avmsf.cli.modetable import levels, mode_rows
@@ -21,6 +22,7 @@ from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.scores import quality_words, score_table, score_values
 from avmsf.field.attention import AttentionGains
 from avmsf.field.doubt import gain_doubt, spectrum_band
+from avmsf.field.gains.model import MixtureGains
 from avmsf.field.posterior import has_posterior, training_contacts
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
@@ -42,7 +44,7 @@ class Options:
     """Capture to set beside the field: its recordings that the field was not fitted to, or all where there are none."""
     output: Path | None = None
     """Folder for the pictures modes.png, gains.png, doubt.png and spectrum.png where the gains know how sure they are,
-    and spectrograms.png with a capture; none without it."""
+    surface.png where they know a body, and spectrograms.png with a capture; none without it."""
     settings: Path | None = None
     """A capture.toml to use in place of the capture's own."""
     json: bool = False
@@ -154,6 +156,10 @@ def draw_field(
         title = f"doubt of {name}"
         pictures["doubt"] = draw_doubt(points, doubt, title=title, struck=training_contacts(field))
         pictures["spectrum"] = draw_band(spectrum_band(field, points[0]), title=f"{name}: one blow, and its doubt")
+    body = field.gain_field.body if isinstance(field.gain_field, MixtureGains) else None
+    if body is not None:
+        surface = Surface(body.nodes.float(), body.triangles[:, :3])
+        pictures["surface"] = draw_surface(surface, title=f"the body of {name}")
     for stem, picture in pictures.items():
         path = folder / f"{stem}.png"
         doing(f"drawing {path}")

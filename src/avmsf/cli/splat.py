@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from avmsf.capture.together import expect_one_unit
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.printing import print_text, say
 from avmsf.cli.scenebar import SceneBar
@@ -43,6 +44,8 @@ def run(options: Options) -> int:
     """Make the Gaussians; return 130 where Ctrl-C stopped it."""
     if options.output is not None:
         expect_writable(options.output)
+    settings = options.read_settings()
+    expect_one_unit(options.folder, settings)
     stages = StageFolder(options.kept)
     try:
         with SceneBar() as bar:
@@ -50,7 +53,7 @@ def run(options: Options) -> int:
                 options.folder,
                 stages,
                 SceneConfig(views=options.views, splat=options.config),
-                settings=options.read_settings(),
+                settings=settings,
                 listener=bar.listener,
             )
             scene.expect_any()

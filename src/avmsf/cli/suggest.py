@@ -39,7 +39,10 @@ class Options:
     count: int = 5
     """How many contacts."""
     candidates: Path | None = None
-    """Capture whose contacts are the places that can be struck; all of the surface without it."""
+    """Capture whose contacts are the places that can be struck. Without it: all of the surface that a straight hammer
+    of 10 mm gets to from outside, at most 45 degrees from straight on."""
+    unseen: bool = False
+    """Consider all of the surface of the field's body, also what no photograph showed, as the side that it stood on."""
     settings: Path | None = None
     """A capture.toml to use in place of that capture's own."""
     output: Path | None = None
@@ -57,6 +60,8 @@ def run(options: Options) -> int:
     """Suggest, print and draw."""
     if options.settings is not None and options.candidates is None:
         raise FitError("--settings are those of a capture of candidates: give --candidates, or leave them out")
+    if options.unseen and options.candidates is not None:
+        raise FitError("expected --unseen or --candidates, got both: leave one out")
     paths = {} if options.output is None else {name: options.output / name for name in (TABLE, PICTURE)}
     for path in paths.values():
         expect_writable(path)
@@ -66,7 +71,7 @@ def run(options: Options) -> int:
     given = False
     doing("weighing the contacts")
     if options.candidates is None:
-        found = suggest(field, options.count)
+        found = suggest(field, options.count, unseen=options.unseen)
     else:
         settings = None if options.settings is None else CaptureSettings.read(options.settings)
         impacts = read_capture(options.candidates, settings).impacts
@@ -86,6 +91,11 @@ def run(options: Options) -> int:
         "left out in turn show it to be",
         soft_wrap=True,
     )
+    if found.unreachable:
+        screen.print(
+            f"left out: {found.unreachable} places that no hammer reaches from outside",
+            soft_wrap=True,
+        )
     if found.directions is not None:
         screen.print("nx, ny, nz: the way the hammer moves" + ("" if given else ", straight into the surface"))
     if paths:
@@ -105,7 +115,14 @@ def run(options: Options) -> int:
         for path in paths.values():
             say(f"wrote {path}")
     if options.json:
-        print_json({"capture": field.origin.capture, "before": found.before, "suggestions": rows})
+        print_json(
+            {
+                "capture": field.origin.capture,
+                "before": found.before,
+                "unreachable": found.unreachable,
+                "suggestions": rows,
+            }
+        )
     return 0
 
 

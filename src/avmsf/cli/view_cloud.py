@@ -9,6 +9,7 @@ import torch
 import tyro
 from jaxtyping import Float
 from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.bench.clouds import component_colours, draw_cloud, draw_features, save_turntable
@@ -85,12 +86,13 @@ def _draw_features(options: Options) -> None:
 def _colors_of(path: Path, features: FeatureField) -> Float[Tensor, "points 3"]:
     """Return the colours of the Gaussians that the features lie on."""
     cloud = read_splats(path)
-    if len(cloud) != len(features.points) or not torch.equal(cloud.centers, features.points):
+    apart, rows = cKDTree(cloud.centers.numpy()).query(features.points.numpy())
+    if apart.any():
         raise SceneError(
             f"{path}: expected the Gaussians that the features lie on ({len(features.points)}), found {len(cloud)} "
             "others: name the file that the features were lifted onto"
         )
-    return plain_colors(cloud)
+    return plain_colors(cloud.take(torch.from_numpy(rows)))
 
 
 def _turn(

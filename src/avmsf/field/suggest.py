@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import FitError
-from avmsf.field.gains.model import PlaceCovariance
+from avmsf.field.gains.model import MixtureGains, PlaceCovariance
+from avmsf.field.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
 from avmsf.field.posterior import energy_of, parts_of, unedited_mixture
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.points import farthest_points
@@ -49,6 +50,8 @@ class Suggestions:
     """Expected error at these with what has been struck."""
     map_after: Float64[Tensor, " points"]
     """Expected error at these after all the contacts."""
+    unreachable: int = 0
+    """How many of `points` were no candidates because a hammer cannot strike them from outside."""
 
 
 def suggest(
@@ -57,25 +60,33 @@ def suggest(
     *,
     candidates: Float[Tensor, "candidates 3"] | None = None,
     directions: Float[Tensor, "_given 3"] | None = None,
+    unseen: bool = False,
 ) -> Suggestions:
     """Return the `count` contacts that lower the expected error of the whole field most, each given those before it.
 
     Gains at two places hang together as far as the field believes they do, so a blow tells of other places too; its
     expected gain is known before it is struck, for in a Gaussian field it does not depend on what will be heard.
     `candidates` are the places to choose from (metres, on the surface; places that have been struck are passed over,
-    but for those of strikes whose labels the field holds for wrong), by itself points spread over the surface;
-    `directions` the unit vectors along which they can be struck, straight into the surface where not given. Of more
-    than `MOST` candidates as many are weighed, spread as far apart as they go.
+    but for those of strikes whose labels the field holds for wrong), by itself points spread over the surface that a
+    hammer can strike from outside (`hammer_access`); `directions` the unit vectors along which they can be struck,
+    straight into the surface where not given. Of more than `MOST` candidates as many are weighed, spread as far apart
+    as they go. A field made of photographs has points where they show the object; with `unseen`, error and candidates
+    are those of all of the surface of the field's body instead.
 
     Raises FitError for gains that know no doubt, a count below 1, candidates that are not finite or not on the object,
-    directions that are not one a candidate, and fewer candidates than contacts asked for.
+    directions that are not one a candidate, fewer candidates than contacts asked for, places none of which a hammer
+    gets to, and `unseen` without a body.
     """
     gains = unedited_mixture(field)
-    spread = farthest_points(gains.points, min(PLACES, len(gains.points)))
-    points = gains.points[spread].double()
-    chosen_from = points if candidates is None else candidates.double()
+    surface = _body_nodes(gains) if unseen else gains.points
+    points = surface[farthest_points(surface, min(PLACES, len(surface)))].double()
+    _expect(gains.points, count, candidates)
     _expect_directions(directions, candidates)
-    _expect(gains.points, count, chosen_from)
+    if candidates is None:
+        chosen_from = reachable(gains, points)
+        unreachable = len(points) - len(chosen_from)
+    else:
+        chosen_from, unreachable = candidates.double(), 0
     size = float((points.amax(0) - points.amin(0)).norm())
     allowed = _apart(chosen_from, gains.contacts, size=size)
     if int(allowed.sum()) < count:
@@ -86,8 +97,8 @@ def suggest(
     kept = _weighed(chosen_from, allowed, max(MOST, count))
     chosen_from, allowed = chosen_from[kept], allowed[kept]
     along = gains.sites(chosen_from, None if directions is None else directions[kept]).directions
-    places = points if candidates is None else torch.cat([points, chosen_from])
-    ways = along if candidates is None else torch.cat([gains.sites(points).directions, along])
+    places = torch.cat([points, chosen_from])
+    ways = torch.cat([gains.sites(points).directions, along])
     ledger = _Ledger(
         gains.covariances(places, ways), 1.0 / (4.0 * field.bank.damping.double()), len(points), len(chosen_from)
     )
@@ -112,7 +123,38 @@ def suggest(
         points,
         (before / energy).sqrt(),
         (ledger.open / energy).sqrt(),
+        unreachable,
     )
+
+
+def reachable(gains: MixtureGains, points: Float64[Tensor, "points 3"]) -> Float64[Tensor, "places 3"]:
+    """Return those of the points, moved onto the surface of the gains' body, that a hammer can strike from outside.
+
+    Without a body they are judged by the object's points, and stay where they are. Raises FitError where none can be.
+    """
+    body = gains.body
+    judge = (
+        PointAccess(gains.points.double().numpy())
+        if body is None
+        else MeshAccess(body.nodes.double().numpy(), body.triangles[:, :3].numpy())
+    )
+    struck, places = judge(points.numpy())
+    if not struck.any():
+        raise FitError(
+            f"expected places that a hammer of {1000 * HAMMER_DIAMETER:g} mm can strike from outside, got none of "
+            f"{len(points)}: the object's shape is wrong or closed; give candidates"
+        )
+    return torch.from_numpy(places[struck])
+
+
+def _body_nodes(gains: MixtureGains) -> Float64[Tensor, "nodes 3"]:
+    """Return places all over the body's surface. Raises FitError without a body."""
+    if gains.body is None:
+        raise FitError(
+            "expected a field that knows the object's surface, of which no view saw a part, got one without a body: "
+            "ask without unseen places, or give candidates"
+        )
+    return gains.body.nodes
 
 
 class _Ledger:
@@ -188,9 +230,12 @@ def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates:
         raise FitError(f"candidate {still[0]}: its direction is a vector of length zero: give the way the hammer moves")
 
 
-def _expect(surface: Float[Tensor, "points 3"], count: int, candidates: Float64[Tensor, "candidates 3"]) -> None:
+def _expect(surface: Float[Tensor, "points 3"], count: int, given: Float[Tensor, "candidates 3"] | None) -> None:
     if count < 1:
         raise FitError(f"count = {count}: expected 1 contact or more")
+    if given is None:
+        return
+    candidates = given.double()
     if len(candidates) == 0:
         raise FitError("candidates is empty: give places on the surface, in metres, or none at all")
     if not bool(torch.isfinite(candidates).all()):

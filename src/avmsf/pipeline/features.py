@@ -15,7 +15,7 @@ from avmsf.scene.dino import DinoEncoder
 from avmsf.scene.encode import Encoder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.lift import Lifted, LiftProgress, by_presence, by_visibility, lift, lift_points
+from avmsf.scene.lift import Lifted, LiftProgress, by_presence, by_visibility, lift, lift_points, supported
 from avmsf.scene.points import sample_surface
 from avmsf.scene.rasteriser import Rasteriser
 from avmsf.scene.reduction import reduce, resize, with_positions
@@ -80,7 +80,8 @@ class MadeFeatures:
     symmetries: Symmetries | None
     """None where none were looked for."""
     report: dict[str, Any]
-    """Plain values: encoder, points that no view sees, agreement of the views, symmetries, spread over orbits."""
+    """Plain values: encoder, points, how many of them no view sees and how many were left out, agreement of the views,
+    symmetries, spread over orbits."""
 
 
 def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None]) -> Encoder:
@@ -106,9 +107,10 @@ def lift_to_cloud(
     rasteriser: Rasteriser,
     progress: Callable[[LiftProgress], None] | None = None,
 ) -> Lifted:
-    """Lift features onto Gaussians as the settings say."""
+    """Lift features onto the Gaussians that views see, as the settings say."""
     weighting = _WEIGHTINGS[config.weighting]
-    return lift(cloud, views, encoder, rasteriser=rasteriser, weighting=weighting, progress=progress)
+    lifted = lift(cloud, views, encoder, rasteriser=rasteriser, weighting=weighting, progress=progress)
+    return supported(lifted, views)
 
 
 def lift_to_surface(
@@ -138,6 +140,7 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
         "encoder": lifted.features.encoder,
         "points": len(features.points),
         "unseen": lifted.unseen,
+        "dropped": lifted.dropped,
         "agreement": lifted.agreement,
     }
     symmetries = None

@@ -3,17 +3,22 @@
 import hashlib
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache as cache_result
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture import Capture, Impacts, Surface
 from avmsf.capture.placement import judge_placement
 from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.surface import read_surface, write_surface
+from avmsf.capture.views import read_views
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import AvmsfError, CaptureError, SceneError
 from avmsf.field.config import FitConfig
@@ -23,21 +28,29 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import NETWORK, GainModel, estimator_for
 from avmsf.field.gains.visual import Visual
 from avmsf.field.store import load, save
+from avmsf.files import write_whole
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages
+from avmsf.pipeline.silhouettes import judge_outlines
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.gaussiansurface import gaussian_surface
 from avmsf.scene.ply import read_splats
 from avmsf.scene.symmetry import Symmetries
+from avmsf.simulate.closest import ClosestPoints
 
 CACHE = ".avmsf"
 """Folder inside the capture's that keeps what each stage made."""
+SURFACE = "surface.ply"
+"""What the stage of the object's surface calls its output, in metres."""
 MODES, FIELD = "modes.safetensors", "field.safetensors"
 """What the last stages call their outputs."""
+OFF_MESH = 0.02
+"""Distance of a Gaussian from a mesh, over its size, up to which it is of its surface: three pixels of a photograph in
+which the object is 150 pixels wide."""
 BODIES = "bodies"
 """Folder of elastic modes in the cache, kept by content."""
 
@@ -64,6 +77,8 @@ class Reconstruction:
     """What the features' file says of itself; empty where the folder shows nothing of the object."""
     modes: Extraction
     """The modes that the field started from."""
+    surface: Path | None = None
+    """The object's surface in the cache; None where its shape is unknown or the gain model needs none."""
 
 
 @dataclass(frozen=True)
@@ -132,8 +147,9 @@ def _reconstruct(
     @cache_result
     def bodies() -> CandidateBodies:
         listener.tell("bodies: what the object may be behind its surface")
+        surface = read_surface(keep_surface(stages, shape.surface, shape.surface_digest).path)
         cache = stages.folder / BODIES
-        return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, tell=listener.tell)
+        return candidate_bodies(surface, config.body, impacts=train, cache=cache, tell=listener.tell)
 
     def make(path: Path) -> None:
         listener.tell(f"fit: a field of {len(modes.bank)} modes")
@@ -166,9 +182,14 @@ def _reconstruct(
     recipe = {**basis, "modes": found.digest, "gain_model": config.gain_model, "name": capture.name}
     recipe |= {"body": asdict(config.body), "settings": asdict(capture.settings), "surface": shape.surface_digest}
     kept = stages.keep(FIELD, recipe, make, usable=is_final)
-    made = {**shape.made, "modes": found, "fit": kept}
+    surface: dict[str, Kept] = {}
+    if config.gain_model != NETWORK:
+        with suppress(AvmsfError):
+            surface["surface"] = keep_surface(stages, shape.surface, shape.surface_digest)
+    made = {**shape.made, **surface, "modes": found, "fit": kept}
     times = tuple(StageTime(name, each.seconds, each.fresh) for name, each in made.items())
-    return Reconstruction(kept.path, times, shape.report, modes)
+    path = surface["surface"].path if surface else None
+    return Reconstruction(kept.path, times, shape.report, modes, path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,9 +250,16 @@ def _shape(
             features = FeatureField.from_contacts(capture.impacts.contacts)
         else:
             features = FeatureField.from_points(capture.surface.vertices)
-        surface, digest = _mesh(capture, None)
+        surface, digest = object_surface(capture.surface, None)
         return _Shape({"positions": features}, {}, {}, surface, digest)
+    if capture.surface is not None and scene.source is not None and scene.source.kind == "cameras":
+        # Before Gaussians, which take minutes.
+        words = judge_outlines(capture.surface, read_views(scene.views.path), settings)
+        if words is not None:
+            warnings.warn(words, CaptureWarning, stacklevel=2)
     features = load_features(scene.features.path)
+    if capture.surface is not None and "cloud" in scene.made():
+        features = moved_onto(features, capture.surface)
     candidates = {}
     candidates["positions"] = FeatureField.from_points(features.points)
     candidates["visual"] = features
@@ -239,18 +267,40 @@ def _shape(
     found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
     expect_on_object(capture.impacts, features.points, strict=found_frame)
     report = read_report(scene.features.path)
-    surface, digest = _mesh(capture, scene)
+    surface, digest = object_surface(capture.surface, scene)
     return _Shape(candidates, scene.made(), report, surface, digest)
 
 
-def _mesh(capture: Capture, scene: SceneStages | None) -> tuple[Callable[[], Surface], str]:
-    """Return what makes the object's surface, and the digest of what it is made of: its mesh before its Gaussians."""
-    found = capture.surface
+def moved_onto(features: FeatureField, surface: Surface) -> FeatureField:
+    """Return features of Gaussians at the places of a mesh nearest to them, without those farther than `OFF_MESH`.
+
+    As they are where most are farther, for the two are in different frames then, and where there are no triangles.
+    """
+    triangles = surface.vertices.double().numpy()[surface.faces.numpy()]
+    sides = triangles[:, 1:] - triangles[:, :1]
+    triangles = triangles[np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) > 0]
+    if not len(triangles):
+        return features
+    found = ClosestPoints(triangles)(features.points.double().numpy())
+    size = float((surface.vertices.amax(0) - surface.vertices.amin(0)).norm())
+    near = found.distances <= OFF_MESH * size
+    if 2 * near.sum() < len(near):
+        return features
+    places = (triangles[found.rows] * found.weights[:, :, None]).sum(axis=1)[near]
+    rows = torch.from_numpy(near)
+    return replace(features, points=torch.from_numpy(places).to(features.points), features=features.features[rows])
+
+
+def object_surface(found: Surface | None, scene: SceneStages | None) -> tuple[Callable[[], Surface], str]:
+    """Return what makes the object's surface, and the digest of what it is made of: its mesh before its Gaussians.
+
+    `found` is the surface that the folder holds. What is returned raises SceneError where the shape is unknown.
+    """
     if found is not None and len(found.faces):
         digest = hashlib.sha256(found.vertices.contiguous().numpy().tobytes())
         digest.update(found.faces.contiguous().numpy().tobytes())
         return lambda: found, digest.hexdigest()
-    cloud = scene.made().get("cloud") if scene is not None else None
+    cloud = scene.cloud if scene is not None else None
 
     def from_cloud() -> Surface:
         if cloud is None:
@@ -260,14 +310,25 @@ def _mesh(capture: Capture, scene: SceneStages | None) -> tuple[Callable[[], Sur
     return from_cloud, "" if cloud is None else cloud.digest
 
 
+def keep_surface(stages: StageFolder, make: Callable[[], Surface], digest: str) -> Kept:
+    """Return the file of the object's surface, made where what is kept is of something else. Raises as `make`."""
+
+    def write(path: Path) -> None:
+        surface = make()
+        write_whole(path, lambda place: write_surface(surface, place), raising=SceneError)
+
+    return stages.keep(SURFACE, {"of": digest}, write)
+
+
 def expect_on_object(impacts: Impacts, points: Float[Tensor, "points 3"], *, strict: bool = False) -> None:
     """Say with `CaptureWarning` how far contacts lie off the object's points, and what mistake may explain it.
 
-    Raises `CaptureError` where one lies farther off than the object is large, and, if `strict`, where any lies off.
+    Raises `CaptureError` where they count another unit, where one lies farther off than the object is large, and, if
+    `strict`, where any lies off.
     """
     placement = judge_placement(impacts.contacts, points)
     words = placement.describe(impacts.names)
-    if words and (strict or float(placement.distances.max()) > placement.diagonal):
+    if words and (strict or placement.other_unit or float(placement.distances.max()) > placement.diagonal):
         raise CaptureError(words)
     if words:
         warnings.warn(words, CaptureWarning, stacklevel=2)

@@ -1,7 +1,7 @@
 """From features in images to features on the object: every point looked up in all views that see it (paper, 3.2)."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -23,6 +23,13 @@ twice as many through thin walls; what one turns away is seen at a slant, and by
 _NEIGHBOURS = 3
 """Seen points whose features an unseen one takes the mean of."""
 
+LEAST_SEEN = 0.05
+"""Part of the views that have a point in their image that must see it, for it to be one of the surface.
+
+Fitted Gaussians also fill walls and the space behind them. On a simulated mug with 48 views of 192 pixels, 34 % of
+10,332 lie more than 2 mm off the true surface. Of the 8080 that `supported` leaves, 18 % do; of those within 1 mm it
+leaves out 1.7 %. A part of .1 costs three times as many of these.
+"""
 Weighting = Callable[[Sight], Float[Tensor, " points"]]
 """How much one view's word counts for each point, given what it sees of them; zero where it sees nothing."""
 
@@ -45,13 +52,37 @@ class Lifted:
     features: FeatureField
     seen: Int[Tensor, " points"]
     """Number of views that see each point; where it is 0 the feature is its neighbours'."""
+    past: Int[Tensor, " points"]
+    """Number of these that see a surface behind the point."""
     agreement: float
     """Share of the features' variance over points and views that lies between points, not between views of a point."""
+    dropped: int = 0
+    """Number of points that were left out because the views contradict them."""
 
     @property
     def unseen(self) -> int:
         """Number of points that no view sees."""
         return int((self.seen == 0).sum())
+
+
+def supported(lifted: Lifted, views: Sequence[View]) -> Lifted:
+    """Return the points that views see as part of the surface.
+
+    That are at least one view and `LEAST_SEEN` of those that have the point in their image: what the views agree to be
+    hidden is inside the object or behind its surface. And at least as many as see a surface behind the point, which is
+    then afloat before it.
+    """
+    points = lifted.features.points
+    held = torch.zeros(len(points), device=points.device)
+    for view in views:
+        places, depth = view.camera.project(points.cpu())
+        size = places.new_tensor([view.camera.width, view.camera.height])
+        held += ((depth > 0) & (places >= 0).all(1) & (places <= size).all(1)).to(held)
+    kept = (lifted.seen >= (LEAST_SEEN * held).clamp_min(1.0)) & (2 * lifted.past <= lifted.seen)
+    features = replace(lifted.features, points=points[kept], features=lifted.features.features[kept])
+    return replace(
+        lifted, features=features, seen=lifted.seen[kept], past=lifted.past[kept], dropped=int((~kept).sum())
+    )
 
 
 def by_presence(sight: Sight) -> Float[Tensor, " points"]:
@@ -115,6 +146,7 @@ def lift_points(
         sight = look(points.detach(), view, depth_map(view.camera), reach=behind)
         found = _sample(_describe(view, encoder), sight)
         tally.add(found, torch.where(sight.seen, weighting(sight), 0.0).float(), view.name)
+        tally.past += sight.seen & (sight.past > 0.5)
         if progress is not None:
             progress(LiftProgress(view.name, done, len(views)))
     return tally.result(points, encoder.name)
@@ -124,7 +156,8 @@ class _Tally:
     """Sums over the views so far."""
 
     def __init__(self, count: int) -> None:
-        self.weights, self.seen = torch.zeros(count), torch.zeros(count, dtype=torch.long)
+        self.weights = torch.zeros(count)
+        self.seen, self.past = torch.zeros(count, dtype=torch.long), torch.zeros(count, dtype=torch.long)
         self.sums, self.squares = torch.zeros(count, 0), torch.zeros(count, dtype=torch.float64)
 
     def add(self, found: Float[Tensor, "points dim"], weights: Float[Tensor, " points"], view: str) -> None:
@@ -158,7 +191,7 @@ class _Tally:
             near = nearest_points(places[known], places[~known], count=min(_NEIGHBOURS, int(known.sum())))
             features[~known] = means[near].mean(1)
         field = FeatureField(points.detach().float(), features.to(points.device), encoder)
-        return Lifted(field, self.seen.to(points.device), self._agreement())
+        return Lifted(field, self.seen.to(points.device), self.past.to(points.device), self._agreement())
 
     def _agreement(self) -> float:
         """Return 1 - (variance between views of one point) / (variance in all), of the points that two views see."""

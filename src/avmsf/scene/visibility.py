@@ -37,6 +37,8 @@ class Sight:
     """Metres along the optical axis."""
     share: Float[Tensor, " points"]
     """From 0, hidden or outside the image or its mask, to 1, seen."""
+    past: Float[Tensor, " points"]
+    """Likewise, of what surrounds a point's place and shows a surface behind the point."""
     camera: Camera
 
     @property
@@ -62,16 +64,17 @@ def look(
     # Behind the camera there are no places, and NaN is not at least 0.
     inside = (places >= 0).all(1) & (places <= places.new_tensor([camera.width, camera.height])).all(1)
     places = torch.where(inside[:, None], places, 0.5)
-    limit = deep - reach.cpu().double() - 2 * deep / min(camera.focal)
+    slack = reach.cpu().double() + 2 * deep / min(camera.focal)
     surface, coverage = depth.detach().double().cpu(), view.coverage
-    share = torch.zeros_like(deep)
+    share, past = torch.zeros_like(deep), torch.zeros_like(deep)
     for rows, columns, weight in _corners(places, camera):
         there = surface[rows, columns]
-        shows = (there > 0) & (there >= limit)
+        shows = (there > 0) & (there >= deep - slack)
         if coverage is not None:
             shows &= coverage[rows, columns] >= _COVERED
         share += weight * shows
-    return Sight(places, deep, torch.where(inside, share, 0.0), camera)
+        past += weight * (shows & (there > deep + slack))
+    return Sight(places, deep, torch.where(inside, share, 0.0), torch.where(inside, past, 0.0), camera)
 
 
 def depth_of_cloud(cloud: GaussianCloud, rasteriser: Rasteriser) -> DepthMap:

@@ -58,7 +58,7 @@ def gather(
     too short after its blow) is left out. A `CaptureWarning` tells of these, of recordings that look wrong, of contacts
     off the surface or struck twice, and of the `remarks`. Sounds that were computed, not `recorded`, are not searched
     for clipping, noise and second blows. Raises DatasetError, which names the `origin`, where fewer than two recordings
-    remain or they do not fit together.
+    remain or they do not fit together, and where contacts and surface count different units.
     """
     kept: list[tuple[str, str, float, np.ndarray]] = []
     recordings, reports, remarks = [], [], list(remarks)
@@ -93,7 +93,7 @@ def gather(
         before=cut.before,
         after=cut.after,
     )
-    remarks += cut.remarks + _repeated(impacts) + _misplaced(impacts, surface)
+    remarks += cut.remarks + _repeated(impacts) + _misplaced(impacts, surface, origin=origin)
     if remarks:
         warnings.warn(f"{origin}: {listed(remarks)}", CaptureWarning, stacklevel=3)
     return Capture(name, impacts, surface)
@@ -145,8 +145,11 @@ def _repeated(impacts: Impacts) -> list[str]:
     return [f"struck in one and the same place: {' and '.join(repeated[:_SHOWN])}"] if repeated else []
 
 
-def _misplaced(impacts: Impacts, surface: Surface | None) -> list[str]:
+def _misplaced(impacts: Impacts, surface: Surface | None, *, origin: str) -> list[str]:
     if surface is None:
         return []
-    found = judge_placement(impacts.contacts, surface_points(surface)).describe(impacts.names)
+    placement = judge_placement(impacts.contacts, surface_points(surface))
+    found = placement.describe(impacts.names)
+    if placement.other_unit:
+        raise DatasetError(f"{origin}: expected contacts and surface in one unit; {found}")
     return [found] if found else []

@@ -118,8 +118,12 @@ class MixtureGains:
 
     def normals(self, points: Float[Tensor, "points 3"]) -> Float64[Tensor, "points 3"] | None:
         """Return the outward unit normals of the body's surface nearest to points, or None without a body."""
-        body = next((each for each in self.families if isinstance(each, Elastic)), None)
-        return None if body is None else body.modes.normals(points.double())
+        return None if self.body is None else self.body.normals(points.double())
+
+    @property
+    def body(self) -> ElasticModes | None:
+        """The elastic modes of the (first) body that the gains know, with its surface; None without one."""
+        return next((each.modes for each in self.families if isinstance(each, Elastic)), None)
 
     def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
         """Return the mean gains of impacts at contacts (metres) along unit vectors, see `sites`."""

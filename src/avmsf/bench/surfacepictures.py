@@ -1,0 +1,65 @@
+"""A picture of an object's surface: seen from a side a little above, and cut through its middle along two planes."""
+
+import numpy as np
+import trimesh
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+
+from avmsf.bench.sides import ALL_SIDES, name_axes, view_from
+from avmsf.capture.surface import Surface
+from avmsf.errors import EvaluationError
+
+_INK = "#1f3b5c"
+_LIGHT = np.array([-0.4, 0.5, 0.77])
+"""Direction to the light in the picture's frame: right, up, towards the eye; of unit length."""
+_MILLIMETERS = 1000.0
+
+
+def draw_surface(surface: Surface, *, title: str) -> Figure:
+    """Draw a surface of triangles (object frame, metres), and its cuts through the middle of its box, in millimeters.
+
+    One cut is along x and z, one along y and z: walls and cavities of what stands upright show in both. Raises
+    EvaluationError for a surface without triangles.
+    """
+    if not len(surface.faces):
+        raise EvaluationError(f"expected a surface of triangles to draw, got {len(surface.vertices)} points")
+    mesh = trimesh.Trimesh(_MILLIMETERS * surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
+    figure = Figure(figsize=(14, 5), layout="constrained")
+    whole, *cuts = figure.subplots(1, 3)
+    _shade(whole, mesh)
+    middle = mesh.bounds.mean(axis=0)
+    for axes, across in zip(cuts, (0, 1), strict=True):
+        _cut(axes, mesh, middle, across=across)
+    figure.suptitle(title)
+    return figure
+
+
+def _shade(axes: Axes, mesh: trimesh.Trimesh) -> None:
+    """Draw the triangles from the farthest to the nearest, lit from above."""
+    view = view_from(ALL_SIDES[0])
+    corners = mesh.triangles @ view.T
+    order = np.argsort(corners[:, :, 2].mean(axis=1))
+    # Either side of a triangle is lit alike: thin sheets and wrong windings look as they should.
+    light = 0.35 + 0.6 * np.abs(mesh.face_normals @ view.T @ _LIGHT)
+    gray = np.repeat(light[order, None].clip(0, 1), 3, axis=1)
+    axes.add_collection(
+        PolyCollection(list(corners[order][:, :, :2]), facecolors=gray, edgecolors=gray, linewidths=0.2)
+    )
+    axes.autoscale_view()
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+    name_axes(axes, view)
+
+
+def _cut(axes: Axes, mesh: trimesh.Trimesh, middle: np.ndarray, *, across: int) -> None:
+    """Draw where a plane along z and one other axis cuts the triangles."""
+    normal = np.eye(3)[1 - across]
+    lines = trimesh.intersections.mesh_plane(mesh, normal, middle)  # type: ignore[no-untyped-call]
+    axes.add_collection(LineCollection(list(lines[:, :, [across, 2]]), colors=_INK, linewidths=1.5))
+    axes.autoscale_view()
+    axes.set_aspect("equal")
+    axes.set_title(f"cut at {'xy'[1 - across]} = {middle[1 - across]:.3g} mm")
+    axes.set_xlabel(f"{'xy'[across]} (mm)")
+    axes.set_ylabel("z (mm)")
+    axes.grid(alpha=0.25)

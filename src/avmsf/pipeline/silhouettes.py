@@ -1,0 +1,129 @@
+"""Whether a mesh and photographs show one object in one frame: the mesh's outlines beside the photographs' masks."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+
+from avmsf.capture.cameras import Camera, View
+from avmsf.capture.meshviews import MeshTracer
+from avmsf.capture.placement import FACTORS
+from avmsf.capture.settings import METRES, CaptureSettings
+from avmsf.capture.surface import Surface
+from avmsf.capture.texturedmesh import TexturedMesh
+from avmsf.errors import CaptureError
+from avmsf.scene.points import farthest_points
+
+MAX_VIEWS = 12
+"""Views that are compared, as far apart as they stand."""
+LONGEST, COARSE = 256, 64
+"""Pixels of the longer side of what is compared, and of what units are tried by."""
+MASK_PIXELS = 2.0
+"""Pixels of a photograph by which its mask's edge may be wrong."""
+BEYOND = 0.005
+"""Part of an outline's area that may differ beyond that: thin parts, which masks lose."""
+SAME_SHAPE = 0.3
+"""Difference of outlines below which a change of unit explains a greater one. A ball beside a cube of its size has
+.2."""
+
+
+@dataclass(frozen=True)
+class OutlineDifference:
+    """How a mesh's outlines differ from masks, medians over the views, so that single wrong masks do not matter."""
+
+    difference: float
+    """Area that only one of them has over the area that at least one has: 0 to 1."""
+    beyond: float
+    """Likewise, without what lies within `MASK_PIXELS` of the mask's edge."""
+    size: float
+    """Square root of the outline's area over the mask's."""
+
+
+def compare_outlines(
+    tracer: MeshTracer, views: Sequence[View], *, longest: int = LONGEST, factor: float = 1.0
+) -> OutlineDifference:
+    """Compare a mesh, times a factor, with the masks of views, which all have one that shows something."""
+    found = []
+    for view in views:
+        assert view.mask is not None
+        scale = min(1.0, longest / max(view.camera.width, view.camera.height))
+        width, height = max(1, round(scale * view.camera.width)), max(1, round(scale * view.camera.height))
+        camera = _scaled(view.camera.resized(width, height), 1.0 / factor)
+        outline = (tracer.look(camera).faces >= 0).numpy()
+        mask = cv2.resize(view.mask.numpy(), (width, height), interpolation=cv2.INTER_AREA) > 127
+        either, differs = outline | mask, outline ^ mask
+        far = _distance_to_edge(mask) > 1.0 + MASK_PIXELS * scale
+        area = max(1, int(either.sum()))
+        found.append((differs.sum() / area, (differs & far).sum() / area, (outline.sum() / max(1, mask.sum())) ** 0.5))
+    return OutlineDifference(*np.median(np.array(found), axis=0).tolist())
+
+
+def judge_outlines(surface: Surface, views: Sequence[View], settings: CaptureSettings) -> str | None:
+    """Return what to tell of a mesh that differs from the masks of photographs by more than these are exact.
+
+    None where they agree, and where no view has a mask; `settings` are those that both were read by. Raises
+    CaptureError where cameras and mesh count different units, with the one that fits: nothing that is made of the
+    photographs would lie on the mesh.
+    """
+    masked = [view for view in views if view.mask is not None and bool((view.mask > 127).any())]
+    if not masked or not len(surface.faces):
+        return None
+    positions = torch.stack([view.camera.position for view in masked])
+    chosen = [masked[row] for row in farthest_points(positions, min(MAX_VIEWS, len(masked))).tolist()]
+    tracer = MeshTracer(TexturedMesh.plain(surface))
+    found = compare_outlines(tracer, chosen)
+    if found.beyond <= BEYOND:
+        return None
+    words = f"the mesh's outlines and the photographs' masks differ by {_percent(found.difference)} of their area"
+    if found.difference > SAME_SHAPE:
+        factor, best = min(
+            ((each, compare_outlines(tracer, chosen, longest=COARSE, factor=each)) for each in FACTORS if each != 1),
+            key=lambda pair: pair[1].difference,
+        )
+        if best.difference < min(SAME_SHAPE, 0.5 * found.difference):
+            raise CaptureError(
+                f"expected the mesh and the cameras in one unit; {words}, and by {_percent(best.difference)} with the "
+                f"mesh times {factor:.4g}: {_mending(factor, settings)}"
+            )
+    size = f"{_percent(abs(found.size - 1))} {'larger' if found.size > 1 else 'smaller'}"
+    return (
+        f"{words}, {_percent(found.beyond)} beyond {MASK_PIXELS:g} pixels of the masks' edges, and the mesh is {size}: "
+        "are both of one object, in one unit and frame? The mesh is taken for the object's shape"
+    )
+
+
+def _mending(factor: float, settings: CaptureSettings) -> str:
+    """Return what to write in capture.toml where the mesh times a factor fits the cameras."""
+
+    def named(metres: float) -> str | None:
+        return next((unit for unit, length in METRES.items() if abs(length / metres - 1) < 1e-6), None)
+
+    views, contacts = named(settings.views_metres / factor), named(settings.metres * factor)
+    if views is not None:
+        return f'write views_unit = "{views}" in capture.toml'
+    mesh = named(settings.surface_metres * factor)
+    if contacts is not None and mesh is not None:
+        return f'write unit = "{contacts}" and surface_unit = "{mesh}" in capture.toml'
+    return "scale the cameras or the mesh"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
+
+
+def _scaled(camera: Camera, factor: float) -> Camera:
+    """Return the camera with its distance from the origin times a factor."""
+    pose = camera.world_to_camera.clone()
+    pose[:3, 3] *= factor
+    return replace(camera, world_to_camera=pose)
+
+
+def _distance_to_edge(mask: np.ndarray) -> np.ndarray:
+    """Return each pixel's distance to the nearest one on the other side of the mask's edge."""
+    inside, outside = mask.astype(np.uint8), (~mask).astype(np.uint8)
+    distance: np.ndarray = cv2.distanceTransform(inside, cv2.DIST_L2, 5) + cv2.distanceTransform(
+        outside, cv2.DIST_L2, 5
+    )
+    return distance

@@ -1,0 +1,98 @@
+"""The object's surface as an output of its own: alone, in three formats, and of a reconstruction."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from avmsf.bench.surfacepictures import draw_surface
+from avmsf.capture import Surface, read_surface
+from avmsf.capture.views.write import write_views
+from avmsf.cli import main
+from avmsf.cli.surface import kind_of
+from avmsf.cli.writing import OutputError
+from avmsf.errors import EvaluationError
+from avmsf.field.store import save
+from believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
+from plate_capture import PLATE, TINY, fill_plate
+from small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views, write_surface_file
+
+Streams = pytest.CaptureFixture[str]
+FIT = tuple(f"--fit.{word[2:]}" if word.startswith("--") else word for word in TINY[:-2])
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj", "glb"])
+def test_a_mesh_is_written_as_it_is_in_metres(kind: str, tmp_path: Path) -> None:
+    folder = tmp_path / "slab"
+    folder.mkdir()
+    write_surface_file(folder)
+    (folder / "capture.toml").write_text('surface_unit = "mm"')
+    for name, words in ((f"a.{kind}", []), ("b", ["--format", kind])):
+        assert main(["surface", str(folder), "--output", str(tmp_path / name), *words]) == 0
+    (tmp_path / "b").rename(tmp_path / f"b.{kind}")
+    for name in "ab":
+        written, given = read_surface(tmp_path / f"{name}.{kind}"), slab()
+        assert torch.allclose(written.vertices, given.vertices / 1000, atol=1e-8)
+        assert torch.equal(written.faces, given.faces)
+
+
+def test_pictures_become_a_closed_surface_that_is_kept(tmp_path: Path) -> None:
+    folder, output = tmp_path / "slab", tmp_path / "slab.ply"
+    write_views(slab_views(), folder)
+    assert main(["surface", str(folder), "--output", str(output), *SMALL_SPLAT]) == 0
+    assert output.read_bytes() == (folder / ".avmsf" / "surface.ply").read_bytes()
+    mesh = trimesh.load(output)
+    assert mesh.is_watertight
+    # A pixel of the pictures is 9 mm.
+    assert mesh.extents.tolist() == pytest.approx([PLATE.length, PLATE.width, THICKNESS], abs=0.02)
+
+
+def test_a_reconstruction_leaves_its_surface_and_says_where(tmp_path: Path, capsys: Streams) -> None:
+    folder = fill_plate(tmp_path / "plate", surface=False)
+    write_surface_file(folder)
+    words = ["--views.rendered", "48", "--views.count", "6", "--lift.encoder", "descriptors", "--lift.points", "300"]
+    assert main(["reconstruct", str(folder), "--gain-model", "smooth", *words, *FIT, "--modes", "12", "--json"]) == 0
+    out, err = capsys.readouterr()
+    values = json.loads(out)
+    assert values["surface"] == str(folder / ".avmsf" / "surface.ply")
+    assert values["surface"] in err.replace("\n", "")
+    assert torch.equal(read_surface(values["surface"]).vertices, slab().vertices)
+    assert "surface" in [each["stage"] for each in values["stages"]]
+
+
+def test_what_cannot_be_written_is_refused_first(tmp_path: Path, capsys: Streams) -> None:
+    with pytest.raises(OutputError):
+        kind_of(tmp_path / "surface.stl")
+    assert main(["surface", str(tmp_path), "--output", str(tmp_path / "surface.obj")]) == 2
+    assert "found none of these" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_surface_is_drawn_with_two_cuts_through_its_middle(tmp_path: Path) -> None:
+    whole, *cuts = draw_surface(slab(), title="slab").axes
+    assert len(whole.collections[0].get_paths()) == len(slab().faces)
+    # The slab's sides, in millimeters: each cut is a rectangle.
+    a, b, c = (1000 * side for side in (PLATE.length, PLATE.width, THICKNESS))
+    for axes, width in zip(cuts, (a, b), strict=True):
+        ends = np.concatenate(axes.collections[0].get_segments())
+        assert ends.min(axis=0) == pytest.approx([0, -c], abs=1e-3)
+        assert ends.max(axis=0) == pytest.approx([width, 0], abs=1e-3)
+    with pytest.raises(EvaluationError):
+        draw_surface(Surface(slab().vertices, torch.zeros(0, 3, dtype=torch.int64)), title="points")
+
+
+def test_the_picture_is_written_beside_the_surface_and_with_a_field(tmp_path: Path) -> None:
+    folder = tmp_path / "slab"
+    folder.mkdir()
+    write_surface_file(folder)
+    assert main(["surface", str(folder), "--picture", str(tmp_path / "slab.png")]) == 0
+    assert (tmp_path / "slab.png").read_bytes().startswith(b"\x89PNG")
+    contacts = bar_contacts(6)
+    for name, made in (("with", elastic_field), ("without", positional_field)):
+        save(sound_field(made(contacts, drawn_gains(contacts, seed=1))), tmp_path / f"{name}.safetensors")
+        assert main(["show", str(tmp_path / f"{name}.safetensors"), "--output", str(tmp_path / name)]) == 0
+    assert (tmp_path / "with" / "surface.png").is_file()
+    assert not (tmp_path / "without" / "surface.png").exists()
