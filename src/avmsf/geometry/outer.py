@@ -18,6 +18,7 @@ from avmsf.geometry.fusion import SeenDepth, fused_depth
 from avmsf.geometry.grid import Grid
 from avmsf.geometry.shape import ObjectShape, ShapeReport
 from avmsf.geometry.silhouettes import Outline, hull_distance
+from avmsf.geometry.taut import drawn_taut
 from avmsf.geometry.whereabouts import masked_views, whereabouts
 
 DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
@@ -66,16 +67,17 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     low, high, right = _rough(masked, outlines)
     kept = [view for view, each in zip(masked, right, strict=True) if each]
     grid = Grid.around(low, high, cells=cells, finest=_FINER, margin=_MARGIN)
-    hull = _hull([outline for outline, each in zip(outlines, right, strict=True) if each], grid)
+    outlines = [outline for outline, each in zip(outlines, right, strict=True) if each]
+    hull = _hull(outlines, grid)
     diagonal = _extent(hull > 0, grid, len(kept))
+    hull = drawn_taut(hull, outlines, grid, diagonal)
     depths = [_Depth(view, depth_map(view.camera).detach().cpu().float().numpy()) for view in kept]
     bias = _bias(hull, grid, depths, diagonal)
     free, sights = _free(hull, grid, depths, bias, diagonal)
     seen = np.minimum(hull, _SLACK * diagonal - free)
     seen, bound, unseen, direction = _closed(hull, seen, sights, grid)
     hollow = _hollows(bound, seen, grid, diagonal)
-    around = ndimage.binary_dilation(hollow > 0, iterations=_NARROW)
-    outer = np.where(around, np.maximum(seen, bound), seen)
+    outer = np.where(_covered(hollow > 0, (bound > 0) & (seen <= 0)), np.maximum(seen, bound), seen)
     rejected = tuple(view.name for view, each in zip(masked, right, strict=True) if not each)
     report = ShapeReport(len(kept), rejected, bias, unseen, direction)
     return ObjectShape(grid, outer, seen, hollow, diagonal, report)
@@ -221,6 +223,14 @@ def _closed(
     if direction is not None:
         direction = (direction[0] / length, direction[1] / length, direction[2] / length)
     return np.minimum(seen, bound), bound, float(areas[hidden].sum() / areas.sum()), direction
+
+
+def _covered(hollow: Bool[np.ndarray, "x y z"], free: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    """Return the cells that lids cover: cavities, the shallow parts beside them, and a margin."""
+    if hollow.any():
+        label, _ = ndimage.label(free)
+        hollow = np.isin(label, np.unique(label[hollow]))
+    return ndimage.binary_dilation(hollow, iterations=_NARROW)
 
 
 def _hollows(

@@ -20,12 +20,15 @@ _SOLID = 0.03
 handles are. By trial: .06 for the thickness (mugs, jugs, pans)."""
 _LID_TURN = 0.8
 """Cosine of the angle to a lid's normal within which the rim beside it belongs to the lid."""
-_LID_REACH = 0.03
-"""How far a lid grows over the rim, over the diagonal: walls are no thicker at openings."""
+_LID_REACH = 0.6
+"""How far a lid grows over the rim, and over floors that were not seen to lie below it, over the radius of a disc of
+its area."""
 _THINNEST, _THICKEST = 0.003, 0.06
 """Wall thicknesses over the diagonal that are worth trying at all."""
 _FINE = 2.0
 """Cells in the least thickness of a wall that marching cubes draw well."""
+_BLUR = 0.6
+"""Standard deviation of the blur that takes steps out of surfaces, cells."""
 _FINEST = 4
 """Most times that cells are divided for that."""
 
@@ -143,13 +146,13 @@ class ObjectShape:
         slopes = np.stack([-each for each in np.gradient(ndimage.gaussian_filter(self.outer, 1.5))], axis=-1)
         slopes /= np.maximum(np.linalg.norm(slopes, axis=-1, keepdims=True), 1e-12)
         label, count = ndimage.label(lids, np.ones((3, 3, 3)))
-        steps = max(1, round(_LID_REACH * self.diagonal / self.grid.spacing))
         grown = lids.copy()
         for number in range(1, count + 1):
             here = label == number
             if int(here.sum()) < 0.02 * int(lids.sum()):
                 grown &= ~here
                 continue
+            steps = max(1, round(_LID_REACH * float(np.sqrt(here.sum() / np.pi))))
             normal = slopes[here].mean(axis=0)
             normal /= max(float(np.linalg.norm(normal)), 1e-12)
             grown |= ndimage.binary_dilation(
@@ -182,7 +185,11 @@ class ObjectShape:
         return away - np.float32(1.2 * margin)
 
     def _enclose(self, values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int) -> Surface:
-        return enclose(values, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
+        smooth = ndimage.gaussian_filter(values, _BLUR)
+        # Triangles without area, where the surface passes through the middle of a cell, pinch coarser ones.
+        least = np.float32(0.02 * grid.spacing)
+        smooth = np.where(smooth > 0, np.maximum(smooth, least), np.minimum(smooth, -least))
+        return enclose(smooth, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
 
 
 def _finer(
