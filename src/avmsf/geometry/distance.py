@@ -7,6 +7,9 @@ from jaxtyping import Bool, Float32
 
 from avmsf.compiled import compiled
 
+_DISC = 0.7
+"""Radius, in cells, of the piece of its tangent plane that stands for the surface around a place next to a cell."""
+
 
 def distance_from(
     values: Float32[np.ndarray, "x y z"], without: Bool[np.ndarray, "x y z"] | None = None
@@ -16,7 +19,7 @@ def distance_from(
     Along an edge between two cells the values are taken to be linear. Edges whose positive cell is `without` are no
     part of the surface. Infinite where there is no surface.
     """
-    nearest = np.full((*values.shape, 3), np.inf, dtype=np.float32)
+    nearest = np.zeros((*values.shape, 6), dtype=np.float32)
     distance = np.full(values.shape, np.inf, dtype=np.float32)
     left_out = np.zeros(values.shape, dtype=np.bool_) if without is None else without
     _begin(values, left_out, nearest, distance)
@@ -29,16 +32,15 @@ def distance_from(
 @compiled(error_model="numpy")
 @no_type_check
 def _begin(values, without, nearest, distance):
-    """Put the nearest place of the surface next to each cell: the plane through where it crosses the cell's edges."""
+    """Put the nearest place of the surface, and its normal, next to each cell whose edges it crosses."""
     shape = values.shape
+    slope = np.zeros(3)
     for i in range(shape[0]):
         for j in range(shape[1]):
             for k in range(shape[2]):
                 here = values[i, j, k]
-                total = 0.0
-                inverse = np.zeros(3)
+                least, along, side = 2.0, 0, 0.0
                 for axis in range(3):
-                    found, side = 2.0, 0.0
                     for step in (-1, 1):
                         a, b, c = i + step * (axis == 0), j + step * (axis == 1), k + step * (axis == 2)
                         if a < 0 or b < 0 or c < 0 or a >= shape[0] or b >= shape[1] or c >= shape[2]:
@@ -48,23 +50,37 @@ def _begin(values, without, nearest, distance):
                             continue
                         if without[i, j, k] if here > 0.0 else without[a, b, c]:
                             continue
-                        reach = min(max(here / (here - other), 1e-3), 1.0)
-                        if reach < found:
-                            found, side = reach, float(step)
-                    if found <= 1.0:
-                        inverse[axis] = side / found
-                        total += inverse[axis] * inverse[axis]
-                if total > 0.0:
-                    distance[i, j, k] = 1.0 / np.sqrt(total)
-                    nearest[i, j, k, 0] = i + inverse[0] / total
-                    nearest[i, j, k, 1] = j + inverse[1] / total
-                    nearest[i, j, k, 2] = k + inverse[2] / total
+                        reach = here / (here - other)
+                        if reach < least:
+                            least, along, side = reach, axis, float(step)
+                if least > 1.0:
+                    continue
+                steep = 0.0
+                for axis in range(3):
+                    x, y, z = axis == 0, axis == 1, axis == 2
+                    a, b, c = min(i + x, shape[0] - 1), min(j + y, shape[1] - 1), min(k + z, shape[2] - 1)
+                    u, v, w = max(i - x, 0), max(j - y, 0), max(k - z, 0)
+                    slope[axis] = (values[a, b, c] - values[u, v, w]) / max(a - u + b - v + c - w, 1)
+                    steep += slope[axis] * slope[axis]
+                # No nearer than by the slope, and no farther than along the edge.
+                if steep > 0.0 and abs(here) < least * np.sqrt(steep):
+                    distance[i, j, k] = abs(here) / np.sqrt(steep)
+                    for axis in range(3):
+                        nearest[i, j, k, 3 + axis] = slope[axis] / np.sqrt(steep)
+                    nearest[i, j, k, 0] = i - here * slope[0] / steep
+                    nearest[i, j, k, 1] = j - here * slope[1] / steep
+                    nearest[i, j, k, 2] = k - here * slope[2] / steep
+                else:
+                    distance[i, j, k] = least
+                    nearest[i, j, k, 0] = i + side * least * (along == 0)
+                    nearest[i, j, k, 1] = j + side * least * (along == 1)
+                    nearest[i, j, k, 2] = k + side * least * (along == 2)
 
 
 @compiled(error_model="numpy")
 @no_type_check
 def _sweep(nearest, distance):
-    """Hand the nearest places on, in the eight directions along the diagonals."""
+    """Hand the nearest places on to neighbors, in the eight directions along the diagonals."""
     first, second, third = distance.shape
     for turn in range(8):
         x, y, z = turn & 1, (turn >> 1) & 1, (turn >> 2) & 1
@@ -84,10 +100,12 @@ def _sweep(nearest, distance):
                         if not distance[a, b, c] < best + 1.0:
                             continue
                         u, v, w = nearest[a, b, c, 0] - i, nearest[a, b, c, 1] - j, nearest[a, b, c, 2] - k
-                        reach = np.sqrt(u * u + v * v + w * w)
+                        above = u * nearest[a, b, c, 3] + v * nearest[a, b, c, 4] + w * nearest[a, b, c, 5]
+                        square = u * u + v * v + w * w
+                        aside = max(np.sqrt(max(square - above * above, 0.0)) - _DISC, 0.0)
+                        reach = np.sqrt(above * above + aside * aside) if above != 0.0 else np.sqrt(square)
                         if reach < best:
                             best = reach
                             distance[i, j, k] = best
-                            nearest[i, j, k, 0] = nearest[a, b, c, 0]
-                            nearest[i, j, k, 1] = nearest[a, b, c, 1]
-                            nearest[i, j, k, 2] = nearest[a, b, c, 2]
+                            for value in range(6):
+                                nearest[i, j, k, value] = nearest[a, b, c, value]

@@ -38,7 +38,7 @@ class Grid:
         """Diagonal of the box of all cells, meters."""
         return self.spacing * float(np.linalg.norm(self.shape))
 
-    def places(self, rows: Int[np.ndarray, "cells 3"]) -> Float64[np.ndarray, "cells 3"]:
+    def places(self, rows: Int[np.ndarray, "*cells 3"]) -> Float64[np.ndarray, "*cells 3"]:
         """Return the middles of cells given by their indices, meters."""
         return self.lowest + self.spacing * rows
 

@@ -104,7 +104,7 @@ def _rough(
         grid = Grid(middle - reach, 2 * reach / (_ROUGH - 1), (_ROUGH,) * 3)
         used = [outline for outline, each in zip(outlines, right, strict=True) if each]
         rank = int(_DISSENT * len(used)) if right.all() else 0
-        solid = hull_distance(used, grid, rank=rank)[0] > -grid.spacing
+        solid = hull_distance(used, grid, rank=rank) > -grid.spacing
         if not solid.any():
             raise SceneError(
                 f"the masks of {len(views)} views have no place in common: check that cameras and masks belong "
@@ -126,7 +126,7 @@ def _agreeing(outlines: Sequence[Outline], grid: Grid, solid: Bool[np.ndarray, "
     """Return which outlines leave out little of what the others keep."""
     core = ndimage.binary_erosion(solid, iterations=2)
     left_out = np.array(
-        [float((hull_distance([each], grid, core, rank=0)[0][core] < 0).mean()) for each in outlines]
+        [float((hull_distance([each], grid, core, rank=0)[core] < 0).mean()) for each in outlines]
         if core.any()
         else [0.0] * len(outlines)
     )
@@ -137,11 +137,11 @@ def _agreeing(outlines: Sequence[Outline], grid: Grid, solid: Bool[np.ndarray, "
 def _hull(outlines: Sequence[Outline], grid: Grid) -> Float32[np.ndarray, "x y z"]:
     """Return how far inside the hull each cell lies; far outside it, the distance of a cell of a coarser grid."""
     coarse = grid.coarser(2)
-    rough = hull_distance(outlines, coarse, rank=0)[0]
+    rough = hull_distance(outlines, coarse, rank=0)
     rough = rough.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
     rough = rough[: grid.shape[0], : grid.shape[1], : grid.shape[2]]
     near = rough > -4 * grid.spacing
-    fine = hull_distance(outlines, grid, near, rank=0)[0]
+    fine = hull_distance(outlines, grid, near, rank=0)
     return np.where(near, fine, rough)
 
 

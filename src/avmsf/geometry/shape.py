@@ -142,7 +142,7 @@ class ObjectShape:
         """Cells inside the outer side at whose surface it only covers a cavity."""
         inside = self.outer > 0
         skin = inside & ~ndimage.binary_erosion(inside)
-        lids = skin & ndimage.binary_dilation(self.hollow > 0, np.ones((3, 3, 3)))
+        lids = skin & (self.seen <= 0) & ndimage.binary_dilation(self.hollow > 0, np.ones((3, 3, 3)))
         slopes = np.stack([-each for each in np.gradient(ndimage.gaussian_filter(self.outer, 1.5))], axis=-1)
         slopes /= np.maximum(np.linalg.norm(slopes, axis=-1, keepdims=True), 1e-12)
         label, count = ndimage.label(lids, np.ones((3, 3, 3)))

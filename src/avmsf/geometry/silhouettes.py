@@ -6,7 +6,7 @@ from typing import no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt16
+from jaxtyping import Bool, Float32, Float64
 
 from avmsf.capture.cameras import View
 from avmsf.compiled import compiled, lane_count, run_lanes
@@ -14,6 +14,9 @@ from avmsf.geometry.grid import Grid
 
 _FINER = 3
 """Times as many pixels across in which the distance to an outline is measured. It must be odd."""
+
+_FAR = np.float32(1e6)
+"""Meters outside, of what is not known to be inside."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +56,12 @@ def _inside(mask: np.ndarray) -> Float32[np.ndarray, "height width"]:
 
 def hull_distance(
     outlines: Sequence[Outline], grid: Grid, where: Bool[np.ndarray, "x y z"] | None = None, *, rank: int
-) -> tuple[Float32[np.ndarray, "x y z"], UInt16[np.ndarray, "x y z"]]:
-    """Return how far inside the hull each cell's middle lies, meters, and how many views have it in their image.
+) -> Float32[np.ndarray, "x y z"]:
+    """Return how far inside the hull each cell's middle lies, meters.
 
     The distance is the `rank`-th smallest (0 for the smallest) over views of the distance from the outline at the
-    cell's depth, negative outside. Cells that are not `where` get the most negative number.
+    cell's depth, negative outside. It is -1e6 where fewer than half as many views have the cell in their image as have
+    any, and in cells that are not `where`.
     """
     rows = np.argwhere(np.ones(grid.shape, dtype=bool) if where is None else where)
     least = np.full((len(rows), rank + 1), np.inf, dtype=np.float32)
@@ -75,11 +79,11 @@ def hull_distance(
             least,
             seen,
         )
-    distance = np.full(grid.shape, -np.finfo(np.float32).max, dtype=np.float32)
-    counts = np.zeros(grid.shape, dtype=np.uint16)
-    distance[tuple(rows.T)] = np.where(np.isfinite(least[:, rank]), least[:, rank], -np.finfo(np.float32).max)
-    counts[tuple(rows.T)] = seen
-    return distance, counts
+    # Of what few views have in their image nothing is known, and the object is in most of them.
+    known = np.isfinite(least[:, rank]) & (seen >= 0.5 * seen.max(initial=0))
+    distance = np.full(grid.shape, -_FAR, dtype=np.float32)
+    distance[tuple(rows.T)] = np.where(known, least[:, rank], -_FAR)
+    return distance
 
 
 @compiled(error_model="numpy")

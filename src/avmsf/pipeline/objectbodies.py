@@ -13,8 +13,6 @@ from avmsf.pipeline.bodies import BodyConfig, candidate_bodies, roughened
 from avmsf.pipeline.scene import SceneConfig, SceneStages
 from avmsf.pipeline.sources import ViewsConfig
 from avmsf.pipeline.stages import StageFolder
-from avmsf.scene.gaussiansurface import gaussian_surface
-from avmsf.scene.ply import read_splats
 
 Geometry = Literal["mesh", "gaussians", "noisy"]
 """What an object's shape is known by: its mesh; Gaussians fitted to its views; its mesh as a bad scan has it."""
@@ -56,4 +54,4 @@ class ObjectBodies:
             seen.folder, StageFolder(self.cache / identifier / "all views"), scene, settings=seen.settings
         )
         with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
-            return gaussian_surface(read_splats(stages.cloud.path))
+            return stages.shape().as_seen()

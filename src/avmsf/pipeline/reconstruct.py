@@ -30,8 +30,6 @@ from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
-from avmsf.scene.gaussiansurface import gaussian_surface
-from avmsf.scene.ply import read_splats
 from avmsf.scene.symmetry import Symmetries
 
 CACHE = ".avmsf"
@@ -180,7 +178,7 @@ class _Shape:
     """The stages that made it."""
     report: Mapping[str, Any]
     surface: Callable[[], Surface]
-    """Makes the object's surface: its mesh, or what encloses its Gaussians. Raises SceneError without either."""
+    """Makes the object's surface: its mesh, or what its views show. Raises SceneError without either."""
     surface_digest: str
     """Of what the surface is made of."""
 
@@ -244,20 +242,20 @@ def _shape(
 
 
 def _mesh(capture: Capture, scene: SceneStages | None) -> tuple[Callable[[], Surface], str]:
-    """Return what makes the object's surface, and the digest of what it is made of: its mesh before its Gaussians."""
+    """Return what makes the object's surface, and the digest of what it is made of: its mesh before its views."""
     found = capture.surface
     if found is not None and len(found.faces):
         digest = hashlib.sha256(found.vertices.contiguous().numpy().tobytes())
         digest.update(found.faces.contiguous().numpy().tobytes())
         return lambda: found, digest.hexdigest()
-    cloud = scene.made().get("cloud") if scene is not None else None
+    made = scene.made() if scene is not None else {}
 
-    def from_cloud() -> Surface:
-        if cloud is None:
+    def from_views() -> Surface:
+        if scene is None or "cloud" not in made:
             raise SceneError("the folder holds neither a mesh nor pictures of the object, so its shape is unknown")
-        return gaussian_surface(read_splats(cloud.path))
+        return scene.shape().as_seen()
 
-    return from_cloud, "" if cloud is None else cloud.digest
+    return from_views, f"{made['views'].digest} {made['cloud'].digest}" if "cloud" in made else ""
 
 
 def expect_on_object(impacts: Impacts, points: Float[Tensor, "points 3"], *, strict: bool = False) -> None:
