@@ -23,6 +23,7 @@ from benchmarks import (
     speed,
     studio,
     suggest,
+    surface,
     tasks,
 )
 from benchmarks.material import MissingDataError
@@ -38,6 +39,7 @@ BENCHMARKS: dict[str, ModuleType] = {
     "proof": proof,
     "settings": settings,
     "suggest": suggest,
+    "surface": surface,
     "physics": physics,
     "residual": residual,
     "tasks": tasks,
@@ -66,7 +68,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--sim-20",
         type=Path,
         metavar="FOLDER",
-        help="residual: objects that `avmsf simulate sim-20` has made; without it they are simulated again",
+        help="residual, surface: objects that `avmsf simulate sim-20` has made; without it they are simulated again",
+    )
+    parser.add_argument(
+        "--clouds",
+        type=Path,
+        metavar="FOLDER",
+        help="surface: keep the Gaussians fitted to the objects here; without it they are fitted again",
     )
     chosen = parser.parse_args(arguments)
     benchmark = BENCHMARKS[chosen.name]
@@ -76,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"{chosen.name} has no part {', '.join(unknown)}; it has {', '.join(benchmark.PARTS)}")
     if not chosen.paper_minutes > 0:
         parser.error(f"--paper-minutes is {chosen.paper_minutes:g}; expected a number above 0")
-    options = Options(parts, chosen.quick_look, chosen.paper_minutes, chosen.sim_20)
+    options = Options(parts, chosen.quick_look, chosen.paper_minutes, chosen.sim_20, chosen.clouds)
     # Remarks on a capture are `avmsf check`'s business.
     warnings.simplefilter("ignore", CaptureWarning)
     try:

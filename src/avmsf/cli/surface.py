@@ -18,7 +18,7 @@ from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import SceneOptions, stage_line
 from avmsf.cli.writing import OutputError, expect_writable
 from avmsf.files import write_whole
-from avmsf.pipeline.reconstruct import keep_surface, object_surface
+from avmsf.pipeline.reconstruct import keep_surface, object_shape
 from avmsf.pipeline.scene import SceneConfig, SceneStages
 from avmsf.pipeline.sources import ViewsConfig
 from avmsf.pipeline.stages import StageFolder
@@ -69,7 +69,7 @@ def run(options: Options) -> int:
             )
             scene.expect_any()
             with stages.lock("avmsf surface"):
-                kept = keep_surface(stages, *object_surface(find_surface(options.folder, settings), scene))
+                kept = keep_surface(stages, *object_shape(find_surface(options.folder, settings), scene))
                 surface = read_surface(kept.path)
                 if options.output is not None:
                     write_whole(

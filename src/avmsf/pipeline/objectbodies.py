@@ -9,12 +9,11 @@ from avmsf.capture.datasets.dataset import Dataset
 from avmsf.capture.surface import Surface
 from avmsf.errors import SceneError
 from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.geometry import ObjectShape
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies, roughened
 from avmsf.pipeline.scene import SceneConfig, SceneStages
 from avmsf.pipeline.sources import ViewsConfig
 from avmsf.pipeline.stages import StageFolder
-from avmsf.scene.gaussiansurface import gaussian_surface
-from avmsf.scene.ply import read_splats
 
 Geometry = Literal["mesh", "gaussians", "noisy"]
 """What an object's shape is known by: its mesh; Gaussians fitted to its views; its mesh as a bad scan has it."""
@@ -39,15 +38,15 @@ class ObjectBodies:
         """Return an object's bodies. Raises SceneError where its shape is unknown, SimulationError for an unfit one."""
         return candidate_bodies(self._surface(identifier), self.config, cache=self.cache / identifier / "bodies")
 
-    def _surface(self, identifier: str) -> Surface:
+    def _surface(self, identifier: str) -> Surface | ObjectShape:
         if self.geometry == "gaussians":
-            return self._gaussian_surface(identifier)
+            return self._shape(identifier)
         surface = self.dataset.capture(identifier).surface
         if surface is None or not len(surface.faces):
             raise SceneError(f"{identifier}: the dataset holds no mesh of it; geometry from Gaussians needs none")
         return surface if self.geometry == "mesh" else roughened(surface, NOISE, seed=self.seed)
 
-    def _gaussian_surface(self, identifier: str) -> Surface:
+    def _shape(self, identifier: str) -> ObjectShape:
         seen = self.dataset.look(identifier)
         if seen is None:
             raise SceneError(f"{identifier}: the dataset holds neither a mesh nor pictures of it, so it has no shape")
@@ -56,4 +55,4 @@ class ObjectBodies:
             seen.folder, StageFolder(self.cache / identifier / "all views"), scene, settings=seen.settings
         )
         with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
-            return gaussian_surface(read_splats(stages.cloud.path))
+            return stages.shape()

@@ -17,7 +17,7 @@ from torch import Tensor
 from avmsf.capture import Capture, Impacts, Surface
 from avmsf.capture.placement import judge_placement
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import read_surface, write_surface
+from avmsf.capture.surface import write_surface
 from avmsf.capture.views import read_views
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import AvmsfError, CaptureError, SceneError
@@ -29,6 +29,7 @@ from avmsf.field.gains.estimator import NETWORK, GainModel, estimator_for
 from avmsf.field.gains.visual import Visual
 from avmsf.field.store import load, save
 from avmsf.files import write_whole
+from avmsf.geometry import ObjectShape
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
@@ -37,8 +38,6 @@ from avmsf.pipeline.silhouettes import judge_outlines
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
-from avmsf.scene.gaussiansurface import gaussian_surface
-from avmsf.scene.ply import read_splats
 from avmsf.scene.symmetry import Symmetries
 from avmsf.simulate.closest import ClosestPoints
 
@@ -147,9 +146,8 @@ def _reconstruct(
     @cache_result
     def bodies() -> CandidateBodies:
         listener.tell("bodies: what the object may be behind its surface")
-        surface = read_surface(keep_surface(stages, shape.surface, shape.surface_digest).path)
         cache = stages.folder / BODIES
-        return candidate_bodies(surface, config.body, impacts=train, cache=cache, tell=listener.tell)
+        return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, tell=listener.tell)
 
     def make(path: Path) -> None:
         listener.tell(f"fit: a field of {len(modes.bank)} modes")
@@ -200,8 +198,8 @@ class _Shape:
     made: Mapping[str, Kept]
     """The stages that made it."""
     report: Mapping[str, Any]
-    surface: Callable[[], Surface]
-    """Makes the object's surface: its mesh, or what encloses its Gaussians. Raises SceneError without either."""
+    surface: Callable[[], Surface | ObjectShape]
+    """Makes the object's mesh, or the shape that its views show. Raises SceneError without either."""
     surface_digest: str
     """Of what the surface is made of."""
 
@@ -250,7 +248,7 @@ def _shape(
             features = FeatureField.from_contacts(capture.impacts.contacts)
         else:
             features = FeatureField.from_points(capture.surface.vertices)
-        surface, digest = object_surface(capture.surface, None)
+        surface, digest = object_shape(capture.surface, None)
         return _Shape({"positions": features}, {}, {}, surface, digest)
     if capture.surface is not None and scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
@@ -267,7 +265,7 @@ def _shape(
     found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
     expect_on_object(capture.impacts, features.points, strict=found_frame)
     report = read_report(scene.features.path)
-    surface, digest = object_surface(capture.surface, scene)
+    surface, digest = object_shape(capture.surface, scene)
     return _Shape(candidates, scene.made(), report, surface, digest)
 
 
@@ -291,8 +289,8 @@ def moved_onto(features: FeatureField, surface: Surface) -> FeatureField:
     return replace(features, points=torch.from_numpy(places).to(features.points), features=features.features[rows])
 
 
-def object_surface(found: Surface | None, scene: SceneStages | None) -> tuple[Callable[[], Surface], str]:
-    """Return what makes the object's surface, and the digest of what it is made of: its mesh before its Gaussians.
+def object_shape(found: Surface | None, scene: SceneStages | None) -> tuple[Callable[[], Surface | ObjectShape], str]:
+    """Return what makes the object's shape, and the digest of what it is made of: its mesh before its views.
 
     `found` is the surface that the folder holds. What is returned raises SceneError where the shape is unknown.
     """
@@ -300,21 +298,21 @@ def object_surface(found: Surface | None, scene: SceneStages | None) -> tuple[Ca
         digest = hashlib.sha256(found.vertices.contiguous().numpy().tobytes())
         digest.update(found.faces.contiguous().numpy().tobytes())
         return lambda: found, digest.hexdigest()
-    cloud = scene.cloud if scene is not None else None
+    if scene is None:
 
-    def from_cloud() -> Surface:
-        if cloud is None:
+        def unknown() -> ObjectShape:
             raise SceneError("the folder holds neither a mesh nor pictures of the object, so its shape is unknown")
-        return gaussian_surface(read_splats(cloud.path))
 
-    return from_cloud, "" if cloud is None else cloud.digest
+        return unknown, ""
+    return cache_result(scene.shape), f"{scene.cloud.digest} {scene.views.digest}"
 
 
-def keep_surface(stages: StageFolder, make: Callable[[], Surface], digest: str) -> Kept:
+def keep_surface(stages: StageFolder, make: Callable[[], Surface | ObjectShape], digest: str) -> Kept:
     """Return the file of the object's surface, made where what is kept is of something else. Raises as `make`."""
 
     def write(path: Path) -> None:
-        surface = make()
+        shape = make()
+        surface = shape if isinstance(shape, Surface) else shape.as_seen()
         write_whole(path, lambda place: write_surface(surface, place), raising=SceneError)
 
     return stages.keep(SURFACE, {"of": digest}, write)

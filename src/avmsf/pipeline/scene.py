@@ -7,14 +7,13 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
-import torch
-
 from avmsf.capture.cameras import View
-from avmsf.capture.meshviews import orbit_cameras
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import Surface, read_surface
+from avmsf.capture.surface import read_surface
 from avmsf.capture.views import read_sparse_points, read_views
 from avmsf.errors import SceneError
+from avmsf.geometry import ObjectShape
+from avmsf.pipeline.cloudshape import shape_of_cloud, views_of_cloud
 from avmsf.pipeline.features import LiftConfig, choose_encoder, finish_features, lift_to_cloud, lift_to_surface
 from avmsf.pipeline.sources import Source, ViewsConfig, find_source, find_splats, keep_views, replace_views
 from avmsf.pipeline.stages import Kept, StageFolder, digest_of
@@ -24,7 +23,7 @@ from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.keep import keep_object
 from avmsf.scene.lift import Lifted, LiftProgress
 from avmsf.scene.ply import read_splats, write_splats
-from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
+from avmsf.scene.rasteriser import choose_rasteriser
 from avmsf.scene.splat import SplatProgress, splat
 from avmsf.scene.splatconfig import SplatConfig
 from avmsf.scene.start import StartPoints
@@ -147,6 +146,15 @@ class SceneStages:
 
         return self.stages.keep(self.name, recipe, make)
 
+    def shape(self) -> ObjectShape:
+        """Return the object's shape, of its views' masks and its Gaussians' depth.
+
+        Where fewer than 3 views have masks, pictures of the Gaussians stand for them.
+        """
+        views, cloud = read_views(self.views.path), read_splats(self.cloud.path)
+        self.listener.tell(f"shape: of {len(views)} views and {len(cloud)} Gaussians")
+        return shape_of_cloud(cloud, views)
+
     def made(self) -> dict[str, Kept]:
         """Return the stages that were needed so far, in order."""
         return {name: self.__dict__[name] for name in ("views", "cloud", "features") if name in self.__dict__}
@@ -218,15 +226,3 @@ class SceneStages:
 def scaled(cloud: GaussianCloud, factor: float) -> GaussianCloud:
     """Return the Gaussians with all lengths times a factor."""
     return replace(cloud, centers=cloud.centers * factor, log_scales=cloud.log_scales + math.log(factor))
-
-
-def views_of_cloud(cloud: GaussianCloud, rasteriser: Rasteriser, *, size: int) -> tuple[View, ...]:
-    """Return the 72 pictures of `orbit_cameras` of Gaussians before white, `size` pixels wide, with masks."""
-    box = Surface(cloud.centers.float(), torch.zeros(0, 3, dtype=torch.int64))
-    views = []
-    for number, camera in enumerate(orbit_cameras(box, size=size)):
-        with torch.no_grad():
-            seen = rasteriser(cloud, camera, background=cloud.centers.new_ones(3))
-        image, mask = ((255 * each.clamp(0, 1)).round().to(torch.uint8) for each in (seen.color, seen.alpha))
-        views.append(View(f"view_{number:03d}", image, camera, mask))
-    return tuple(views)

@@ -1,7 +1,6 @@
 """The visual hull: all that no mask speaks against, carved from a box of voxels, as points to start Gaussians on."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import no_type_check
@@ -14,9 +13,9 @@ from scipy import ndimage
 from torch import Tensor
 
 from avmsf.capture.cameras import View
-from avmsf.capture.warning import CaptureWarning
 from avmsf.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import SceneError
+from avmsf.geometry.whereabouts import masked_views, whereabouts
 
 _ROUGH = 48
 """Voxels along the longest side of the first carving, which finds where the object is."""
@@ -45,8 +44,8 @@ def visual_hull(views: Sequence[View], *, points: int, dissent: float = 0.05) ->
     those whose mask is empty, with a `CaptureWarning`. Raises `SceneError` where fewer than 3 masks remain, or masks
     that have nothing in common.
     """
-    masked = _masked(views)
-    middle, reach = _whereabouts(masked)
+    masked = masked_views(views)
+    middle, reach = whereabouts(masked)
     lowest, spacing = middle - reach, 2 * reach / _ROUGH
     shape = (_ROUGH,) * 3
     # The rough box is a guess: where the object touches its edge, it grows.
@@ -70,59 +69,6 @@ def visual_hull(views: Sequence[View], *, points: int, dissent: float = 0.05) ->
     normals = _normals(solid, rows)
     places = lowest + (rows + 0.5) * spacing
     return Hull(torch.from_numpy(places).float(), torch.from_numpy(normals).float(), spacing)
-
-
-def _masked(views: Sequence[View]) -> list[View]:
-    known = [view for view in views if view.mask is not None]
-    empty = [view.name for view in known if view.mask is not None and not bool((view.mask > 127).any())]
-    if known and len(empty) == len(known):
-        raise SceneError(
-            f"the masks of all {len(known)} views are background alone; expected the object in them: check that white "
-            "stands for the object, or leave the masks out and let the foreground be found"
-        )
-    if empty:
-        warnings.warn(
-            f"the object is in no pixel of the masks of {', '.join(empty)}; these views are passed over",
-            CaptureWarning,
-            stacklevel=3,
-        )
-    kept = [view for view in known if view.name not in empty]
-    if len(kept) < 3:
-        raise SceneError(
-            f"{len(kept)} of {len(views)} views have a mask; a visual hull takes 3 or more: give masks, images with "
-            "alpha or a plain background whose foreground can be found, or points to start from"
-        )
-    return kept
-
-
-def _whereabouts(views: Sequence[View]) -> tuple[np.ndarray, float]:
-    """Return about where the object's middle is, and how far it reaches from there, metres.
-
-    The place nearest to the lines of sight through the masks' middles, without those that miss it by far.
-    """
-    positions, directions, sizes = [], [], []
-    for view in views:
-        assert view.mask is not None
-        rows, columns = np.nonzero(view.mask.numpy() > 127)
-        camera = view.camera
-        pixel = np.array([np.median(columns) + 0.5, np.median(rows) + 0.5])
-        ray = np.append((pixel - camera.principal) / camera.focal, 1.0)
-        rotation = camera.world_to_camera[:3, :3].numpy()
-        directions.append(ray / np.linalg.norm(ray) @ rotation)
-        positions.append(camera.position.numpy())
-        sizes.append(max(np.ptp(columns) / camera.focal[0], np.ptp(rows) / camera.focal[1]))
-    starts, rays = np.stack(positions), np.stack(directions)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    weight = np.ones(len(views))
-    for _ in range(10):
-        weighted = across * weight[:, None, None]
-        # A little pull towards the cameras' side of infinity keeps parallel lines of sight solvable.
-        middle = np.linalg.lstsq(weighted.sum(0), np.einsum("vij,vj->i", weighted, starts), rcond=1e-9)[0]
-        missed = np.linalg.norm(np.einsum("vij,vj->vi", across, middle - starts), axis=1)
-        weight = 1.0 / (missed + 1e-3 * np.median(np.linalg.norm(middle - starts, axis=1)))
-    distance = np.abs(np.einsum("vi,vi->v", middle - starts, rays))
-    # Half the largest extent, and as much again as the middle of a mask may lie off the object's.
-    return middle, float(0.8 * np.quantile(np.array(sizes) * distance, 0.9))
 
 
 def _carve(

@@ -1,0 +1,256 @@
+"""From masks and depth of many views to an object's shape."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64
+from scipy import ndimage
+from torch import Tensor
+
+from avmsf.capture.cameras import Camera, View
+from avmsf.capture.levelset import enclose
+from avmsf.capture.meshviews import MeshTracer
+from avmsf.capture.texturedmesh import TexturedMesh
+from avmsf.errors import SceneError
+from avmsf.geometry.convex import depth_in_convex_hull
+from avmsf.geometry.fusion import SeenDepth, fused_depth
+from avmsf.geometry.grid import Grid
+from avmsf.geometry.shape import ObjectShape, ShapeReport
+from avmsf.geometry.silhouettes import Outline, hull_distance
+from avmsf.geometry.taut import drawn_taut
+from avmsf.geometry.whereabouts import masked_views, whereabouts
+
+DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
+"""What gives the depth of the first surface that each pixel of a camera sees, meters along the axis; 0 where none."""
+
+_ROUGH = 48
+"""Cells along an edge of the first grid, which finds where the object is and which masks are wrong."""
+_DISSENT = 0.05
+"""Part of the views that may be wrong there."""
+_WRONG = 0.1
+"""Part of the rough hull that a view's mask leaves out, from which on the mask is wrong, if four times the median."""
+_FINER = 4.0
+"""Times as many cells along the longest side of a slender object, at most."""
+_MARGIN = 4
+"""Cells of free room around the hull."""
+_BAND = 0.015
+"""How far behind a view's depth places are still seen, over the diagonal: depth of Gaussians scatters so much."""
+_QUANTILE = 0.35
+"""Of the distances before the surface: two thirds of the views must see a place free."""
+_SLACK = 0.005
+"""How far depth must lie behind the hull to be believed, over the diagonal: its mean over views is so exact."""
+_LEAST = 0.04
+"""Part of the views that must see a place for its depth to count, but three views at least."""
+_CLOSED = 4000
+"""Triangles of the surface whose convex hull closes what no view sees."""
+_NARROW = 2
+"""Half the width of hollows that are none, cells."""
+_HOLLOW_DEPTH = 0.08
+"""Depth below its lid, over the diagonal, from which on what is free is a cavity."""
+_HOLLOW_VOLUME = 0.08
+"""Part of the filled volume from which on it is a cavity although it is shallow: plates."""
+
+
+def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 128) -> ObjectShape:
+    """Return the shape of the object that views with masks show, and whose depth `depth_map` gives.
+
+    `cells` count along the longest side; slender objects have up to four times as many. Views whose masks contradict
+    the others' are left out. Depth may lie behind the surface by the same length everywhere: that is found where the
+    masks' outlines touch the surface, and taken off. Raises SceneError where fewer than 3 views have masks, where masks
+    have nothing in common, and where an image cuts the object so that its extent is not known.
+    """
+    if cells < 16:
+        raise SceneError(f"cells = {cells}: expected 16 or more")
+    masked = masked_views(views)
+    outlines = [Outline.of(view) for view in masked]
+    low, high, right = _rough(masked, outlines)
+    kept = [view for view, each in zip(masked, right, strict=True) if each]
+    grid = Grid.around(low, high, cells=cells, finest=_FINER, margin=_MARGIN)
+    outlines = [outline for outline, each in zip(outlines, right, strict=True) if each]
+    hull = _hull(outlines, grid)
+    diagonal = _extent(hull > 0, grid, len(kept))
+    hull = drawn_taut(hull, outlines, grid, diagonal)
+    depths = [_Depth(view, depth_map(view.camera).detach().cpu().float().numpy()) for view in kept]
+    bias = _bias(hull, grid, depths, diagonal)
+    free, sights = _free(hull, grid, depths, bias, diagonal)
+    seen = np.minimum(hull, _SLACK * diagonal - free)
+    seen, bound, unseen, direction = _closed(hull, seen, sights, grid)
+    hollow = _hollows(bound, seen, grid, diagonal)
+    outer = np.where(_covered(hollow > 0, (bound > 0) & (seen <= 0)), np.maximum(seen, bound), seen)
+    rejected = tuple(view.name for view, each in zip(masked, right, strict=True) if not each)
+    report = ShapeReport(len(kept), rejected, bias, unseen, direction)
+    return ObjectShape(grid, outer, seen, hollow, diagonal, report)
+
+
+class _Depth:
+    """What one view sees."""
+
+    def __init__(self, view: View, depth: np.ndarray) -> None:
+        assert view.mask is not None
+        self.camera = view.camera
+        self.projection = (view.camera.intrinsics @ view.camera.world_to_camera[:3]).numpy()
+        # At the outline a pixel's depth is the background's in part.
+        self.depth = np.where(view.mask.numpy() > 127, depth, np.float32(0.0)).astype(np.float32)
+
+
+def _rough(
+    views: Sequence[View], outlines: Sequence[Outline]
+) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"], Bool[np.ndarray, " views"]]:
+    """Return the box around the object, and which views' masks agree with the others'."""
+    middle, reach = whereabouts(views)
+    right = np.ones(len(views), dtype=bool)
+    for attempt in range(5):
+        grid = Grid(middle - reach, 2 * reach / (_ROUGH - 1), (_ROUGH,) * 3)
+        used = [outline for outline, each in zip(outlines, right, strict=True) if each]
+        rank = int(_DISSENT * len(used)) if right.all() else 0
+        solid = hull_distance(used, grid, rank=rank) > -grid.spacing
+        if not solid.any():
+            raise SceneError(
+                f"the masks of {len(views)} views have no place in common: check that cameras and masks belong "
+                "together, and that the poses are camera-to-world in the convention that their file promises"
+            )
+        if any(solid.take(end, axis=axis).any() for axis in range(3) for end in (0, -1)) and attempt < 4:
+            reach *= 1.5
+            continue
+        if right.all():
+            right = _agreeing(outlines, grid, solid)
+            if not right.all():
+                continue
+        break
+    rows = np.argwhere(solid)
+    return grid.places(rows.min(axis=0)), grid.places(rows.max(axis=0)), right
+
+
+def _agreeing(outlines: Sequence[Outline], grid: Grid, solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, " views"]:
+    """Return which outlines leave out little of what the others keep."""
+    core = ndimage.binary_erosion(solid, iterations=2)
+    left_out = np.array(
+        [float((hull_distance([each], grid, core, rank=0)[core] < 0).mean()) for each in outlines]
+        if core.any()
+        else [0.0] * len(outlines)
+    )
+    right = left_out < max(_WRONG, 4.0 * float(np.median(left_out)))
+    return right if int(right.sum()) >= 3 else np.ones(len(outlines), dtype=bool)
+
+
+def _hull(outlines: Sequence[Outline], grid: Grid) -> Float32[np.ndarray, "x y z"]:
+    """Return how far inside the hull each cell lies; far outside it, the distance of a cell of a coarser grid."""
+    coarse = grid.coarser(2)
+    rough = hull_distance(outlines, coarse, rank=0)
+    rough = rough.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
+    rough = rough[: grid.shape[0], : grid.shape[1], : grid.shape[2]]
+    near = rough > -4 * grid.spacing
+    fine = hull_distance(outlines, grid, near, rank=0)
+    return np.where(near, fine, rough)
+
+
+def _extent(inside: Bool[np.ndarray, "x y z"], grid: Grid, views: int) -> float:
+    """Return the diagonal of the box around what is inside, meters."""
+    if not inside.any():
+        raise SceneError(
+            f"nothing is in the masks of all {views} views: check the masks and the cameras' poses; masks that are "
+            "shifted or too small leave thin objects out"
+        )
+    return grid.spacing * float(np.linalg.norm(np.ptp(np.argwhere(inside), axis=0)))
+
+
+def _bias(hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[_Depth], diagonal: float) -> float:
+    """Return by how much depth lies behind the hull where it does so most often, meters.
+
+    Most of a surface touches its hull; the depth of cavities lies behind it by lengths of all kinds.
+    """
+    tracer = MeshTracer(TexturedMesh.plain(enclose(hull, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=40_000)))
+    behind = []
+    for each in depths[:: max(1, len(depths) // 24)]:
+        front = tracer.look(each.camera).depth.numpy()
+        both = np.isfinite(front) & (each.depth > 0)
+        behind.append((each.depth - front)[both])
+    found = np.sort(np.concatenate(behind))
+    found = found[np.abs(found) < 0.05 * diagonal]
+    if len(found) < 100:
+        return 0.0
+    # The half that is closest together, again and again (half-sample mode).
+    while len(found) > 100:
+        half = len(found) // 2
+        start = int((found[half:] - found[:-half]).argmin())
+        found = found[start : start + half + 1]
+    return float(np.median(found))
+
+
+def _free(
+    hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[_Depth], bias: float, diagonal: float
+) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
+    """Return how far each cell lies before the surface that views see, meters, and how many see the cell."""
+    known = [
+        SeenDepth(each.projection, np.where(each.depth > 0, each.depth - np.float32(bias), np.float32(0.0)))
+        for each in depths
+    ]
+    least = max(3.0, _LEAST * len(depths))
+    band = _BAND * diagonal
+    free, sights = fused_depth(known, grid, hull > -2 * grid.spacing, band=band, quantile=_QUANTILE, least=least)
+    return ndimage.gaussian_filter(free, 1.0), sights
+
+
+def _closed(
+    hull: Float32[np.ndarray, "x y z"],
+    seen: Float32[np.ndarray, "x y z"],
+    sights: Float32[np.ndarray, "x y z"],
+    grid: Grid,
+) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"], float, tuple[float, float, float] | None]:
+    """Cut what no view sees by the convex hull of what views see.
+
+    Return the cut solid, the hull cut likewise, which lids cavities, the part of the surface that no view saw, and the
+    direction in which it lies.
+    """
+    surface = enclose(seen, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=_CLOSED)
+    places = surface.vertices.double().numpy()
+    rows = np.rint((places - grid.lowest) / grid.spacing).astype(int)
+    known = ndimage.maximum_filter(sights, 3)[tuple(rows.T)] >= 1
+    if int(known.sum()) < 4:
+        raise SceneError("no view sees a surface in its mask: check that depth and views are of one object")
+    near = hull > -2 * grid.spacing
+    bound = hull.copy()
+    inside = depth_in_convex_hull(places[known], grid, np.argwhere(near))
+    bound[near] = np.minimum(hull[near], inside)
+    corners = surface.vertices.double()[surface.faces]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).numpy()
+    hidden = ~known[surface.faces.numpy()].any(axis=1)
+    areas = np.linalg.norm(normals, axis=1)
+    total = normals[hidden].sum(axis=0)
+    length = float(np.linalg.norm(total))
+    direction = None if length == 0.0 else (float(total[0]), float(total[1]), float(total[2]))
+    if direction is not None:
+        direction = (direction[0] / length, direction[1] / length, direction[2] / length)
+    return np.minimum(seen, bound), bound, float(areas[hidden].sum() / areas.sum()), direction
+
+
+def _covered(hollow: Bool[np.ndarray, "x y z"], free: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    """Return the cells that lids cover: cavities, the shallow parts beside them, and a margin."""
+    if hollow.any():
+        label, _ = ndimage.label(free)
+        hollow = np.isin(label, np.unique(label[hollow]))
+    return ndimage.binary_dilation(hollow, iterations=_NARROW)
+
+
+def _hollows(
+    bound: Float32[np.ndarray, "x y z"], seen: Float32[np.ndarray, "x y z"], grid: Grid, diagonal: float
+) -> np.ndarray:
+    """Return the number of the cavity that each cell is in, the largest first; 0 in none."""
+    free = (bound > 0) & (seen <= 0)
+    core = ndimage.distance_transform_edt(free) > _NARROW
+    opened = free & (ndimage.distance_transform_edt(~core) <= _NARROW + 0.5)
+    label, count = ndimage.label(opened)
+    depth = ndimage.distance_transform_edt(bound > 0)
+    total = int((bound > 0).sum())
+    sizes = np.bincount(label.ravel(), minlength=count + 1)
+    deepest = ndimage.maximum(depth, label, np.arange(count + 1))
+    kept = [
+        number
+        for number in range(1, count + 1)
+        if deepest[number] * grid.spacing > _HOLLOW_DEPTH * diagonal or sizes[number] > _HOLLOW_VOLUME * total
+    ]
+    numbers = np.zeros(count + 1, dtype=np.int32)
+    for place, number in enumerate(sorted(kept, key=lambda each: -int(sizes[each]))):
+        numbers[number] = place + 1
+    return numbers[label]

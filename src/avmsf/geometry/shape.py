@@ -1,0 +1,215 @@
+"""An object's shape on a grid: its outer side, its cavities, and the bodies that it may be."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int
+from scipy import ndimage
+
+from avmsf.capture.levelset import enclose
+from avmsf.capture.surface import Surface
+from avmsf.errors import SceneError
+from avmsf.geometry.distance import distance_from
+from avmsf.geometry.grid import Grid
+
+FACES = 6000
+"""Triangles at most of a body's surface: tetrahedra of 12,000 to 40,000 degrees of freedom have no more outside."""
+_SOLID = 0.03
+"""Half the thickness beyond the wall's, over the diagonal, below which a part is solid unless seen to be hollow:
+handles are. By trial: .06 for the thickness (mugs, jugs, pans)."""
+_LID_TURN = 0.8
+"""Cosine of the angle to a lid's normal within which the rim beside it belongs to the lid."""
+_LID_REACH = 0.6
+"""How far a lid grows over the rim, and over floors that were not seen to lie below it, over the radius of a disc of
+its area."""
+_THINNEST, _THICKEST = 0.003, 0.06
+"""Wall thicknesses over the diagonal that are worth trying at all."""
+_FINE = 2.0
+"""Cells in the least thickness of a wall that marching cubes draw well."""
+_BLUR = 0.6
+"""Standard deviation of the blur that takes steps out of surfaces, cells."""
+_FINEST = 4
+"""Most times that cells are divided for that."""
+
+
+@dataclass(frozen=True)
+class Cavity:
+    """A hollow that opens to the outside."""
+
+    volume: float
+    """Cubic meters, as far as views saw it empty."""
+    depth: float
+    """Largest distance from the openings, meters, as far as views saw it empty."""
+    openings: int
+    """Separate openings; 2 for a tube."""
+    opening_area: float
+    """Of all openings, square meters."""
+
+
+@dataclass(frozen=True)
+class ShapeReport:
+    """What is known of how good a shape is."""
+
+    views: int
+    """Views whose masks were used."""
+    rejected: tuple[str, ...]
+    """Names of the views whose masks contradict the others'."""
+    depth_bias: float
+    """How far depth lay behind the surface, meters; it was taken off."""
+    unseen: float
+    """Part of the surface, 0 to 1, that no view saw; it was closed by the convex hull of what was seen."""
+    unseen_direction: tuple[float, float, float] | None
+    """Mean outward normal of the part that no view saw, of length 1; None where all was seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectShape:
+    """The outer side of an object and its cavities, as signed distances on a grid; positive inside."""
+
+    grid: Grid
+    outer: Float32[np.ndarray, "x y z"]
+    """Meters inside the outer side, with cavities filled up to flat lids; exact near the surface only."""
+    seen: Float32[np.ndarray, "x y z"]
+    """Meters inside what views show, cavities empty as far as seen; exact near the surface only."""
+    hollow: Int[np.ndarray, "x y z"]
+    """Number of the cavity, from 1, that each cell was seen to be in; 0 elsewhere."""
+    diagonal: float
+    """Of the box around the object, meters."""
+    report: ShapeReport
+
+    @cached_property
+    def cavities(self) -> tuple[Cavity, ...]:
+        """All cavities, the largest first."""
+        found = []
+        for number in range(1, int(self.hollow.max()) + 1):
+            here = self.hollow == number
+            lids, count = ndimage.label(self._lids & ndimage.binary_dilation(here, iterations=2), np.ones((3, 3, 3)))
+            sizes = np.bincount(lids.ravel())[1:]
+            big = sizes >= 0.05 * sizes.max(initial=0)
+            depth = ndimage.distance_transform_edt(~(lids > 0))[here].max() if count else 0.0
+            cell = self.grid.spacing
+            found.append(
+                Cavity(int(here.sum()) * cell**3, float(depth) * cell, int(big.sum()), float(sizes.sum()) * cell**2)
+            )
+        return tuple(found)
+
+    @property
+    def thickness_range(self) -> tuple[float, float] | None:
+        """Least and largest thickness of walls around the cavities that the views allow, meters; None without any.
+
+        Views see into a cavity no farther than to its wall, so that a wall is hardly thicker than what they leave.
+        """
+        if not self.hollow.any():
+            return None
+        rim = (self.hollow > 0) & ndimage.binary_dilation((self.hollow == 0) & (self.outer > 0)) & ~self._lids
+        left = 1.5 * float(np.quantile(self._depth[rim], 0.5)) if rim.any() else 0.0
+        most = min(max(left, 3 * _THINNEST * self.diagonal), _THICKEST * self.diagonal)
+        return _THINNEST * self.diagonal, most
+
+    def solid(self, *, faces: int = FACES) -> Surface:
+        """Return the outer side, cavities filled."""
+        return self._enclose(self.outer, self.grid, faces)
+
+    def as_seen(self, *, faces: int = 2 * FACES) -> Surface:
+        """Return what views show: both sides of walls where both were seen."""
+        return self._enclose(self.seen, self.grid, faces)
+
+    def shell(self, thickness: float, *, faces: int = FACES) -> Surface:
+        """Return the body whose walls around its cavities are `thickness` meters thick, measured from outside.
+
+        Whatever lies deeper below the outer side is empty where it is connected with a cavity; parts that are hardly
+        thicker than a wall on both sides, like handles, stay solid. Raises SceneError where there is no cavity, and for
+        a thickness that is not positive or leaves nothing of the cavity.
+        """
+        if not 0 < thickness < np.inf:
+            raise SceneError(f"expected a thickness above 0 m, got {thickness:g} m")
+        if not self.hollow.any():
+            raise SceneError("expected an object with a cavity, got one without: take solid() or as_seen()")
+        empty = self._emptied(thickness)
+        if empty is None:
+            raise SceneError(
+                f"a wall of {1000 * thickness:.3g} mm leaves nothing of the cavity: try less than "
+                f"{1000 * float(self._depth[self.hollow > 0].max()):.3g} mm"
+            )
+        factor = int(np.clip(np.ceil(_FINE * self.grid.spacing / thickness), 1, _FINEST))
+        grid, (outer, below, reach) = _finer(self.grid, (self.outer, self._signed_depth, empty), factor)
+        values = np.minimum(outer, np.maximum(thickness - below, reach))
+        return self._enclose(values, grid, faces)
+
+    @cached_property
+    def _lids(self) -> Bool[np.ndarray, "x y z"]:
+        """Cells inside the outer side at whose surface it only covers a cavity."""
+        inside = self.outer > 0
+        skin = inside & ~ndimage.binary_erosion(inside)
+        lids = skin & (self.seen <= 0) & ndimage.binary_dilation(self.hollow > 0, np.ones((3, 3, 3)))
+        slopes = np.stack([-each for each in np.gradient(ndimage.gaussian_filter(self.outer, 1.5))], axis=-1)
+        slopes /= np.maximum(np.linalg.norm(slopes, axis=-1, keepdims=True), 1e-12)
+        label, count = ndimage.label(lids, np.ones((3, 3, 3)))
+        grown = lids.copy()
+        for number in range(1, count + 1):
+            here = label == number
+            if int(here.sum()) < 0.02 * int(lids.sum()):
+                grown &= ~here
+                continue
+            steps = max(1, round(_LID_REACH * float(np.sqrt(here.sum() / np.pi))))
+            normal = slopes[here].mean(axis=0)
+            normal /= max(float(np.linalg.norm(normal)), 1e-12)
+            grown |= ndimage.binary_dilation(
+                here, np.ones((3, 3, 3)), iterations=steps, mask=skin & (slopes @ normal > _LID_TURN)
+            )
+        return grown
+
+    @cached_property
+    def _depth(self) -> Float32[np.ndarray, "x y z"]:
+        """Distance from the outer side without its lids, meters."""
+        return distance_from(self.outer, self._lids) * np.float32(self.grid.spacing)
+
+    @cached_property
+    def _signed_depth(self) -> Float32[np.ndarray, "x y z"]:
+        """Distance below the outer side without its lids, meters; negative outside unless a lid is nearer."""
+        outside = (self.outer <= 0) & (self._depth <= distance_from(self.outer) * self.grid.spacing * 1.001)
+        return np.where(outside, -self._depth, self._depth)
+
+    def _emptied(self, thickness: float) -> Float32[np.ndarray, "x y z"] | None:
+        """Return how far each cell lies from what is emptied, meters; None where nothing is."""
+        margin, seen = _SOLID * self.diagonal, self.hollow > 0
+        inside = self.outer > 0
+        deep = inside & (self._depth > thickness)
+        label, _ = ndimage.label(inside & (self._depth > thickness + margin))
+        joined = np.unique(label[ndimage.binary_dilation(seen) & (label > 0)])
+        start = (seen & deep) | np.isin(label, joined[joined > 0])
+        if not start.any():
+            return None
+        away = ndimage.distance_transform_edt(~start).astype(np.float32) * np.float32(self.grid.spacing)
+        return away - np.float32(1.2 * margin)
+
+    def _enclose(self, values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int) -> Surface:
+        smooth = ndimage.gaussian_filter(values, _BLUR)
+        # Triangles without area, where the surface passes through the middle of a cell, pinch coarser ones.
+        least = np.float32(0.02 * grid.spacing)
+        smooth = np.where(smooth > 0, np.maximum(smooth, least), np.minimum(smooth, -least))
+        return enclose(smooth, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
+
+
+def _finer(
+    grid: Grid, fields: tuple[Float32[np.ndarray, "x y z"], ...], factor: int
+) -> tuple[Grid, tuple[Float32[np.ndarray, "a b c"], ...]]:
+    """Return fields on a grid of cells divided by `factor` along each axis, linear between their middles."""
+    if factor == 1:
+        return grid, fields
+    counts = [factor * (count - 1) + 1 for count in grid.shape]
+    finer = Grid(grid.lowest, grid.spacing / factor, (counts[0], counts[1], counts[2]))
+    return finer, tuple(_stretched(each, factor) for each in fields)
+
+
+def _stretched(values: Float32[np.ndarray, "x y z"], factor: int) -> Float32[np.ndarray, "a b c"]:
+    for axis in range(3):
+        count = values.shape[axis]
+        at = np.arange(factor * (count - 1) + 1) / factor
+        low = np.minimum(at.astype(int), count - 2)
+        shape = [1, 1, 1]
+        shape[axis] = -1
+        part = (at - low).astype(np.float32).reshape(shape)
+        values = values.take(low, axis) * (1 - part) + values.take(low + 1, axis) * part
+    return values

@@ -1,0 +1,67 @@
+"""Which views have masks, and whereabouts their object is."""
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from avmsf.capture.cameras import View
+from avmsf.capture.warning import CaptureWarning
+from avmsf.errors import SceneError
+
+
+def masked_views(views: Sequence[View]) -> list[View]:
+    """Return the views whose masks show something; a CaptureWarning names those whose masks are empty.
+
+    Raises SceneError for fewer than 3.
+    """
+    known = [view for view in views if view.mask is not None]
+    empty = [view.name for view in known if view.mask is not None and not bool((view.mask > 127).any())]
+    if known and len(empty) == len(known):
+        raise SceneError(
+            f"the masks of all {len(known)} views are background alone; expected the object in them: check that white "
+            "stands for the object, or leave the masks out and let the foreground be found"
+        )
+    if empty:
+        warnings.warn(
+            f"the object is in no pixel of the masks of {', '.join(empty)}; these views are passed over",
+            CaptureWarning,
+            stacklevel=3,
+        )
+    kept = [view for view in known if view.name not in empty]
+    if len(kept) < 3:
+        raise SceneError(
+            f"{len(kept)} of {len(views)} views have a mask; a visual hull takes 3 or more: give masks, images with "
+            "alpha or a plain background whose foreground can be found, or points to start from"
+        )
+    return kept
+
+
+def whereabouts(views: Sequence[View]) -> tuple[np.ndarray, float]:
+    """Return about where the object's middle is, and how far it reaches from there, meters.
+
+    The place nearest to the lines of sight through the masks' middles, without those that miss it by far.
+    """
+    positions, directions, sizes = [], [], []
+    for view in views:
+        assert view.mask is not None
+        rows, columns = np.nonzero(view.mask.numpy() > 127)
+        camera = view.camera
+        pixel = np.array([np.median(columns) + 0.5, np.median(rows) + 0.5])
+        ray = np.append((pixel - camera.principal) / camera.focal, 1.0)
+        rotation = camera.world_to_camera[:3, :3].numpy()
+        directions.append(ray / np.linalg.norm(ray) @ rotation)
+        positions.append(camera.position.numpy())
+        sizes.append(max(np.ptp(columns) / camera.focal[0], np.ptp(rows) / camera.focal[1]))
+    starts, rays = np.stack(positions), np.stack(directions)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    weight = np.ones(len(views))
+    for _ in range(10):
+        weighted = across * weight[:, None, None]
+        # A little pull towards the cameras' side of infinity keeps parallel lines of sight solvable.
+        middle = np.linalg.lstsq(weighted.sum(0), np.einsum("vij,vj->i", weighted, starts), rcond=1e-9)[0]
+        missed = np.linalg.norm(np.einsum("vij,vj->vi", across, middle - starts), axis=1)
+        weight = 1.0 / (missed + 1e-3 * np.median(np.linalg.norm(middle - starts, axis=1)))
+    distance = np.abs(np.einsum("vi,vi->v", middle - starts, rays))
+    # Half the largest extent, and as much again as the middle of a mask may lie off the object's.
+    return middle, float(0.8 * np.quantile(np.array(sizes) * distance, 0.9))

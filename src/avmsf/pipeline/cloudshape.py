@@ -1,0 +1,75 @@
+"""The shape of what Gaussians show, and pictures of them."""
+
+from collections.abc import Sequence
+from dataclasses import fields
+
+import torch
+
+from avmsf.capture.cameras import View
+from avmsf.capture.meshviews import orbit_cameras
+from avmsf.capture.surface import Surface
+from avmsf.errors import SceneError
+from avmsf.geometry import ObjectShape, object_surface
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
+from avmsf.scene.visibility import depth_of_cloud
+
+_FEWEST = 100
+"""Gaussians; what encloses an object is not known from fewer."""
+_FAINT = 0.05
+"""Opacity below which a Gaussian does not show where the object is."""
+_FEWEST_MASKS = 3
+"""Masks from which outlines are taken; with fewer, pictures of the Gaussians have them."""
+_SIZE = 256
+"""Width and height of such pictures, pixels."""
+
+
+def shape_of_cloud(cloud: GaussianCloud, views: Sequence[View] = (), *, cells: int = 128) -> ObjectShape:
+    """Return the shape of the object that Gaussians show; masks of views say where its outlines are.
+
+    Where fewer than 3 views have masks, pictures of the Gaussians from all sides stand for them. Raises SceneError for
+    fewer than 100 Gaussians that can be seen, numbers that are not finite, Gaussians in one place, and as
+    `object_surface` does.
+    """
+    cloud = _visible(cloud)
+    rasteriser = choose_rasteriser(cloud.centers.device)
+    if sum(view.mask is not None for view in views) < _FEWEST_MASKS:
+        views = views_of_cloud(cloud, rasteriser, size=_SIZE)
+    return object_surface(views, depth_of_cloud(cloud, rasteriser), cells=cells)
+
+
+def views_of_cloud(cloud: GaussianCloud, rasteriser: Rasteriser, *, size: int) -> tuple[View, ...]:
+    """Return the 72 pictures of `orbit_cameras` of Gaussians before white, `size` pixels wide, with masks."""
+    box = Surface(cloud.centers.float(), torch.zeros(0, 3, dtype=torch.int64))
+    views = []
+    for number, camera in enumerate(orbit_cameras(box, size=size)):
+        with torch.no_grad():
+            seen = rasteriser(cloud, camera, background=cloud.centers.new_ones(3))
+        image, mask = ((255 * each.clamp(0, 1)).round().to(torch.uint8) for each in (seen.color, seen.alpha))
+        views.append(View(f"view_{number:03d}", image, camera, mask))
+    return tuple(views)
+
+
+def _visible(cloud: GaussianCloud) -> GaussianCloud:
+    """Return the Gaussians that are not faint. Raises SceneError where they cannot be an object."""
+    for each in fields(cloud):
+        values = getattr(cloud, each.name).detach()
+        wrong = torch.nonzero(~torch.isfinite(values.reshape(len(values), -1)).all(1)).flatten()
+        if len(wrong):
+            raise SceneError(
+                f"expected finite numbers, found {each.name} {values[wrong[0]].tolist()} of Gaussian {int(wrong[0])}, "
+                f"and of {len(wrong) - 1} others: drop them with `GaussianCloud.take`"
+            )
+    visible = cloud.detach().take(cloud.opacities.detach() >= _FAINT)
+    if len(visible) < _FEWEST:
+        raise SceneError(
+            f"{len(visible)} of {len(cloud)} Gaussians have an opacity of {_FAINT} or more; expected {_FEWEST} and "
+            "more to show a surface: splat the object again, with more steps or better masks"
+        )
+    extent = (visible.centers.amax(0) - visible.centers.amin(0)).tolist()
+    if not max(extent) > 0:
+        raise SceneError(
+            f"all {len(visible)} Gaussians are in one place, {visible.centers[0].tolist()}: expected them all over an "
+            "object; splat it again"
+        )
+    return visible
