@@ -10,6 +10,7 @@ from scipy import ndimage
 from avmsf.capture.levelset import enclose
 from avmsf.capture.surface import Surface
 from avmsf.errors import SceneError
+from avmsf.geometry.boolean import difference
 from avmsf.geometry.distance import distance_from
 from avmsf.geometry.grid import Grid
 
@@ -25,12 +26,8 @@ _LID_REACH = 0.6
 its area."""
 _THINNEST, _THICKEST = 0.003, 0.06
 """Wall thicknesses over the diagonal that are worth trying at all."""
-_FINE = 2.0
-"""Cells in the least thickness of a wall that marching cubes draw well."""
 _BLUR = 0.6
 """Standard deviation of the blur that takes steps out of surfaces, cells."""
-_FINEST = 4
-"""Most times that cells are divided for that."""
 
 
 @dataclass(frozen=True)
@@ -132,10 +129,14 @@ class ObjectShape:
                 f"a wall of {1000 * thickness:.3g} mm leaves nothing of the cavity: try less than "
                 f"{1000 * float(self._depth[self.hollow > 0].max()):.3g} mm"
             )
-        factor = int(np.clip(np.ceil(_FINE * self.grid.spacing / thickness), 1, _FINEST))
-        grid, (outer, below, reach) = _finer(self.grid, (self.outer, self._signed_depth, empty), factor)
-        values = np.minimum(outer, np.maximum(thickness - below, reach))
-        return self._enclose(values, grid, faces)
+        # Both sides are drawn by themselves, so a wall may be thinner than a cell.
+        values = np.minimum(self._signed_depth - np.float32(thickness), -empty)
+        grid = Grid(self.grid.lowest - self.grid.spacing, self.grid.spacing, tuple(each + 2 for each in values.shape))
+        cavity = self._enclose(np.pad(values, 1, constant_values=-self.grid.spacing), grid, faces)
+        left = difference(self.solid(faces=faces), cavity)
+        if not len(left.faces):
+            raise SceneError(f"a wall of {1000 * thickness:.3g} mm leaves nothing: try a thicker one")
+        return left
 
     @cached_property
     def _lids(self) -> Bool[np.ndarray, "x y z"]:
@@ -190,26 +191,3 @@ class ObjectShape:
         least = np.float32(0.02 * grid.spacing)
         smooth = np.where(smooth > 0, np.maximum(smooth, least), np.minimum(smooth, -least))
         return enclose(smooth, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
-
-
-def _finer(
-    grid: Grid, fields: tuple[Float32[np.ndarray, "x y z"], ...], factor: int
-) -> tuple[Grid, tuple[Float32[np.ndarray, "a b c"], ...]]:
-    """Return fields on a grid of cells divided by `factor` along each axis, linear between their middles."""
-    if factor == 1:
-        return grid, fields
-    counts = [factor * (count - 1) + 1 for count in grid.shape]
-    finer = Grid(grid.lowest, grid.spacing / factor, (counts[0], counts[1], counts[2]))
-    return finer, tuple(_stretched(each, factor) for each in fields)
-
-
-def _stretched(values: Float32[np.ndarray, "x y z"], factor: int) -> Float32[np.ndarray, "a b c"]:
-    for axis in range(3):
-        count = values.shape[axis]
-        at = np.arange(factor * (count - 1) + 1) / factor
-        low = np.minimum(at.astype(int), count - 2)
-        shape = [1, 1, 1]
-        shape[axis] = -1
-        part = (at - low).astype(np.float32).reshape(shape)
-        values = values.take(low, axis) * (1 - part) + values.take(low + 1, axis) * part
-    return values

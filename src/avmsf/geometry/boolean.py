@@ -1,0 +1,20 @@
+"""One closed surface cut out of another."""
+
+import manifold3d
+import numpy as np
+import torch
+
+from avmsf.capture.surface import Surface
+
+
+def difference(surface: Surface, cut: Surface) -> Surface:
+    """Return the largest part that is left of what one closed surface encloses without what the other one does."""
+    left = _manifold(surface) - _manifold(cut)
+    mesh = max(left.decompose(), key=lambda part: float(part.volume()), default=left).to_mesh()
+    vertices, faces = np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts)
+    return Surface(torch.from_numpy(vertices).float(), torch.from_numpy(faces).long())
+
+
+def _manifold(surface: Surface) -> manifold3d.Manifold:
+    vertices, faces = surface.vertices.numpy().astype(np.float32), surface.faces.numpy().astype(np.uint32)
+    return manifold3d.Manifold(manifold3d.Mesh(vert_properties=vertices, tri_verts=faces))
