@@ -168,7 +168,8 @@ class ObjectShape:
     @cached_property
     def _signed_depth(self) -> Float32[np.ndarray, "x y z"]:
         """Distance below the outer side without its lids, meters; negative outside unless a lid is nearer."""
-        outside = (self.outer <= 0) & (self._depth <= distance_from(self.outer) * self.grid.spacing * 1.001)
+        near = self._depth <= 1.2 * np.abs(self.outer) + 0.5 * self.grid.spacing
+        outside = (self.outer <= 0) & near
         return np.where(outside, -self._depth, self._depth)
 
     def _emptied(self, thickness: float) -> Float32[np.ndarray, "x y z"] | None:

@@ -12,7 +12,6 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Bool, Float32, Float64, Int
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from avmsf.capture.levelset import enclose
 from avmsf.geometry.grid import Grid
@@ -46,22 +45,15 @@ def drawn_taut(
         return hull
     drawn = _membrane(places, faces, touched)
     inward = np.maximum(((places - drawn) * _normals(places, faces)).sum(axis=1), 0.0)
-    moved = inward > 0.25 * grid.spacing
-    if not moved.any():
-        return hull
-    reach = 2.0 * float(inward.max()) + 2.0 * grid.spacing
+    fall = np.zeros(grid.shape, dtype=np.float32)
+    cells = tuple(np.rint((places - grid.lowest) / grid.spacing).astype(int).T)
+    np.maximum.at(fall, cells, inward.astype(np.float32))
     far = np.ones(grid.shape, dtype=bool)
-    far[tuple(np.rint((places[moved] - grid.lowest) / grid.spacing).astype(int).T)] = False
+    far[cells] = False
+    nearest = ndimage.distance_transform_edt(far, return_distances=False, return_indices=True)
+    fall = fall[tuple(nearest)]
     # A flat roof is lowered as it is; far below it nothing changes.
-    near = np.argwhere((hull > 0) & (ndimage.distance_transform_edt(far) * grid.spacing < reach))
-    distance, rows = cKDTree(places).query(grid.places(near), distance_upper_bound=reach)
-    found = np.isfinite(distance)
-    near, distance, fall = near[found], distance[found], inward[rows[found]]
-    taut = hull.copy()
-    before = hull[tuple(near.T)]
-    lowered = np.minimum(before, distance - fall)
-    taut[tuple(near.T)] = np.where(distance < 2.0 * (fall + grid.spacing), lowered, before)
-    return taut
+    return np.where((hull > 0) & (hull < 2.0 * (fall + grid.spacing)), hull - fall, hull)
 
 
 def _touching(outline: Outline, places: Float64[np.ndarray, "places 3"], bent: np.ndarray) -> Int[np.ndarray, " found"]:
