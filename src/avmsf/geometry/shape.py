@@ -25,8 +25,10 @@ _LID_REACH = 0.6
 its area."""
 _THINNEST, _THICKEST = 0.003, 0.06
 """Wall thicknesses over the diagonal that are worth trying at all."""
-_FINE = 2.0
+_FINE = 1.5
 """Cells in the least thickness of a wall that marching cubes draw well."""
+_MOST_CELLS = 16e6
+"""Cells at most after that: a second's work."""
 _BLUR = 0.6
 """Standard deviation of the blur that takes steps out of surfaces, cells."""
 _FINEST = 4
@@ -74,6 +76,8 @@ class ObjectShape:
     """Meters inside what views show, cavities empty as far as seen; exact near the surface only."""
     hollow: Int[np.ndarray, "x y z"]
     """Number of the cavity, from 1, that each cell was seen to be in; 0 elsewhere."""
+    supposed: bool
+    """Whether no view saw into the cavities: they only may be there, behind flat faces."""
     diagonal: float
     """Of the box around the object, meters."""
     report: ShapeReport
@@ -102,6 +106,8 @@ class ObjectShape:
         """
         if not self.hollow.any():
             return None
+        if self.supposed:
+            return _THINNEST * self.diagonal, _THICKEST * self.diagonal
         rim = (self.hollow > 0) & ndimage.binary_dilation((self.hollow == 0) & (self.outer > 0)) & ~self._lids
         left = 1.5 * float(np.quantile(self._depth[rim], 0.5)) if rim.any() else 0.0
         most = min(max(left, 3 * _THINNEST * self.diagonal), _THICKEST * self.diagonal)
@@ -132,7 +138,8 @@ class ObjectShape:
                 f"a wall of {1000 * thickness:.3g} mm leaves nothing of the cavity: try less than "
                 f"{1000 * float(self._depth[self.hollow > 0].max()):.3g} mm"
             )
-        factor = int(np.clip(np.ceil(_FINE * self.grid.spacing / thickness), 1, _FINEST))
+        most = max(1, min(_FINEST, int((_MOST_CELLS / self.outer.size) ** (1 / 3))))
+        factor = int(np.clip(np.ceil(_FINE * self.grid.spacing / thickness), 1, most))
         grid, (outer, below, reach) = _finer(self.grid, (self.outer, self._signed_depth, empty), factor)
         values = np.minimum(outer, np.maximum(thickness - below, reach))
         return self._enclose(values, grid, faces)
@@ -142,7 +149,10 @@ class ObjectShape:
         """Cells inside the outer side at whose surface it only covers a cavity."""
         inside = self.outer > 0
         skin = inside & ~ndimage.binary_erosion(inside)
-        lids = skin & (self.seen <= 0) & ndimage.binary_dilation(self.hollow > 0, np.ones((3, 3, 3)))
+        if self.supposed:
+            lids = self.hollow > 0
+        else:
+            lids = skin & (self.seen <= 0) & ndimage.binary_dilation(self.hollow > 0, np.ones((3, 3, 3)))
         slopes = np.stack([-each for each in np.gradient(ndimage.gaussian_filter(self.outer, 1.5))], axis=-1)
         slopes /= np.maximum(np.linalg.norm(slopes, axis=-1, keepdims=True), 1e-12)
         label, count = ndimage.label(lids, np.ones((3, 3, 3)))
@@ -186,7 +196,8 @@ class ObjectShape:
         return away - np.float32(1.2 * margin)
 
     def _enclose(self, values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int) -> Surface:
-        smooth = ndimage.gaussian_filter(values, _BLUR)
+        # Finer cells are smooth by interpolation, and walls as thin as they are would be blurred away.
+        smooth = ndimage.gaussian_filter(values, _BLUR) if grid.spacing == self.grid.spacing else values
         # Triangles without area, where the surface passes through the middle of a cell, pinch coarser ones.
         least = np.float32(0.02 * grid.spacing)
         smooth = np.where(smooth > 0, np.maximum(smooth, least), np.minimum(smooth, -least))

@@ -32,8 +32,8 @@ _ROUNDS = 300
 
 def drawn_taut(
     hull: Float32[np.ndarray, "x y z"], outlines: Sequence[Outline], grid: Grid, diagonal: float
-) -> Float32[np.ndarray, "x y z"]:
-    """Return how far inside the taut hull each cell lies, meters; never more than inside the hull."""
+) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
+    """Return how far inside the taut hull each cell lies, meters, and how far from any outline's touch it lies."""
     surface = enclose(hull, 0.0, lowest=grid.lowest, spacing=grid.spacing)
     places, faces = surface.vertices.double().numpy(), surface.faces.numpy()
     full = ndimage.gaussian_filter((hull > 0).astype(np.float32), _ROUND * diagonal / grid.spacing)
@@ -42,7 +42,7 @@ def drawn_taut(
     for each in outlines:
         touched[_touching(each, places, bent)] = True
     if not touched.any():
-        return hull
+        return hull, np.full(grid.shape, diagonal, dtype=np.float32)
     drawn = _membrane(places, faces, touched)
     inward = np.maximum(((places - drawn) * _normals(places, faces)).sum(axis=1), 0.0)
     fall = np.zeros(grid.shape, dtype=np.float32)
@@ -53,7 +53,10 @@ def drawn_taut(
     nearest = ndimage.distance_transform_edt(far, return_distances=False, return_indices=True)
     fall = fall[tuple(nearest)]
     # A flat roof is lowered as it is; far below it nothing changes.
-    return np.where((hull > 0) & (hull < 2.0 * (fall + grid.spacing)), hull - fall, hull)
+    taut = np.where((hull > 0) & (hull < 2.0 * (fall + grid.spacing)), hull - fall, hull)
+    away = np.ones(grid.shape, dtype=bool)
+    away[tuple(each[touched] for each in cells)] = False
+    return taut, ndimage.distance_transform_edt(away).astype(np.float32) * np.float32(grid.spacing)
 
 
 def _touching(outline: Outline, places: Float64[np.ndarray, "places 3"], bent: np.ndarray) -> Int[np.ndarray, " found"]:
