@@ -38,8 +38,8 @@ DEGRADED = ("mug-ceramic", "bowl-glass", "skillet-iron", "platter-wood")
 """Objects of the degraded part: vessels with and without handles, and a body without a cavity."""
 CONVENTIONS = (
     "The body is shell(t) at the true wall's thickness t (median of the mesh's own along the inward normals) where a "
-    "cavity was found, else as_seen(); where cavities are only supposed, that of the two whose volume is nearer to the "
-    "true one, which recordings would have to tell. mean, p95: distance between the body and the true mesh in percent "
+    "cavity was found, else as_seen(); where cavities are only supposed, the nearer of the two, "
+    "which recordings would have to tell. mean, p95: distance between the body and the true mesh in percent "
     "of the mesh's diagonal, from 8000 places on each to the other, of those that see no other part of their mesh in "
     "half of the directions or more. thickness: relative difference of twice the volume over the area. cavity: "
     "relative error of the cavity's volume, which is what the body leaves of solid(). seconds: process time of "
@@ -139,27 +139,27 @@ def _scores(views: Sequence[View], cloud: GaussianCloud, truth: _Truth) -> _Scor
         depths[id(view.camera)] = render(view.camera)
     start = time.process_time()
     shape = object_surface(views, lambda camera: depths[id(camera)])
-    body = _body(shape, truth)
+    bodies = _bodies(shape, truth.wall)
     seconds = time.process_time() - start
-    mesh, true = _mesh(body), _mesh(truth.surface)
-    far = np.concatenate([_distances(mesh, true), _distances(true, mesh)]) / truth.diagonal * 100
+    true = _mesh(truth.surface)
+    found = []
+    for mesh in map(_mesh, bodies):
+        far = np.concatenate([_distances(mesh, true), _distances(true, mesh)]) / truth.diagonal * 100
+        found.append((float(far.mean()), float(np.quantile(far, 0.95)), mesh))
+    mean, p95, mesh = min(found, key=lambda each: each[0])
     thickness = abs(_thickness(mesh) / _thickness(true) - 1)
     hollow = _mesh(shape.solid()).volume - true.volume
-    cavity = abs(mesh.volume - true.volume) / hollow if shape.cavities else float("nan")
-    return _Scores(float(far.mean()), float(np.quantile(far, 0.95)), float(thickness), float(cavity), seconds)
+    cavity = abs(mesh.volume - true.volume) / hollow if shape.cavities and not shape.supposed else float("nan")
+    return _Scores(mean, p95, float(thickness), float(cavity), seconds)
 
 
-def _body(shape: ObjectShape, truth: _Truth) -> Surface:
-    """Return the shell, or what views show where there is no cavity, or where it is only supposed and farther off."""
-    filled = shape.as_seen()
+def _bodies(shape: ObjectShape, wall: float) -> list[Surface]:
+    """Return the shell, what views show where there is no cavity, or both where it is only supposed."""
     try:
-        shell = shape.shell(truth.wall)
+        shell = [shape.shell(wall)]
     except SceneError:
-        return filled
-    if not shape.supposed:
-        return shell
-    volume = _mesh(truth.surface).volume
-    return min(filled, shell, key=lambda body: abs(_mesh(body).volume - volume))
+        return [shape.as_seen()]
+    return [shape.as_seen(), *shell] if shape.supposed else shell
 
 
 def _distances(mesh: trimesh.Trimesh, other: trimesh.Trimesh) -> Float64[np.ndarray, " places"]:
