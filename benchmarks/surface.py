@@ -86,7 +86,7 @@ def measure(options: Options) -> Report:
 def _objects(folder: Path, clouds: Path, quick: bool) -> Report:
     rows: list[list[str | float]] = []
     found = []
-    for name in SIM20[:2] if quick else tuple(SIM20):
+    for name in tuple(SIM20)[: 2 if quick else None]:
         views, truth, cloud = _material(folder / name, clouds, quick)
         scores = _scores(views, cloud, truth)
         found.append(scores)
