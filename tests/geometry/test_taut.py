@@ -13,7 +13,7 @@ def _hull(mesh: trimesh.Trimesh, *, taut: bool) -> trimesh.Trimesh:
     outlines = [Outline.of(view) for view in views_of(mesh, azimuths=24)]
     grid = Grid.around(mesh.bounds[0] - 0.03, mesh.bounds[1] + 0.03, cells=96, finest=1.0, margin=2)
     hull = hull_distance(outlines, grid, rank=0)
-    values = drawn_taut(hull, outlines, grid, float(np.linalg.norm(mesh.extents))) if taut else hull
+    values = drawn_taut(hull, outlines, grid, float(np.linalg.norm(mesh.extents)))[0] if taut else hull
     return mesh_of(enclose(values, 0.0, lowest=grid.lowest, spacing=grid.spacing))
 
 

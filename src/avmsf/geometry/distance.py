@@ -24,8 +24,7 @@ def distance_from(
     left_out = np.zeros(values.shape, dtype=np.bool_) if without is None else without
     _begin(values, left_out, nearest, distance)
     if np.isfinite(distance).any():
-        for _ in range(2):
-            _sweep(nearest, distance)
+        _sweep(nearest, distance)
     return distance
 
 

@@ -46,6 +46,13 @@ _CLOSED = 4000
 """Triangles of the surface whose convex hull closes what no view sees."""
 _NARROW = 2
 """Half the width of hollows that are none, cells."""
+_UNTOUCHED = 0.025
+"""Distance from the nearest touch of an outline, over the diagonal, from which on a place is inside a face of which
+outlines tell the edge alone. Touches on round parts are three pixels apart."""
+_ALIKE = 0.7
+"""Area of such a face over that of the largest, from which on both are openings or neither: the ends of a tube."""
+_LARGE_FACE = 0.02
+"""Part of the surface that a face must be for a supposed opening."""
 _HOLLOW_DEPTH = 0.08
 """Depth below its lid, over the diagonal, from which on what is free is a cavity."""
 _HOLLOW_VOLUME = 0.08
@@ -70,17 +77,22 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     outlines = [outline for outline, each in zip(outlines, right, strict=True) if each]
     hull = _hull(outlines, grid)
     diagonal = _extent(hull > 0, grid, len(kept))
-    hull = drawn_taut(hull, outlines, grid, diagonal)
+    hull, untouched = drawn_taut(hull, outlines, grid, diagonal)
     depths = [_Depth(view, depth_map(view.camera).detach().cpu().float().numpy()) for view in kept]
     bias = _bias(hull, grid, depths, diagonal)
     free, sights = _free(hull, grid, depths, bias, diagonal)
     seen = np.minimum(hull, _SLACK * diagonal - free)
     seen, bound, unseen, direction = _closed(hull, seen, sights, grid)
     hollow = _hollows(bound, seen, grid, diagonal)
-    outer = np.where(_covered(hollow > 0, (bound > 0) & (seen <= 0)), np.maximum(seen, bound), seen)
+    supposed = not hollow.any()
+    if supposed:
+        hollow = _supposed(seen, untouched > _UNTOUCHED * diagonal)
+    outer = seen
+    if not supposed:
+        outer = np.where(_covered(hollow > 0, (bound > 0) & (seen <= 0)), np.maximum(seen, bound), seen)
     rejected = tuple(view.name for view, each in zip(masked, right, strict=True) if not each)
     report = ShapeReport(len(kept), rejected, bias, unseen, direction)
-    return ObjectShape(grid, outer, seen, hollow, diagonal, report)
+    return ObjectShape(grid, outer, seen, hollow, supposed, diagonal, report)
 
 
 class _Depth:
@@ -190,6 +202,23 @@ def _free(
     band = _BAND * diagonal
     free, sights = fused_depth(known, grid, hull > -2 * grid.spacing, band=band, quantile=_QUANTILE, least=least)
     return ndimage.gaussian_filter(free, 1.0), sights
+
+
+def _supposed(seen: Float32[np.ndarray, "x y z"], untouched: Bool[np.ndarray, "x y z"]) -> np.ndarray:
+    """Return cavities, numbered, right below the largest faces that no outline touches, as deep as a cell.
+
+    Outlines do not say whether such a face is there, or only its edge.
+    """
+    inside = seen > 0
+    shallow = inside & ~ndimage.binary_erosion(inside)
+    skin = shallow & untouched
+    label, count = ndimage.label(skin, np.ones((3, 3, 3)))
+    sizes = np.bincount(label.ravel(), minlength=count + 1)[1:]
+    total = int(shallow.sum())
+    large = [row + 1 for row in range(count) if sizes[row] >= max(_ALIKE * sizes.max(), _LARGE_FACE * total)]
+    numbers = np.zeros(count + 1, dtype=np.int32)
+    numbers[large] = np.arange(1, len(large) + 1)
+    return numbers[label]
 
 
 def _closed(

@@ -71,6 +71,8 @@ class ObjectShape:
     """Meters inside what views show, cavities empty as far as seen; exact near the surface only."""
     hollow: Int[np.ndarray, "x y z"]
     """Number of the cavity, from 1, that each cell was seen to be in; 0 elsewhere."""
+    supposed: bool
+    """Whether no view saw into the cavities: they only may be there, behind flat faces."""
     diagonal: float
     """Of the box around the object, meters."""
     report: ShapeReport
@@ -99,6 +101,8 @@ class ObjectShape:
         """
         if not self.hollow.any():
             return None
+        if self.supposed:
+            return _THINNEST * self.diagonal, _THICKEST * self.diagonal
         rim = (self.hollow > 0) & ndimage.binary_dilation((self.hollow == 0) & (self.outer > 0)) & ~self._lids
         left = 1.5 * float(np.quantile(self._depth[rim], 0.5)) if rim.any() else 0.0
         most = min(max(left, 3 * _THINNEST * self.diagonal), _THICKEST * self.diagonal)
@@ -143,7 +147,10 @@ class ObjectShape:
         """Cells inside the outer side at whose surface it only covers a cavity."""
         inside = self.outer > 0
         skin = inside & ~ndimage.binary_erosion(inside)
-        lids = skin & (self.seen <= 0) & ndimage.binary_dilation(self.hollow > 0, np.ones((3, 3, 3)))
+        if self.supposed:
+            lids = self.hollow > 0
+        else:
+            lids = skin & (self.seen <= 0) & ndimage.binary_dilation(self.hollow > 0, np.ones((3, 3, 3)))
         slopes = np.stack([-each for each in np.gradient(ndimage.gaussian_filter(self.outer, 1.5))], axis=-1)
         slopes /= np.maximum(np.linalg.norm(slopes, axis=-1, keepdims=True), 1e-12)
         label, count = ndimage.label(lids, np.ones((3, 3, 3)))
@@ -169,7 +176,8 @@ class ObjectShape:
     @cached_property
     def _signed_depth(self) -> Float32[np.ndarray, "x y z"]:
         """Distance below the outer side without its lids, meters; negative outside unless a lid is nearer."""
-        outside = (self.outer <= 0) & (self._depth <= distance_from(self.outer) * self.grid.spacing * 1.001)
+        near = self._depth <= 1.2 * np.abs(self.outer) + 0.5 * self.grid.spacing
+        outside = (self.outer <= 0) & near
         return np.where(outside, -self._depth, self._depth)
 
     def _emptied(self, thickness: float) -> Float32[np.ndarray, "x y z"] | None:
@@ -186,7 +194,8 @@ class ObjectShape:
         return away - np.float32(1.2 * margin)
 
     def _enclose(self, values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int) -> Surface:
-        smooth = ndimage.gaussian_filter(values, _BLUR)
+        # Finer cells are smooth by interpolation, and walls as thin as they are would be blurred away.
+        smooth = ndimage.gaussian_filter(values, _BLUR) if grid.spacing == self.grid.spacing else values
         # Triangles without area, where the surface passes through the middle of a cell, pinch coarser ones.
         least = np.float32(0.02 * grid.spacing)
         smooth = np.where(smooth > 0, np.maximum(smooth, least), np.minimum(smooth, -least))

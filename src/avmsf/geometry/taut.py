@@ -12,7 +12,6 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Bool, Float32, Float64, Int
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from avmsf.capture.levelset import enclose
 from avmsf.geometry.grid import Grid
@@ -33,8 +32,8 @@ _ROUNDS = 300
 
 def drawn_taut(
     hull: Float32[np.ndarray, "x y z"], outlines: Sequence[Outline], grid: Grid, diagonal: float
-) -> Float32[np.ndarray, "x y z"]:
-    """Return how far inside the taut hull each cell lies, meters; never more than inside the hull."""
+) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
+    """Return how far inside the taut hull each cell lies, meters, and how far from any outline's touch it lies."""
     surface = enclose(hull, 0.0, lowest=grid.lowest, spacing=grid.spacing)
     places, faces = surface.vertices.double().numpy(), surface.faces.numpy()
     full = ndimage.gaussian_filter((hull > 0).astype(np.float32), _ROUND * diagonal / grid.spacing)
@@ -43,25 +42,21 @@ def drawn_taut(
     for each in outlines:
         touched[_touching(each, places, bent)] = True
     if not touched.any():
-        return hull
+        return hull, np.full(grid.shape, diagonal, dtype=np.float32)
     drawn = _membrane(places, faces, touched)
     inward = np.maximum(((places - drawn) * _normals(places, faces)).sum(axis=1), 0.0)
-    moved = inward > 0.25 * grid.spacing
-    if not moved.any():
-        return hull
-    reach = 2.0 * float(inward.max()) + 2.0 * grid.spacing
+    fall = np.zeros(grid.shape, dtype=np.float32)
+    cells = tuple(np.rint((places - grid.lowest) / grid.spacing).astype(int).T)
+    np.maximum.at(fall, cells, inward.astype(np.float32))
     far = np.ones(grid.shape, dtype=bool)
-    far[tuple(np.rint((places[moved] - grid.lowest) / grid.spacing).astype(int).T)] = False
+    far[cells] = False
+    nearest = ndimage.distance_transform_edt(far, return_distances=False, return_indices=True)
+    fall = fall[tuple(nearest)]
     # A flat roof is lowered as it is; far below it nothing changes.
-    near = np.argwhere((hull > 0) & (ndimage.distance_transform_edt(far) * grid.spacing < reach))
-    distance, rows = cKDTree(places).query(grid.places(near), distance_upper_bound=reach)
-    found = np.isfinite(distance)
-    near, distance, fall = near[found], distance[found], inward[rows[found]]
-    taut = hull.copy()
-    before = hull[tuple(near.T)]
-    lowered = np.minimum(before, distance - fall)
-    taut[tuple(near.T)] = np.where(distance < 2.0 * (fall + grid.spacing), lowered, before)
-    return taut
+    taut = np.where((hull > 0) & (hull < 2.0 * (fall + grid.spacing)), hull - fall, hull)
+    away = np.ones(grid.shape, dtype=bool)
+    away[tuple(each[touched] for each in cells)] = False
+    return taut, ndimage.distance_transform_edt(away).astype(np.float32) * np.float32(grid.spacing)
 
 
 def _touching(outline: Outline, places: Float64[np.ndarray, "places 3"], bent: np.ndarray) -> Int[np.ndarray, " found"]:
