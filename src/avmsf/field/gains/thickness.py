@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from avmsf.simulate.nominal import NominalBody
 
@@ -19,6 +20,9 @@ _MOST = 6
 """Bodies computed at most."""
 _UNLIKELY = math.log(100.0)
 """Log evidence (nats) below the most probable body's, from which on a body is no hypothesis."""
+_DISCREPANCY = 0.15
+"""Standard deviation of the log thickness that errors of the shape leave, which the evidence takes for right: found for
+a mug, a jug and a bowl from photographs were .86, .85 and 1.05 of the walls' thickness, each within 3 % by evidence."""
 _STEPS = 2000
 """Thicknesses on which the posterior is summed up."""
 
@@ -88,8 +92,9 @@ def _next(places: np.ndarray, values: np.ndarray) -> float | None:
 
 def _posterior(walls: Sequence[tuple[float, float]]) -> ThicknessPosterior:
     places, values = np.log([wall for wall, _ in walls]), np.array([each for _, each in walls])
-    grid = np.linspace(places[0], places[-1], _STEPS)
-    density = np.exp(np.interp(grid, places, values - values.max()))
+    grid = np.linspace(places[0] - 3 * _DISCREPANCY, places[-1] + 3 * _DISCREPANCY, _STEPS)
+    likely = np.exp(np.interp(grid, places, values - values.max(), left=-np.inf, right=-np.inf))
+    density = gaussian_filter1d(likely, _DISCREPANCY / (grid[1] - grid[0]), mode="constant")
     share = np.cumsum(density) / density.sum()
     low, median, high = np.exp(grid[np.searchsorted(share, [0.05, 0.5, 0.95])])
     return ThicknessPosterior(float(median), float(low), float(high))
