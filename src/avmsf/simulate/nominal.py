@@ -271,7 +271,9 @@ class _Maker:
             try:
                 return NominalBody(wall, self._modes(wall, trial, perturbed=False), fine=False)
             except SimulationError as error:
-                # Thin walls are lost in few tetrahedra.
+                # Thin walls are lost in few tetrahedra. A shape has other thicknesses, and the thinnest is a bound.
+                if self._shape is not None:
+                    raise
                 self._tell(f"again with more tetrahedra ({error})")
         return NominalBody(wall, self._converged(wall, freedoms))
 
