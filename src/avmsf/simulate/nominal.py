@@ -280,7 +280,8 @@ class _Maker:
     def _converged(self, wall: float | None, freedoms: int) -> ElasticModes:
         """Return modes of one body, of twice as many degrees of freedom where their frequencies still change much."""
         modes = self._modes(wall, freedoms, perturbed=True)
-        if freedoms <= TRIAL:
+        # The thickness of a shape's wall is found with such elements, and makes up for their stiffness.
+        if freedoms <= TRIAL or self._shape is not None:
             return modes
         try:
             error = _frequency_error(self._modes(wall, TRIAL, perturbed=False), modes)
