@@ -1,0 +1,68 @@
+"""Bodies of a shape as photographs show it: what was seen, and walls of several thicknesses."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+import trimesh
+
+from avmsf.capture.surface import Surface
+from avmsf.errors import SceneError
+from avmsf.geometry.boolean import difference
+from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
+from avmsf.simulate.nominal import nominal_bodies, with_wall
+
+SIDES = (0.08, 0.06, 0.05)
+
+
+def box(inset: float, *, above: float = 0.0) -> Surface:
+    """Return the block that the cup is cut from, each side but the upper one moved inwards."""
+    low, high = (inset, inset, inset), (SIDES[0] - inset, SIDES[1] - inset, SIDES[2] + above)
+    made = trimesh.creation.box(bounds=(low, high))
+    return Surface(torch.tensor(made.vertices).float(), torch.tensor(made.faces))
+
+
+@dataclass(frozen=True, eq=False)
+class Cup:
+    """A cup of flat sides whose wall is unknown; walls above `most` leave nothing of its cavity."""
+
+    most: float = 0.02
+    thickness_range: tuple[float, float] | None = (0.006, 0.018)
+
+    def as_seen(self) -> Surface:
+        return box(0.0)
+
+    def shell(self, thickness: float) -> Surface:
+        if thickness > self.most:
+            raise SceneError("nothing is left of the cavity")
+        return difference(self.as_seen(), box(thickness, above=0.01))
+
+
+def test_walls_cover_the_range_and_thicker_ones_are_stiffer() -> None:
+    filled, *walls = nominal_bodies(Cup(), count=6, freedoms=4000).bodies
+    assert filled.wall is None
+    assert [body.wall for body in walls] == pytest.approx([0.006 * 3 ** (step / 4) for step in range(5)])
+    lowest = [float(body.elastic.frequency[0]) for body in walls]
+    assert lowest == sorted(lowest)
+    # Of panels that bend, frequencies go with the thickness, 1.32 here, and panels between thicker walls are smaller.
+    assert 1.3 < lowest[1] / lowest[0] < 1.6
+
+
+def test_walls_that_cannot_be_had_are_left_out() -> None:
+    found = nominal_bodies(Cup(most=0.01), count=6, freedoms=4000)
+    assert [body.wall is None or body.wall <= 0.01 for body in found.bodies] == [True] * len(found.bodies)
+    assert {wall for wall in found.refused if wall is not None and wall > 0.01} == set(found.refused)
+    assert with_wall(Cup(most=0.01), 0.011, count=6, freedoms=4000) is None
+
+
+def test_the_thickness_is_searched_for_unless_it_is_known_or_there_is_no_cavity() -> None:
+    config = BodyConfig(shapes=6, freedoms=4000)
+    searched = candidate_bodies(Cup(), config)
+    assert searched.thicken is not None
+    body = searched.thicken(0.007)
+    assert body is not None
+    assert body.wall == 0.007
+    known = candidate_bodies(Cup(), BodyConfig(wall=0.005, shapes=6, freedoms=4000))
+    assert (known.thicken, [each.wall for each in known.bodies.bodies]) == (None, [0.005])
+    solid = candidate_bodies(Cup(thickness_range=None), config)
+    assert (solid.thicken, [each.wall for each in solid.bodies.bodies]) == (None, [None])
