@@ -105,3 +105,19 @@ def test_views_without_masks_are_refused() -> None:
     views = [replace(view, mask=None) for view in views_of(mesh, azimuths=4)]
     with pytest.raises(SceneError):
         object_surface(views, depth_of(mesh))
+
+
+def test_the_digest_is_of_all_that_decides_the_surfaces(cup_shape: ObjectShape) -> None:
+    others = [replace(cup_shape, **{name: getattr(cup_shape, name) + 1}) for name in ("outer", "seen", "hollow")]
+    others.append(replace(cup_shape, supposed=not cup_shape.supposed))
+    assert len({each.digest() for each in (cup_shape, replace(cup_shape), *others)}) == 5
+
+
+def test_a_wall_as_thick_as_the_cup_is_wide_is_refused(cup_shape: ObjectShape) -> None:
+    for part in (0.8, 0.9, 0.95, 1.0, 1.2):
+        try:
+            assert mesh_of(cup_shape.shell(part * RADIUS)).is_watertight
+        except SceneError:
+            continue
+    with pytest.raises(SceneError):
+        cup_shape.shell(1.2 * RADIUS)

@@ -32,6 +32,9 @@ class Cup:
     def as_seen(self) -> Surface:
         return box(0.0)
 
+    def digest(self) -> str:
+        return f"{self}"
+
     def shell(self, thickness: float) -> Surface:
         if thickness > self.most:
             raise SceneError("nothing is left of the cavity")

@@ -5,11 +5,17 @@ import numpy as np
 import torch
 
 from avmsf.capture.surface import Surface
+from avmsf.errors import SceneError
 
 
 def difference(surface: Surface, cut: Surface) -> Surface:
-    """Return the largest part that is left of what one closed surface encloses without what the other one does."""
+    """Return the largest part that is left of what one closed surface encloses without what the other one does.
+
+    It has no triangles where nothing is left. Raises SceneError for surfaces that are not closed.
+    """
     left = _manifold(surface) - _manifold(cut)
+    if left.status() != manifold3d.Error.NoError:
+        raise SceneError(f"expected two closed surfaces, got {left.status().name}: make the shape on finer cells")
     mesh = max(left.decompose(), key=lambda part: float(part.volume()), default=left).to_mesh()
     vertices, faces = np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts)
     return Surface(torch.from_numpy(vertices).float(), torch.from_numpy(faces).long())

@@ -1,5 +1,6 @@
 """An object's shape on a grid: its outer side, its cavities, and the bodies that it may be."""
 
+import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,7 +10,7 @@ from scipy import ndimage
 
 from avmsf.capture.levelset import enclose
 from avmsf.capture.surface import Surface
-from avmsf.errors import SceneError
+from avmsf.errors import CaptureError, SceneError
 from avmsf.geometry.boolean import difference
 from avmsf.geometry.distance import distance_from
 from avmsf.geometry.grid import Grid
@@ -194,9 +195,31 @@ class ObjectShape:
         return away - np.float32(1.2 * margin)
 
     def _enclose(self, values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int) -> Surface:
-        # Finer cells are smooth by interpolation, and walls as thin as they are would be blurred away.
-        smooth = ndimage.gaussian_filter(values, _BLUR) if grid.spacing == self.grid.spacing else values
+        smooth = ndimage.gaussian_filter(values, _BLUR)
         # Triangles without area, where the surface passes through the middle of a cell, pinch coarser ones.
         least = np.float32(0.02 * grid.spacing)
         smooth = np.where(smooth > 0, np.maximum(smooth, least), np.minimum(smooth, -least))
-        return enclose(smooth, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
+        try:
+            return enclose(smooth, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
+        except CaptureError as error:
+            raise SceneError(
+                f"expected a shape with an inside, found none on a grid of {grid.shape}: {error}"
+            ) from error
+
+    def describe(self) -> str:
+        """Say what is known of the shape: its cavities, what no view saw, and masks that were left out."""
+        count = int(self.hollow.max())
+        cavities = f"{count or 'no'} {'cavities' if count > 1 else 'cavity'}"
+        parts = [f"{cavities}{', supposed behind faces that no outline touches' if self.supposed and count else ''}"]
+        if self.report.unseen > 0:
+            parts.append(f"{self.report.unseen:.0%} of the surface was seen by no view and is closed")
+        if self.report.rejected:
+            parts.append(f"masks left out, which contradict the others: {', '.join(self.report.rejected)}")
+        return "; ".join(parts)
+
+    def digest(self) -> str:
+        """Return a digest of all that decides the surfaces."""
+        content = hashlib.sha256(f"{self.grid} {self.supposed} {self.diagonal}".encode())
+        for values in (self.outer, self.seen, self.hollow):
+            content.update(np.ascontiguousarray(values).tobytes())
+        return content.hexdigest()

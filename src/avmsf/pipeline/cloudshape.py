@@ -33,7 +33,7 @@ def shape_of_cloud(cloud: GaussianCloud, views: Sequence[View] = (), *, cells: i
     """
     cloud = _visible(cloud)
     rasteriser = choose_rasteriser(cloud.centers.device)
-    if sum(view.mask is not None for view in views) < _FEWEST_MASKS:
+    if sum(view.mask is not None and bool((view.mask > 127).any()) for view in views) < _FEWEST_MASKS:
         views = views_of_cloud(cloud, rasteriser, size=_SIZE)
     return object_surface(views, depth_of_cloud(cloud, rasteriser), cells=cells)
 

@@ -153,7 +153,9 @@ class SceneStages:
         """
         views, cloud = read_views(self.views.path), read_splats(self.cloud.path)
         self.listener.tell(f"shape: of {len(views)} views and {len(cloud)} Gaussians")
-        return shape_of_cloud(cloud, views)
+        shape = shape_of_cloud(cloud, views)
+        self.listener.tell(f"shape: {shape.describe()}")
+        return shape
 
     def made(self) -> dict[str, Kept]:
         """Return the stages that were needed so far, in order."""

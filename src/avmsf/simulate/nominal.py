@@ -60,7 +60,11 @@ class Shape(Protocol):
         ...
 
     def shell(self, thickness: float) -> Surface:
-        """Return the closed surface of a wall, meters thick, behind the outer side."""
+        """Return the closed surface of a wall, meters thick, behind the outer side. Raises SceneError without one."""
+        ...
+
+    def digest(self) -> str:
+        """Return a digest of all that decides the surfaces."""
         ...
 
 
@@ -137,7 +141,7 @@ def nominal_bodies(
     for wall in likely:
         try:
             bodies.append(maker.body(wall, freedoms, fine=fine))
-        except (SimulationError, SceneError) as error:
+        except SimulationError as error:
             refused[wall] = str(error)
     reasons = _grouped(refused)
     for reason in reasons:
@@ -166,7 +170,7 @@ def with_wall(
     told = tell or (lambda words: None)
     try:
         return _Maker(surface, count, cache, told).body(wall, freedoms, fine=False)
-    except (SimulationError, SceneError) as error:
+    except SimulationError as error:
         told(f"not tried: {body_name(wall)}: {error}")
         return None
 
@@ -209,19 +213,20 @@ def supported(
 ) -> tuple[NominalBody, ...]:
     """Return a free body of `nominal_bodies`, and held where an object may be: at its lowest face or point, or an edge.
 
-    All have the same tetrahedra, of `TRIAL` degrees of freedom at most: enough to choose by; `refined` makes the chosen
-    one fine, without a check of its convergence. Those whose modes cannot be computed are left out, of which `tell`
-    hears; none are returned if the free one's cannot.
+    All have the same tetrahedra, of `TRIAL` or `WALL_TRIAL` degrees of freedom at most, enough to choose by; `refined`
+    makes the chosen one fine, without a check of its convergence. Those whose modes cannot be computed are left out, of
+    which `tell` hears; none are returned if the free one's cannot.
     """
     told = tell or (lambda words: None)
-    few = min(freedoms, TRIAL)
+    trial = TRIAL if isinstance(surface, Surface) else WALL_TRIAL
+    few = min(freedoms, trial)
     maker, bodies = _Maker(surface, len(body.elastic), cache, told), []
     try:
         solid = maker.solid(body.wall, few)
         for support in (None, *supports_of(SecondOrder.of(solid))):
             try:
-                modes = maker.held(body.wall, few, solid, support, perturbed=freedoms <= TRIAL)
-                bodies.append(NominalBody(body.wall, modes, freedoms <= TRIAL, support))
+                modes = maker.held(body.wall, few, solid, support, perturbed=freedoms <= trial)
+                bodies.append(NominalBody(body.wall, modes, freedoms <= trial, support))
             except SimulationError as error:
                 if support is None:
                     raise
@@ -235,10 +240,14 @@ class _Maker:
     """Makes the bodies of one surface or shape, and does once what all of them need."""
 
     def __init__(self, surface: Surface | Shape, count: int, cache: Path | None, tell: Callable[[str], None]) -> None:
-        self._shape = surface if isinstance(surface, Shape) else None
-        self._seen = surface if isinstance(surface, Surface) else surface.as_seen()
+        self._given = surface
+        self._shape = None if isinstance(surface, Surface) else surface
         self._count, self._cache, self._tell = count, cache, tell
         self._walls: dict[int, Callable[[float], Solid]] = {}
+
+    @cached_property
+    def _seen(self) -> Surface:
+        return self._given if isinstance(self._given, Surface) else self._given.as_seen()
 
     @cached_property
     def checked(self) -> CheckedSurface:
@@ -281,7 +290,7 @@ class _Maker:
         """Return modes of one body, of twice as many degrees of freedom where their frequencies still change much."""
         modes = self._modes(wall, freedoms, perturbed=True)
         # The thickness of a shape's wall is found with such elements, and makes up for their stiffness.
-        if freedoms <= TRIAL or self._shape is not None:
+        if freedoms <= TRIAL or (self._shape is not None and wall is not None):
             return modes
         try:
             error = _frequency_error(self._modes(wall, TRIAL, perturbed=False), modes)
@@ -337,7 +346,11 @@ class _Maker:
         if wall is None:
             return filled_solid(self.checked, freedoms)
         if self._shape is not None:
-            return filled_solid(checked(self._shape.shell(wall), tell=self._tell), freedoms)
+            try:
+                surface = self._shape.shell(wall)
+            except SceneError as error:
+                raise SimulationError(str(error)) from error
+            return filled_solid(checked(surface, tell=self._tell), freedoms)
         if freedoms not in self._walls:
             self._walls[freedoms] = wall_solids(self.checked, freedoms)
         return self._walls[freedoms](wall)
@@ -362,9 +375,10 @@ class _Maker:
 
     @cached_property
     def _digest(self) -> str:
-        """Digest of the surface's vertices and triangles, or those of a thin wall."""
-        between = None if self._shape is None else self._shape.thickness_range
-        surface = self._seen if self._shape is None or between is None else self._shape.shell(between[0])
+        """Digest of the surface's vertices and triangles, or of the shape."""
+        if self._shape is not None:
+            return self._shape.digest()
+        surface = self._seen
         vertices, faces = surface.vertices.double().cpu().numpy(), surface.faces.long().cpu().numpy()
         content = hashlib.sha256(f"{vertices.shape} {faces.shape}".encode())
         content.update(vertices.tobytes())

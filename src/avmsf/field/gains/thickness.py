@@ -44,7 +44,7 @@ def search_thickness(
     evidence: Callable[[Sequence[NominalBody]], Sequence[float]],
     with_wall: Callable[[float], NominalBody | None],
 ) -> tuple[list[NominalBody], ThicknessPosterior | None]:
-    """Return the bodies that are not improbable, and the posterior of the thickness.
+    """Return the bodies that are not improbable, the most probable one first, and the posterior of the thickness.
 
     `evidence` has the log evidence of the gains with each body by itself, nats. `with_wall` computes a body with a wall
     of a thickness in meters, None where that fails. There is no posterior where a body without a wall is the most
@@ -61,9 +61,9 @@ def search_thickness(
             break
         [found[body]] = evidence([body])
     best = max(found, key=found.__getitem__)
-    likely = [body for body, each in found.items() if each > found[best] - _UNLIKELY]
+    likely = sorted((body for body, each in found.items() if each > found[best] - _UNLIKELY), key=found.__getitem__)
     walls = _walls(found)
-    return likely, None if best.wall is None or len(walls) < 2 else _posterior(walls)
+    return likely[::-1], None if best.wall is None or len(walls) < 2 else _posterior(walls)
 
 
 def _walls(found: dict[NominalBody, float]) -> list[tuple[float, float]]:
