@@ -35,7 +35,7 @@ class Cup:
     def digest(self) -> str:
         return f"{self}"
 
-    def shell(self, thickness: float) -> Surface:
+    def shell(self, thickness: float, *, faces: int) -> Surface:
         if thickness > self.most:
             raise SceneError("nothing is left of the cavity")
         return difference(self.as_seen(), box(thickness, above=0.01))

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -10,6 +11,7 @@ from types import MappingProxyType
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Int
 
 from avmsf._utils.caching import source_digest
@@ -21,7 +23,7 @@ from avmsf.simulate.elasticstore import modes_once
 from avmsf.simulate.elements import SecondOrder
 from avmsf.simulate.material import Material
 from avmsf.simulate.nominalcheck import CheckedSurface, checked
-from avmsf.simulate.nominalsolid import FEWEST, expect_memory, filled_solid, freedoms_of, wall_solids
+from avmsf.simulate.nominalsolid import FEWEST, TRIANGLES, expect_memory, filled_solid, freedoms_of, wall_solids
 from avmsf.simulate.recipe import key_of
 from avmsf.simulate.solid import Solid
 
@@ -59,8 +61,11 @@ class Shape(Protocol):
         """Return the closed surface of what was seen, both sides of walls included."""
         ...
 
-    def shell(self, thickness: float) -> Surface:
-        """Return the closed surface of a wall, meters thick, behind the outer side. Raises SceneError without one."""
+    def shell(self, thickness: float, *, faces: int) -> Surface:
+        """Return the closed surface of a wall, meters thick, behind the outer side. Raises SceneError without one.
+
+        Each of its sides has about so many triangles.
+        """
         ...
 
     def digest(self) -> str:
@@ -137,12 +142,17 @@ def nominal_bodies(
         except SimulationError as error:
             refused[wall] = str(error)
     fine = len(likely) == 1
-    bodies = []
-    for wall in likely:
+
+    def made(wall: float | None) -> NominalBody | None:
         try:
-            bodies.append(maker.body(wall, freedoms, fine=fine))
+            return maker.body(wall, freedoms, fine=fine)
         except SimulationError as error:
             refused[wall] = str(error)
+            return None
+
+    # Tetrahedra are made in processes, and factorizations let other threads run.
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        bodies = [body for body in pool.map(made, likely) if body is not None]
     reasons = _grouped(refused)
     for reason in reasons:
         told(f"not tried: {reason}")
@@ -347,7 +357,7 @@ class _Maker:
             return filled_solid(self.checked, freedoms)
         if self._shape is not None:
             try:
-                surface = self._shape.shell(wall)
+                surface = self._shape.shell(wall, faces=round(0.5 * TRIANGLES * freedoms))
             except SceneError as error:
                 raise SimulationError(str(error)) from error
             return filled_solid(checked(surface, tell=self._tell), freedoms)
