@@ -44,7 +44,7 @@ from avmsf.simulate.closest import ClosestPoints
 CACHE = ".avmsf"
 """Folder inside the capture's that keeps what each stage made."""
 SURFACE = "surface.ply"
-"""What the stage of the object's surface calls its output, in metres."""
+"""What the stage of the object's surface calls its output, in meters."""
 MODES, FIELD = "modes.safetensors", "field.safetensors"
 """What the last stages call their outputs."""
 OFF_MESH = 0.02
@@ -150,10 +150,10 @@ def _reconstruct(
         return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, tell=listener.tell)
 
     def make(path: Path) -> None:
-        listener.tell(f"fit: a field of {len(modes.bank)} modes")
         gains = estimator_for(
             config.gain_model, bodies, symmetries=shape.symmetries, features=shape.features, log=listener.tell
         )
+        listener.tell(f"fit: a field of {len(modes.bank)} modes")
         fitted = fit(
             train,
             shape.features if config.gain_model == Visual.kind else shape.points,
