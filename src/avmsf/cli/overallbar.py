@@ -68,7 +68,7 @@ class OverallBar:
         stage = words.partition(":")[0]
         if stage in self.stages:
             self._stage = stage
-            self._advance(0.0)
+        self._advance(0.0)
         if self._live:
             self._bar.update(self._task, description=words[:60])
         else:
