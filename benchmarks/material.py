@@ -13,7 +13,7 @@ from avmsf.capture.audio import read_recording
 from avmsf.capture.onset import find_second_push
 from avmsf.capture.prepare import prepare
 from avmsf.scene.features import FeatureField
-from avmsf.simulate.example import EXAMPLE_FOLDER, example_surface
+from avmsf.simulate.example import EXAMPLE_FOLDER, example_mesh
 from avmsf.simulate.plate import Plate, plate_surface_points, sample_contacts, strike
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -97,7 +97,7 @@ def capture_in_place(name: str) -> Capture:
 
 def example_capture() -> Capture:
     """Read the built-in example, and give it the mesh that it was simulated from."""
-    return replace(read_capture(EXAMPLE_FOLDER), surface=example_surface())
+    return replace(read_capture(EXAMPLE_FOLDER), surface=example_mesh().surface)
 
 
 def surface_features(capture: Capture) -> FeatureField:

@@ -12,7 +12,7 @@ from avmsf.capture.views import read_views
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.simulate.closest import ClosestPoints
-from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER, example_surface
+from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER, example_mesh
 from avmsf.simulate.truth import read_truth
 
 
@@ -50,7 +50,7 @@ def test_the_example_is_small_and_whole() -> None:
 
 def test_the_example_shows_its_shape_in_photographs_alone() -> None:
     assert read_capture(EXAMPLE_FOLDER).surface is None
-    shape = example_surface()
+    shape = example_mesh().surface
     contacts = read_truth(EXAMPLE_FOLDER).contacts
     assert contacts is not None
     nearest = ClosestPoints(shape.vertices.double().numpy()[shape.faces.numpy()])

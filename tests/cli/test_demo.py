@@ -22,7 +22,7 @@ from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig
 from avmsf.scene.ply import read_splats
 from avmsf.scene.splatconfig import SplatConfig
-from avmsf.simulate.example import EXAMPLE, example_surface
+from avmsf.simulate.example import EXAMPLE, example_mesh
 from plate_field import QUICK
 
 METHODS = {
@@ -73,7 +73,7 @@ def test_the_demo_as_shipped_uses_elastic_mode_shapes_and_beats_the_nearest_reco
     record = json.loads((folder / "demo.json").read_text())
     assert not any(name.startswith("capture/surface.") for name in record["files"])
     surface = read_surface(folder / "mug-surface.ply").vertices
-    true = example_surface().vertices
+    true = example_mesh().vertices
     # A pixel of the photographs is .6 mm wide; below the mug, the hull is three of them too low.
     for side in (torch.amin, torch.amax):
         assert float((side(surface, 0) - side(true, 0)).abs().max()) < 0.0025
