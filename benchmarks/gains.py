@@ -37,11 +37,10 @@ from avmsf.scene.features import GEOMETRY, FeatureField
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.simulate.elastic import ElasticModes
-from avmsf.simulate.example import EXAMPLE_FOLDER
 from avmsf.simulate.sim20 import ABLATED, SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.truth import Truth, read_truth
-from benchmarks.material import shared_data, surface_features
+from benchmarks.material import example_capture, shared_data, surface_features
 from benchmarks.report import Options, Report, Table, tell
 
 STARTS = (0, 18, 37)
@@ -286,7 +285,7 @@ def _speed(options: Options) -> Report:
     """Seconds of the fit of the built-in example with its elastic modes at hand, and of the gains of a large case."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CaptureWarning)
-        capture = read_capture(EXAMPLE_FOLDER)
+        capture = example_capture()
     bodies = _bodies(capture, options)
     train, test = split(capture.impacts, count=12)
     case = _case(train, test, capture, bodies)

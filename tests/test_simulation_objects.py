@@ -245,6 +245,14 @@ def test_a_written_object_is_an_ordinary_capture_with_views_and_truth(simulation
     assert list(tmp_path.iterdir()) == [folder]
 
 
+def test_a_mesh_is_written_where_it_is_asked_for(simulation: Simulation, recipe: ObjectRecipe, tmp_path: Path) -> None:
+    for surface, files in ((True, {"surface.ply"}), (False, set())):
+        made = replace(simulation, recipe=replace(recipe, surface=surface))
+        write_simulation(made, tmp_path / str(surface))
+        assert {each.name for each in (tmp_path / str(surface)).glob("surface.*")} == files
+        assert len(read_views(tmp_path / str(surface))) == 3
+
+
 def test_the_same_recipe_gives_the_same_bytes(recipe: ObjectRecipe, tmp_path: Path) -> None:
     digests = []
     for folder in (tmp_path / "one", tmp_path / "two"):

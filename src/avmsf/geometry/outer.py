@@ -14,12 +14,12 @@ from avmsf.capture.meshviews import MeshTracer
 from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.errors import SceneError
 from avmsf.geometry.convex import depth_in_convex_hull
+from avmsf.geometry.extent import masked_views, object_extent
 from avmsf.geometry.fusion import SeenDepth, fused_depth
 from avmsf.geometry.grid import Grid
 from avmsf.geometry.shape import ObjectShape, ShapeReport
 from avmsf.geometry.silhouettes import Outline, hull_distance
 from avmsf.geometry.taut import drawn_taut
-from avmsf.geometry.whereabouts import masked_views, whereabouts
 
 DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
 """What gives the depth of the first surface that each pixel of a camera sees, meters along the axis; 0 where none."""
@@ -110,7 +110,7 @@ def _rough(
     views: Sequence[View], outlines: Sequence[Outline]
 ) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"], Bool[np.ndarray, " views"]]:
     """Return the box around the object, and which views' masks agree with the others'."""
-    middle, reach = whereabouts(views)
+    middle, reach = object_extent(views)
     right = np.ones(len(views), dtype=bool)
     for attempt in range(5):
         grid = Grid(middle - reach, 2 * reach / (_ROUGH - 1), (_ROUGH,) * 3)

@@ -1,8 +1,8 @@
-"""A visual hull drawn taut: where no outline touches it, it is as small as what does allows.
+"""A visual hull made smaller where no outline touches it: the surface there is a stretched membrane.
 
-Cameras that stand below a flat top see its near edge against the sky, so that the hull bears a low roof over it. Every
-line of sight along an outline touches the object somewhere; it is taken to do so where the hull is bent most, and
-between these places the surface is that of a stretched membrane.
+Cameras below a flat top see only its near edge, so that the hull has a low pyramid above it. Every line of sight along
+an outline touches the object somewhere. It is assumed to do so where the hull is bent most; between these places the
+surface is a membrane that is fixed at them.
 """
 
 from collections.abc import Sequence
@@ -18,22 +18,21 @@ from avmsf.geometry.grid import Grid
 from avmsf.geometry.silhouettes import Outline
 
 _ROUND = 0.015
-"""Standard deviation of the ball in which the hull's part says how bent it is, over the diagonal."""
+"""Standard deviation of the Gaussian blur of the hull that measures how bent its surface is, over the diagonal."""
 _TOUCHING = 0.75
 """Distance from an outline, pixels, within which a place is on it."""
 _EVEN = 0.03
-"""Difference in the hull's part of a ball up to which two places are bent alike: half a ball is .5, an edge .25."""
+"""Difference of the blurred hull up to which two places are equally bent: a plane has .5, a right-angled edge .25."""
 _HELD = 1e-3
-"""Weight of where the hull was, beside the membrane's: parts that no outline touches stay about where they are."""
-
+"""Weight of the hull's own position, relative to the membrane's: parts that no outline touches stay about there."""
 _ROUNDS = 300
-"""Most steps of the conjugate gradients that stretch the membrane."""
+"""Iterations of the conjugate gradient method at most."""
 
 
 def drawn_taut(
     hull: Float32[np.ndarray, "x y z"], outlines: Sequence[Outline], grid: Grid, diagonal: float
 ) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
-    """Return how far inside the taut hull each cell lies, meters, and how far from any outline's touch it lies."""
+    """Return how far inside the smaller hull each cell lies, and how far from the nearest touched place, meters."""
     surface = enclose(hull, 0.0, lowest=grid.lowest, spacing=grid.spacing)
     places, faces = surface.vertices.double().numpy(), surface.faces.numpy()
     full = ndimage.gaussian_filter((hull > 0).astype(np.float32), _ROUND * diagonal / grid.spacing)
@@ -52,7 +51,7 @@ def drawn_taut(
     far[cells] = False
     nearest = ndimage.distance_transform_edt(far, return_distances=False, return_indices=True)
     fall = fall[tuple(nearest)]
-    # A flat roof is lowered as it is; far below it nothing changes.
+    # A low pyramid is lowered with what lies just below it; farther below nothing changes.
     taut = np.where((hull > 0) & (hull < 2.0 * (fall + grid.spacing)), hull - fall, hull)
     away = np.ones(grid.shape, dtype=bool)
     away[tuple(each[touched] for each in cells)] = False
@@ -78,7 +77,7 @@ def _touching(outline: Outline, places: Float64[np.ndarray, "places 3"], bent: n
 def _membrane(
     places: Float64[np.ndarray, "places 3"], faces: Int[np.ndarray, "faces 3"], fixed: Bool[np.ndarray, " places"]
 ) -> Float64[np.ndarray, "places 3"]:
-    """Return where the vertices of a stretched membrane lie that is fixed at some."""
+    """Return where the vertices of a stretched membrane lie that is `fixed` at some of them, meters."""
     ends = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     count = len(places)
     links = scipy.sparse.csr_array((np.ones(len(ends)), ends.T), shape=(count, count))

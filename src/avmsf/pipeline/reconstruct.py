@@ -17,7 +17,7 @@ from torch import Tensor
 from avmsf.capture import Capture, Impacts, Surface
 from avmsf.capture.placement import judge_placement
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import write_surface
+from avmsf.capture.surface import read_surface, write_surface
 from avmsf.capture.views import read_views
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import AvmsfError, CaptureError, SceneError
@@ -44,7 +44,7 @@ from avmsf.simulate.closest import ClosestPoints
 CACHE = ".avmsf"
 """Folder inside the capture's that keeps what each stage made."""
 SURFACE = "surface.ply"
-"""What the stage of the object's surface calls its output, in metres."""
+"""What the stage of the object's surface calls its output, in meters."""
 MODES, FIELD = "modes.safetensors", "field.safetensors"
 """What the last stages call their outputs."""
 OFF_MESH = 0.02
@@ -150,10 +150,10 @@ def _reconstruct(
         return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, tell=listener.tell)
 
     def make(path: Path) -> None:
-        listener.tell(f"fit: a field of {len(modes.bank)} modes")
         gains = estimator_for(
             config.gain_model, bodies, symmetries=shape.symmetries, features=shape.features, log=listener.tell
         )
+        listener.tell(f"fit: a field of {len(modes.bank)} modes")
         fitted = fit(
             train,
             shape.features if config.gain_model == Visual.kind else shape.points,
@@ -180,13 +180,9 @@ def _reconstruct(
     recipe = {**basis, "modes": found.digest, "gain_model": config.gain_model, "name": capture.name}
     recipe |= {"body": asdict(config.body), "settings": asdict(capture.settings), "surface": shape.surface_digest}
     kept = stages.keep(FIELD, recipe, make, usable=is_final)
-    surface: dict[str, Kept] = {}
-    if config.gain_model != NETWORK:
-        with suppress(AvmsfError):
-            surface["surface"] = keep_surface(stages, shape.surface, shape.surface_digest)
-    made = {**shape.made, **surface, "modes": found, "fit": kept}
+    made = {**shape.made, "modes": found, "fit": kept}
     times = tuple(StageTime(name, each.seconds, each.fresh) for name, each in made.items())
-    path = surface["surface"].path if surface else None
+    path = shape.made["surface"].path if "surface" in shape.made else None
     return Reconstruction(kept.path, times, shape.report, modes, path)
 
 
@@ -249,15 +245,21 @@ def _shape(
         else:
             features = FeatureField.from_points(capture.surface.vertices)
         surface, digest = object_shape(capture.surface, None)
-        return _Shape({"positions": features}, {}, {}, surface, digest)
+        return _Shape({"positions": features}, _surface_stage(stages, config, surface, digest), {}, surface, digest)
     if capture.surface is not None and scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
         words = judge_outlines(capture.surface, read_views(scene.views.path), settings)
         if words is not None:
             warnings.warn(words, CaptureWarning, stacklevel=2)
     features = load_features(scene.features.path)
-    if capture.surface is not None and "cloud" in scene.made():
-        features = moved_onto(features, capture.surface)
+    surface, digest = object_shape(capture.surface, scene)
+    made = scene.made() | _surface_stage(stages, config, surface, digest)
+    seen = capture.surface
+    if seen is None and "surface" in made:
+        # Gaussians lie up to a wall's thickness below the surface, where a wall's other side may be nearer.
+        seen = read_surface(made["surface"].path)
+    if seen is not None and "cloud" in made:
+        features = moved_onto(features, seen)
     candidates = {}
     candidates["positions"] = FeatureField.from_points(features.points)
     candidates["visual"] = features
@@ -265,8 +267,18 @@ def _shape(
     found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
     expect_on_object(capture.impacts, features.points, strict=found_frame)
     report = read_report(scene.features.path)
-    surface, digest = object_shape(capture.surface, scene)
-    return _Shape(candidates, scene.made(), report, surface, digest)
+    return _Shape(candidates, made, report, surface, digest)
+
+
+def _surface_stage(
+    stages: StageFolder, config: ReconstructConfig, surface: Callable[[], Surface | ObjectShape], digest: str
+) -> dict[str, Kept]:
+    """Return the stage of the object's surface; none where its shape is unknown or the gain model needs none."""
+    if config.gain_model == NETWORK:
+        return {}
+    with suppress(AvmsfError):
+        return {"surface": keep_surface(stages, surface, digest)}
+    return {}
 
 
 def moved_onto(features: FeatureField, surface: Surface) -> FeatureField:
