@@ -53,6 +53,8 @@ class ShapeReport:
     """Views whose masks were used."""
     rejected: tuple[str, ...]
     """Names of the views whose masks contradict the others'."""
+    mask_offset: float
+    """How far inside the masks' outlines the photographs' edges lay, pixels; outlines were moved there."""
     depth_bias: float
     """How far depth lay behind the surface, meters; it was taken off."""
     unseen: float
@@ -199,12 +201,7 @@ class ObjectShape:
         # Triangles without area, where the surface passes through the middle of a cell, pinch coarser ones.
         least = np.float32(0.02 * grid.spacing)
         smooth = np.where(smooth > 0, np.maximum(smooth, least), np.minimum(smooth, -least))
-        try:
-            return enclose(smooth, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
-        except CaptureError as error:
-            raise SceneError(
-                f"expected a shape with an inside, found none on a grid of {grid.shape}: {error}"
-            ) from error
+        return closed_surface(smooth, grid, faces)
 
     def describe(self) -> str:
         """Say what is known of the shape: its cavities, what no view saw, and masks that were left out."""
@@ -223,3 +220,14 @@ class ObjectShape:
         for values in (self.outer, self.seen, self.hollow):
             content.update(np.ascontiguousarray(values).tobytes())
         return content.hexdigest()
+
+
+def closed_surface(values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int | None = None) -> Surface:
+    """Return the closed surface where values on a grid are zero, positive inside, of about `faces` triangles.
+
+    Raises SceneError where nothing is inside, and where the inside touches the grid's edge.
+    """
+    try:
+        return enclose(values, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
+    except CaptureError as error:
+        raise SceneError(f"expected a shape with an inside, got none on a grid of {grid.shape}: {error}") from error

@@ -13,8 +13,8 @@ import scipy.sparse.linalg
 from jaxtyping import Bool, Float32, Float64, Int
 from scipy import ndimage
 
-from avmsf.capture.levelset import enclose
 from avmsf.geometry.grid import Grid
+from avmsf.geometry.shape import closed_surface
 from avmsf.geometry.silhouettes import Outline
 
 _ROUND = 0.015
@@ -34,7 +34,7 @@ def drawn_taut(
     hull: Float32[np.ndarray, "x y z"], outlines: Sequence[Outline], grid: Grid, diagonal: float
 ) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
     """Return how far inside the taut hull each cell lies, meters, and how far from any outline's touch it lies."""
-    surface = enclose(hull, 0.0, lowest=grid.lowest, spacing=grid.spacing)
+    surface = closed_surface(hull, grid)
     places, faces = surface.vertices.double().numpy(), surface.faces.numpy()
     full = ndimage.gaussian_filter((hull > 0).astype(np.float32), _ROUND * diagonal / grid.spacing)
     bent = ndimage.map_coordinates(full, ((places - grid.lowest) / grid.spacing).T, order=1)
