@@ -1,8 +1,9 @@
 """A visual hull drawn taut: where no outline touches it, it is as small as what does allows.
 
 Cameras that stand below a flat top see its near edge against the sky, so that the hull bears a low roof over it. Every
-line of sight along an outline touches the object somewhere; it is taken to do so where the hull is bent most, and
-between these places the surface is that of a stretched membrane.
+line of sight along an outline touches the object somewhere. It is taken to do so where many other outlines pass as
+well, which meet at edges of the object but hardly on a roof, and of these places where the hull is bent most. Between
+them the surface is that of a stretched membrane.
 """
 
 from collections.abc import Sequence
@@ -23,6 +24,12 @@ _TOUCHING = 0.75
 """Distance from an outline, pixels, within which a place is on it."""
 _EVEN = 0.03
 """Difference in the hull's part of a ball up to which two places are bent alike: half a ball is .5, an edge .25."""
+_ALIKE = 0.5
+"""Part of the most outlines that pass a place on a line of sight, from which on another place is touched as well. On a
+bracket with a hole, 15 to 23 of 72 pass the places of the hole's edge and 3 to 9 the roof's ridge around it."""
+_COUNTS = 2
+"""Times that the outlines which pass a place are counted, the second time only those that chose it. On that bracket the
+mean distance is .43 % of the diagonal with one, .34 with two, .35 with four."""
 _HELD = 1e-3
 """Weight of where the hull was, beside the membrane's: parts that no outline touches stay about where they are."""
 
@@ -37,10 +44,8 @@ def drawn_taut(
     surface = closed_surface(hull, grid)
     places, faces = surface.vertices.double().numpy(), surface.faces.numpy()
     full = ndimage.gaussian_filter((hull > 0).astype(np.float32), _ROUND * diagonal / grid.spacing)
-    bent = ndimage.map_coordinates(full, ((places - grid.lowest) / grid.spacing).T, order=1)
-    touched = np.zeros(len(places), dtype=bool)
-    for each in outlines:
-        touched[_touching(each, places, bent)] = True
+    bent = ndimage.map_coordinates(full, ((places - grid.lowest) / grid.spacing).T, order=1, output=np.float64)
+    touched = _touched(outlines, places, bent)
     if not touched.any():
         return hull, np.full(grid.shape, diagonal, dtype=np.float32)
     drawn = _membrane(places, faces, touched)
@@ -59,20 +64,43 @@ def drawn_taut(
     return taut, ndimage.distance_transform_edt(away).astype(np.float32) * np.float32(grid.spacing)
 
 
-def _touching(outline: Outline, places: Float64[np.ndarray, "places 3"], bent: np.ndarray) -> Int[np.ndarray, " found"]:
-    """Return, for each line of sight along an outline, where on it the hull is bent most."""
+def _touched(
+    outlines: Sequence[Outline], places: Float64[np.ndarray, "places 3"], bent: Float64[np.ndarray, " places"]
+) -> Bool[np.ndarray, " places"]:
+    """Return which places of a hull's surface the object is taken to touch."""
+    passing = [_passing(each, places) for each in outlines]
+    votes = np.bincount(np.concatenate([rows for rows, _ in passing]), minlength=len(places)).astype(np.float64)
+    for _ in range(_COUNTS):
+        chosen = np.zeros(len(places))
+        for each, (rows, pixels) in zip(outlines, passing, strict=True):
+            often = votes[rows] >= _ALIKE * _largest(votes[rows], pixels, each.inside.shape)
+            few, where = rows[often], pixels[:, often]
+            chosen[few[bent[few] <= _EVEN - _largest(-bent[few], where, each.inside.shape)]] += 1
+        votes = chosen
+    return votes > 0
+
+
+def _passing(
+    outline: Outline, places: Float64[np.ndarray, "places 3"]
+) -> tuple[Int[np.ndarray, " found"], Int[np.ndarray, "2 found"]]:
+    """Return which places an outline passes, and the rows and columns of their pixels."""
     seen = places @ outline.projection[:, :3].T + outline.projection[:, 3]
     pixels = seen[:, :2] / np.maximum(seen[:, 2:], 1e-12)
     height, width = outline.inside.shape
-    inside = (seen[:, 2] > 0) & (pixels > 0).all(axis=1) & (pixels < [width, height]).all(axis=1)
-    rows = np.flatnonzero(inside)
+    rows = np.flatnonzero((seen[:, 2] > 0) & (pixels > 0).all(axis=1) & (pixels < [width, height]).all(axis=1))
     apart = ndimage.map_coordinates(outline.inside, pixels[rows, ::-1].T - 0.5, order=1, mode="nearest")
     rows = rows[np.abs(apart) < _TOUCHING]
-    column, row = pixels[rows].astype(int).T
-    least = np.ones((height, width))
-    np.minimum.at(least, (row, column), bent[rows])
-    # Lines of sight through neighboring pixels touch in the same place.
-    return rows[bent[rows] <= ndimage.minimum_filter(least, 3)[row, column] + _EVEN]
+    return rows, pixels[rows, ::-1].astype(int).T
+
+
+def _largest(
+    values: Float64[np.ndarray, " found"], pixels: Int[np.ndarray, "2 found"], shape: tuple[int, int]
+) -> Float64[np.ndarray, " found"]:
+    """Return the largest value in each one's pixel and those around: their lines of sight touch in the same place."""
+    found = np.full(shape, -np.inf)
+    np.maximum.at(found, tuple(pixels), values)
+    largest: Float64[np.ndarray, " found"] = ndimage.maximum_filter(found, 3)[tuple(pixels)]
+    return largest
 
 
 def _membrane(
