@@ -26,7 +26,7 @@ _LID_REACH = 0.6
 """How far a lid grows over the rim, and over floors that were not seen to lie below it, over the radius of a disc of
 its area."""
 _THINNEST, _THICKEST = 0.0025, 0.06
-"""Wall thicknesses over the diagonal that are worth trying at all. Of the 20 simulated objects a tube has the least, .0027,
+"""Wall thicknesses over the diagonal that are worth trying. Of the 20 simulated objects a tube has the least, .0027,
 and thinner walls take more elements than a model has."""
 _BLUR = 0.6
 """Standard deviation of the blur that takes steps out of surfaces, cells."""
