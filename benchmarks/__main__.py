@@ -68,7 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--sim-20",
         type=Path,
         metavar="FOLDER",
-        help="residual, surface: objects that `avmsf simulate sim-20` has made; without it they are simulated again",
+        help="residual, surface: objects that `avmsf simulate sim-20` has made; surface needs it, residual simulates "
+        "them again without it",
     )
     parser.add_argument(
         "--clouds",

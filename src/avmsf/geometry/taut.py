@@ -1,7 +1,8 @@
 """A visual hull made smaller where no outline touches it: the surface there is a stretched membrane.
 
 Cameras below a flat top see only its near edge, so that the hull has a low pyramid above it. Every line of sight along
-an outline touches the object somewhere. It is assumed to do so where the hull is bent most; between these places the
+an outline touches the object somewhere. It is assumed to do so where many other outlines pass as well, which meet at
+edges of the object but hardly on a pyramid, and of these places where the hull is bent most. Between these places the
 surface is a membrane that is fixed at them.
 """
 
@@ -13,8 +14,8 @@ import scipy.sparse.linalg
 from jaxtyping import Bool, Float32, Float64, Int
 from scipy import ndimage
 
-from avmsf.capture.levelset import enclose
 from avmsf.geometry.grid import Grid
+from avmsf.geometry.shape import closed_surface
 from avmsf.geometry.silhouettes import Outline
 
 _ROUND = 0.015
@@ -23,6 +24,12 @@ _TOUCHING = 0.75
 """Distance from an outline, pixels, within which a place is on it."""
 _EVEN = 0.03
 """Difference of the blurred hull up to which two places are equally bent: a plane has .5, a right-angled edge .25."""
+_ALIKE = 0.5
+"""Part of the most outlines that pass a place on a line of sight, from which on another place is touched as well. On a
+bracket with a hole, 15 to 23 of 72 pass the places of the hole's edge and 3 to 9 the pyramid's around it."""
+_COUNTS = 2
+"""Times that the outlines which pass a place are counted, the second time only those that chose it. On that bracket the
+mean distance is .43 % of the diagonal with one, .34 with two, .35 with four."""
 _HELD = 1e-3
 """Weight of the hull's own position, relative to the membrane's: parts that no outline touches stay about there."""
 _ROUNDS = 300
@@ -33,13 +40,11 @@ def drawn_taut(
     hull: Float32[np.ndarray, "x y z"], outlines: Sequence[Outline], grid: Grid, diagonal: float
 ) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
     """Return how far inside the smaller hull each cell lies, and how far from the nearest touched place, meters."""
-    surface = enclose(hull, 0.0, lowest=grid.lowest, spacing=grid.spacing)
+    surface = closed_surface(hull, grid)
     places, faces = surface.vertices.double().numpy(), surface.faces.numpy()
     full = ndimage.gaussian_filter((hull > 0).astype(np.float32), _ROUND * diagonal / grid.spacing)
-    bent = ndimage.map_coordinates(full, ((places - grid.lowest) / grid.spacing).T, order=1)
-    touched = np.zeros(len(places), dtype=bool)
-    for each in outlines:
-        touched[_touching(each, places, bent)] = True
+    bent = ndimage.map_coordinates(full, ((places - grid.lowest) / grid.spacing).T, order=1, output=np.float64)
+    touched = _touched(outlines, places, bent)
     if not touched.any():
         return hull, np.full(grid.shape, diagonal, dtype=np.float32)
     drawn = _membrane(places, faces, touched)
@@ -58,20 +63,43 @@ def drawn_taut(
     return taut, ndimage.distance_transform_edt(away).astype(np.float32) * np.float32(grid.spacing)
 
 
-def _touching(outline: Outline, places: Float64[np.ndarray, "places 3"], bent: np.ndarray) -> Int[np.ndarray, " found"]:
-    """Return, for each line of sight along an outline, where on it the hull is bent most."""
+def _touched(
+    outlines: Sequence[Outline], places: Float64[np.ndarray, "places 3"], bent: Float64[np.ndarray, " places"]
+) -> Bool[np.ndarray, " places"]:
+    """Return which places of a hull's surface the object is taken to touch."""
+    passing = [_passing(each, places) for each in outlines]
+    votes = np.bincount(np.concatenate([rows for rows, _ in passing]), minlength=len(places)).astype(np.float64)
+    for _ in range(_COUNTS):
+        chosen = np.zeros(len(places))
+        for each, (rows, pixels) in zip(outlines, passing, strict=True):
+            often = votes[rows] >= _ALIKE * _largest(votes[rows], pixels, each.inside.shape)
+            few, where = rows[often], pixels[:, often]
+            chosen[few[bent[few] <= _EVEN - _largest(-bent[few], where, each.inside.shape)]] += 1
+        votes = chosen
+    return votes > 0
+
+
+def _passing(
+    outline: Outline, places: Float64[np.ndarray, "places 3"]
+) -> tuple[Int[np.ndarray, " found"], Int[np.ndarray, "2 found"]]:
+    """Return which places an outline passes, and the rows and columns of their pixels."""
     seen = places @ outline.projection[:, :3].T + outline.projection[:, 3]
     pixels = seen[:, :2] / np.maximum(seen[:, 2:], 1e-12)
     height, width = outline.inside.shape
-    inside = (seen[:, 2] > 0) & (pixels > 0).all(axis=1) & (pixels < [width, height]).all(axis=1)
-    rows = np.flatnonzero(inside)
+    rows = np.flatnonzero((seen[:, 2] > 0) & (pixels > 0).all(axis=1) & (pixels < [width, height]).all(axis=1))
     apart = ndimage.map_coordinates(outline.inside, pixels[rows, ::-1].T - 0.5, order=1, mode="nearest")
     rows = rows[np.abs(apart) < _TOUCHING]
-    column, row = pixels[rows].astype(int).T
-    least = np.ones((height, width))
-    np.minimum.at(least, (row, column), bent[rows])
-    # Lines of sight through neighboring pixels touch in the same place.
-    return rows[bent[rows] <= ndimage.minimum_filter(least, 3)[row, column] + _EVEN]
+    return rows, pixels[rows, ::-1].astype(int).T
+
+
+def _largest(
+    values: Float64[np.ndarray, " found"], pixels: Int[np.ndarray, "2 found"], shape: tuple[int, int]
+) -> Float64[np.ndarray, " found"]:
+    """Return the largest value in each one's pixel and those around: their lines of sight touch in the same place."""
+    found = np.full(shape, -np.inf)
+    np.maximum.at(found, tuple(pixels), values)
+    largest: Float64[np.ndarray, " found"] = ndimage.maximum_filter(found, 3)[tuple(pixels)]
+    return largest
 
 
 def _membrane(
