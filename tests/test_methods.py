@@ -23,8 +23,8 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
-from avmsf.field.uninformed import uninformed
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.uninformed import uninformed
 from avmsf.modal.synthesis import synthesise
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.elastic import elastic_modes

@@ -11,8 +11,8 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import GainModel, estimator_for
 from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.soundfield import SoundField
-from avmsf.field.uninformed import uninformed
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.uninformed import uninformed
 from avmsf.scene.features import FeatureField
 
 QUICK = FitConfig()

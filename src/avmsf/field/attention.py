@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from avmsf._utils.records import count_of, like, record_of
 from avmsf.field.gainfield import Gains
-from avmsf.field.records import count_of, like, record_of
 from avmsf.scene.features import FeatureField, Regions
 
 

@@ -16,12 +16,12 @@ from typing import Any
 
 from torch import Tensor
 
+from avmsf._utils.records import count_of, like, record_of
 from avmsf._utils.text_files import parse_json
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, FieldFileError, FitError
 from avmsf.field.config import FitConfig
-from avmsf.field.records import count_of, like, record_of
 from avmsf.field.soundfield import Origin, SoundField
 
 FORMAT = 7

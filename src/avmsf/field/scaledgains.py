@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
+from avmsf._utils.records import count_of, like
 from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.kinds import FITTED
-from avmsf.field.records import count_of, like
 
 _INNER = "field."
 

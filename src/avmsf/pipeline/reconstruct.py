@@ -30,6 +30,7 @@ from avmsf.field.gains.visual import Visual
 from avmsf.field.store import load, save
 from avmsf.files import write_whole
 from avmsf.geometry import ObjectShape
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
@@ -39,7 +40,6 @@ from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.symmetry import Symmetries
-from avmsf.simulate.closest import ClosestPoints
 
 CACHE = ".avmsf"
 """Folder inside the capture's that keeps what each stage made."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf.errors import SimulationError
 from avmsf.fem.perturbation import Perturbations, perturbations
-from avmsf.simulate.closest import Closest, ClosestPoints
+from avmsf.geometry.closest import Closest, ClosestPoints
 from avmsf.simulate.eigen import Vibrations, lowest_vibrations, rigid_motions
 from avmsf.simulate.elements import SecondOrder, elements_of, mass, stiffness
 from avmsf.simulate.material import Material

@@ -13,10 +13,11 @@ import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
-from avmsf.capture.placement import surface_points
+from avmsf.capture.placement import expect_placed, surface_points
 from avmsf.capture.surface import Surface
 from avmsf.errors import AvmsfError, FitError
 from avmsf.fem.supports import FREE, FREE_PRIOR
+from avmsf.fem.updating import update
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import FACTORS, Elastic
@@ -29,9 +30,7 @@ from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.symmetry import Group, Symmetric, groups_of
 from avmsf.field.gains.thickness import search_thickness
-from avmsf.field.gains.updating import update
 from avmsf.field.gains.visual import Visual
-from avmsf.field.placed import expect_placed
 from avmsf.field.recipes import SHARED, Attention, GainCase, GainRecipe
 from avmsf.scene.features import GEOMETRY, FeatureField
 from avmsf.scene.points import farthest_points
@@ -289,7 +288,8 @@ class _Fit:
         measured = self.at(rows)
         others = [WeighedFamily.of(family, measured, NOISE_SHARES) for family in self.families(rows, [])]
         found = update(
-            body.elastic, sites, measured.frequency, measured.values.real, measured.informative.chunk(2)[0],
+            body.elastic, sites.points, sites.directions, measured.frequency, measured.values.real,
+            measured.informative.chunk(2)[0],
             lambda modes: matched(others, Elastic(sites, size, modes), measured),
         )  # fmt: skip
         return None if found is None else replace(body, elastic=found[0], updated=found[1])

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Complex128, Float, Float32, Float64, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from avmsf._utils.records import count_of, like
 from avmsf.field.gainfield import Gains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import KernelFamily, Sites, nearest_sites
@@ -18,7 +19,6 @@ from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.symmetry import Group, Symmetric
 from avmsf.field.gains.visual import Visual
 from avmsf.field.places import places_of
-from avmsf.field.records import count_of, like
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.nominal import NOMINAL
 
