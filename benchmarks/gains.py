@@ -23,7 +23,7 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, KNOWN, POSITIONAL, MixtureEstimator
-from avmsf.field.gains.symmetry import Symmetric, groups_of
+from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.posterior import parts_of, std_of
 from avmsf.field.recipes import GainCase, along_phase
 from avmsf.field.soundfield import SoundField
@@ -35,6 +35,7 @@ from avmsf.modal.synthesis import synthesise, synthesise_phased
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies, roughened
 from avmsf.scene.features import GEOMETRY, FeatureField
 from avmsf.scene.symmetry import Symmetries
+from avmsf.scene.symmetrycharacters import groups_of
 from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.example import EXAMPLE_FOLDER

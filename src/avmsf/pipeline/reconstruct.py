@@ -26,7 +26,7 @@ from avmsf.field.fit import Progress, fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import NETWORK, GainModel, estimator_for
-from avmsf.field.gains.visual import Visual
+from avmsf.field.gains.positional import Visual
 from avmsf.field.store import load, save
 from avmsf.files import write_whole
 from avmsf.geometry import ObjectShape

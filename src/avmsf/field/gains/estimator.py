@@ -26,15 +26,15 @@ from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture,
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.outliers import Fit, Judgment, judge_contacts, predicts_better
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.refinement import RefinedGains
-from avmsf.field.gains.symmetry import Group, Symmetric, groups_of
+from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.gains.thickness import search_thickness
-from avmsf.field.gains.visual import Visual
 from avmsf.field.recipes import SHARED, Attention, GainCase, GainRecipe
 from avmsf.scene.features import GEOMETRY, FeatureField
 from avmsf.scene.points import farthest_points
 from avmsf.scene.symmetry import Symmetries
+from avmsf.scene.symmetrycharacters import Group, groups_of
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.nominal import NominalBody, body_name
 

@@ -15,10 +15,10 @@ from avmsf.field.gainfield import Gains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import KernelFamily, Sites, nearest_sites
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
-from avmsf.field.gains.symmetry import Group, Symmetric
-from avmsf.field.gains.visual import Visual
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
+from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.places import places_of
+from avmsf.scene.symmetrycharacters import Group
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.nominal import NOMINAL
 
