@@ -16,10 +16,9 @@ from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.writing import expect_writable, write_text
 from avmsf.errors import FitError
-from avmsf.field.doubt import gain_doubt
-from avmsf.field.posterior import unedited_mixture
 from avmsf.field.store import load
 from avmsf.field.suggest import Suggestions, suggest
+from avmsf.field.uncertainty import relative_gain_std, unedited_mixture
 
 TABLE, PICTURE = "suggested.csv", "suggested.png"
 """What the folder of results holds."""
@@ -105,7 +104,7 @@ def run(options: Options) -> int:
         points = gains.points[::step]
         picture = draw_doubt(
             points,
-            gain_doubt(field, points),
+            relative_gain_std(field, points),
             title=f"{field.origin.capture or 'field'}: doubt, and where to strike next",
             struck=gains.contacts,
             suggested=found.contacts,

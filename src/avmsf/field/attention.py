@@ -1,4 +1,4 @@
-"""How strongly a blow at a place excites each mode: the paper's attention network (section 3.5)."""
+"""How strongly an impact at a place excites each mode: the paper's attention network (section 3.5)."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from avmsf._utils.records import count_of, like, record_of
-from avmsf.field.gainfield import Gains
+from avmsf.field.gainfield import Gains, TrainableGains
 from avmsf.scene.features import FeatureField, Regions
 
 
@@ -41,7 +41,7 @@ to build before it can be compared with the file's tensors."""
 _EXAMPLE = AttentionShape(clusters=1, bands=0, width=1, hidden=1, layers=0, feature_scale=1.0)
 
 
-class AttentionGains(nn.Module):
+class AttentionGains(TrainableGains):
     """Gains from a contact's own feature and from attention over the object's regions (paper, eqs. 7-11).
 
     Holds the points it looks contacts up in, so that a saved network needs nothing else.
@@ -106,15 +106,6 @@ class AttentionGains(nn.Module):
             nn.init.zeros_(self.to_dampings.weight)
 
     @property
-    def report(self) -> dict[str, Any]:
-        """Return nothing: the network chose nothing beforehand."""
-        return {}
-
-    def used_rows(self, contacts: int) -> list[int]:
-        """Return all contacts: the network doubts none."""
-        return list(range(contacts))
-
-    @property
     def feature_field(self) -> FeatureField:
         """The points and features that the network reads."""
         return FeatureField(self.points, self.features, self.encoder)
@@ -129,7 +120,7 @@ class AttentionGains(nn.Module):
                     layer.bias.copy_(layer.bias[modes])
 
     def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
-        """Return the gains at the contacts, whichever way they are struck, and the factors where dampings vary."""
+        """Return the gains at the contacts, for any direction, and the factors where dampings vary."""
         return self.read(self.feature_field.nearest(contacts))
 
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
@@ -147,12 +138,8 @@ class AttentionGains(nn.Module):
     def deviation(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Float[Tensor, "contacts modes 2"] | None:
-        """Return None: a network knows no doubt."""
+        """Return None: the network has no posterior."""
         return None
-
-    def penalty(self) -> Float[Tensor, ""]:
-        """Return zero: what is known of the network beforehand is in its optimiser's weight decay."""
-        return self.gain_scale.new_zeros(())
 
     def finished(self, order: Int[Tensor, " modes"]) -> "AttentionGains":
         """Return the network with its modes in the given order, ready for use."""

@@ -1,5 +1,6 @@
 """From recordings, features and modes to a sound field."""
 
+import io
 import math
 import time
 import warnings
@@ -15,8 +16,6 @@ from torch import Tensor
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
-from avmsf.field.arguments import expect_fitting, fingerprint
-from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField
 from avmsf.field.gains.estimator import MixtureEstimator
@@ -24,13 +23,13 @@ from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.losses import spectral_loss
 from avmsf.field.places import held_out, rows_by_place
 from avmsf.field.quality import with_quality
-from avmsf.field.recipes import GainCase, GainRecipe, along_phase
+from avmsf.field.recipes import GainCase, GainRecipe, along_phase, fingerprint, gain_case
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.training import Targets, TrainingRun
+from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.extraction.least_squares import fit_gains, fit_sine_gains
-from avmsf.modal.phase import common_phase
+from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual, estimate_residual
 from avmsf.modal.spectra import envelope
 from avmsf.scene.features import FeatureField
@@ -71,7 +70,7 @@ def fit(
 ) -> SoundField:
     """Fit a sound field to recordings (paper, section 3.5).
 
-    `modes` as extracted from `train`, or `uninformed` where there is no warm-up. `gains` makes the gain model; the
+    `modes` as extracted from `train`, or `random_modes` where there is no warm-up. `gains` makes the gain model; the
     default is the Gaussian process without elastic mode shapes (`MixtureEstimator`), for of the object's shape
     nothing is known here. `settings` are the capture's, which the field keeps: recordings that it is asked about later
     are read by them. What the config leaves open is chosen on a part of the training contacts held out for the purpose,
@@ -85,7 +84,6 @@ def fit(
     if train.before is not None and bool(train.before.isnan().all()):
         # Files that start with their impacts were not cut, and others are to be read alike.
         settings = replace(settings, align=False)
-    expect_fitting(train, modes)
     case = gain_case(train, features, modes, config)
     train = case.train
     recipe = MixtureEstimator() if gains is None else gains
@@ -123,25 +121,6 @@ def _with_measured_residual(field: SoundField, train: Impacts) -> SoundField:
     silent = replace(field, residual=Residual(torch.zeros(bins)))
     modes = silent.render(train.contacts, directions=train.directions)
     return replace(field, residual=estimate_residual(train.sounds, modes, bins=bins))
-
-
-def gain_case(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> GainCase:
-    """Return what gain fields are made from: the aligned recordings, with the phases and strengths of their modes."""
-    train = modes.aligned(train)
-    # Amplitudes are float32 from here on, so that a field is the same whichever its recordings came in. The alignment
-    # comes first, as it recognizes recordings by their samples.
-    train = replace(train, sounds=train.sounds.float())
-    modes = replace(modes, residual=Residual(modes.residual.magnitude.float()))
-    phase = torch.zeros_like(modes.bank.frequency)
-    if config.phase == "common":
-        phase = common_phase(modes.gains, modes.quadrature)
-    if config.warmup_steps:
-        gains = fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate, phase=phase)
-    else:
-        # No aim then, they only say how strong the modes are: what of the extraction's own has the phase does.
-        turned = modes.gains * torch.cos(phase) + modes.quadrature * torch.sin(phase)
-        gains = turned.to(train.sounds)
-    return GainCase(train, features, modes, phase, gains, config)
 
 
 @dataclass(frozen=True)
@@ -313,3 +292,35 @@ def _expect_finite_loss(loss: float, name: str, step: int) -> None:
             f"the {name} diverged, its loss at step {step} is {loss}: lower learning_rate or warmup_rate, or the "
             "correction_rate"
         )
+
+
+def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Write a fit's state: tensors, numbers, words and containers of these. Raises `FieldFileError`."""
+    # By way of memory: torch's own writer reports a full disk as a RuntimeError of its archive format.
+    content = io.BytesIO()
+    torch.save(state, content)
+    write_whole(path, lambda place: place.write_bytes(content.getvalue()))
+
+
+def read_checkpoint(path: Path, *, fingerprint: str) -> dict[str, Any] | None:
+    """Return the state at `path`, None where there is none.
+
+    Raises `FieldFileError` for a file that is no checkpoint, or one of a fit to other recordings or with other
+    settings, which `fingerprint` tells.
+    """
+    if not path.exists():
+        return None
+    try:
+        state: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
+        found = state["fingerprint"]
+    # torch.load raises whatever unpacking raises, in words that advise to trust the file.
+    except Exception as error:
+        raise FieldFileError(
+            f"{path}: expected a checkpoint of a fit, found something else or a part of one: delete it or name another"
+        ) from error
+    if found != fingerprint:
+        raise FieldFileError(
+            f"{path}: this checkpoint belongs to a fit of other recordings, features, modes or settings, or of another "
+            "version: delete it to start anew, or repeat that fit's arguments to go on with it"
+        )
+    return state

@@ -10,9 +10,12 @@ from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
 from avmsf._utils.records import count_of, like
+from avmsf.field.attention import AttentionGains
 from avmsf.field.gainfield import GainField, Gains
-from avmsf.field.kinds import FITTED
+from avmsf.field.gains.model import MixtureGains
 
+FITTED: dict[str, type[GainField]] = {each.kind: each for each in (AttentionGains, MixtureGains)}
+"""The gain fields that are fitted to recordings, by what a file calls them."""
 _INNER = "field."
 
 
@@ -61,7 +64,7 @@ class ScaledGains:
     def deviation(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Float[Tensor, "contacts modes 2"] | None:
-        """Return the fitted gains' deviation, scaled like them: what is asked for by an edit is not in doubt."""
+        """Return the fitted gains' deviation, scaled like them."""
         known = self.field.deviation(contacts.double() / self.length, directions)
         return None if known is None else (known.double() * self.scale.abs()[:, None]).float()
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from avmsf.errors import FitError
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.posterior import energy_of, parts_of, unedited_mixture
 from avmsf.field.soundfield import SoundField
+from avmsf.field.uncertainty import energy_of, parts_of, unedited_mixture
 from avmsf.geometry.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
 from avmsf.scene.points import farthest_points
 

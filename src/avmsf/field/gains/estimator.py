@@ -18,7 +18,6 @@ from avmsf.capture.surface import Surface
 from avmsf.errors import AvmsfError, FitError
 from avmsf.fem.supports import FREE, FREE_PRIOR
 from avmsf.fem.updating import update
-from avmsf.field.config import FitConfig
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import FACTORS, Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
@@ -30,7 +29,7 @@ from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.gains.thickness import search_thickness
-from avmsf.field.recipes import SHARED, Attention, GainCase, GainRecipe
+from avmsf.field.recipes import Attention, GainCase, GainRecipe
 from avmsf.scene.features import GEOMETRY, FeatureField
 from avmsf.scene.points import farthest_points
 from avmsf.scene.symmetry import Symmetries
@@ -58,7 +57,7 @@ _PLACES = 500
 
 
 @dataclass(frozen=True, eq=False)
-class MixtureEstimator:
+class MixtureEstimator(GainRecipe):
     """Fits a Gaussian process whose kernel families are weighed by evidence."""
 
     kinds: tuple[str, ...] = FAMILIES
@@ -84,24 +83,11 @@ class MixtureEstimator:
         """The family's name where there is one alone, else `auto`."""
         return AUTO if len(self.kinds) > 1 else self.kinds[0]
 
-    @property
-    def warms_up(self) -> bool:
-        """The model is solved for."""
-        return False
-
     def digest(self) -> str:
         """Return a digest of the families, the bodies and the symmetries."""
         bodies = "" if self.bodies is None else self.bodies.digest()
         symmetries = "" if self.symmetries is None else json.dumps(self.symmetries.to_dict())
         return hashlib.sha256(f"{' '.join(self.kinds)} {bodies} {symmetries}".encode()).hexdigest()
-
-    def dampings(self, config: FitConfig) -> tuple[str, ...]:
-        """Return shared dampings alone: a mode's damping does not depend on the contact."""
-        return (SHARED,)
-
-    def rows(self, case: GainCase) -> Int[Tensor, " contacts"]:
-        """Return the contacts themselves."""
-        return torch.arange(len(case.train))
 
     def start(self, case: GainCase, damping: str) -> RefinedGains:
         """Return the gain model, to be refined end to end.

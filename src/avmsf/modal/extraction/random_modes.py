@@ -19,7 +19,7 @@ _NOISE = 0.01
 """Noise over the sounds' root mean square: 40 dB down."""
 
 
-def uninformed(train: Impacts, *, modes: int, bins: int, generator: torch.Generator) -> Extraction:
+def random_modes(train: Impacts, *, modes: int, bins: int, generator: torch.Generator) -> Extraction:
     """Return modes drawn at random in place of extracted ones, with flat noise of `bins` bands.
 
     Frequencies are spread evenly over their logarithm, from the lowest that the sounds' length allows (17 Hz in 3 s) to
