@@ -5,7 +5,6 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache as cache_result
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.caching import once
 from avmsf.capture import Capture, Impacts, Surface
 from avmsf.capture.placement import judge_placement
 from avmsf.capture.settings import CaptureSettings
@@ -143,7 +143,7 @@ def _reconstruct(
     modes = extract_once(train, method, found.path)
     basis = {**heard, "features": shape.digest, "fit": asdict(config.fit)}
 
-    @cache_result
+    @once
     def bodies() -> CandidateBodies:
         listener.tell("bodies: what the object may be behind its surface")
         cache = stages.folder / BODIES
@@ -182,7 +182,7 @@ def _reconstruct(
     kept = stages.keep(FIELD, recipe, make, usable=is_final)
     surface: dict[str, Kept] = {}
     if config.gain_model != NETWORK:
-        with suppress(AvmsfError):
+        with suppress(SceneError):  # The object's shape is unknown.
             surface["surface"] = keep_surface(stages, shape.surface, shape.surface_digest)
     made = {**shape.made, **surface, "modes": found, "fit": kept}
     times = tuple(StageTime(name, each.seconds, each.fresh) for name, each in made.items())
@@ -304,7 +304,7 @@ def object_shape(found: Surface | None, scene: SceneStages | None) -> tuple[Call
             raise SceneError("the folder holds neither a mesh nor pictures of the object, so its shape is unknown")
 
         return unknown, ""
-    return cache_result(scene.shape), f"{scene.cloud.digest} {scene.views.digest}"
+    return once(scene.shape), f"{scene.cloud.digest} {scene.views.digest}"
 
 
 def keep_surface(stages: StageFolder, make: Callable[[], Surface | ObjectShape], digest: str) -> Kept:

@@ -20,7 +20,7 @@ from avmsf.fem.supports import FREE, FREE_PRIOR
 from avmsf.fem.updating import update
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import FACTORS, Elastic
-from avmsf.field.gains.family import KernelFamily, Sites
+from avmsf.field.gains.family import KernelFamily, Sites, sites_along
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains
@@ -306,19 +306,18 @@ def _sites(case: GainCase, bodies: Sequence[NominalBody]) -> Sites:
 
     Without a body they are that of the nearest impact whose direction is known, or all alike where none is.
     """
-    points = case.train.contacts.double()
-    given = torch.zeros_like(points) if case.train.directions is None else case.train.directions.double()
-    length = given.norm(dim=1, keepdim=True)
-    known = length[:, 0] > 0
-    used = given / length.clamp_min(torch.finfo(torch.float64).tiny)
-    if bodies:
-        used[~known] = -bodies[0].elastic.normals(points[~known])
-    elif bool(known.any()):
-        apart = (points[~known, None] - points[known]).square().sum(2)
-        used[~known] = used[known][apart.argmin(1)]
-    else:
-        used[:] = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    return Sites(points, used)
+    points, given = case.train.contacts.double(), case.train.directions
+
+    def otherwise(unknown: Float64[Tensor, "unknown 3"]) -> Float64[Tensor, "unknown 3"]:
+        if bodies:
+            return -bodies[0].elastic.normals(unknown)
+        known = torch.zeros(len(points), dtype=torch.bool) if given is None else given.any(1)
+        if given is None or not bool(known.any()):
+            return torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(len(unknown), 3)
+        nearest = (unknown[:, None] - points[known]).square().sum(2).argmin(1)
+        return torch.nn.functional.normalize(given[known][nearest].double(), dim=1)
+
+    return sites_along(points, given, otherwise)
 
 
 def _has_directions(case: GainCase) -> bool:
