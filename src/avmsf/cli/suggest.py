@@ -96,7 +96,9 @@ def run(options: Options) -> int:
             soft_wrap=True,
         )
     if found.directions is not None:
-        screen.print("nx, ny, nz: the way the hammer moves" + ("" if given else ", straight into the surface"))
+        screen.print(
+            "nx, ny, nz: the way the hammer moves" + ("" if given else ", as straight into the surface as it can")
+        )
     if paths:
         write_text(paths[TABLE], _list(rows))
         doing("drawing the uncertainty")

@@ -163,35 +163,29 @@ class AttentionGains(TrainableGains):
     @classmethod
     def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return tensors like those of a network of these sizes, which take no memory."""
-        points, dim, modes = (count_of(record[name], name) for name in ("points", "dim", "modes"))
-        shape = record_of(_EXAMPLE, record["shape"], "gain_field.shape")
-        if shape.layers > _MAX_LAYERS or shape.bands > _MAX_LAYERS:
-            raise ValueError(f"layers and bands: expected at most {_MAX_LAYERS}, got {shape.layers} and {shape.bands}")
-        with torch.device("meta"):
-            features = FeatureField(torch.empty(points, 3), torch.empty(points, dim), "")
-            regions = Regions(torch.empty(shape.clusters, 3), torch.empty(shape.clusters, dim))
-            network = cls(
-                features,
-                gain_scale=torch.empty(modes),
-                shape=shape,
-                generator=torch.Generator(device="cpu"),
-                regions=regions,
-            )
-        like(record["encoder"], "", "gain_field.encoder")
-        return dict(network.state_dict())
+        return dict(cls._empty(record).state_dict())
 
     @classmethod
     def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "AttentionGains":
         """Return the network, ready for use."""
-        network = cls(
-            FeatureField(tensors["points"], tensors["features"], record["encoder"]),
-            gain_scale=tensors["gain_scale"],
-            shape=record_of(_EXAMPLE, record["shape"], "gain_field.shape"),
-            generator=torch.Generator(),
-            regions=Regions(tensors["centers"], tensors["descriptors"]),
-        )
-        network.load_state_dict(dict(tensors))
+        network = cls._empty(record)
+        network.load_state_dict(dict(tensors), assign=True)
         return network.eval().requires_grad_(False)
+
+    @classmethod
+    def _empty(cls, record: Mapping[str, Any]) -> "AttentionGains":
+        points, dim, modes = (count_of(record[name], name) for name in ("points", "dim", "modes"))
+        encoder, shape = like(record["encoder"], "", "encoder"), record_of(_EXAMPLE, record["shape"], "shape")
+        if shape.layers > _MAX_LAYERS or shape.bands > _MAX_LAYERS:
+            raise ValueError(f"layers and bands: expected at most {_MAX_LAYERS}, got {shape.layers} and {shape.bands}")
+        with torch.device("meta"):
+            return cls(
+                FeatureField(torch.empty(points, 3), torch.empty(points, dim), encoder),
+                gain_scale=torch.empty(modes),
+                shape=shape,
+                generator=torch.Generator(device="cpu"),
+                regions=Regions(torch.empty(shape.clusters, 3), torch.empty(shape.clusters, dim)),
+            )
 
 
 def encode(offsets: Float[Tensor, "*shape 3"], bands: int) -> Float[Tensor, "*shape encoded"]:

@@ -21,10 +21,15 @@ class Gains:
     """Factors on the modes' dampings; None where these are the same everywhere."""
 
     @property
+    def parts(self) -> Float64[Tensor, "contacts modes 2"]:
+        """The gains and the quadrature."""
+        quadrature = torch.zeros_like(self.mean) if self.quadrature is None else self.quadrature
+        return torch.stack([self.mean, quadrature], dim=2).double()
+
+    @property
     def power(self) -> Float64[Tensor, "contacts modes"]:
         """Squares of the amplitudes whatever their phase, gains and quadrature together."""
-        power = self.mean.double().square()
-        return power if self.quadrature is None else power + self.quadrature.double().square()
+        return self.parts.square().sum(2)
 
 
 @runtime_checkable

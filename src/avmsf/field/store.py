@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from avmsf._utils.records import count_of, like, record_of
+from avmsf._utils.state import read_tensors
 from avmsf._utils.text_files import parse_json
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
@@ -80,7 +80,9 @@ def load(path: str | Path) -> SoundField:
     tensor is missing, unexpected, of another shape or dtype, or not finite.
     """
     path = Path(path)
-    words, tensors = _read(path)
+    words, tensors = read_tensors(
+        path, _KEY, what="a sound field", advice="fit and save it again", raising=FieldFileError
+    )
     try:
         record = parse_json(words)
         found, writer = record["format"], record["version"]
@@ -190,41 +192,6 @@ def _tensors(field: SoundField) -> dict[str, Tensor]:
     named |= {_GAIN_FIELD + name: tensor for name, tensor in field.gain_field.tensors().items()}
     # Safetensors refuses tensors that share memory, as a field's points may with its features.
     return {name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in named.items()}
-
-
-def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
-    """Return the header's record and the tensors of a file that is ours."""
-    if not path.exists():
-        raise FieldFileError(f"{path}: expected a sound field, found no such file: check the name, or fit and save one")
-    try:
-        with safe_open(path, framework="pt") as file:
-            words = (file.metadata() or {}).get(_KEY)
-            if words is None:
-                raise FieldFileError(
-                    f"{path}: expected a sound field, found a safetensors file of something else (its metadata has no "
-                    f"entry {_KEY!r}): name a file that avmsf saved"
-                )
-            # Clones, for what the file maps into memory would change with it.
-            return words, {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise FieldFileError(f"{path}: expected a sound field, found {_guess(path)}") from error
-
-
-def _guess(path: Path) -> str:
-    """Return what a file is that safetensors cannot read, and what to do."""
-    if path.is_dir():
-        return "a folder: name the file in it"
-    try:
-        with open(path, "rb") as file:
-            start = file.read(9)
-    except OSError as error:
-        return f"a file that cannot be read ({error.strerror}): check its permissions"
-    if not start:
-        return "an empty file: copy it again, or fit and save it again"
-    # Eight bytes of length, then the header's opening brace.
-    if start[8:] == b"{":
-        return "one that is cut short or damaged: copy it again, or fit and save it again"
-    return f"a file of another kind, which starts with {start[:8]!r}: name a file that avmsf saved"
 
 
 def _expect_tensors(tensors: dict[str, Tensor], skeleton: dict[str, Tensor], path: Path) -> None:

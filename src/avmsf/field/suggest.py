@@ -65,16 +65,14 @@ def suggest(
 ) -> Suggestions:
     """Return the `count` contacts that lower the expected error of the whole field most, each given those before it.
 
-    The posterior variance of a Gaussian process does not depend on the values that will be measured. `candidates` are
-    the places to choose from (metres, on the surface; contacts that the gains were fitted to are passed over); without
+    `candidates` are the places to choose from (metres, on the surface; contacts of the fit are passed over); without
     them they are points spread over the surface that a hammer can strike from outside (`hammer_access`). `directions`
-    are the unit vectors along which they can be struck, straight into the surface where not given. Of more than `MOST`
-    candidates as many are weighed, spread as far apart as they go. A field made of photographs has points where they
-    show the object; with `unseen`, error and candidates are those of all of the surface of the field's body instead.
+    are the unit vectors along which candidates can be struck, straight into the surface where not given. A field made
+    of photographs has points where they show the object; with `unseen`, error and candidates are those of all of the
+    surface of the field's body instead.
 
-    Raises FitError for gains without a posterior, a count below 1, candidates that are not finite or not on the object,
-    directions that are not one a candidate, fewer candidates than contacts asked for, places none of which a hammer
-    gets to, and `unseen` without a body.
+    Raises FitError for gains without a posterior, unfit arguments, fewer candidates than contacts asked for, places
+    none of which a hammer gets to, and `unseen` without a body.
     """
     gains = unedited_mixture(field)
     if count < 1:

@@ -118,9 +118,7 @@ def parts_of(
     field: SoundField, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
 ) -> Float64[Tensor, "contacts modes 2"]:
     """Return both parts of the mean gains."""
-    known = field.known(contacts, directions=directions)
-    quadrature = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
-    return torch.stack([known.mean, quadrature], dim=2).double()
+    return field.known(contacts, directions=directions).parts
 
 
 def relative_gain_std(field: SoundField, points: Float[Tensor, "points 3"]) -> Float64[Tensor, " points"]:

@@ -7,14 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from typing import Any, Literal
-from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
-from avmsf.capture.placement import expect_placed, surface_points
-from avmsf.capture.surface import Surface
+from avmsf.capture.placement import expect_placed
 from avmsf.errors import AvmsfError, FitError
 from avmsf.fem.supports import FREE, FREE_PRIOR
 from avmsf.fem.updating import update
@@ -34,7 +32,6 @@ from avmsf.scene.features import GEOMETRY, FeatureField
 from avmsf.scene.points import farthest_points
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrycharacters import Group, groups_of
-from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.nominal import NominalBody, body_name
 
 POSITIONAL: dict[str, type[KernelFamily]] = {Smooth.kind: Smooth, ThinPlate.kind: ThinPlate}
@@ -107,7 +104,8 @@ class MixtureEstimator(GainRecipe):
         density updated becomes one more hypothesis.
         """
         bodies, missing = self._usable_bodies(case)
-        directional, every = bool(bodies) or _has_directions(case), torch.arange(len(case.train))
+        given, every = case.train.directions, torch.arange(len(case.train))
+        directional = bool(bodies) or (given is not None and bool(given.any()))
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
         if self.name == Symmetric.kind and not groups:
             raise FitError("symmetry: expected symmetries of the object's shape, found none: take another gain model")
@@ -163,7 +161,7 @@ class MixtureEstimator(GainRecipe):
                 raise FitError(f"elastic mode shapes need the object's shape: {self.missing or 'give its mesh'}")
             return [], {Elastic.kind: self.missing} if self.missing else {}
         try:
-            _expect_on_body(case, self.bodies.bodies.bodies[0].elastic)
+            expect_placed(case.train.contacts, self.bodies.bodies.bodies[0].elastic.points, names=case.train.names)
         except FitError as error:
             if self.name == Elastic.kind:
                 raise
@@ -227,8 +225,9 @@ class _Fit:
 
     @cached_property
     def measured(self) -> MeasuredGains:
-        """The gains at all contacts."""
-        return measured_gains(self.case)
+        """The gains at all contacts, with the variance that background noise gives them."""
+        values, bank = torch.view_as_complex(self.case.parts.contiguous()), self.case.modes.bank
+        return MeasuredGains(values, gain_variance(self.case), bank.frequency, bank.damping)
 
     def at(self, rows: Int[Tensor, " rows"]) -> MeasuredGains:
         """Return the gains at some contacts."""
@@ -281,12 +280,6 @@ class _Fit:
         return None if found is None else replace(body, elastic=found[0], updated=found[1])
 
 
-def measured_gains(case: GainCase) -> MeasuredGains:
-    """Return a case's gains, with the variance that its background noise gives them."""
-    values = torch.view_as_complex(case.parts.contiguous())
-    return MeasuredGains(values, gain_variance(case), case.modes.bank.frequency, case.modes.bank.damping)
-
-
 def gain_variance(case: GainCase) -> Float64[Tensor, " modes"]:
     """Return the variance that the background noise gives each part of a gain by least squares.
 
@@ -318,17 +311,6 @@ def _sites(case: GainCase, bodies: Sequence[NominalBody]) -> Sites:
         return torch.nn.functional.normalize(given[known][nearest].double(), dim=1)
 
     return sites_along(points, given, otherwise)
-
-
-def _has_directions(case: GainCase) -> bool:
-    return case.train.directions is not None and bool(case.train.directions.any())
-
-
-def _expect_on_body(case: GainCase, elastic: ElasticModes) -> None:
-    """Raise FitError where the contacts are not on the body's surface."""
-    if elastic not in _POINTS:
-        _POINTS[elastic] = surface_points(Surface(elastic.nodes, elastic.triangles[:, :3]))
-    expect_placed(case.train.contacts, _POINTS[elastic], names=case.train.names)
 
 
 def _judged(fit: _Fit, model: MixtureGains, body: NominalBody | None) -> Judgment:
@@ -397,7 +379,3 @@ def _judgment_report(judgment: Judgment, case: GainCase, used: Int[Tensor, " use
         "excluded": [name for row, name in enumerate(names) if row not in kept],
         "credibility": None if credibility is None else asdict(credibility) | {"credible": credibility.credible},
     }
-
-
-_POINTS: WeakKeyDictionary[ElasticModes, Tensor] = WeakKeyDictionary()
-"""Points all over bodies' surfaces."""
