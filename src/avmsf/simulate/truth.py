@@ -109,9 +109,8 @@ def read_truth(path: str | Path) -> Truth:
 
 
 def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
-    return read_tensors(
-        path, _KEY, what="the truth of a simulated object", advice="simulate the object again", raising=SimulationError
-    )
+    what, advice = "the truth of a simulated object", "simulate it: only objects that `avmsf simulate` made have one"
+    return read_tensors(path, _KEY, what=what, advice=advice, raising=SimulationError)
 
 
 def _understand(words: str, path: Path) -> dict[str, Any]:
