@@ -209,7 +209,7 @@ def test_of_very_many_candidates_some_that_are_far_apart_are_weighed(
         return covariances(gains, places, ways)
 
     monkeypatch.setattr(MixtureGains, "covariances", counted)
-    monkeypatch.setattr("avmsf.field.suggest.MOST", 30)
+    monkeypatch.setattr("avmsf.field.suggest.MAX_CANDIDATES", 30)
     fewer = suggest(field, 3, candidates=candidates, directions=DOWN.expand(120, 3))
     assert asked == [len(whole.points) + 30]
     assert torch.equal(fewer.contacts, candidates[fewer.rows])

@@ -91,14 +91,10 @@ def run(options: Options) -> int:
         soft_wrap=True,
     )
     if found.unreachable:
-        screen.print(
-            f"left out: {found.unreachable} places that no hammer reaches from outside",
-            soft_wrap=True,
-        )
+        screen.print(f"left out: {found.unreachable} places that no hammer reaches from outside", soft_wrap=True)
     if found.directions is not None:
-        screen.print(
-            "nx, ny, nz: the way the hammer moves" + ("" if given else ", as straight into the surface as it can")
-        )
+        straight = "" if given else ", as straight into the surface as it can"
+        screen.print(f"nx, ny, nz: the way the hammer moves{straight}")
     if paths:
         write_text(paths[TABLE], _list(rows))
         doing("drawing the uncertainty")

@@ -63,7 +63,7 @@ class FitConfig:
     phase: Literal["common", "sine"] = "common"
     """How modes start: each with the phase that the training recordings agree on, or as sines (paper, eq. 3)."""
     residual: bool = True
-    """Whether noise is modelled beside the modes."""
+    """Whether noise is modeled in addition to the modes."""
     residual_noise: Literal["low-fluctuation", "gaussian"] = "low-fluctuation"
     """Noise that is filtered to the residual's spectrum when the field is rendered: a fixed sequence whose spectrogram
     hardly fluctuates, 2 dB below a recording's noise, or a random draw at its level (paper)."""

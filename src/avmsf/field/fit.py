@@ -33,7 +33,7 @@ from avmsf.modal.residual import Residual, estimate_residual
 from avmsf.modal.spectra import envelope
 from avmsf.scene.features import FeatureField
 
-_FEWEST_TO_VALIDATE = 6
+_MIN_PLACES = 6
 _CHECKPOINT_SECONDS = 30.0
 _VALIDATION_STEPS = 10
 """Steps between validations."""
@@ -164,7 +164,7 @@ class _Job:
         default = _Plan(dampings[0], self.steps)
         held = held_out(self.train.contacts, self.config.validation)
         undecided = len(dampings) > 1 or (self.config.patience > 0 and self.recipe.warms_up)
-        if len(rows_by_place(self.train.contacts)) < _FEWEST_TO_VALIDATE or not held or not undecided:
+        if len(rows_by_place(self.train.contacts)) < _MIN_PLACES or not held or not undecided:
             return default, {"damping": default.damping, "validated": False}
         learned = [row for row in range(len(self.train)) if row not in held]
         for damping in dampings:

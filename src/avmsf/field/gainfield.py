@@ -62,7 +62,7 @@ class GainField(Protocol):
         ...
 
     def record(self) -> dict[str, Any]:
-        """Return what a file holds beside the tensors, as plain values, sizes included, that of `modes` among them."""
+        """Return what a file holds besides the tensors, as plain values, sizes included, that of `modes` among them."""
         ...
 
     def tensors(self) -> dict[str, Tensor]:

@@ -21,10 +21,10 @@ MIN_PLACES = 4
 def with_quality(field: SoundField, train: Impacts, *, advise: bool = True) -> SoundField:
     """Return a field with the residual that predicts its own contacts best, and its quality in the report.
 
-    The residual is the stationary noise of the field, or the mean of what the three nearest recordings have beside
-    their modes; whichever gives the smaller error at contacts left out. `train` holds the recordings that the gain
-    model uses, row for row. A field of fewer than `MIN_PLACES` places keeps its noise and has no quality. `advise`:
-    whether to name the contact to record next, one of the field's points; not if these are not on the object.
+    The residual is the stationary noise of the field, or the mean of what the three nearest recordings have in
+    addition to their modes, by the error at contacts left out. `train` holds the recordings that the gain model uses,
+    row for row. A field of fewer than `MIN_PLACES` places keeps its noise and has no quality. `advise`: whether to name
+    the contact to record next, one of the field's points; not if these are not on the object.
     """
     gains = field.gain_field
     if not isinstance(gains, MixtureGains) or gains.place_count < MIN_PLACES:

@@ -31,7 +31,7 @@ class ScaledGains:
     scale: Float64[Tensor, " modes"]
     """Factors on the gains of each mode; 0 mutes one."""
     length: float = 1.0
-    """Lengths on this object over those on the fitted one: a place here is heard where it is, divided by this."""
+    """Lengths on this object over those on the fitted one: contacts are divided by it."""
 
     kind: ClassVar[str] = "scaled"
 

@@ -101,7 +101,7 @@ class SoundField:
     phase: Float64[Tensor, " modes"]
     """How each mode starts, radians: mode k sounds as exp(-d t) sin(2 pi f t + phase). Zero in the paper."""
     residual: Residual
-    """Noise beside the modes."""
+    """Noise in addition to the modes."""
     sample_rate: float
     """Samples per second of rendered sounds, Hz."""
     samples: int
@@ -190,7 +190,7 @@ class SoundField:
         directions: Float[Tensor, "contacts 3"] | None,
         samples: int,
     ) -> Float[Tensor, "contacts samples"]:
-        """Return the mean of what the nearest recordings have beside their modes; silence after their end."""
+        """Return the mean of what the nearest recordings have in addition to their modes; silence after their end."""
         gains, recordings = fitted_gains(self.gain_field), self.residual.recordings
         assert isinstance(gains, MixtureGains)
         assert recordings is not None

@@ -1,4 +1,4 @@
-"""Where to strike next: the places whose sounds would tell most of the sounds everywhere else."""
+"""Where to strike next: the places whose recordings would reduce the expected error of the whole field most."""
 
 import math
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from avmsf.scene.points import farthest_points
 
 PLACES = 400
 """Points of the surface that the expected error is summed over, and that are candidates unless others are given."""
-MOST = 500
+MAX_CANDIDATES = 500
 """Candidates that are weighed; of more, as many that lie far apart. The memory grows with their square."""
 _OFF = 0.05
 """Distance of a candidate from the surface over the object's size, from which on it is not on the object."""
@@ -93,12 +93,11 @@ def suggest(
             f"{count} contacts are asked for and {int(allowed.sum())} of the {len(pool)} candidates have not been "
             "struck yet: ask for fewer, or give more candidates"
         )
-    kept = _weighed(pool, allowed, max(MOST, count))
+    kept = _weighed(pool, allowed, max(MAX_CANDIDATES, count))
     sites = gains.sites(pool[kept], None if directions is None else directions[kept])
     error = _ExpectedError(field, gains, points, sites)
     before, allowed = error.map(), allowed[kept]
-    rows: list[int] = []
-    after: list[float] = []
+    rows, after = list[int](), list[float]()
     while len(rows) < count and bool(allowed.any()):
         rows.append(int(torch.where(allowed, error.reductions(), -math.inf).argmax()))
         error.add(rows[-1])

@@ -40,10 +40,10 @@ AUTO, NETWORK = "auto", "network"
 GainModel = Literal["auto", "network", "smooth", "thin-plate", "symmetry", "visual", "elastic"]
 """The Gaussian process over all kernel families, the paper's attention network, or the process over one family."""
 FAMILIES = (*POSITIONAL, Symmetric.kind, Elastic.kind)
-"""What the model is made of beside the unstructured family, which is always there."""
+"""What the model is made of besides the unstructured family, which is always there."""
 KNOWN = (*FAMILIES, Visual.kind)
 """All families. Looks must be asked for by name: with the built-in descriptors of four simulated objects they made the
-errors between 0.4 % smaller and 1.7 % larger without a body, and changed nothing beside one."""
+errors between 0.4 % smaller and 1.7 % larger without a body, and changed nothing with one."""
 _UPDATED = 64
 """Contacts that a body is updated from, at most."""
 _PREDICTS = 1.0
@@ -66,7 +66,7 @@ class MixtureEstimator(GainRecipe):
     symmetries: Symmetries | None = None
     """Of the object's geometry; without any there is no symmetry family.
 
-    Nor is there where a body is usable, whose mode shapes have the symmetries already: beside them the family made the
+    Nor is there where a body is usable, whose mode shapes have the symmetries already: with them the family made the
     error of one of 11 splits of captures 6 % larger, and none smaller than by 2 %.
     """
 
@@ -193,7 +193,7 @@ def estimator_for(
     """Return the estimator of this name; the network reads `features`, or the fit's own.
 
     `bodies` computes what may lie behind the object's surface. Where it raises an AvmsfError, `auto` has no elastic
-    family, which `log` is told, and takes the `symmetries` of the object's shape; with `elastic` the error passes.
+    family, which `log` reports, and takes the `symmetries` of the object's shape; with `elastic` the error passes.
     """
     if name == NETWORK:
         return Attention(features, NETWORK)

@@ -13,7 +13,7 @@ from avmsf.scene.points import nearest_points
 LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Lengths of the smooth kernels over the object's size, the diagonal of the box around it."""
 AFFINE_SHARES = (0.5, 0.9)
-"""Shares of an affine function of the position beside a smooth one."""
+"""Shares of an affine function of the position in its sum with a smooth one."""
 DRIFT_SHARES = (0.3, 0.7, 0.95)
 """Shares of the thin plate's affine part."""
 FEATURE_LENGTHS = (0.25, 0.5, 1.0)

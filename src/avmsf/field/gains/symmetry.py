@@ -24,7 +24,7 @@ from avmsf.scene.symmetrycharacters import Group
 
 REMAINDERS = (0.1, 0.3)
 """Shares p of what is not symmetric."""
-_LEAST = 0.01
+_MIN_PART = 0.01
 """Least part of the variance at the contacts that a character must have: where all contacts lie on a mirror plane
 nothing is known of functions that are odd."""
 
@@ -52,7 +52,7 @@ class Symmetric(KernelFamily):
             for parts in (shares, identity)
         )
         own = self.diagonal(reference).mean(1)
-        seen = symmetric @ own > _LEAST * (whole @ own)
+        seen = symmetric @ own > _MIN_PART * (whole @ own)
         symmetric, whole = (each[seen] / (each[seen] @ own)[:, None] for each in (symmetric, whole))
         self.shares = torch.cat([(1.0 - share) * symmetric + share * whole for share in REMAINDERS])
         group_of = torch.repeat_interleave(torch.tensor([len(each) for each in characters]))
