@@ -19,13 +19,13 @@ from avmsf.capture.surface import Surface, read_surface
 from avmsf.capture.views import find_foreground, read_views
 from avmsf.errors import SceneError
 from avmsf.geometry import ObjectShape, object_surface
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats, write_splats
 from avmsf.scene.rasteriser import choose_rasteriser
 from avmsf.scene.splat import splat
 from avmsf.scene.splatconfig import SplatConfig
 from avmsf.scene.visibility import depth_of_cloud
-from avmsf.simulate.closest import ClosestPoints
 from avmsf.simulate.sim20 import SIM20
 from benchmarks.material import MissingDataError
 from benchmarks.report import Options, Report, Table, tell

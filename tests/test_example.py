@@ -9,9 +9,9 @@ from avmsf.capture.audio import read_sound
 from avmsf.capture.meshviews import MeshTracer
 from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.capture.views import read_views
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
-from avmsf.simulate.closest import ClosestPoints
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER, example_mesh
 from avmsf.simulate.truth import read_truth
 

@@ -7,8 +7,8 @@ import torch
 import trimesh
 
 from avmsf.capture.surface import Surface
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.simulate import nominalthin
-from avmsf.simulate.closest import ClosestPoints
 from avmsf.simulate.nominal import nominal_bodies
 from avmsf.simulate.nominalthin import simplified, thinned
 from avmsf.simulate.skin import Skin

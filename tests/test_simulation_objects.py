@@ -352,13 +352,13 @@ def test_a_sheet_without_a_wall_is_told_to_have_one(recipe: ObjectRecipe, tmp_pa
 
 
 def test_truths_that_are_damaged_or_of_something_else_are_refused(simulation: Simulation, tmp_path: Path) -> None:
-    with pytest.raises(SimulationError, match="found no such file: only objects that `avmsf simulate` made"):
+    with pytest.raises(SimulationError, match=r"found no such file: .*only objects that"):
         read_truth(tmp_path)
     path = tmp_path / TRUTH
     write_truth(simulation.truth, path)
     content = path.read_bytes()
     path.write_bytes(content[:-100])
-    with pytest.raises(SimulationError, match="another kind or one cut short"):
+    with pytest.raises(SimulationError, match="cut short"):
         read_truth(path)
     path.write_bytes(content.replace(b'\\"format\\": 2', b'\\"format\\": 9'))
     with pytest.raises(SimulationError, match="expected a truth of format 1 or 2, found format 9"):

@@ -87,9 +87,9 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(tmp_path: Path, background:
     # The finished run is kept too: what comes after it may fail.
     assert _same(splat(views, config, checkpoint=place, progress=lambda progress: steps.append(0)), resumed)
     assert steps == [50, 60]
-    with pytest.raises(SceneError, match=r"splat\.ckpt: this checkpoint belongs to other views or settings"):
+    with pytest.raises(SceneError, match=r"splat\.ckpt: this checkpoint belongs to a splatting with another view"):
         splat(views, replace(config, seed=5), checkpoint=place)
-    with pytest.raises(SceneError, match="this checkpoint belongs to other views"):
+    with pytest.raises(SceneError, match="this checkpoint belongs to a splatting with another view"):
         splat(views[1:], config, checkpoint=place)
 
 

@@ -12,8 +12,8 @@ from avmsf.cli import main
 from avmsf.cli.fit import summary
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.store import load
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.pipeline.reconstruct import CACHE, SURFACE
-from avmsf.simulate.closest import ClosestPoints
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
 from plate_capture import TINY, fill_plate
 from small_scene import SMALL_SPLAT, slab_views

@@ -16,7 +16,7 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float64, Int
 
 from avmsf.errors import SimulationError
-from avmsf.simulate.closest import ClosestPoints
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.simulate.shell import prisms
 from avmsf.simulate.skin import Skin, unit
 from avmsf.simulate.solid import Solid

@@ -116,9 +116,13 @@ class ObjectShape:
         """Return the outer side, cavities filled."""
         return self._enclose(self.outer, self.grid, faces)
 
-    def as_seen(self, *, faces: int = 2 * FACES) -> Surface:
+    def as_seen(self) -> Surface:
         """Return what views show: both sides of walls where both were seen."""
-        return self._enclose(self.seen, self.grid, faces)
+        return self._as_seen
+
+    @cached_property
+    def _as_seen(self) -> Surface:
+        return self._enclose(self.seen, self.grid, 2 * FACES)
 
     def shell(self, thickness: float, *, faces: int = FACES) -> Surface:
         """Return the body whose walls around its cavities are `thickness` meters thick, measured from outside.

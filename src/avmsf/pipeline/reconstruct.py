@@ -5,7 +5,6 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache as cache_result
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.caching import once
 from avmsf.capture import Capture, Impacts, Surface
 from avmsf.capture.placement import judge_placement
 from avmsf.capture.settings import CaptureSettings
@@ -26,10 +26,11 @@ from avmsf.field.fit import Progress, fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import NETWORK, GainModel, estimator_for
-from avmsf.field.gains.visual import Visual
+from avmsf.field.gains.positional import Visual
 from avmsf.field.store import load, save
 from avmsf.files import write_whole
 from avmsf.geometry import ObjectShape
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
@@ -39,7 +40,6 @@ from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.symmetry import Symmetries
-from avmsf.simulate.closest import ClosestPoints
 
 CACHE = ".avmsf"
 """Folder inside the capture's that keeps what each stage made."""
@@ -143,7 +143,7 @@ def _reconstruct(
     modes = extract_once(train, method, found.path)
     basis = {**heard, "features": shape.digest, "fit": asdict(config.fit)}
 
-    @cache_result
+    @once
     def bodies() -> CandidateBodies:
         listener.tell("bodies: what the object may be behind its surface")
         cache = stages.folder / BODIES
@@ -276,7 +276,7 @@ def _surface_stage(
     """Return the stage of the object's surface; none where its shape is unknown or the gain model needs none."""
     if config.gain_model == NETWORK:
         return {}
-    with suppress(AvmsfError):
+    with suppress(SceneError):
         return {"surface": keep_surface(stages, surface, digest)}
     return {}
 
@@ -316,7 +316,7 @@ def object_shape(found: Surface | None, scene: SceneStages | None) -> tuple[Call
             raise SceneError("the folder holds neither a mesh nor pictures of the object, so its shape is unknown")
 
         return unknown, ""
-    return cache_result(scene.shape), f"{scene.cloud.digest} {scene.views.digest}"
+    return once(scene.shape), f"{scene.cloud.digest} {scene.views.digest}"
 
 
 def keep_surface(stages: StageFolder, make: Callable[[], Surface | ObjectShape], digest: str) -> Kept:
