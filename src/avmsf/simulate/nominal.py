@@ -360,7 +360,7 @@ class _Maker:
                 surface = self._shape.shell(wall, faces=round(0.5 * TRIANGLES * freedoms))
             except SceneError as error:
                 raise SimulationError(str(error)) from error
-            return filled_solid(checked(surface, tell=self._tell), freedoms)
+            return filled_solid(checked(surface, tell=self._tell), freedoms, wall=wall)
         if freedoms not in self._walls:
             self._walls[freedoms] = wall_solids(self.checked, freedoms)
         return self._walls[freedoms](wall)

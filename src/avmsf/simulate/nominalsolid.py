@@ -60,19 +60,20 @@ def freedoms_of(solid: Solid) -> int:
     return 3 * len(SecondOrder.of(solid).nodes)
 
 
-def filled_solid(checked: CheckedSurface, freedoms: int) -> Solid:
+def filled_solid(checked: CheckedSurface, freedoms: int, *, wall: float | None = None) -> Solid:
     """Return what a surface encloses as tetrahedra with about so many degrees of freedom.
 
-    A mesh that shows both sides of a wall is filled by prisms, one that has lumps too by tetrahedra. Raises
-    SimulationError as `fill` does, for sheets, and where no detail comes near enough.
+    A mesh that shows both sides of a wall, which may be `wall` meters thick everywhere, is filled by prisms, one that
+    has lumps too by tetrahedra. Raises SimulationError as `fill` does, for sheets, and where no detail comes near
+    enough.
     """
     checked.expect_filling()
-    wall = wall_of(checked.skin)
-    if wall is not None:
+    sides = wall_of(checked.skin, wall)
+    if sides is not None:
         with contextlib.suppress(SimulationError):
             # Freedoms may be few for prisms along a wall that bends tightly; tetrahedra need not follow it.
             return _near(
-                lambda detail: wall.solid(detail * wall.size), freedoms, first=wall.length(freedoms) / wall.size
+                lambda detail: sides.solid(detail * sides.size), freedoms, first=sides.length(freedoms) / sides.size
             )
     first = _filling_detail(checked, freedoms)
 
