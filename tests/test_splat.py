@@ -122,7 +122,7 @@ def test_photographs_without_masks_start_from_points() -> None:
     start = StartPoints(torch.tensor(MIDDLE) + RADIUS * normals, ball_color(normals))
     cloud = splat(views, replace(QUICK, steps=100), start=start)
     assert _mean_psnr(cloud, views, background=0.6) > 26.0
-    with pytest.raises(SceneError, match="0 of 16 views have a mask; a visual hull takes 3 or more"):
+    with pytest.raises(SceneError, match="0 of 16"):
         splat(views, QUICK)
 
 
