@@ -93,7 +93,7 @@ def run(options: Options) -> int:
     if found.unreachable:
         screen.print(f"left out: {found.unreachable} places that no hammer reaches from outside", soft_wrap=True)
     if found.directions is not None:
-        straight = "" if given else ", as straight into the surface as it can"
+        straight = "" if given else ", as straight into the body as it can where the field has one"
         screen.print(f"nx, ny, nz: the way the hammer moves{straight}")
     if paths:
         write_text(paths[TABLE], _list(rows))

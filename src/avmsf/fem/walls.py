@@ -38,8 +38,8 @@ _EVEN_VOLUME = 0.05
 with facets of a third of its radius has 2.4 % less, and its lowest modes are 4 to 8 % too high; tetrahedra as many made
 them 6 to 33 % too high, each mode by another factor."""
 _ASTRAY = 0.02
-"""Part of either surface that may be more than half of the wall's thickness away from the other, or all of it where the
-thickness is known."""
+"""Part of either surface that may be farther from the other than half the wall's thickness; than the whole thickness
+where that is known."""
 _INSIDE = 1e-5
 """How far behind a triangle rays start, in diagonals of the box around the mesh."""
 _TRIANGLE = 1.0
@@ -59,7 +59,7 @@ class Wall:
     sheet: Skin
     """The larger side."""
     thickness: float
-    """Mean, meters."""
+    """Meters; the mean of an uneven wall."""
     even: bool = False
     """Whether the thickness is known to be the same everywhere."""
 

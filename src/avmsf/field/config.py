@@ -71,7 +71,8 @@ class FitConfig:
     """Start of all chance in the fit: initial weights, noise in training, and rendered Gaussian noise."""
 
     def __post_init__(self) -> None:
-        numbers = {name: value for name, value in asdict(self).items() if type(value) in (int, float)}
+        values = {name: value for name, value in asdict(self).items() if not isinstance(value, bool)}
+        numbers = {name: value for name, value in values.items() if isinstance(value, int | float)}
         for name, value in numbers.items():
             least = 1 if name in _COUNTS else 0
             if not least <= value < math.inf or (name in _POSITIVE and value == 0):

@@ -37,8 +37,8 @@ class Suggestions:
     contacts: Float64[Tensor, "contacts 3"]
     """Object frame, metres."""
     directions: Float64[Tensor, "contacts 3"] | None
-    """Unit vectors along which to strike: as given, or the nearest to straight into the body that a hammer can take;
-    None where the field knows nothing of directions."""
+    """Unit vectors along which to strike: as given, or the nearest to straight into the field's body that a hammer can
+    take; without a body that of the nearest recording; None where the field knows nothing of directions."""
     rows: Int[Tensor, " contacts"]
     """Which of the candidates they are."""
     before: float

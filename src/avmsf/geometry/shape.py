@@ -25,6 +25,8 @@ _LID_TURN = 0.8
 _LID_REACH = 0.6
 """How far a lid grows over the rim, and over floors that were not seen to lie below it, over the radius of a disc of
 its area."""
+_SHIFTED = 0.5
+"""Pixels by which outlines are moved, from which on the user hears of it; masks that the package finds take .2."""
 _THINNEST, _THICKEST = 0.0025, 0.06
 """Wall thicknesses over the diagonal that are worth trying. Of the 20 simulated objects a tube has the least, .0027,
 and thinner walls take more elements than a model has."""
@@ -215,6 +217,9 @@ class ObjectShape:
         parts = [f"{cavities}{', supposed behind faces that no outline touches' if self.supposed and count else ''}"]
         if self.report.unseen > 0:
             parts.append(f"{self.report.unseen:.0%} of the surface was seen by no view and is closed")
+        if abs(self.report.mask_offset) >= _SHIFTED:
+            way = "inwards" if self.report.mask_offset > 0 else "outwards"
+            parts.append(f"outlines of masks moved {way} by {abs(self.report.mask_offset):.1f} pixels")
         if self.report.rejected:
             parts.append(f"masks left out, which contradict the others: {', '.join(self.report.rejected)}")
         return "; ".join(parts)

@@ -3,7 +3,6 @@
 import hashlib
 import warnings
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -245,7 +244,8 @@ def _shape(
         else:
             features = FeatureField.from_points(capture.surface.vertices)
         surface, digest = object_shape(capture.surface, None)
-        return _Shape({"positions": features}, _surface_stage(stages, config, surface, digest), {}, surface, digest)
+        made = _surface_stage(stages, config, surface, digest, listener)
+        return _Shape({"positions": features}, made, {}, surface, digest)
     if capture.surface is not None and scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
         words = judge_outlines(capture.surface, read_views(scene.views.path), settings)
@@ -253,7 +253,7 @@ def _shape(
             warnings.warn(words, CaptureWarning, stacklevel=2)
     features = load_features(scene.features.path)
     surface, digest = object_shape(capture.surface, scene)
-    made = scene.made() | _surface_stage(stages, config, surface, digest)
+    made = scene.made() | _surface_stage(stages, config, surface, digest, listener)
     seen = capture.surface
     if seen is None and "surface" in made:
         # Gaussians lie up to a wall's thickness below the surface, where a wall's other side may be nearer.
@@ -271,14 +271,20 @@ def _shape(
 
 
 def _surface_stage(
-    stages: StageFolder, config: ReconstructConfig, surface: Callable[[], Surface | ObjectShape], digest: str
+    stages: StageFolder,
+    config: ReconstructConfig,
+    surface: Callable[[], Surface | ObjectShape],
+    digest: str,
+    listener: Listener,
 ) -> dict[str, Kept]:
     """Return the stage of the object's surface; none where its shape is unknown or the gain model needs none."""
     if config.gain_model == NETWORK:
         return {}
-    with suppress(SceneError):
+    try:
         return {"surface": keep_surface(stages, surface, digest)}
-    return {}
+    except SceneError as error:
+        listener.tell(f"no surface is written: {error}")
+        return {}
 
 
 def moved_onto(features: FeatureField, surface: Surface) -> FeatureField:

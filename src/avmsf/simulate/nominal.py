@@ -2,7 +2,6 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -11,7 +10,6 @@ from types import MappingProxyType
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-import torch
 from jaxtyping import Int
 
 from avmsf._utils.caching import source_digest
@@ -142,17 +140,12 @@ def nominal_bodies(
         except SimulationError as error:
             refused[wall] = str(error)
     fine = len(likely) == 1
-
-    def made(wall: float | None) -> NominalBody | None:
+    bodies = []
+    for wall in likely:
         try:
-            return maker.body(wall, freedoms, fine=fine)
+            bodies.append(maker.body(wall, freedoms, fine=fine))
         except SimulationError as error:
             refused[wall] = str(error)
-            return None
-
-    # Tetrahedra are made in processes, and factorizations let other threads run.
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        bodies = [body for body in pool.map(made, likely) if body is not None]
     reasons = _grouped(refused)
     for reason in reasons:
         told(f"not tried: {reason}")

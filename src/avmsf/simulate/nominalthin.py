@@ -39,15 +39,16 @@ def thinned(skin: Skin, *, tell: Callable[[str], None]) -> Skin:
 
 
 def simplified(skin: Skin, count: int, *, like: Skin | None = None) -> Skin:
-    """Return a skin of about `count` triangles by quadrics, which keep its volume; the same where it has no more.
+    """Return a skin of about `count` triangles by quadrics, its volume about the same; as it is if it has no more.
 
     More are left where fewer would open a seam or share an edge among three, compared with the skin that it is `like`.
     """
-    opened, crowded = (each := like or skin).open_edges, each.crowded_edges
+    reference = skin if like is None else like
+    opened, crowded, count = reference.open_edges, reference.crowded_edges, max(count, 4)
     while count < len(skin.faces):
         points, faces = fast_simplification.simplify(skin.points, skin.faces, target_count=count)
         found = Skin.compact(points.astype(np.float64), faces.astype(np.int64))
-        if found.open_edges <= opened and found.crowded_edges <= crowded:
+        if len(found.faces) >= 4 and found.open_edges <= opened and found.crowded_edges <= crowded:
             return found
         count *= 2
     return skin

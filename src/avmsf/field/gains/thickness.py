@@ -2,7 +2,7 @@
 
 The log evidence of bodies with walls of different thickness is a function of the log thickness, which is computed where
 the next body says most: at the top of the parabola through the three thicknesses around the most probable one, half way
-to the neighbor of a wide gap, or a step below the thinnest where that is the most probable one. The prior is uniform in
+to a likely neighbor, or a step below the thinnest where that is the most probable one. The prior is uniform in
 the log thickness over the range that was computed.
 """
 
@@ -18,7 +18,7 @@ from avmsf.simulate.nominal import NominalBody
 _RESOLUTION = 0.06
 """Difference of log thickness below which no body is computed between two: real walls vary by 3 to 5 %."""
 _MOST = 6
-"""Bodies computed at most."""
+"""Bodies computed at most, failures included."""
 _UNLIKELY = math.log(100.0)
 """Log evidence (nats) below the most probable body's, from which on a body is no hypothesis."""
 _DISCREPANCY = 0.15
@@ -87,8 +87,8 @@ def _next(places: np.ndarray, values: np.ndarray, failed: np.ndarray) -> float |
     # Half way to a neighbor, the likelier one first; on a parabola a quarter of the neighbor's fall is lost there.
     near = [row for row in (best - 1, best + 1) if 0 <= row < len(places)]
     if best == 0:
-        # Views bound a wall from above alone.
-        proposals.append(2.0 * places[0] - places[1])
+        # The first range is a guess below; above, the views or the object's width bound it.
+        proposals += [places[0] - part * (places[1] - places[0]) for part in (1.0, 0.5)]
     near = [row for row in near if values[best] - values[row] < 4.0 * _UNLIKELY]
     proposals += [0.5 * (places[best] + places[row]) for row in sorted(near, key=lambda row: -values[row])]
     known = np.concatenate([places, failed])

@@ -68,15 +68,15 @@ export class ObjectView {
     }
     const same = this.grid?.count === points.length / 3 && points.every((value, at) => value === this.grid.points[at]);
     const files = ({ object, surface }) => `${object.file} ${surface?.file}`;
-    if (same && files(this.bundle.manifest) === files(bundle.manifest)) {
+    if (this.bundle && same && files(this.bundle.manifest) === files(bundle.manifest)) {
       this.normals = bundle.tensors.normals;
       return;
     }
+    const layers = { object: this.#layer(bundle, "object") };
+    await layers.object;
     this.grid = new PointGrid(points);
     this.spacing = this.grid.spacing;
     this.normals = bundle.tensors.normals;
-    const layers = { object: this.#layer(bundle, "object") };
-    await layers.object;
     if (this.layer) {
       this.scene.remove(this.layer.object);
       for (const each of Object.values(this.layers)) (await each).dispose();
