@@ -72,11 +72,11 @@ export class ObjectView {
       this.normals = bundle.tensors.normals;
       return;
     }
-    const layers = { object: this.#layer(bundle, "object") };
-    await layers.object;
     this.grid = new PointGrid(points);
     this.spacing = this.grid.spacing;
     this.normals = bundle.tensors.normals;
+    const layers = { object: this.#layer(bundle, "object") };
+    await layers.object;
     if (this.layer) {
       this.scene.remove(this.layer.object);
       for (const each of Object.values(this.layers)) (await each).dispose();
