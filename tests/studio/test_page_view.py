@@ -135,7 +135,7 @@ def test_finer_triangles_cover_the_same_surface_without_gaps(plain: "Page") -> N
 def picture(page: "Page") -> np.ndarray:
     from PIL import Image
 
-    # What was asked for is drawn in the next frame, which takes long on a busy computer; Gaussians are sorted meanwhile.
+    # What was asked for is drawn in the next frame, which takes long on a busy computer.
     page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     page.wait_for_timeout(400)
     box = page.locator("#stage canvas").bounding_box()
