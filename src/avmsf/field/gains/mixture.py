@@ -127,10 +127,7 @@ class KernelMixture:
 
     def solve(self) -> Float64[Tensor, "kernels contacts series"]:
         """Return the sum over noise shares of weight times C^-1 y: a mean at a place is k' times it, over kernels."""
-        scaled = torch.zeros_like(self.projected)
-        for row, inverse in enumerate(self._inverses()):
-            scaled += self.weights[:, row, None] * inverse
-        return self.eigen[1] @ (scaled * self.projected)
+        return self.eigen[1] @ self._averaged[0]
 
     def standard_error(self) -> Float64[Tensor, " series"]:
         """Return the standard deviation of the noise in each value."""
@@ -197,22 +194,35 @@ class KernelMixture:
 
         `cross` holds each kernel's covariances between places and contacts, `own` its variance at each place.
         """
-        vectors = self.eigen[1]
-        along = cross @ vectors
-        mean = torch.zeros(cross.shape[1], self.values.shape[1], dtype=torch.float64)
-        square = torch.zeros_like(mean)
-        for noise, inverse in enumerate(self._inverses()):
-            for series in range(self.values.shape[1]):
-                kept = torch.nonzero(self.weights[:, noise, series]).flatten()
-                if not len(kept):
-                    continue
-                weight, scaled = self.weights[kept, noise, series], along[kept] * inverse[kept, None, :, series]
-                location = (scaled @ self.projected[kept, :, series, None])[..., 0]
-                within = (own[kept] - (scaled * along[kept]).sum(2)).clamp_min(0.0)
-                scale = self.quadratic[kept, noise, series] / len(self.values)
-                mean[:, series] += weight @ location
-                square[:, series] += weight @ (scale[:, None] * within + location.square())
+        scale = (self.weights * self.quadratic).sum(1) / len(self.values)
+        square = own.mT @ scale
+        mean = torch.zeros_like(square)
+        for row, (series, weights, solved) in enumerate(self._weighted):
+            along = cross[row] @ self.eigen[1][row]
+            mean.addmm_(along, self._averaged[0][row])
+            square.index_add_(1, series, (along @ solved).square_().mul_(weights))
+            square.addmm_(along.square_(), self._averaged[1][row], alpha=-1.0)
         return (square - mean.square()).clamp_min(0.0).sqrt()
+
+    @cached_property
+    def _averaged(self) -> tuple[Float64[Tensor, "kernels contacts series"], Float64[Tensor, "kernels contacts series"]]:
+        """The sums over noise shares of weight times U' C^-1 y, and of weight times s^2 / (lambda + v)."""
+        solved, reduced = torch.zeros_like(self.projected), torch.zeros_like(self.projected)
+        for row, inverse in enumerate(self._inverses()):
+            weights = self.weights[:, row, None]
+            solved += weights * inverse * self.projected
+            reduced += weights * self.quadratic[:, row, None] / len(self.values) * inverse
+        return solved, reduced
+
+    @cached_property
+    def _weighted(self) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """For each kernel the series and the weights above zero, and U' C^-1 y of each of these (contacts, pairs)."""
+        values, found = self.eigen[0], []
+        for row, weights in enumerate(self.weights):
+            noise, series = torch.nonzero(weights, as_tuple=True)
+            variance = values[row][:, None] + self.noise_variance[noise, series]
+            found.append((series, weights[noise, series], self.projected[row][:, series] / variance))
+        return found
 
     def _inverses(self) -> Iterator[Float64[Tensor, "kernels contacts series"]]:
         """Yield 1 / (lambda + v) for each noise share."""

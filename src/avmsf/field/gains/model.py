@@ -24,7 +24,7 @@ from avmsf.simulate.nominal import NOMINAL
 
 NEIGHBORS = 3
 """Nearest recordings that are averaged, as in the paper's baseline."""
-_MEMORY = 4_000_000
+_MEMORY = 16_000_000
 """Covariances between places and contacts that are held at once, over all kernels."""
 _POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
 _OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "symmetries", Visual.kind: "features"}
