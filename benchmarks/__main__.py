@@ -9,6 +9,7 @@ from types import ModuleType
 
 from avmsf.capture import CaptureWarning
 from avmsf.errors import AvmsfError
+from avmsf.simulate.sim20 import SIM20
 from benchmarks import (
     align,
     extract,
@@ -68,14 +69,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--sim-20",
         type=Path,
         metavar="FOLDER",
-        help="residual, surface: objects that `avmsf simulate sim-20` has made; surface needs it, residual simulates "
-        "them again without it",
+        help="gains, residual, surface: objects that `avmsf simulate sim-20` has made; surface and the photographs of "
+        "gains need it, the others simulate them again without it",
+    )
+    parser.add_argument(
+        "--objects", nargs="+", default=(), choices=tuple(SIM20), metavar="NAME", help="gains: some of these objects"
     )
     parser.add_argument(
         "--clouds",
         type=Path,
         metavar="FOLDER",
-        help="surface: keep the Gaussians fitted to the objects here; without it they are fitted again",
+        help="gains, surface: keep the Gaussians fitted to the objects here; without it they are fitted again",
     )
     chosen = parser.parse_args(arguments)
     benchmark = BENCHMARKS[chosen.name]
@@ -85,7 +89,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"{chosen.name} has no part {', '.join(unknown)}; it has {', '.join(benchmark.PARTS)}")
     if not chosen.paper_minutes > 0:
         parser.error(f"--paper-minutes is {chosen.paper_minutes:g}; expected a number above 0")
-    options = Options(parts, chosen.quick_look, chosen.paper_minutes, chosen.sim_20, chosen.clouds)
+    options = Options(
+        parts, chosen.quick_look, chosen.paper_minutes, chosen.sim_20, tuple(chosen.objects), chosen.clouds
+    )
     # Remarks on a capture are `avmsf check`'s business.
     warnings.simplefilter("ignore", CaptureWarning)
     try:

@@ -4,7 +4,7 @@ import tempfile
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -21,18 +21,21 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.estimator import FAMILIES, KNOWN, POSITIONAL, MixtureEstimator
+from avmsf.field.gains.estimator import FAMILIES, POSITIONAL, MixtureEstimator
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.recipes import GainCase, along_phase
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uncertainty import coverage, parts_of, std_of
+from avmsf.geometry import ObjectShape
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction, extract
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise, synthesise_phased
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies, roughened
-from avmsf.scene.features import GEOMETRY, FeatureField
+from avmsf.pipeline.cloudshape import shape_of_cloud
+from avmsf.scene.features import FeatureField
+from avmsf.scene.points import farthest_points
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrycharacters import groups_of
 from avmsf.scene.symmetrysearch import find_symmetries
@@ -40,8 +43,10 @@ from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.sim20 import ABLATED, SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.truth import Truth, read_truth
-from benchmarks.material import example_capture, shared_data, surface_features
+from avmsf.tasks.locator import Locator
+from benchmarks.material import MissingDataError, example_capture, shared_data, surface_features
 from benchmarks.report import Options, Report, Table, tell
+from benchmarks.surface import views_and_gaussians
 
 STARTS = (0, 18, 37)
 COUNTS = {"aircraft_response": (8, 15, 28), "ruler10": (5, 7), "tree43": (12, 20, 40)}
@@ -157,32 +162,59 @@ def _errors(case: SplitCase, options: Options) -> tuple[dict[str, float], float]
     return single, case.coverage(field)
 
 
-def _sim20(options: Options) -> Report:
-    """Errors on the simulated objects with their meshes, 8 training contacts of 40."""
-    found: dict[bool, list[list[str | float]]] = {False: [], True: []}
+def _sim20(options: Options, condition: str = "") -> Report:
+    """Errors on the simulated objects, 8 training contacts of 40, with what is known of them by a condition."""
+    rows: list[list[str | float]] = []
     with tempfile.TemporaryDirectory() as cache:
-        for name in tuple(SIM20)[:2] if options.quick_look else tuple(SIM20):
-            for tidy, rows in found.items():
-                capture, truth = _simulated(name, options, Path(cache), tidy=tidy)
-                # Both have the same mesh, so that the second finds its bodies.
-                bodies = _bodies(capture, options, cache=Path(cache) / name)
-                case = _case(*split(capture.impacts, fraction=0.2), capture, bodies)
-                rows.append([name, *_simulated_row(case, truth, options)])
-                tell(f"{'tidy' if tidy else 'untidy'} {rows[-1]}")
-    report = Report()
-    for tidy, rows in found.items():
-        values = np.array([row[1:] for row in rows])
-        means = [*values[:, :_ERRORS].mean(0), *np.exp(np.log(values[:, _ERRORS:-1]).mean(0)), values[:, -1].mean()]
-        rows.append(["mean; of ratios the geometric mean", *map(float, means)])
-        title = f"simulated objects, 8 contacts, exact meshes{', recordings that need no alignment' * tidy}"
-        keys = {f"gains.sim20{'_tidy' * tidy}_{key}": float(value) for key, value in zip(_KEYS, means, strict=True)}
-        report += Report(tables=(Table(title, ("object", *_KEYS), rows),), figures=keys)
-    return report
+        for name in options.objects or tuple(SIM20)[: 2 if options.quick_look else None]:
+            capture, truth = _simulated(name, options, Path(cache), tidy=condition == "tidy")
+            assert capture.surface is not None
+            surface: Surface | ObjectShape = capture.surface
+            if condition == "noisy":
+                surface = roughened(capture.surface, _ROUGH, seed=0)
+            elif condition in {"photographs", "offset"}:
+                surface = _photographed(name, options)
+                capture = replace(capture, surface=surface.as_seen())
+            if condition == "offset":
+                capture = replace(capture, impacts=_moved(capture.impacts))
+            case = _case(*split(capture.impacts, fraction=0.2), capture, _bodies_of(surface, options))
+            rows.append([name, *_simulated_row(case, truth, options)])
+            tell(f"{condition} {rows[-1]}")
+    values = np.array([row[1:] for row in rows])
+    ratios = slice(_ERRORS, _ERRORS + _RATIOS)
+    means = values.mean(0)
+    means[ratios] = np.exp(np.log(values[:, ratios]).mean(0))
+    rows.append(["mean; of ratios the geometric mean", *map(float, means)])
+    prefix = f"gains.sim20_{condition}".rstrip("_")
+    keys = {f"{prefix}_{key}": float(value) for key, value in zip(_KEYS, means, strict=True)}
+    title = f"simulated objects, 8 contacts, {_CONDITIONS[condition]}"
+    return Report(tables=(Table(title, ("object", *_KEYS), rows),), figures=keys)
 
 
-_KEYS = ("error", "averaging", "modal", "l1", "l1_log", "envelope", "coverage")
-_ERRORS = 3
-"""So many of the keys are errors; the others are ratios to averaging, and the last is the coverage."""
+def _photographed(name: str, options: Options) -> ObjectShape:
+    """Return the shape of an object from its photographs alone."""
+    if options.sim20 is None or options.clouds is None:
+        raise MissingDataError("photographs: give --sim-20 and --clouds, folders of the objects and their Gaussians")
+    views, cloud = views_and_gaussians(options.sim20 / name, options.clouds, quick=options.quick_look)
+    return shape_of_cloud(cloud, views)
+
+
+def _moved(impacts: Impacts) -> Impacts:
+    """Return impacts with contacts 2 mm off, in random directions."""
+    ways = torch.randn(impacts.contacts.shape, generator=torch.Generator().manual_seed(0))
+    return replace(impacts, contacts=impacts.contacts + 0.002 * ways / ways.norm(dim=1, keepdim=True))
+
+
+_CONDITIONS = {
+    "": "exact meshes",
+    "tidy": "exact meshes, recordings that need no alignment",
+    "noisy": "meshes whose vertices are off by .3 % of the size (standard deviation, each axis)",
+    "photographs": "shapes from 72 photographs",
+    "offset": "shapes from 72 photographs, contacts 2 mm off in random directions",
+}
+_KEYS = ("error", "averaging", "modal", "l1", "l1_log", "envelope", "coverage", "located")
+_ERRORS, _RATIOS = 3, 3
+"""So many of the keys are errors; so many more are ratios to averaging."""
 
 
 def _simulated_row(case: SplitCase, truth: Truth, options: Options) -> list[float]:
@@ -191,7 +223,16 @@ def _simulated_row(case: SplitCase, truth: Truth, options: Options) -> list[floa
     scores, averaged = evaluate(field, case.test).mean(), evaluate(MeanWaveform(case.train), case.test).mean()
     row = [scores["relative_stft"], averaged["relative_stft"], _modal_error(field, case.test, truth)]
     row += [scores[metric] / averaged[metric] for metric in ("l1", "l1_log", "envelope")]
-    return [*row, case.coverage(field)]
+    return [*row, case.coverage(field), _located(field, case.test)]
+
+
+def _located(field: SoundField, test: Impacts) -> float:
+    """Return the median distance of held-out contacts from where their recordings are located, over the diagonal."""
+    points = field.gain_field.points
+    size = float((points.amax(0) - points.amin(0)).norm())
+    locator = Locator.of(field, points=points[farthest_points(points, min(_PLACES, len(points)))])
+    places = torch.stack([locator.locate(sound).place for sound in test.sounds])
+    return float((places - test.contacts).norm(dim=1).median()) / size
 
 
 def _ablation(options: Options) -> Report:
@@ -236,16 +277,10 @@ def _variants(case: SplitCase, options: Options) -> Iterator[tuple[str, float]]:
     yield "positions alone", case.error(case.fit(MixtureEstimator(tuple(POSITIONAL)), quick=False))
     yield "positions and symmetry", case.error(case.fit(MixtureEstimator(symmetries=case.symmetries), quick=False))
     if case.bodies is not None:
-        nominal = [
-            replace(body, elastic=replace(body.elastic, perturbations=None)) for body in case.bodies.bodies.bodies
-        ]
-        bodies = CandidateBodies(replace(case.bodies.bodies, bodies=tuple(nominal)), case.bodies.refine)
-        yield "no updating", case.error(case.fit(MixtureEstimator(bodies=bodies), quick=False))
+        yield "no updating", case.error(case.fit(MixtureEstimator(bodies=case.bodies, update=False), quick=False))
     if case.surface is not None:
         rough = _bodies_of(roughened(case.surface, _ROUGH, seed=0), options)
         yield "noisy mesh", case.error(case.fit(MixtureEstimator(bodies=rough), quick=False))
-    if case.features.encoder != GEOMETRY:
-        yield "visual features", case.error(case.fit(MixtureEstimator(KNOWN, bodies=case.bodies), quick=False))
 
 
 def _outliers(options: Options) -> Report:
@@ -382,14 +417,14 @@ def _case(train: Impacts, test: Impacts, capture: Capture, bodies: CandidateBodi
     return SplitCase(modes.aligned(train), modes.aligned(test), modes, features, bodies, capture.surface)
 
 
-def _bodies(capture: Capture, options: Options, *, cache: Path | None = None) -> CandidateBodies:
+def _bodies(capture: Capture, options: Options) -> CandidateBodies:
     assert capture.surface is not None
-    return _bodies_of(capture.surface, options, cache)
+    return _bodies_of(capture.surface, options)
 
 
-def _bodies_of(surface: Surface, options: Options, cache: Path | None = None) -> CandidateBodies:
+def _bodies_of(surface: Surface | ObjectShape, options: Options) -> CandidateBodies:
     config = BodyConfig(shapes=12, freedoms=3000) if options.quick_look else BodyConfig()
-    return candidate_bodies(surface, config, cache=cache, tell=tell)
+    return candidate_bodies(surface, config, tell=tell)
 
 
 def _read(name: str) -> Capture:
@@ -413,9 +448,17 @@ def _simulated(name: str, options: Options, cache: Path, *, tidy: bool = False) 
     return made.capture, made.truth
 
 
+_PLACES = 1000
+"""Points of the surface among which recordings are located."""
 _ROUGH = 0.003
 """Standard deviation of a noisy mesh's vertices along each axis, over the object's size."""
 _TIDY = {"speed": 0.15, "contact_time": 0.0, "pretrigger": 0.0, "jitter": 0.0, "propagation": 0.0}
 
 
-PARTS = {"captures": _captures, "sim20": _sim20, "ablation": _ablation, "outliers": _outliers, "speed": _speed}
+PARTS: dict[str, Callable[[Options], Report]] = {
+    "captures": _captures,
+    **{f"sim20-{name}".rstrip("-"): partial(_sim20, condition=name) for name in _CONDITIONS},
+    "ablation": _ablation,
+    "outliers": _outliers,
+    "speed": _speed,
+}

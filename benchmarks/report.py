@@ -22,6 +22,8 @@ class Options:
     """Time for a real run of the paper's recipe, minutes."""
     sim20: Path | None = None
     """Folder of the objects that `avmsf simulate sim-20` makes; None to simulate them."""
+    objects: tuple[str, ...] = ()
+    """Some of these objects; none for all."""
     clouds: Path | None = None
     """Folder that keeps Gaussians fitted to these objects; None to fit them again."""
 

@@ -42,12 +42,13 @@ CONVENTIONS = (
     "which recordings would have to tell. mean, p95: distance between the body and the true mesh in percent "
     "of the mesh's diagonal, from 8000 places on each to the other, of those that see no other part of their mesh in "
     "half of the directions or more. thickness: relative difference of twice the volume over the area. cavity: "
-    "relative error of the cavity's volume, which is what the body leaves of solid(). seconds: process time of "
-    "object_surface and one shell(t). Gaussians as SplatConfig has them, of 72 views of 256 pixels, seed 0.",
+    "relative error of the cavity's volume, which is what the body leaves of solid(). Neither says what wall the "
+    "recordings find. seconds: process time of object_surface and one shell(t). Gaussians as SplatConfig has them, of "
+    "72 views of 256 pixels, seed 0.",
     "Degraded: the masks and cameras that shapes are made of, with Gaussians of the undegraded views seen from the "
-    "cameras at hand. upper: elevations of 0 and more; twelve: each sixth view; eroded, dilated: masks by so many "
-    "pixels; found: masks found before the pictures' plain background; wrong: 5 % of the masks mirrored; turned: "
-    "cameras by .3 degrees about random axes.",
+    "cameras at hand. upper: elevations of -6 degrees and more; twelve: each sixth view; eroded, dilated: masks by "
+    "so many pixels; found: masks found before the pictures' plain background; wrong: 5 % of the masks turned by 180 "
+    "degrees; turned: cameras by .3 degrees about random axes.",
 )
 
 
@@ -93,7 +94,7 @@ def _objects(folder: Path, clouds: Path, quick: bool) -> Report:
         found.append(scores)
         rows.append([name, *_cells(scores)])
         tell(f"surface: {name}: {scores}")
-    means = [float(np.nanmean([getattr(each, key) for each in found])) for key in _KEYS]
+    means = [_mean([getattr(each, key) for each in found]) for key in _KEYS]
     rows.append(["mean", *means])
     names = ("outer_mean", "outer_p95", "thickness_error", "cavity_error", "seconds")
     figures = {f"surface.{name}": value for name, value in zip(names, means, strict=True)}
@@ -111,19 +112,31 @@ def _degraded(folder: Path, clouds: Path, quick: bool) -> Report:
                 found.append(_scores(change(views), cloud, truth))
             except SceneError as error:
                 tell(f"surface: {name}: {error}")
-        means = [float(np.nanmean([getattr(each, key) for each in found])) for key in _KEYS]
+        means = [_mean([getattr(each, key) for each in found]) for key in _KEYS]
         rows.append([name, *means, len(materials) - len(found)])
         figures |= {f"surface.{name}.{key}": value for key, value in zip(_KEYS, means, strict=True)}
         tell(f"surface: {name}: {means}")
     return Report(tables=(Table("degraded views", ("condition", *_KEYS, "failed"), rows),), figures=figures)
 
 
-def _material(folder: Path, clouds: Path, quick: bool) -> tuple[tuple[View, ...], _Truth, GaussianCloud]:
+def _mean(values: Sequence[float]) -> float:
+    """Return the mean of what is known; NaN where nothing is."""
+    known = [value for value in values if not np.isnan(value)]
+    return float(np.mean(known)) if known else float("nan")
+
+
+def views_and_gaussians(folder: Path, clouds: Path, *, quick: bool) -> tuple[tuple[View, ...], GaussianCloud]:
+    """Return an object's views and its Gaussians, which are kept in the folder `clouds`."""
     config = replace(SplatConfig(), steps=200) if quick else SplatConfig()
     views, path = read_views(folder), clouds / f"{folder.name}{'-200-steps' if quick else ''}.ply"
     if not path.exists():
         write_splats(splat(views, config), path)
-    return tuple(views), _truth(read_surface(folder / "surface.ply")), read_splats(path)
+    return tuple(views), read_splats(path)
+
+
+def _material(folder: Path, clouds: Path, quick: bool) -> tuple[tuple[View, ...], _Truth, GaussianCloud]:
+    views, cloud = views_and_gaussians(folder, clouds, quick=quick)
+    return views, _truth(read_surface(folder / "surface.ply")), cloud
 
 
 def _truth(surface: Surface) -> _Truth:

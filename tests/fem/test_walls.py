@@ -95,6 +95,13 @@ def test_prisms_of_a_thick_block_have_several_layers():
     assert len(torch.unique(solid.points[:, 2].round(decimals=6))) == 1 + math.ceil(0.04 / length)
 
 
+def test_a_mesh_with_three_triangles_at_an_edge_is_no_wall():
+    surface = box(0.1, 0.06, 0.002)
+    doubled = Surface(surface.vertices, torch.cat([surface.faces, surface.faces[:1]]))
+    assert wall_of(Skin.of(surface)) is not None
+    assert wall_of(Skin.of(doubled)) is None
+
+
 @pytest.mark.parametrize("kind", ["blob", "mug"])
 def test_lumps_and_walls_with_handles_are_not_filled_by_prisms(kind: str):
     wall = wall_of(Skin.of(make_shape(kind, seed=1).surface))

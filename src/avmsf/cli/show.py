@@ -201,7 +201,9 @@ def _words(values: dict[str, Any], quality: list[str]) -> str:
         f"  fitted to  {len(values['trained_on'])} recordings",
     ]
     lines += [f"  quality    {words}" for words in quality]
-    lines += [f"  left out   {words}" for words in report.get("outliers", {}).values()]
+    excluded = report.get("excluded", ())
+    for name, words in report.get("outliers", {}).items():
+        lines.append(f"  {'left out' if name in excluded else 'outlier'}   {words}")
     for edit in report.get("edits", []):
         lines.append(f"  edited     {_edit_words(edit)}")
     if report.get("validated"):

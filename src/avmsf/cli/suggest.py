@@ -86,8 +86,8 @@ def run(options: Options) -> int:
         table(title, columns, [[_cell(value) for value in row.values()] for row in rows], words=1 + bool(names))
     )
     screen.print(
-        "error: relative to the energy of the gains, 0 = certain, 1 = as wrong as silence; as large as strikes "
-        "left out in turn show it to be",
+        "error: relative to the energy of the gains, as the field's posterior expects it; 0 = certain, 1 = as wrong "
+        "as silence",
         soft_wrap=True,
     )
     if found.unreachable:

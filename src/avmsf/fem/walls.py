@@ -131,7 +131,8 @@ def wall_of(skin: Skin, thickness: float | None = None) -> Wall | None:
 
     `Wall.solid` finds out whether prisms between the sides fill it. `thickness` states that of an even wall, meters.
     """
-    if skin.open_edges or skin.volume <= 0.0:
+    # Sides are found over edges of two triangles each.
+    if skin.open_edges or skin.crowded_edges or skin.volume <= 0.0:
         return None
     normals = _normals(skin)
     areas, total = skin.areas, float(skin.areas.sum())

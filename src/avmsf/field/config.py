@@ -45,7 +45,7 @@ class FitConfig:
     """Steps end to end on spectra (paper, eq. 14)."""
     patience: int = 0
     """Stop when the validation contacts have not improved for this many steps; 0 runs all steps. For the network alone:
-    physics and splines begin with solved gains, and take all of theirs."""
+    the mixture begins with solved gains, and takes all of its steps."""
     fft_sizes: tuple[int, ...] = (2048, 1024, 512, 256)
     """Resolutions of the spectral loss, samples at 44.1 and 48 kHz; other rates scale them in octaves."""
     hop: int = 0

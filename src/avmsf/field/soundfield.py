@@ -75,7 +75,8 @@ class FieldQuality:
             )
         return (
             f"No better than averaging the three nearest recordings: relative STFT errors of {self.error:.2f} and "
-            f"{self.averaging:.2f} at contacts left out ({self.places} places). Give a mesh, or record more places."
+            f"{self.averaging:.2f} at contacts left out ({self.places} places). Record more places; without a mesh, "
+            "give one."
         )
 
     @property

@@ -31,7 +31,7 @@ from avmsf.errors import CaptureError, FieldFileError, FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField
 from avmsf.field.scaledgains import FITTED, ScaledGains
-from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.soundfield import FieldQuality, Origin, SoundField
 from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
@@ -158,6 +158,8 @@ class _Header:
             report=like(origin["report"], {}, "origin.report"),
             settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
         )
+        if (quality := read.report.get("quality")) is not None:
+            FieldQuality.of(quality)
         return cls(rate, samples, kind, gains, read, skeleton)
 
 

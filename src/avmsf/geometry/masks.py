@@ -62,6 +62,7 @@ def agreeing(views: Sequence[View], outlines: Sequence[Outline], grid: Grid) -> 
 
     The consensus is what all but 5 % of the masks keep. A right mask may leave out a part of it that few other views
     could see, but shows nothing beyond it; one that does both is wrong, and one that leaves out much.
+    At least half of the masks agree, for a wrong one leaves out more than the median.
     """
     values = hull_distance(outlines, grid, rank=round(DISSENT * len(outlines)))
     solid = values > 0
@@ -76,8 +77,7 @@ def agreeing(views: Sequence[View], outlines: Sequence[Outline], grid: Grid) -> 
     tracer = MeshTracer(TexturedMesh.plain(closed_surface(values, grid)))
     beyond = np.array([_beyond(view, each, tracer) for view, each in zip(views, outlines, strict=True)])
     shown = beyond > max(_BEYOND, _TIMES_MEDIAN * float(np.median(beyond)))
-    right = ~(suspect & (shown | (cut > _CUT_ALONE)))
-    return right if int(right.sum()) >= 3 else np.ones(len(outlines), dtype=bool)
+    return ~(suspect & (shown | (cut > _CUT_ALONE)))
 
 
 def _left_out(outline: Outline, grid: Grid, solid: Bool[np.ndarray, "x y z"]) -> float:

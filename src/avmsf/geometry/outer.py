@@ -61,8 +61,8 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     `cells` count along the longest side; slender objects have up to four times as many. Views whose masks contradict
     the others' are left out, and all outlines are moved to the edges in the photographs by the same number of pixels.
     Depth may lie behind the surface by the same length everywhere: that is found where the masks' outlines touch the
-    surface, and taken off. Raises SceneError where fewer than 3 views have masks, where masks have nothing in common,
-    and where views do not bound the object: an image cuts it, or all are from one side.
+    surface, and taken off. Raises SceneError where fewer than 3 views have masks, where masks have nothing in
+    common, and where views do not bound the object: an image cuts it, or all are from one side.
     """
     if cells < 16:
         raise SceneError(f"cells = {cells}: expected 16 or more")

@@ -33,9 +33,14 @@ def shape_of_cloud(cloud: GaussianCloud, views: Sequence[View] = (), *, cells: i
     """
     cloud = _visible(cloud)
     rasteriser = choose_rasteriser(cloud.centers.device)
-    if sum(view.mask is not None and bool((view.mask > 127).any()) for view in views) < _FEWEST_MASKS:
+    if not masks_suffice(views):
         views = views_of_cloud(cloud, rasteriser, size=_SIZE)
     return object_surface(views, depth_of_cloud(cloud, rasteriser), cells=cells)
+
+
+def masks_suffice(views: Sequence[View]) -> bool:
+    """Return whether 3 or more views have masks that show something."""
+    return sum(view.mask is not None and bool((view.mask > 127).any()) for view in views) >= _FEWEST_MASKS
 
 
 def views_of_cloud(cloud: GaussianCloud, rasteriser: Rasteriser, *, size: int) -> tuple[View, ...]:

@@ -13,7 +13,7 @@ from avmsf.capture.surface import read_surface
 from avmsf.capture.views import read_sparse_points, read_views
 from avmsf.errors import SceneError
 from avmsf.geometry import ObjectShape
-from avmsf.pipeline.cloudshape import shape_of_cloud, views_of_cloud
+from avmsf.pipeline.cloudshape import masks_suffice, shape_of_cloud, views_of_cloud
 from avmsf.pipeline.features import LiftConfig, choose_encoder, finish_features, lift_to_cloud, lift_to_surface
 from avmsf.pipeline.sources import Source, ViewsConfig, find_source, find_splats, keep_views, replace_views
 from avmsf.pipeline.stages import Kept, StageFolder, digest_of
@@ -152,7 +152,8 @@ class SceneStages:
         Where fewer than 3 views have masks, pictures of the Gaussians stand for them.
         """
         views, cloud = read_views(self.views.path), read_splats(self.cloud.path)
-        self.listener.tell(f"shape: of {len(views)} views and {len(cloud)} Gaussians")
+        source = f"{len(views)} views" if masks_suffice(views) else "pictures of the Gaussians, as views have no masks,"
+        self.listener.tell(f"shape: of {source} and {len(cloud)} Gaussians")
         shape = shape_of_cloud(cloud, views)
         self.listener.tell(f"shape: {shape.describe()}")
         return shape

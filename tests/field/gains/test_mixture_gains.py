@@ -186,6 +186,7 @@ def test_a_mode_without_gains_is_silent_and_changes_no_other(variance):
     assert not gains_at(one)[:, 2].any()
     assert torch.equal(deviation_at(one)[:, 2], torch.zeros(len(ASKED), 2, dtype=torch.float64))
     assert bool(one.standardized_errors()[:, 2].isnan().all())
+    assert not one.leave_one_out()[:, 2].any()
     assert torch.allclose(gains_at(one)[:, others], gains_at(other), rtol=1e-6, atol=1e-7)
 
 

@@ -59,6 +59,18 @@ def test_walls_thinner_than_the_first_ones_are_found() -> None:
     assert thickness.median == pytest.approx(true, rel=0.03)
 
 
+def test_walls_are_not_made_ever_thinner() -> None:
+    asked: list[float] = []
+
+    def wall(thickness: float) -> NominalBody:
+        asked.append(thickness)
+        return walled(thickness)
+
+    falling = partial(evidence, of=lambda log: -20.0 * log, filled=-1000.0)
+    search_thickness([walled(each) for each in GRID], falling, wall)
+    assert GRID[0] / 4 <= min(asked) < GRID[0]
+
+
 def test_no_thickness_is_looked_for_where_the_filled_body_is_the_most_probable() -> None:
     flat = partial(evidence, of=lambda log: 0.0, filled=10.0)
     found, thickness = search_thickness(

@@ -69,6 +69,8 @@ class MixtureEstimator(GainRecipe):
     Nor is there where a body is usable, whose mode shapes have the symmetries already: with them the family made the
     error of one of 11 splits of captures 6 % larger, and none smaller than by 2 %.
     """
+    update: bool = True
+    """Whether the stiffness and density of the most probable body are updated."""
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.kinds) - set(KNOWN))
@@ -84,7 +86,7 @@ class MixtureEstimator(GainRecipe):
         """Return a digest of the families, the bodies and the symmetries."""
         bodies = "" if self.bodies is None else self.bodies.digest()
         symmetries = "" if self.symmetries is None else json.dumps(self.symmetries.to_dict())
-        return hashlib.sha256(f"{' '.join(self.kinds)} {bodies} {symmetries}".encode()).hexdigest()
+        return hashlib.sha256(f"{' '.join(self.kinds)} {bodies} {symmetries} {self.update}".encode()).hexdigest()
 
     def start(self, case: GainCase, damping: str) -> RefinedGains:
         """Return the gain model, to be refined end to end.
@@ -140,10 +142,13 @@ class MixtureEstimator(GainRecipe):
             fewer = fit(rows, fewer_families)
             if predicts_better(fewer.leave_one_out(), model.leave_one_out()[rows], fit.at(rows)):
                 model, families, used = fewer, fewer_families, rows
-        if best is not None and (updated := fit.updated(used, bodies[best])) is not None:
-            bodies.append(updated)
-            families = fit.families(used, bodies)
-            model = fit(used, families)
+                weights = _body_weights(model, families, fit.measured)
+        if bodies and self.update:
+            updated = fit.updated(used, bodies[max(range(len(bodies)), key=weights.__getitem__)])
+            if updated is not None:
+                bodies.append(updated)
+                families = fit.families(used, bodies)
+                model = fit(used, families)
         weights = _body_weights(model, families, fit.measured)
         report = _report(bodies, families, weights, missing) | _judgment_report(judgment, case, used)
         report["thickness"] = None if thickness is None else asdict(thickness)

@@ -23,6 +23,8 @@ from avmsf.field.gains.model import MixtureGains, series_of
 
 _STRONGEST = 16
 """Modes of the most energy, which decide on the factor on nominal frequencies: many weak ones are not the body's."""
+_ALL_NOISE = 1e12
+"""Variance of the noise over the mean square of a part at most: far beyond what leaves anything of the gains."""
 _SUBSTANTIAL = 1e-3
 """Part of a mode's energy from which on a part of its gains counts in learning the prior."""
 
@@ -75,9 +77,9 @@ class MeasuredGains:
 
     @property
     def floor(self) -> Float64[Tensor, " series"]:
-        """The variance over the mean square of a part; finite for a mode without gains too."""
-        size, limits = self.values.abs().square().mean(0) / 2.0, torch.finfo(torch.float64)
-        return (self.variance / size.clamp_min(limits.tiny)).clamp_max(limits.max).repeat(2)
+        """The variance over the mean square of a part; for a mode without gains so large that its gains are noise."""
+        size = self.values.abs().square().mean(0) / 2.0
+        return (self.variance / size.clamp_min(torch.finfo(torch.float64).tiny)).clamp_max(_ALL_NOISE).repeat(2)
 
 
 @dataclass(frozen=True, eq=False)

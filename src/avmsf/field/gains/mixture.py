@@ -168,7 +168,10 @@ class KernelMixture:
         return mean, deviation
 
     def _left_out(self, rows: Int[Tensor, " rows"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the weights without the rows' values, and each hypothesis's errors and variances of these."""
+        """Return the weights without the rows' values, and each hypothesis's errors and variances of these.
+
+        The shapes are (kernels, noises, series), and twice (kernels, noises, rows, series).
+        """
         count, left = len(self.values), max(len(self.values) - len(rows), 1)
         along = self.eigen[1][:, rows]
         logs, errors, variances = [], [], []
@@ -205,8 +208,11 @@ class KernelMixture:
         return (square - mean.square()).clamp_min(0.0).sqrt()
 
     @cached_property
-    def _averaged(self) -> tuple[Float64[Tensor, "kernels contacts series"], Float64[Tensor, "kernels contacts series"]]:
-        """The sums over noise shares of weight times U' C^-1 y, and of weight times s^2 / (lambda + v)."""
+    def _averaged(self) -> tuple[Tensor, Tensor]:
+        """The sums over noise shares of weight times U' C^-1 y, and of weight times s^2 / (lambda + v).
+
+        Both have the shape (kernels, contacts, series).
+        """
         solved, reduced = torch.zeros_like(self.projected), torch.zeros_like(self.projected)
         for row, inverse in enumerate(self._inverses()):
             weights = self.weights[:, row, None]
