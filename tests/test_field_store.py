@@ -351,7 +351,7 @@ def test_a_record_that_is_not_of_these_tensors_is_refused(tmp_path, keys, value)
         (("origin", "trained_on"), [1], "trained_on"),
         (("origin",), None, "NoneType"),
         (("origin", "settings", "highpass"), -1.0, "highpass"),
-        (("origin", "report", "quality"), {"places": 9, "errors": 0.3}, "errors"),
+        (("origin", "report", "quality"), {"places": 9, "error": 0.3, "averaging": 0.7, "errors": 0.3}, "errors"),
     ],
 )
 def test_a_damaged_record_is_refused_with_what_is_wrong(tmp_path, keys, value, reason):

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.field.fit import fit
-from avmsf.field.places import held_out, rows_by_place
+from avmsf.capture.places import rows_by_place
+from avmsf.field.fit import fit, held_out
 from avmsf.field.recipes import Attention
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import farthest_points

@@ -12,8 +12,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
+from avmsf.capture.places import rows_by_place
 from avmsf.errors import EvaluationError
-from avmsf.field.places import rows_by_place
 from avmsf.scene.points import closest_points, farthest_points
 from avmsf.wording import counted
 

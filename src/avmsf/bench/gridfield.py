@@ -8,8 +8,9 @@ from typing import Any, Literal
 from avmsf.bench.fieldmethods import QUICK, fit_field
 from avmsf.bench.task import Look, Task
 from avmsf.capture.impacts import Impacts
+from avmsf.capture.places import rows_by_place
 from avmsf.field.config import FitConfig
-from avmsf.field.places import held_out, rows_by_place
+from avmsf.field.fit import held_out
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.spectra import envelope

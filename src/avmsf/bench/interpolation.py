@@ -11,8 +11,8 @@ from scipy.interpolate import RBFInterpolator
 from torch import Tensor
 
 from avmsf.bench.modalbaseline import ModalBaseline
+from avmsf.capture.places import places_of
 from avmsf.field.gains.positional import Axes
-from avmsf.field.places import places_of
 
 
 @dataclass(frozen=True, eq=False)

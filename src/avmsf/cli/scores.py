@@ -11,8 +11,8 @@ from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, WhiteN
 from avmsf.bench.evaluation import Scores, evaluate, score
 from avmsf.bench.renderer import Renderer
 from avmsf.capture import Impacts
+from avmsf.capture.places import places_of
 from avmsf.cli.printing import figure, table
-from avmsf.field.places import places_of
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.wording import counted

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.capture.impacts import Impacts
+from avmsf.capture.places import rows_by_place
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.config import FitConfig
@@ -21,7 +22,6 @@ from avmsf.field.gainfield import GainField
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.losses import spectral_loss
-from avmsf.field.places import held_out, rows_by_place
 from avmsf.field.quality import with_quality
 from avmsf.field.recipes import GainCase, GainRecipe, along_phase, fingerprint, gain_case
 from avmsf.field.soundfield import Origin, SoundField
@@ -32,6 +32,7 @@ from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual, estimate_residual
 from avmsf.modal.spectra import envelope
 from avmsf.scene.features import FeatureField
+from avmsf.scene.points import farthest_points
 
 _MIN_PLACES = 6
 _CHECKPOINT_SECONDS = 30.0
@@ -276,3 +277,13 @@ class _Validation:
         if not self.config.patience or spectral < self.best["spectral"]:
             self.best = {"spectral": spectral, "envelope": distance, "steps": run.step}
         return self.config.patience > 0 and run.step - self.best["steps"] >= self.config.patience
+
+
+def held_out(contacts: Float[Tensor, "contacts 3"], fraction: float) -> list[int]:
+    """Return all rows of the places, a fraction of all, that farthest-point sampling takes last.
+
+    Of single rows it would take repeats last, whose places are trained on.
+    """
+    rows = rows_by_place(contacts)
+    order = farthest_points(contacts[[each[0] for each in rows]], len(rows)).tolist()
+    return [row for place in order[len(rows) - round(fraction * len(rows)) :] for row in rows[place]]

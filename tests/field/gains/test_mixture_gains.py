@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from avmsf.capture.places import SAME_PLACE, places_of
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import fit_mixture
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains, series_of
-from avmsf.field.places import SAME_PLACE, places_of
 from gain_cases import draw, families, impacts, measured, model
 
 ASKED = impacts(9, seed=5)

@@ -11,13 +11,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf._utils.records import count_of, like
+from avmsf.capture.places import places_of
 from avmsf.field.gainfield import Gains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Family, KernelFamily, Sites, nearest_sites, sites_along
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.symmetry import Symmetric
-from avmsf.field.places import places_of
 from avmsf.scene.symmetrycharacters import Group
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.nominal import NOMINAL

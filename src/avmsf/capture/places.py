@@ -1,4 +1,4 @@
-"""Recordings by place, and those that are held out to choose settings by."""
+"""Which contacts are at one place."""
 
 import numpy as np
 import torch
@@ -6,8 +6,6 @@ from jaxtyping import Float, Float64, Int
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial import cKDTree
 from torch import Tensor
-
-from avmsf.scene.points import farthest_points
 
 SAME_PLACE = 0.01
 """Distance between contacts over the diagonal of the box around all, up to which they are one place: hammers do not hit
@@ -34,13 +32,3 @@ def rows_by_place(contacts: Float[Tensor, "contacts 3"]) -> tuple[tuple[int, ...
     for row, place in enumerate(places_of(contacts.double()).tolist() if len(contacts) else ()):
         found.setdefault(place, []).append(row)
     return tuple(tuple(rows) for rows in found.values())
-
-
-def held_out(contacts: Float[Tensor, "contacts 3"], fraction: float) -> list[int]:
-    """Return all rows of the places, a fraction of all, that farthest-point sampling takes last.
-
-    Of single rows it would take repeats last, whose places are trained on.
-    """
-    rows = rows_by_place(contacts)
-    order = farthest_points(contacts[[each[0] for each in rows]], len(rows)).tolist()
-    return [row for place in order[len(rows) - round(fraction * len(rows)) :] for row in rows[place]]
