@@ -254,6 +254,9 @@ class Echo:
         self.asked.append((prompt, negative))
         return prompt
 
+    def generate(self, prompt: str, *, seconds: float, seed: int, negative: str | None) -> torch.Tensor:
+        return 0.1 * self.answer[: round(seconds * RATE)]
+
     def denoised(
         self, latents: torch.Tensor, level: torch.Tensor, conditioning: str, *, guidance: float
     ) -> torch.Tensor:
@@ -309,7 +312,10 @@ def test_towards_words(field: Path, monkeypatch: pytest.MonkeyPatch, capsys: Str
 
     monkeypatch.setattr(steering.StableAudio, "load", load_model)
     words = ["--prompt", "a bell", "--negative", "wood", "--model", "here", "--steps", "40", "--contacts", "2"]
-    new = edited(field, *words, "--model-seconds", "1")
+    alone = field.with_name("generated.wav")
+    new = edited(field, *words, "--model-seconds", "1", "--generated", str(alone), "--parameters", "published")
+    assert soundfile.info(str(alone)).samplerate == RATE
+    assert new.origin.report[EDITS][0]["parameters"] == "published"
     assert loaded == [("here", {"seconds": 1.0, "device": None})]
     assert model.asked[0] == ("a bell", "wood")
     assert new.origin.report[EDITS][0]["prompt"] == "a bell"

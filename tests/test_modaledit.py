@@ -53,6 +53,14 @@ def test_gain_ratios_between_contacts_stay(kind):
         torch.testing.assert_close(after.quadrature, before.quadrature * edit.scale.exp().float(), rtol=1e-6, atol=0)
 
 
+def test_gains_that_follow_frequencies_keep_their_product_with_them():
+    field, edit = made_field(), replace(made_edit(), scale=torch.zeros(5, dtype=torch.float64))
+    contacts = made_fields.places(3, seed=4)
+    new = edit.following(field.bank).of(field)
+    before, after = (each.bank.frequency.float() * each.known(contacts).mean for each in (field, new))
+    torch.testing.assert_close(after, before, rtol=1e-6, atol=0)
+
+
 def test_nothing_changes_nothing():
     field, contacts = made_field(), made_fields.places(3, seed=4)
     same = ModalEdit.none(field.bank).of(field)

@@ -9,7 +9,7 @@ import torch
 from avmsf.errors import EditError
 from avmsf.tasks.clips import level
 from avmsf.tasks.modaledit import ModalEdit
-from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, SEARCHED
+from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, PUBLISHED, SEARCHED
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.retune import retune
 from avmsf.tasks.steer import Guide, SteerConfig, steer
@@ -117,6 +117,21 @@ def test_independent_modes_have_nothing_in_common():
     made, seen = trace(ringing_field(), towards(pitch=1.01), config=QUICK, parameters=INDEPENDENT)
     assert (seen[-1].pitch, seen[-1].decay) == (1.0, 1.0)
     assert made.origin.report["edits"][-1]["parameters"] == "independent"
+
+
+def test_the_published_form_has_one_factor_on_frequencies_and_gains_that_follow_them():
+    field = ringing_field()
+    follow, stay = (
+        trace(field, towards(pitch=0.9), config=QUICK, parameters=replace(PUBLISHED, gains_follow=each))[0]
+        for each in (True, False)
+    )
+    entry = follow.origin.report["edits"][-1]
+    assert entry["pitch"] == pytest.approx(0.9, rel=0.03)
+    assert entry["decay"] == 1.0
+    torch.testing.assert_close(follow.bank.frequency, stay.bank.frequency)
+    # The level of the whole is none of the edit's.
+    ratio = follow.gain_field.scale / stay.gain_field.scale * (follow.bank.frequency / field.bank.frequency)
+    torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio), rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize(("parameters", "pitch"), [(INDEPENDENT, 1.0), (SEARCHED, 0.5)])

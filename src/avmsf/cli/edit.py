@@ -187,6 +187,8 @@ def _expect(options: Options) -> None:
             "--brightness, --mode-db, --mode-pitch or --mode-decay, --prompt, --like or --like-material"
         )
     expect_writable(options.output)
+    if options.steering.generated is not None:
+        expect_writable(options.steering.generated)
     if options.output.exists() and options.field.exists() and options.output.samefile(options.field):
         raise OutputError(f"{options.output}: is the field itself, which would be lost: name another file")
     if options.pictures is not None:

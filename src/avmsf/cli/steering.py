@@ -6,7 +6,7 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -19,13 +19,16 @@ from avmsf.field.soundfield import SoundField
 from avmsf.simulate.material import Material, material_named
 from avmsf.tasks.distillation import DecoderDistillation, DistillationConfig, expect_prompt
 from avmsf.tasks.materialstatistics import MaterialStatistics
+from avmsf.tasks.parameters import PARAMETERISATIONS
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
 from avmsf.tasks.stableaudiofiles import STABLE_AUDIO
 from avmsf.tasks.steer import Guide, SteerConfig, SteerProgress, steer
 
 _PREVIEW = Level("peak", -1.0)
-_OF_THE_MODEL = ("--model", "--negative", "--model-seconds", "--device")
+_GENERATED_SECONDS = 3.0
+"""Length of a sound that is made of a prompt alone."""
+_OF_THE_MODEL = ("--model", "--negative", "--model-seconds", "--device", "--generated")
 """Options that nothing but words needs."""
 
 
@@ -53,6 +56,13 @@ class Steering:
     """Seconds that the model works at; all that it was made for where not given, which costs in proportion."""
     device: str | None = None
     """Where the model computes: cuda, cpu; the GPU where there is one."""
+    generated: Annotated[Path | None, tyro.conf.arg(metavar="WAV")] = None
+    """Also write the sound that the model makes of the prompt alone, without the field: the paper's baseline."""
+    parameters: Literal["hierarchical", "published", "independent", "searched"] = "hierarchical"
+    """What is free to move. hierarchical: factors on all frequencies and all dampings, then single modes, with a
+    penalty. published: the paper's form, a factor on all frequencies and single modes without a penalty, gains times
+    f1/f2 at the end. independent: single modes alone (Audio-SDS). searched: the same from where the search for common
+    factors ends."""
     distillation: tyro.conf.OmitArgPrefixes[DistillationConfig] = field(default_factory=DistillationConfig)
     config: tyro.conf.OmitArgPrefixes[SteerConfig] = field(default_factory=SteerConfig)
 
@@ -74,7 +84,8 @@ class Steering:
         if self.like_material is not None:
             material_named(self.like_material)
         if not self._guides:
-            _expect_unchanged(_changed(self.config), "--prompt, --like or --like-material, and none of them is given")
+            given = [*(name for name in _changed(self) if name == "--parameters"), *_changed(self.config)]
+            _expect_unchanged(given, "--prompt, --like or --like-material, and none of them is given")
         if self.prompt is None:
             own = [name for name in _changed(self) if name in _OF_THE_MODEL]
             _expect_unchanged([*own, *_changed(self.distillation)], "--prompt, which is not given")
@@ -91,7 +102,10 @@ class Steering:
         guide = self._guide(field, old)
         preview = beside(output, "preview.wav")
         with SteerBar(preview, sample_rate=field.sample_rate) as bar:
-            return steer(field, guide, config=self.config, progress=bar.show, checkpoint=beside(output, "checkpoint"))
+            return steer(
+                field, guide, config=self.config, parameters=PARAMETERISATIONS[self.parameters], progress=bar.show,
+                checkpoint=beside(output, "checkpoint"),
+            )  # fmt: skip
 
     @property
     def _guides(self) -> list[str]:
@@ -107,8 +121,13 @@ class Steering:
         if self.prompt is None:
             return Reference.read(self.like, sample_rate=field.sample_rate)
         say(f"loading {self.model}")
+        model = StableAudio.load(self.model, seconds=self.model_seconds, device=self.device)
+        if self.generated is not None:
+            seconds = _GENERATED_SECONDS if self.model_seconds is None else self.model_seconds
+            made = model.generate(self.prompt, seconds=seconds, seed=self.config.seed, negative=self.negative)
+            write_sound(self.generated, made, sample_rate=model.sample_rate, coding="float32")
         return DecoderDistillation(
-            StableAudio.load(self.model, seconds=self.model_seconds, device=self.device),
+            model,
             self.prompt,
             sample_rate=field.sample_rate,
             negative=self.negative,

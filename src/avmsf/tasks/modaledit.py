@@ -65,6 +65,10 @@ class ModalEdit:
         """Return the edit with all gains multiplied by a factor above 0."""
         return replace(self, scale=self.scale + factor.double().log())
 
+    def following(self, bank: ModalBank) -> "ModalEdit":
+        """Return the edit of a bank with the gains of a mode from f1 to f2 Hz multiplied by f1 / f2 (paper, eq. 21)."""
+        return replace(self, scale=self.scale + (bank.frequency / self.bank(bank).frequency).log())
+
     def bank(self, bank: ModalBank) -> ModalBank:
         """Return the edited modes, in the order of the given ones."""
         return ModalBank(

@@ -43,10 +43,17 @@ class Parameterisation:
     """How far a gain factor goes, the common level aside."""
     searches: bool = True
     """Whether it begins where the guide proposes; else the object as it is."""
+    gains_follow: bool = False
+    """Whether gains of a mode from f1 to f2 Hz are multiplied by f1 / f2 when the edit ends (paper, section 3.6)."""
 
 
 HIERARCHICAL = Parameterisation("hierarchical", 0.02, 0.02, 0.003, 0.01, 0.02, 0.05)
-"""The paper's: one pitch and one damping factor take the object to another material, single modes refine."""
+"""The paper's factor on all frequencies, and ours: one on all dampings, penalties on single modes, a search first."""
+PUBLISHED = Parameterisation("published", 0.02, 0.0, 0.003, 0.01, 0.02, 0.0, searches=False, gains_follow=True)
+"""The paper's: f = exp(log alpha + log f0 + delta), dampings and gains mode by mode, nothing that holds them back.
+
+The rates, which the paper does not state, are those of `HIERARCHICAL`.
+"""
 INDEPENDENT = Parameterisation("independent", 0.0, 0.0, 0.02, 0.02, 0.02, 0.0, searches=False)
 """The paper's baseline, after Audio-SDS: every frequency, damping and gain by itself, nothing in common.
 
@@ -54,6 +61,9 @@ The rates are this package's, those at which the common factors move above; Audi
 """
 SEARCHED = replace(INDEPENDENT, name="searched", searches=True)
 """Every mode by itself, but from where the common factors' search ends: what is left is the hierarchy's own share."""
+
+PARAMETERISATIONS = {each.name: each for each in (HIERARCHICAL, PUBLISHED, INDEPENDENT, SEARCHED)}
+"""All of them, by name."""
 
 
 class EditVariables:

@@ -257,6 +257,8 @@ class _Steering:
         """Return the edit as it stands, as loud at the probes as the field was."""
         with torch.no_grad():
             edit = self.variables.edit()
+            if self.parameters.gains_follow:
+                edit = edit.following(self.probes.bank)
             after = level(self.probes.sounds(edit), sample_rate=self.field.sample_rate)
             factor = (self.loudness.square().sum() / after.square().sum()).sqrt()
             return edit.louder(factor).to("cpu")
