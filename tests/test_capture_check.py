@@ -84,7 +84,7 @@ def test_wav_files_in_hidden_folders_are_none_of_the_captures(tmp_path: Path) ->
 
 BROKEN = [
     {},
-    {"rows": ROWS[:1]},
+    {"rows": ()},
     {"rows": (*ROWS, "a.wav,0,0,0")},
     {"rows": (*ROWS[:2], "c.wav,0,0.2,0")},
     {"rows": (*ROWS[:2], "c.wav,0,0,300")},

@@ -86,7 +86,6 @@ def test_directions_become_unit_vectors(tmp_path: Path) -> None:
         (HEADER, (ROWS[0], "/b.wav,0,0.2,0"), "line 3: /b.wav lies outside"),
         (HEADER, (ROWS[0], "C:\\b.wav,0,0.2,0"), "line 3: .* lies outside"),
         (HEADER, (ROWS[0], ROWS[1], "a.wav,0,0,1"), "line 4: a.wav stands in line 2 already"),
-        (HEADER, (ROWS[0],), "lists 1 recording; .*at least 2"),
         ("file,x,y,z,nx,ny,nz", ("a.wav,0,0,0,1,0,0", "b.wav,0,1,0,0,0,0"), "line 3: nx,ny,nz is the zero vector"),
         ("file,x,y,z,force_newtons", ("a.wav,0,0,0,2", "b.wav,0,1,0,0"), "line 3: force_newtons is 0"),
         ("file,x,y,z,force_newtons", ("a.wav,0,0,0,2", "b.wav,0,1,0,"), "line 3: force_newtons is ''"),

@@ -111,7 +111,7 @@ class CaseRun:
         with self._sharing():
             if self.found is None:
                 path = self.folder / "modes" / f"{self.place}.safetensors"
-                self.found = extract_once(self.train, self.evaluation.finder, path, lone=True)
+                self.found = extract_once(self.train, self.evaluation.finder, path)
             return self.found
 
     def _align(self) -> None:

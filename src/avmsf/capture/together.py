@@ -32,12 +32,10 @@ MAX_RANGE_DB = 140.0
 loudest in float32 (144 dB), in which they are fitted."""
 
 
-def refuse_few(count: int) -> None:
-    """Raise `CaptureError` for fewer than two recordings: nothing can be learned about where one strikes."""
-    if count < 2:
-        raise CaptureError(
-            f"{TABLE} lists {counted(count, 'recording')}; a capture needs at least 2, at different contacts"
-        )
+def refuse_empty(count: int) -> None:
+    """Raise `CaptureError` for a table without recordings."""
+    if count < 1:
+        raise CaptureError(f"{TABLE}: expected one or more recordings, got none: add a row for each")
 
 
 def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:

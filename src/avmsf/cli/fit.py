@@ -34,6 +34,7 @@ from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrysearch import find_symmetries
+from avmsf.wording import counted
 
 _FEW = 8
 """Recordings below which little is told of the gains between contacts."""
@@ -125,7 +126,7 @@ def run(options: Options) -> int:
         say(f"{len(train)} recordings tell little of how loud modes are between contacts; {_FEW} or more tell much")
     # Before the modes: what is wrong with the object's shape shows in less time than they take.
     gains = _estimator(options, capture, train)
-    say(f"finding the modes of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
+    say(f"finding the modes of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     modes = extract_once(train, finder(options.method, options.modes), _beside(options.output, "modes"))
     for sentence in describe_alignment(modes, train):
         say(sentence)
@@ -247,13 +248,19 @@ def summary(fitted: SoundField, contacts: int) -> str:
     report = fitted.origin.report
     how = "chosen on validation contacts" if report.get("validated") else "as set"
     gains = report.get("gains", "attention")
-    if (report.get("credibility") or {}).get("credible"):
+    credibility = report.get("credibility") or {}
+    if credibility.get("credible"):
         best, thickness = report["bodies"][0], report.get("thickness")
         between = "{low:.2g} to {high:.2g} mm" if thickness and best["wall"] is not None else ""
         interval = between.format(**{key: 1000 * value for key, value in (thickness or {}).items()})
-        gains += f" (most probable body: {best['body']}{interval and ', 90 % interval of the wall ' + interval})"
+        gained = credibility["with_body"] - credibility["without_body"]
+        gains += (
+            f" (most probable body: {best['body']}{interval and ', 90 % interval of the wall ' + interval}, its "
+            f"frequencies {best['factor']:.2f} times those of aluminum; adds {gained:.1f} nats per mode at contacts "
+            "left out)"
+        )
     return (
-        f"field of {fitted.origin.capture}: {len(fitted.bank)} modes from {contacts} recordings, gains by {gains}, "
-        f"{report.get('damping', 'shared')} damping ({how}), {report.get('steps', fitted.origin.config.steps)} steps "
-        "end to end"
+        f"field of {fitted.origin.capture}: {len(fitted.bank)} modes from {counted(contacts, 'recording')}, gains by "
+        f"{gains}, {report.get('damping', 'shared')} damping ({how}), "
+        f"{report.get('steps', fitted.origin.config.steps)} steps end to end"
     )

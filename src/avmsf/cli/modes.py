@@ -15,6 +15,7 @@ from avmsf.cli.printing import console, decimals, figure, print_json, say, table
 from avmsf.modal.extraction.extract import extract
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
 from avmsf.modal.extraction.quality import measure_quality
+from avmsf.wording import counted
 
 Method = Literal["high-resolution", "short-time"]
 
@@ -55,7 +56,8 @@ def run(options: Options) -> int:
     settings = None if options.settings is None else CaptureSettings.read(options.settings)
     capture = read_capture(options.capture, settings)
     impacts = capture.impacts
-    say(f"finding the modes of {len(impacts)} recordings, {impacts.duration:.3g} s at {impacts.sample_rate:g} Hz")
+    count = counted(len(impacts), "recording")
+    say(f"finding the modes of {count}, {impacts.duration:.3g} s at {impacts.sample_rate:g} Hz")
     extraction = extract(impacts, finder(options.method, options.modes))
     level = levels(amplitudes(extraction))
     rows = mode_rows(extraction.bank, level)

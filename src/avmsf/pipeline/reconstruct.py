@@ -39,6 +39,7 @@ from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.symmetry import Symmetries
+from avmsf.wording import counted
 
 CACHE = ".avmsf"
 """Folder inside the capture's that keeps what each stage made."""
@@ -137,7 +138,7 @@ def _reconstruct(
 ) -> Reconstruction:
     shape = _shape(folder, capture, config, stages, settings=settings, listener=listener)
     heard = {"impacts": train.digest(), "method": repr(method)}
-    listener.tell(f"modes: of {len(train)} recordings, {train.duration:.3g} s at {train.sample_rate:g} Hz")
+    listener.tell(f"modes: of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path, needed=True))
     modes = extract_once(train, method, found.path)
     basis = {**heard, "features": shape.digest, "fit": asdict(config.fit)}

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from avmsf.capture.together import refuse_few
+from avmsf.capture.together import refuse_empty
 from avmsf.errors import CaptureError
 from avmsf.field.store import load, save
 from avmsf.studio.capturing import StrikeBook
@@ -148,7 +148,7 @@ class Studio:
         book = self.expect_book()
         strikes = await self.threads.read(book.strikes)
         try:
-            refuse_few(len(strikes))
+            refuse_empty(len(strikes))
         except CaptureError as error:
             raise RefusedError(409, f"{error}: strike more places first") from error
         # One place is enough: the next job starts when this one's field is open.

@@ -55,13 +55,9 @@ def extract(impacts: Impacts, method: ModeFinder | None = None) -> Extraction:
 
     `method` is `HighResolution()` unless another is given. Recordings that are not final (`Impacts.before`) are aligned
     with one another first. Gains are the least-squares amplitudes of the modes over the whole of each sound. Raises
-    `ExtractionError` when there are fewer than two recordings or no mode is found.
+    `ExtractionError` when no mode is found.
     """
-    if len(impacts) < 2:
-        raise ExtractionError(
-            f"modes are what recordings have in common: expected at least 2 recordings, found {len(impacts)}"
-        )
-    alignment = None if impacts.before is None else align(impacts)
+    alignment = None if impacts.before is None or len(impacts) < 2 else align(impacts)
     final = impacts if alignment is None else alignment.apply(impacts)
     found = extract_sounds(final.sounds, sample_rate=impacts.sample_rate, method=method)
     return replace(found, alignment=alignment)
@@ -119,22 +115,17 @@ def _why_no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) 
     return f"{found}: nothing rings above the noise there. Record at a higher rate, closer, or a less damped object"
 
 
-def extract_once(
-    train: Impacts, method: ModeFinder, path: Path, *, lone: bool = False, needed: bool = False
-) -> Extraction:
+def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool = False) -> Extraction:
     """Return the modes that `path` keeps of these recordings and this method; find and keep them where it has none.
 
-    With `lone`, one recording is enough. Where the file cannot be written, the modes are found again next time; it is
+    Where the file cannot be written, the modes are found again next time; it is
     an error if the file is `needed`. Raises as `extract`, and FieldFileError.
     """
     digest = _digest(train, method)
     kept = _read(path, digest, train)
     if kept is not None:
         return kept
-    if lone and len(train) == 1:
-        found = extract_sounds(train.sounds, sample_rate=train.sample_rate, method=method)
-    else:
-        found = extract(train, method)
+    found = extract(train, method)
     tensors = {
         "frequency": found.bank.frequency,
         "damping": found.bank.damping,
