@@ -76,7 +76,7 @@ class DiffSound:
     def complex_gains(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Complex[Tensor, "contacts modes"]:
-        """Return amplitudes A at the contacts: their sounds are the real part of the sum of A exp((-d + 2 pi i f) t)."""
+        """Return amplitudes A: sounds are the real part of the sum of A exp((-d + 2 pi i f) t)."""
         gains = self.gains(contacts, directions=directions)
         return torch.complex(torch.zeros_like(gains), -gains)
 

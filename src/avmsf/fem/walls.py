@@ -98,7 +98,7 @@ class Wall:
             solid = prisms(coarse, factor * thickness, layers=self._layers(length))
             if solid is None:
                 raise SimulationError(
-                    f"a wall of {1000 * factor * self.thickness:.2g} mm folds where the mesh bends: expected a thinner one"
+                    f"a wall of {1000 * factor * self.thickness:.2g} mm folds where the mesh bends: take a thinner one"
                 )
             return solid
 
