@@ -54,7 +54,7 @@ class ClipSpectra:
             own = _power(predicted[None], fft_size)
             position = _positions(own.shape[1], frequency / (0.5 * self.sample_rate)).to(own)
             for found, wanted in ((_log_feature(own), logs), (own, powers)):
-                total = total + _divergence(_cloud(found, position)[0], wanted[row])
+                total = total + divergence(_cloud(found, position)[0], wanted[row])
         return total
 
     def difference(self, predicted: Float[Tensor, " samples"]) -> Float[Tensor, ""]:
@@ -116,5 +116,9 @@ def _cloud(
     return torch.cat([sampled, position.expand(len(sampled), -1)[..., None]], dim=2)
 
 
-def _divergence(found: Float[Tensor, "points 4"], wanted: Float[Tensor, "targets 4"]) -> Float[Tensor, ""]:
+def divergence(found: Float[Tensor, "points features"], wanted: Float[Tensor, "targets features"]) -> Float[Tensor, ""]:
+    """Return the debiased Sinkhorn divergence of two clouds whose points weigh alike.
+
+    Without blur it is half the mean squared distance of the best matching. Differentiable in both.
+    """
     return SamplesLoss("sinkhorn", p=2, blur=_BLUR, backend="tensorized")(found, wanted)
