@@ -138,14 +138,6 @@ def test_it_recovers_the_material_of_a_body_that_sounds_as_it_assumes():
     assert found.poisson == pytest.approx(POISSON, abs=0.03)
 
 
-@pytest.mark.slow
-def test_it_recovers_the_material_from_that_of_another_by_its_published_route():
-    spectra = clip_spectra(struck(torch.ones(1, 12)))
-    config = DiffSoundConfig(material="glass", transport_steps=12, difference_steps=200, scan=False)
-    found = fit_material(spectra, curve(), family(), config)
-    assert found.stiffness == pytest.approx(STIFFNESS, rel=0.02)
-
-
 def test_twice_the_signal_renders_twice_as_loud():
     loud = replace(simulated(), sounds=2.0 * simulated().sounds)
     twice = leveled(known_fit(), curve(), loud, SILENT, weighted=True)

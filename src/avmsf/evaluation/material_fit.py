@@ -34,6 +34,10 @@ MODES = 16
 RATE = 32_000.0
 """Sample rate at which clips are compared, Hz."""
 SAMPLES = 8_000
+CLIPS = 8
+"""Recordings that are compared at most, the first of them."""
+_SCANNED_CLIPS = 4
+"""Of them, those that are scanned by."""
 HIGH_PASS = 100.0
 """Hz."""
 BAND = 20.0, 16_000.0
@@ -140,7 +144,7 @@ class DampingCurve:
 def clip_spectra(impacts: Impacts) -> ClipSpectra:
     """Return the recordings as DiffSound compares them: .25 s at 32 kHz, without what is below 100 Hz, of peak 1.
 
-    Silent recordings are left out. Raises EvaluationError where all are silent.
+    Silent recordings are left out, and those after the first `CLIPS`. Raises EvaluationError where all are silent.
     """
     sounds = impacts.sounds.detach().cpu().double().numpy()
     rates = int(RATE), round(impacts.sample_rate)
@@ -155,12 +159,12 @@ def clip_spectra(impacts: Impacts) -> ClipSpectra:
             "record the impacts again"
         )
     loud = peaks > 0.0
-    return ClipSpectra(torch.from_numpy(kept[loud] / peaks[loud, None]).float(), RATE)
+    return ClipSpectra(torch.from_numpy((kept[loud] / peaks[loud, None])[:CLIPS]).float(), RATE)
 
 
 def predicted_sound(
     frequency: Float64[Tensor, " modes"], damping: Float64[Tensor, " modes"]
-) -> tuple[Float[Tensor, " samples"], Float64[Tensor, " modes"]]:
+) -> tuple[Float[Tensor, " samples"], Float64[Tensor, " heard"]]:
     """Return the sum of the modes with equal amplitudes, of peak 1, and the damped frequencies of those in the band.
 
     `frequency` is undamped, Hz. Raises EvaluationError where no mode is in the band.
@@ -193,7 +197,7 @@ def fit_material(
     starts = [material_named(config.material)] if config.material is not None else list(MATERIALS.values())
     _expect_audible(family, starts)
     problem = _Problem(spectra, curve, family, _bounds(starts))
-    scanned = problem.scan() if config.scan else None
+    scanned = problem.by_few_clips().scan() if config.scan else None
     start = _start(problem, starts)
     ends = [problem.descended(problem.transported(start, config.transport_steps), config.difference_steps)]
     if scanned is not None:
@@ -270,7 +274,7 @@ class _Problem:
     bounds: tuple[float, float]
     """Of E / rho, m2/s2."""
 
-    def sound(self, here: _Parameters) -> tuple[Float[Tensor, " samples"], Float64[Tensor, " modes"]]:
+    def sound(self, here: _Parameters) -> tuple[Float[Tensor, " samples"], Float64[Tensor, " heard"]]:
         frequency = here.frequency(self.family)
         return predicted_sound(frequency, self.curve(frequency))
 
@@ -281,6 +285,10 @@ class _Problem:
                 return float(self.spectra.difference(self.sound(here)[0]))
             except EvaluationError:
                 return math.inf
+
+    def by_few_clips(self) -> "_Problem":
+        clips = self.spectra.clips[:_SCANNED_CLIPS]
+        return replace(self, spectra=ClipSpectra(clips, self.spectra.sample_rate))
 
     def middle(self) -> float:
         """Return a thickness in the middle of the range, meters; 1 where none is fitted."""
