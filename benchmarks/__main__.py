@@ -11,6 +11,7 @@ from avmsf.capture import CaptureWarning
 from avmsf.errors import AvmsfError
 from benchmarks import (
     align,
+    baselines,
     extract,
     field,
     gains,
@@ -31,6 +32,7 @@ from benchmarks.report import Options, show
 
 BENCHMARKS: dict[str, ModuleType] = {
     "align": align,
+    "baselines": baselines,
     "field": field,
     "gains": gains,
     "extract": extract,
@@ -68,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--sim-20",
         type=Path,
         metavar="FOLDER",
-        help="residual, surface: objects that `avmsf simulate sim-20` has made; without it they are simulated again",
+        help="baselines, residual, surface: objects that `avmsf simulate sim-20` has made; without it they are simulated again",
     )
     parser.add_argument(
         "--clouds",
