@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--sim-20",
         type=Path,
         metavar="FOLDER",
-        help="baselines, residual, surface: objects that `avmsf simulate sim-20` has made; without it they are simulated again",
+        help="baselines, residual, surface: objects that `avmsf simulate sim-20` has made; else made now",
     )
     parser.add_argument(
         "--clouds",
