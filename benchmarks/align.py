@@ -32,7 +32,7 @@ from avmsf.simulate.example import EXAMPLE_FOLDER
 from avmsf.simulate.truth import read_truth
 from benchmarks.field import QUICK_LOOK, filled_estimator
 from benchmarks.look import slab
-from benchmarks.material import STRUCK, shared_data, surface_features
+from benchmarks.material import STRUCK, example_capture, shared_data, surface_features
 from benchmarks.modes import AIRCRAFT, LEAST_SHARE, count_modes, tree_frequencies
 from benchmarks.report import Options, Report, Table, tell
 
@@ -156,7 +156,7 @@ def _jitter(options: Options) -> Report:
 def _jitter_with(options: Options, cache: Path) -> Report:
     rows: list[list[str | float]] = []
     figures: Figures = {}
-    capture = read_capture(EXAMPLE_FOLDER)
+    capture = example_capture()
     truth = read_truth(EXAMPLE_FOLDER)
     assert truth.starts is not None
     assert capture.surface is not None

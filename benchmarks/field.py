@@ -17,12 +17,12 @@ from avmsf.bench.renderer import Renderer
 from avmsf.capture import Impacts, Surface
 from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.field.config import FitConfig
-from avmsf.field.doubt import coverage
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
+from avmsf.field.uncertainty import coverage
 from avmsf.modal.extraction.extract import extract
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.scene.features import FeatureField

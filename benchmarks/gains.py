@@ -18,15 +18,14 @@ from avmsf.bench.evaluation import evaluate, score, split
 from avmsf.bench.knowntruth import truth_at, truth_from_first_sample
 from avmsf.capture import Capture, CaptureSettings, CaptureWarning, Impacts, Surface, read_capture
 from avmsf.field.config import FitConfig
-from avmsf.field.doubt import coverage
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, KNOWN, POSITIONAL, MixtureEstimator
-from avmsf.field.gains.symmetry import Symmetric, groups_of
-from avmsf.field.posterior import parts_of, std_of
+from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.recipes import GainCase, along_phase
 from avmsf.field.soundfield import SoundField
+from avmsf.field.uncertainty import coverage, parts_of, std_of
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction, extract
 from avmsf.modal.extraction.least_squares import fit_gains
@@ -35,13 +34,13 @@ from avmsf.modal.synthesis import synthesise, synthesise_phased
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies, roughened
 from avmsf.scene.features import GEOMETRY, FeatureField
 from avmsf.scene.symmetry import Symmetries
+from avmsf.scene.symmetrycharacters import groups_of
 from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.simulate.elastic import ElasticModes
-from avmsf.simulate.example import EXAMPLE_FOLDER
 from avmsf.simulate.sim20 import ABLATED, SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.truth import Truth, read_truth
-from benchmarks.material import shared_data, surface_features
+from benchmarks.material import example_capture, shared_data, surface_features
 from benchmarks.report import Options, Report, Table, tell
 
 STARTS = (0, 18, 37)
@@ -286,7 +285,7 @@ def _speed(options: Options) -> Report:
     """Seconds of the fit of the built-in example with its elastic modes at hand, and of the gains of a large case."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CaptureWarning)
-        capture = read_capture(EXAMPLE_FOLDER)
+        capture = example_capture()
     bodies = _bodies(capture, options)
     train, test = split(capture.impacts, count=12)
     case = _case(train, test, capture, bodies)

@@ -13,6 +13,7 @@ from avmsf.capture.audio import read_recording
 from avmsf.capture.onset import find_second_push
 from avmsf.capture.prepare import prepare
 from avmsf.scene.features import FeatureField
+from avmsf.simulate.example import EXAMPLE_FOLDER, example_mesh
 from avmsf.simulate.plate import Plate, plate_surface_points, sample_contacts, strike
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -92,6 +93,11 @@ def shared_data() -> Path:
 def capture_in_place(name: str) -> Capture:
     """Read a capture of measured data with the settings in `benchmarks/captures`."""
     return read_capture(shared_data() / name, _settings(name))
+
+
+def example_capture() -> Capture:
+    """Read the built-in example, and give it the mesh that it was simulated from."""
+    return replace(read_capture(EXAMPLE_FOLDER), surface=example_mesh().surface)
 
 
 def surface_features(capture: Capture) -> FeatureField:

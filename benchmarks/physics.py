@@ -16,9 +16,9 @@ import torch
 from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture import read_capture, write_capture
 from avmsf.field.config import FitConfig
-from avmsf.field.doubt import coverage
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.uncertainty import coverage
 from avmsf.modal.extraction.extract import extract
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.simulate.bodies import make_body

@@ -16,11 +16,10 @@ from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import extract
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.scene.features import FeatureField
-from avmsf.simulate.example import EXAMPLE_FOLDER
 from avmsf.simulate.sim20 import SIM20, sim20_recipe
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.field import QUICK_LOOK, filled_estimator
-from benchmarks.material import STRUCK, capture_in_place, surface_features
+from benchmarks.material import STRUCK, capture_in_place, example_capture, surface_features
 from benchmarks.report import Options, Report, Table, tell
 
 RATES = {"trained": 0.1, "measured": 0.0}
@@ -101,7 +100,7 @@ def _tail_power(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -
 
 
 def _mug(options: Options) -> Iterator[_Case]:
-    capture = read_capture(EXAMPLE_FOLDER)
+    capture = example_capture()
     assert capture.surface is not None
     train, test = split(capture.impacts, count=12)
     bodies = None if options.quick_look else candidate_bodies(capture.surface)

@@ -27,6 +27,8 @@ from avmsf.export.sampledfield import SampledField
 from avmsf.export.webpage import page_files
 from avmsf.scene.ply import write_splats
 from avmsf.scene.start import StartPoints, starting_cloud
+from avmsf.simulate.example import example_mesh
+from avmsf.simulate.simulationfolder import write_textured
 from avmsf.studio.modules import fetch_modules, find_modules, with_local_modules
 from benchmarks.report import Report, Table
 from benchmarks.studiosound import ARGUMENTS, CHROMIUM
@@ -116,6 +118,7 @@ def draw_screenshots(folder: Path) -> tuple[Path, ...]:
     ):
         capture = Path(scratch) / "example"
         shutil.copytree(example, capture)
+        write_textured(example_mesh(), capture)
         field = Path(scratch) / "example.safetensors"
         _avmsf("fit", str(capture), "--gain-model", "smooth", "--output", str(field))
         with _studio(str(field), "--capture", str(capture)) as address:

@@ -50,7 +50,7 @@ def test_the_same_command_goes_on_to_the_same_field(
     )
     # Another fit does not take this one's checkpoint for its own.
     assert main([*words, "--seed", "1"]) == 2
-    assert "checkpoint belongs to a fit of other" in capsys.readouterr().err
+    assert str(checkpoint) in capsys.readouterr().err
     del shown[:]
     assert main(words) == 0
     assert shown == [15, 16, 17, 18]

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from avmsf.field.descent import Descent, Group
+from avmsf.field.training import AdamW, Group
 
 
 def made() -> list[nn.Parameter]:
@@ -27,7 +27,7 @@ def groups(parameters: list[nn.Parameter]) -> list[Group]:
 
 def test_steps_are_those_of_torch() -> None:
     ours, theirs = made(), made()
-    descent = Descent(groups(ours))
+    descent = AdamW(groups(ours))
     optimiser = torch.optim.AdamW(
         [
             {"params": theirs[:1], "weight_decay": 0.3, "rate": 0.1},
@@ -37,7 +37,7 @@ def test_steps_are_those_of_torch() -> None:
     for step in range(20):
         for group in optimiser.param_groups:
             group["lr"] = group["rate"] / (1 + step)
-        for each, parameters in ((descent.forget_slopes, ours), (optimiser.zero_grad, theirs)):
+        for each, parameters in ((descent.zero_grad, ours), (optimiser.zero_grad, theirs)):
             each()
             loss(parameters, step).backward()
         descent.step(1 / (1 + step))
@@ -48,20 +48,20 @@ def test_steps_are_those_of_torch() -> None:
 
 def test_a_descent_goes_on_from_its_state() -> None:
     parameters = made()
-    descent = Descent(groups(parameters))
+    descent = AdamW(groups(parameters))
     for step in range(10):
         if step == 5:
             again = [nn.Parameter(each.detach().clone()) for each in parameters]
-            other = Descent(groups(again))
-            other.resume(descent.state())
+            other = AdamW(groups(again))
+            other.resume(descent.moments)
             break
-        descent.forget_slopes()
+        descent.zero_grad()
         loss(parameters, step).backward()
         descent.step(1.0)
     kept = [each.detach().clone() for each in again]
     for run, values in ((other, again), (descent, parameters)):
         for step in range(5, 10):
-            run.forget_slopes()
+            run.zero_grad()
             loss(values, step).backward()
             run.step(1.0)
     assert not torch.equal(kept[0], again[0])
@@ -72,8 +72,8 @@ def test_a_descent_goes_on_from_its_state() -> None:
 @pytest.mark.slow
 def test_a_step_brings_no_compiler_in() -> None:
     program = (
-        "import sys, torch; from avmsf.field.descent import Descent, Group; "
-        "p = torch.nn.Parameter(torch.ones(2)); p.square().sum().backward(); Descent([Group([p], 0.1)]).step(1.0); "
+        "import sys, torch; from avmsf.field.training import AdamW, Group; "
+        "p = torch.nn.Parameter(torch.ones(2)); p.square().sum().backward(); AdamW([Group([p], 0.1)]).step(1.0); "
         "assert float(p[0]) < 0.95; print('torch._dynamo' in sys.modules)"
     )
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -210,8 +210,8 @@ def test_results_of_different_evaluations_are_not_mixed(
     changed = replace(Counting([]), name="knn3")
     with pytest.raises(EvaluationError, match="another method knn3"):
         run_objects(planned(plates, changed), ("a",), results)
-    monkeypatch.setattr("avmsf.bench.plan.version", lambda name: "0.0.0")
-    with pytest.raises(EvaluationError, match="version is"):
+    monkeypatch.setattr("avmsf.bench.plan.source_digest", lambda: "of other code")
+    with pytest.raises(EvaluationError, match="source is"):
         run_objects(planned(plates, "knn3"), ("a",), results)
     assert (tmp_path / "results" / "objects" / "a.json").read_bytes() == before
 

@@ -6,10 +6,13 @@ import torch
 
 from avmsf.capture import read_capture
 from avmsf.capture.audio import read_sound
+from avmsf.capture.meshviews import MeshTracer
+from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.capture.views import read_views
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
-from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
+from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER, example_mesh
 from avmsf.simulate.truth import read_truth
 
 
@@ -43,3 +46,17 @@ def test_the_example_is_small_and_whole() -> None:
     assert all(view.mask is not None and bool(view.mask.any()) for view in views)
     assert sum(path.stat().st_size for path in EXAMPLE_FOLDER.rglob("*") if path.is_file()) < 5e6  # bytes
     assert torch.isfinite(read_capture(EXAMPLE_FOLDER).impacts.sounds).all()
+
+
+def test_the_example_shows_its_shape_in_photographs_alone() -> None:
+    assert read_capture(EXAMPLE_FOLDER).surface is None
+    shape = example_mesh().surface
+    contacts = read_truth(EXAMPLE_FOLDER).contacts
+    assert contacts is not None
+    nearest = ClosestPoints(shape.vertices.double().numpy()[shape.faces.numpy()])
+    assert float(nearest(contacts.numpy()).distances.max()) < 1e-6  # meters
+    for view in read_views(EXAMPLE_FOLDER)[::12]:
+        assert view.mask is not None
+        depth = MeshTracer(TexturedMesh.plain(shape)).look(view.camera).depth
+        # Masks are smooth at outlines: a pixel there may be on either side.
+        assert float((torch.isfinite(depth) != (view.mask > 127)).float().mean()) < 0.005

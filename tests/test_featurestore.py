@@ -96,12 +96,12 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(SceneError, match="found no such file"):
         load_features(path)
     path.write_bytes(b"ply\n")
-    with pytest.raises(SceneError, match="of another kind or cut short"):
+    with pytest.raises(SceneError, match="of another kind"):
         load_features(path)
     save_file(TENSORS, path)
     with pytest.raises(SceneError, match="safetensors file of something else"):
         load_features(path)
     save_features(field(), path)
     path.write_bytes(path.read_bytes()[:-10])
-    with pytest.raises(SceneError, match="of another kind or cut short"):
+    with pytest.raises(SceneError, match="cut short"):
         load_features(path)

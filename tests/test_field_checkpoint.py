@@ -9,14 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.errors import FieldFileError
-from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
 from avmsf.field.config import FitConfig
-from avmsf.field.descent import Descent
 from avmsf.field.fit import Progress, fit
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
-from avmsf.field.training import TrainingRun
+from avmsf.field.training import AdamW, TrainingRun
 from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
 
 CONFIG = replace(
@@ -110,9 +109,7 @@ def interrupt(patch: pytest.MonkeyPatch, owner: type, name: str, *, call: int) -
     patch.setattr(owner, name, interrupted)
 
 
-@pytest.mark.parametrize(
-    ("owner", "name"), [(TrainingRun, "sounds"), (TrainingRun, "spectral_loss"), (Descent, "step")]
-)
+@pytest.mark.parametrize(("owner", "name"), [(TrainingRun, "sounds"), (TrainingRun, "spectral_loss"), (AdamW, "step")])
 def test_an_interruption_in_the_middle_of_a_step_loses_no_more_than_it(tmp_path, monkeypatch, owner, name):
     """Ctrl-C falls inside the arithmetic nearly always: noise drawn, gradients made, parameters half moved."""
     checkpoint = tmp_path / "fit.checkpoint"
@@ -175,7 +172,7 @@ def test_a_path_may_be_a_word(tmp_path):
 
 
 def test_a_full_disk_costs_the_checkpoint_and_not_the_fit(tmp_path, monkeypatch):
-    def full(path: Path, state: dict[str, object]) -> None:
+    def full(path: Path, *arguments: object, **named: object) -> None:
         raise FieldFileError(f"{path}: cannot be written (No space left on device)")
 
     monkeypatch.setattr("avmsf.field.fit.write_checkpoint", full)
@@ -222,7 +219,7 @@ def test_a_checkpoint_of_other_arguments_is_refused_and_kept(tmp_path, other):
     with pytest.raises(KeyboardInterrupt):
         fitted(checkpoint, Interruption((STAGES[0], 1)))
     before = checkpoint.read_bytes()
-    with pytest.raises(FieldFileError, match=r"fit\.checkpoint: this checkpoint belongs to a fit of other recordings"):
+    with pytest.raises(FieldFileError, match=r"fit\.checkpoint: this checkpoint belongs to a fit with another input"):
         fit(*other(impacts, plate_features(60), plate_extraction(impacts)), gains=Attention(), checkpoint=checkpoint)
     assert checkpoint.read_bytes() == before
 
@@ -230,11 +227,11 @@ def test_a_checkpoint_of_other_arguments_is_refused_and_kept(tmp_path, other):
 @pytest.mark.parametrize("kind", ["empty", "text", "cut", "list", "pickle"])
 def test_what_is_no_checkpoint_is_refused_and_kept(tmp_path, kind):
     checkpoint = tmp_path / "fit.checkpoint"
-    write_checkpoint(checkpoint, {"fingerprint": "x", "trials": {}, "running": None})
+    write_checkpoint(checkpoint, {"trials": {}, "running": None}, {"fit": "x"}, raising=FieldFileError)
     if kind == "list":
         torch.save([1, 2], checkpoint)
     elif kind == "pickle":
-        torch.save({"fingerprint": Path("x")}, checkpoint)
+        torch.save({"identity": Path("x"), "state": {}}, checkpoint)
     else:
         whole = checkpoint.read_bytes()
         checkpoint.write_bytes({"empty": b"", "text": b"hello there", "cut": whole[:-40]}[kind])
@@ -247,9 +244,9 @@ def test_what_is_no_checkpoint_is_refused_and_kept(tmp_path, kind):
 
 
 def test_no_checkpoint_is_none(tmp_path):
-    assert read_checkpoint(tmp_path / "nowhere", fingerprint="x") is None
+    assert read_checkpoint(tmp_path / "nowhere", {"fit": "x"}, what="a fit", raising=FieldFileError) is None
 
 
 def test_a_folder_is_no_checkpoint(tmp_path):
     with pytest.raises(FieldFileError, match="expected a checkpoint of a fit"):
-        read_checkpoint(tmp_path, fingerprint="x")
+        read_checkpoint(tmp_path, {"fit": "x"}, what="a fit", raising=FieldFileError)

@@ -206,7 +206,7 @@ def test_looking_more_often_changes_no_step(monkeypatch):
     """The looks draw noise too, which must not be missing in the training's stream."""
     losses: dict[int, list[float]] = {1: [], 100: []}
     for every, seen in losses.items():
-        monkeypatch.setattr("avmsf.field.fit._LOOK_EVERY", every)
+        monkeypatch.setattr("avmsf.field.fit._VALIDATION_STEPS", every)
         fitted(VALIDATED, progress=lambda told, seen=seen: seen.append(told.loss))
     assert losses[1] == losses[100]
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from avmsf.field import comparison
+from avmsf.field import losses
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.modal.spectra import magnitude_stft
 
@@ -144,8 +144,8 @@ def test_the_compiled_loop_does_what_torch_does(dtype, rounding):
     spectra[2, 1, 7], target[2, 3, 7] = 3 + 4j, 5
     slopes = [spectra.clone(), spectra.clone()]
     # The frames 1, 3, 5 and 7 of the target.
-    distance = comparison.compare(slopes[0], target, 1e-3, first=1, every=2)
-    expected = comparison._by_torch(slopes[1], target, 1e-3, 1, 2)
+    distance = losses._compare(slopes[0], target, 1e-3, first=1, every=2)
+    expected = losses._compare_torch(slopes[1], target, 1e-3, 1, 2)
     assert float(distance) == pytest.approx(float(expected), rel=rounding)
     torch.testing.assert_close(*slopes, rtol=0, atol=rounding)
     assert slopes[0][2, 1, 7] == 0

@@ -62,14 +62,14 @@ def test_a_few_wrong_masks_among_many_carve_nothing_away() -> None:
 
 def test_masks_without_the_object_are_refused() -> None:
     empty = [_with_mask(view, torch.zeros(64, 64, dtype=torch.uint8)) for view in ball_views(5)]
-    with pytest.raises(SceneError, match="the masks of all 5 views are background alone"):
+    with pytest.raises(SceneError, match="all 5 of them"):
         visual_hull(empty, points=500)
 
 
 def test_too_few_masks_are_refused() -> None:
-    with pytest.raises(SceneError, match="0 of 5 views have a mask; a visual hull takes 3 or more"):
+    with pytest.raises(SceneError, match="3 or more views with a mask, got 0 of 5"):
         visual_hull(ball_views(5, masked=False), points=500)
-    with pytest.raises(SceneError, match="2 of 2 views have a mask"):
+    with pytest.raises(SceneError, match="got 2 of 2"):
         visual_hull(ball_views(2), points=500)
 
 

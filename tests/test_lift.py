@@ -351,3 +351,10 @@ def test_points_afloat_before_a_surface_that_the_views_see_are_left_out() -> Non
     # Hardly any of the surface, though depth changes by more than two pixels beside its outlines.
     assert len(kept.features.points) > 450
     assert float(kept.features.points.norm(dim=1).max()) == pytest.approx(RADIUS)
+
+
+def test_points_none_of_which_the_views_support_are_refused() -> None:
+    views = [view_of(camera) for camera in AROUND]
+    lifted = lift_points(sphere_points(), views, painted_sphere(AROUND), depth_map=sphere_depth)
+    with pytest.raises(SceneError):
+        supported(replace(lifted, past=lifted.seen), views)

@@ -27,8 +27,8 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
-from avmsf.field.uninformed import uninformed
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.random_modes import random_modes
 from avmsf.modal.synthesis import synthesise
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.block import block
@@ -248,9 +248,9 @@ def test_without_initialisation_no_mode_of_the_recordings_leaks_in():
     """Other recordings of the same energy give the same start; and the fit begins as silent as that start says."""
     train, _ = parts()
     chance = torch.Generator().manual_seed(3)
-    start = uninformed(train, modes=12, bins=17, generator=chance)
+    start = random_modes(train, modes=12, bins=17, generator=chance)
     other = replace(train, sounds=train.sounds.flip(1))
-    again = uninformed(other, modes=12, bins=17, generator=torch.Generator().manual_seed(3))
+    again = random_modes(other, modes=12, bins=17, generator=torch.Generator().manual_seed(3))
     for one, two in zip((*bank_of(start), start.gains), (*bank_of(again), again.gains), strict=True):
         assert torch.allclose(one, two, rtol=1e-6)
     frequency, damping = bank_of(start)
@@ -273,7 +273,7 @@ def test_frequencies_without_initialisation_are_free_to_move():
     train, _ = parts()
     field = tiny(METHODS["field-no-initialisation"]).fit(plate_task(train))
     count = len(field.bank)
-    start = uninformed(train, modes=count, bins=33, generator=torch.Generator().manual_seed(0))
+    start = random_modes(train, modes=count, bins=33, generator=torch.Generator().manual_seed(0))
     width = (start.bank.damping / (2 * math.pi)).clamp(min=1 / SECONDS)
     moved = (field.bank.frequency - start.bank.frequency).abs() / width
     # Ten steps of at most three hundredths of a width each.
@@ -288,11 +288,11 @@ def test_nothing_can_be_started_from_nothing():
     train, _ = parts()
     generator = torch.Generator()
     with pytest.raises(FitError, match="0 modes and 17 bands"):
-        uninformed(train, modes=0, bins=17, generator=generator)
+        random_modes(train, modes=0, bins=17, generator=generator)
     with pytest.raises(FitError, match="1 bands"):
-        uninformed(train, modes=3, bins=1, generator=generator)
+        random_modes(train, modes=3, bins=1, generator=generator)
     with pytest.raises(FitError, match="100 samples are too short"):
-        uninformed(replace(train, sounds=train.sounds[:, :100]), modes=3, bins=17, generator=generator)
+        random_modes(replace(train, sounds=train.sounds[:, :100]), modes=3, bins=17, generator=generator)
 
 
 def test_the_papers_grid_has_all_its_combinations():

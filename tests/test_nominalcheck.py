@@ -9,7 +9,7 @@ import trimesh
 
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
-from avmsf.simulate.closest import ClosestPoints
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.simulate.nominalcheck import CheckedSurface, checked
 from avmsf.simulate.nominalsmooth import ROUGH, denoised, roughness
 from avmsf.simulate.skin import Skin

@@ -7,11 +7,10 @@ import torch
 import trimesh
 
 from avmsf.capture.surface import Surface
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.simulate import nominalthin
-from avmsf.simulate.closest import ClosestPoints
 from avmsf.simulate.nominal import nominal_bodies
-from avmsf.simulate.nominalsolid import Coarsening
-from avmsf.simulate.nominalthin import thinned
+from avmsf.simulate.nominalthin import simplified, thinned
 from avmsf.simulate.skin import Skin
 
 
@@ -95,14 +94,13 @@ def test_more_triangles_are_left_where_fewer_would_tear_the_skin(monkeypatch: py
     assert thinned(ball, tell=lambda words: None) is ball
 
 
-def test_a_coarser_skin_starts_from_the_last_one_that_is_finer() -> None:
-    coarsened = Coarsening(ellipsoid(4))
-    first, coarser, finer = (coarsened(length) for length in (0.006, 0.012, 0.004))
-
-    def places(skin: Skin) -> set[tuple[float, ...]]:
-        return {tuple(point) for point in skin.points.tolist()}
-
-    assert places(coarser) < places(first)
-    assert len(coarser.points) < 0.5 * len(first.points)
-    # What the first one had lost is there again.
-    assert len(finer.points) > 1.3 * len(first.points)
+def test_fewer_triangles_of_a_thin_shell_keep_its_volume() -> None:
+    outer, inner = ellipsoid(4), ellipsoid(4)
+    count = len(outer.points)
+    shell = Skin(
+        np.concatenate([outer.points, 0.95 * inner.points]), np.concatenate([outer.faces, count + inner.faces[:, ::-1]])
+    )
+    found = simplified(shell, 1200)
+    assert 1000 < len(found.faces) <= 1200
+    assert found.open_edges == 0
+    assert found.volume == pytest.approx(shell.volume, rel=0.05)

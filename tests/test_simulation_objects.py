@@ -245,6 +245,14 @@ def test_a_written_object_is_an_ordinary_capture_with_views_and_truth(simulation
     assert list(tmp_path.iterdir()) == [folder]
 
 
+def test_a_mesh_is_written_where_it_is_asked_for(simulation: Simulation, recipe: ObjectRecipe, tmp_path: Path) -> None:
+    for surface, files in ((True, {"surface.ply"}), (False, set())):
+        made = replace(simulation, recipe=replace(recipe, surface=surface))
+        write_simulation(made, tmp_path / str(surface))
+        assert {each.name for each in (tmp_path / str(surface)).glob("surface.*")} == files
+        assert len(read_views(tmp_path / str(surface))) == 3
+
+
 def test_the_same_recipe_gives_the_same_bytes(recipe: ObjectRecipe, tmp_path: Path) -> None:
     digests = []
     for folder in (tmp_path / "one", tmp_path / "two"):
@@ -344,13 +352,13 @@ def test_a_sheet_without_a_wall_is_told_to_have_one(recipe: ObjectRecipe, tmp_pa
 
 
 def test_truths_that_are_damaged_or_of_something_else_are_refused(simulation: Simulation, tmp_path: Path) -> None:
-    with pytest.raises(SimulationError, match="found no such file: only objects that `avmsf simulate` made"):
+    with pytest.raises(SimulationError, match=r"found no such file: .*only objects that"):
         read_truth(tmp_path)
     path = tmp_path / TRUTH
     write_truth(simulation.truth, path)
     content = path.read_bytes()
     path.write_bytes(content[:-100])
-    with pytest.raises(SimulationError, match="another kind or one cut short"):
+    with pytest.raises(SimulationError, match="cut short"):
         read_truth(path)
     path.write_bytes(content.replace(b'\\"format\\": 2', b'\\"format\\": 9'))
     with pytest.raises(SimulationError, match="expected a truth of format 1 or 2, found format 9"):

@@ -10,10 +10,10 @@ import trimesh
 
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.simulate import shell as shells
 from avmsf.simulate import tetrahedra
 from avmsf.simulate.block import block
-from avmsf.simulate.closest import ClosestPoints
 from avmsf.simulate.coarsening import coarsen
 from avmsf.simulate.shell import shell
 from avmsf.simulate.skin import Skin

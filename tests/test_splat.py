@@ -87,9 +87,9 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(tmp_path: Path, background:
     # The finished run is kept too: what comes after it may fail.
     assert _same(splat(views, config, checkpoint=place, progress=lambda progress: steps.append(0)), resumed)
     assert steps == [50, 60]
-    with pytest.raises(SceneError, match=r"splat\.ckpt: this checkpoint belongs to other views or settings"):
+    with pytest.raises(SceneError, match=r"splat\.ckpt: this checkpoint belongs to a splatting with another view"):
         splat(views, replace(config, seed=5), checkpoint=place)
-    with pytest.raises(SceneError, match="this checkpoint belongs to other views"):
+    with pytest.raises(SceneError, match="this checkpoint belongs to a splatting with another view"):
         splat(views[1:], config, checkpoint=place)
 
 
@@ -122,7 +122,7 @@ def test_photographs_without_masks_start_from_points() -> None:
     start = StartPoints(torch.tensor(MIDDLE) + RADIUS * normals, ball_color(normals))
     cloud = splat(views, replace(QUICK, steps=100), start=start)
     assert _mean_psnr(cloud, views, background=0.6) > 26.0
-    with pytest.raises(SceneError, match="0 of 16 views have a mask; a visual hull takes 3 or more"):
+    with pytest.raises(SceneError, match="0 of 16"):
         splat(views, QUICK)
 
 

@@ -195,7 +195,7 @@ def test_a_checkpoint_of_another_edit_is_refused_by_name(tmp_path):
     with pytest.raises(EditError, match="another settings"):
         steer(ringing_field(), guide, config=replace(QUICK, steps=13), checkpoint=place)
     place.write_bytes(place.read_bytes()[:100])
-    with pytest.raises(EditError, match="expected the checkpoint of an edit, found something else"):
+    with pytest.raises(EditError, match="expected a checkpoint of an edit, found something else"):
         steer(ringing_field(), guide, config=QUICK, checkpoint=place)
 
 

@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 
 from avmsf.errors import FitError
-from avmsf.field.doubt import gain_doubt
-from avmsf.field.fit import gain_case
 from avmsf.field.gains.elastic import REACH
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.recipes import SHARED, Attention
+from avmsf.field.recipes import SHARED, Attention, gain_case
 from avmsf.field.soundfield import SoundField
 from avmsf.field.suggest import suggest
+from avmsf.field.uncertainty import relative_gain_std
 from believing_field import (
     BANK,
     DOWN,
@@ -210,7 +209,7 @@ def test_of_very_many_candidates_some_that_are_far_apart_are_weighed(
         return covariances(gains, places, ways)
 
     monkeypatch.setattr(MixtureGains, "covariances", counted)
-    monkeypatch.setattr("avmsf.field.suggest.MOST", 30)
+    monkeypatch.setattr("avmsf.field.suggest.MAX_CANDIDATES", 30)
     fewer = suggest(field, 3, candidates=candidates, directions=DOWN.expand(120, 3))
     assert asked == [len(whole.points) + 30]
     assert torch.equal(fewer.contacts, candidates[fewer.rows])
@@ -232,5 +231,5 @@ def test_errors_are_those_of_the_map_of_uncertainty() -> None:
     field = of_one_hypothesis()
     found = suggest(field, 1)
     # The map is relative to the energy of the mean gains, to which errors add what is not known.
-    doubt = float(gain_doubt(field, found.points.float()).square().mean())
+    doubt = float(relative_gain_std(field, found.points.float()).square().mean())
     assert found.before**2 == pytest.approx(doubt / (1 + doubt), rel=1e-3)

@@ -73,7 +73,7 @@ class _Announcer(event.Listener):
         pass
 
 
-_PARTS = {"field": "the fit", "modal": "the search for modes", "scene": "the rasterizer", "simulate": "distances"}
+_PARTS = {"field": "the fit", "geometry": "distances", "modal": "the search for modes", "scene": "the rasterizer"}
 
 
 def lane_count() -> int:

@@ -94,3 +94,22 @@ def test_a_file_that_can_be_kept_is_kept_without_a_word(tmp_path: Path) -> None:
             tmp_path / "kept",
         )
     assert (tmp_path / "kept").read_text() == "a"
+
+
+def test_what_is_made_once_gives_its_result_or_its_failure_again() -> None:
+    calls = []
+
+    def make() -> int:
+        calls.append(None)
+        return len(calls)
+
+    def fail() -> None:
+        calls.append(None)
+        raise FitError(f"call {len(calls)}")
+
+    made, failed = caching.once(make), caching.once(fail)
+    assert (made(), made()) == (1, 1)
+    for _ in range(2):
+        with pytest.raises(FitError, match="call 2"):
+            failed()
+    assert len(calls) == 2

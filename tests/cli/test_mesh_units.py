@@ -16,6 +16,7 @@ VERBS = {
     "modes": [],
     "fit": ["OUT.safetensors"],
     "splat": ["OUT.ply"],
+    "surface": ["OUT.ply"],
     "lift": ["OUT.safetensors"],
     "reconstruct": ["OUT.safetensors"],
 }

@@ -1,6 +1,8 @@
 """What a page reads is the field, and the object beside it; read back by hand."""
 
+import base64
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from avmsf.errors import AvmsfError, ExportError
 from avmsf.export.bundle import make_bundle, write_bundle
 from avmsf.export.objectfile import read_object
 from avmsf.export.sampledfield import SampledField
+from avmsf.export.webpage import write_webpage
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import write_splats
 from struck_table import RATE, struck_table
@@ -192,6 +195,21 @@ def test_gaussians_are_kept_as_they_are(tmp_path: Path) -> None:
     (tmp_path / "short.ply").write_bytes((tmp_path / "ball.ply").read_bytes()[:-100])
     with pytest.raises(AvmsfError, match=r"short\.ply"):
         read_object(tmp_path / "short.ply", points)
+
+
+def test_a_surface_is_carried_beside_the_object_by_a_page_in_one_file(tmp_path: Path) -> None:
+    trimesh.creation.icosphere(subdivisions=2, radius=0.1).export(tmp_path / "ball.ply")
+    trimesh.PointCloud(ball_points().numpy()).export(tmp_path / "bare.ply")
+    assert make_bundle(ball_table(), surface=tmp_path / "bare.ply").manifest["surface"] is None
+    write_webpage(ball_table(), tmp_path / "page.html", surface=tmp_path / "ball.ply")
+    html = (tmp_path / "page.html").read_text()
+    inlined = json.loads(re.search(r"avmsfInlined = (.*?);</script>", html)[1])
+    manifest = json.loads(base64.b64decode(inlined["manifest.json"]["base64"]))
+    assert manifest["object"]["kind"] == "points"
+    assert manifest["surface"] == {"kind": "mesh", "file": "surface.glb"}
+    content = base64.b64decode(inlined["surface.glb"]["base64"])
+    loaded = trimesh.load_mesh(trimesh.util.wrap_as_stream(content), file_type="glb", process=False)
+    np.testing.assert_allclose(np.linalg.norm(loaded.vertices, axis=1), 0.1, rtol=1e-5)
 
 
 def test_points_without_triangles_are_the_fields_own(tmp_path: Path) -> None:

@@ -61,6 +61,19 @@ def test_a_thin_tube_bends_like_a_ring():
     assert lowest == pytest.approx(ring, rel=0.04)
 
 
+def test_facets_may_cut_across_a_wall_whose_thickness_is_known():
+    radius, wall = 0.05, 0.001
+    skin = Skin.of(tube(radius, wall, 0.15, sides=96, rings=16))
+    unknown, known = wall_of(skin), wall_of(skin, wall)
+    assert unknown is not None
+    assert known is not None
+    with pytest.raises(SimulationError):
+        unknown.solid(unknown.length(9_000))
+    lowest = float(elastic_modes(known.solid(known.length(9_000)), STEEL, count=1).frequency[0])
+    speed = math.sqrt(STEEL.young / (12 * STEEL.density * (1 - STEEL.poisson**2)))
+    assert lowest == pytest.approx(6 / math.sqrt(5) * wall / radius**2 * speed / (2 * math.pi), rel=0.04)
+
+
 def test_prisms_fill_a_wall_of_uneven_thickness():
     shape = make_shape("tray", seed=14)
     skin = Skin.of(shape.surface)

@@ -7,8 +7,9 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
-from avmsf.field.fit import fit, gain_case
+from avmsf.field.fit import fit
 from avmsf.field.gains.model import MixtureGains
+from avmsf.field.recipes import gain_case
 from avmsf.modal.extraction.extract import Extraction, extract
 from avmsf.scene.features import FeatureField
 from delayed_plate import ALIGNED, delays, distance, strikes, without_delays

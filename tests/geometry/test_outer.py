@@ -56,6 +56,15 @@ def test_a_shell_is_as_thick_as_asked_for_though_cells_are_wider(cup_shape: Obje
     assert mesh.volume == pytest.approx(cup_volume(wall), abs=0.125 * cup_shape.grid.spacing * area)
 
 
+def test_a_thin_shell_of_few_triangles_is_not_pierced(cup_shape: ObjectShape) -> None:
+    wall = 0.004 * cup_shape.diagonal
+    mesh = mesh_of(cup_shape.shell(wall, faces=1100))
+    assert mesh.is_watertight
+    assert mesh.euler_number == 2
+    assert len(mesh.faces) < 2400
+    assert mesh.volume == pytest.approx(cup_volume(wall), rel=0.2)
+
+
 def test_a_tube_is_open_at_both_ends() -> None:
     shape = _shape(tube())
     assert sum(cavity.openings for cavity in shape.cavities) == 2

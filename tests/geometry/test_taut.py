@@ -17,11 +17,11 @@ def _hull(mesh: trimesh.Trimesh, *, taut: bool) -> trimesh.Trimesh:
     return mesh_of(enclose(values, 0.0, lowest=grid.lowest, spacing=grid.spacing))
 
 
-def test_the_roof_over_a_flat_top_goes() -> None:
+def test_the_pyramid_above_a_flat_top_is_removed() -> None:
     block = trimesh.creation.cylinder(radius=0.05, height=0.04, sections=96)
-    roof = _hull(block, taut=False).bounds[1, 2] - 0.02
-    assert roof > 0.003
-    assert _hull(block, taut=True).bounds[1, 2] - 0.02 < 0.35 * roof
+    above = _hull(block, taut=False).bounds[1, 2] - 0.02
+    assert above > 0.003
+    assert _hull(block, taut=True).bounds[1, 2] - 0.02 < 0.35 * above
 
 
 def test_a_ball_stays_as_large_as_its_hull() -> None:

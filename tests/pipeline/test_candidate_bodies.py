@@ -12,10 +12,10 @@ from avmsf.capture.surface import Surface
 from avmsf.errors import FitError
 from avmsf.fem.supports import Support
 from avmsf.field.config import FitConfig
-from avmsf.field.fit import fit, gain_case
+from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator, gain_variance
-from avmsf.field.recipes import GainCase
+from avmsf.field.recipes import GainCase, gain_case
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains

@@ -13,12 +13,11 @@ import torch
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.surface import Surface
 from avmsf.errors import CaptureError, SimulationError
-from avmsf.field import arguments
-from avmsf.field.arguments import fingerprint
+from avmsf.field import recipes
 from avmsf.field.config import FitConfig
-from avmsf.field.fit import gain_case
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.recipes import fingerprint, gain_case
 from avmsf.field.store import load
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline import reconstruct as module
@@ -81,7 +80,7 @@ def edit_key() -> dict[str, str]:
     [
         (recipe, lambda: recipe.ObjectRecipe().elastic_values()),
         (nominal, body_key),
-        (arguments, fit_key),
+        (recipes, fit_key),
         (steercheckpoint, edit_key),
     ],
     ids=["elastic modes", "body", "fit", "edit"],

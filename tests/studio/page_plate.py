@@ -20,6 +20,8 @@ from avmsf.studio.modules import MODULES_VARIABLE, PINNED, find_modules, with_lo
 
 PAGE = Path(__file__).resolve().parents[2] / "src" / "avmsf" / "studio" / "page"
 SIDES = (0.24, 0.16, 0.02)
+LARGER = 1.1
+"""Size of the plate's reconstructed surface over its own, so that it is seen which of them is shown."""
 WAVES = ((1, 0), (0, 1), (1, 1), (2, 0), (2, 1), (3, 1))
 """Half waves along and across the plate, one pair a mode."""
 ACROSS, ALONG = 21, 31
@@ -67,12 +69,12 @@ def plate_strikes(table: SampledField, rows: tuple[int, ...] = (100, 500)) -> Im
 
 
 def plate_object(kind: str, folder: Path) -> Path | None:
-    """Write what shows the plate: a mesh of twelve triangles, Gaussians, or nothing."""
+    """Write what shows the plate: a mesh of twelve triangles, a surface `LARGER` than that, Gaussians, or nothing."""
     if kind == "points":
         return None
     path = folder / f"{kind}.ply"
-    if kind == "mesh":
-        trimesh.creation.box(SIDES).export(path)
+    if kind in ("mesh", "surface"):
+        trimesh.creation.box([side * (1 if kind == "mesh" else LARGER) for side in SIDES]).export(path)
         return path
     points = plate_table().points
     normals = torch.zeros_like(points)

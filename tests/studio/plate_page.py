@@ -26,14 +26,17 @@ def plate_site(serve: Callable[[Path], str], modules: Path, tmp_path_factory: py
     """Return a function that gives the address of the plate's page; the same one twice for the same wishes."""
     known: dict[str, str] = {}
 
-    def address(kind: str = "points", *, strikes: bool = False, live: dict[str, Any] | None = None) -> str:
-        name = repr((kind, strikes, live))
+    def address(
+        kind: str = "points", *, surface: bool = False, strikes: bool = False, live: dict[str, Any] | None = None
+    ) -> str:
+        name = repr((kind, surface, strikes, live))
         if name not in known:
             folder = tmp_path_factory.mktemp("page")
             table = plate_table()
-            shown = plate_object(kind, tmp_path_factory.mktemp("object"))
+            files = tmp_path_factory.mktemp("object")
+            seen = {"object": plate_object(kind, files), "surface": plate_object("surface", files) if surface else None}
             measured = plate_strikes(table) if strikes else None
-            known[name] = serve(lay_out(folder / "site", table, modules, object=shown, strikes=measured, live=live))
+            known[name] = serve(lay_out(folder / "site", table, modules, strikes=measured, live=live, **seen))
         return known[name]
 
     return address

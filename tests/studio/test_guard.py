@@ -1,6 +1,5 @@
 """Who is let in: every way in that is no page's of ours is refused, and told nothing."""
 
-import asyncio
 import contextlib
 import os
 import socket
@@ -12,6 +11,7 @@ import pytest
 from avmsf.studio.guard import LOOPBACK, NOTHING_HERE, Guard, contained, new_token
 from avmsf.studio.refusal import RefusedError
 from avmsf.studio.routes import PAGE
+from event_loop import run_async
 from opened_plate import blow, open_plate
 from served import Served, served
 
@@ -210,5 +210,5 @@ def test_sockets_of_another_protocol_are_closed() -> None:
         sent.append(message)
 
     guard = Guard(application, token="token", port=80)
-    asyncio.run(guard({"type": "websocket", "path": "/token/", "headers": []}, receive, send))
+    run_async(guard({"type": "websocket", "path": "/token/", "headers": []}, receive, send))
     assert sent == [{"type": "websocket.close", "code": 1008}]

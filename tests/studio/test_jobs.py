@@ -15,6 +15,7 @@ from avmsf.errors import CaptureError
 from avmsf.studio.jobs import Job, Jobs
 from avmsf.studio.refusal import RefusedError
 from avmsf.studio.worker import Voice
+from event_loop import run_async
 
 # A loop that a test closes right after a process was killed leaves pipes for the collector, which warns of them.
 pytestmark = [
@@ -47,7 +48,7 @@ def run(text: str, *, finish: Callable[[Any], Awaitable[Any]] = same) -> list[An
         await task
         return events
 
-    return asyncio.run(all_events())
+    return run_async(all_events())
 
 
 def test_events_come_in_order_and_the_result_last() -> None:
@@ -113,7 +114,7 @@ def test_a_finish_that_breaks_is_an_error_and_the_next_job_runs(
         second = jobs.start("reconstruct", {}, same, script("say(result={})"))
         return heard, [event async for _, event in second.listen()]
 
-    [first], second = asyncio.run(asyncio.wait_for(two(), 20))
+    [first], second = run_async(asyncio.wait_for(two(), 20))
     assert "reconstruct failed" in first["error"]
     assert words in first["error"]
     assert second == [{"taken": {}}]
@@ -128,7 +129,7 @@ def test_a_line_without_end_is_an_error(capsys: pytest.CaptureFixture[str]) -> N
         await task
         return events
 
-    [last] = asyncio.run(asyncio.wait_for(hear(), 20))
+    [last] = run_async(asyncio.wait_for(hear(), 20))
     assert "test failed (ValueError" in last["error"]
     assert "Traceback" in capsys.readouterr().err
 
@@ -142,7 +143,7 @@ def test_a_worker_that_cannot_start_is_an_error(tmp_path: Path, capsys: pytest.C
         await jobs.close()
         return events
 
-    [last] = asyncio.run(asyncio.wait_for(hear(), 20))
+    [last] = run_async(asyncio.wait_for(hear(), 20))
     assert "test failed (FileNotFoundError" in last["error"]
     assert "Traceback" in capsys.readouterr().err
 
@@ -164,7 +165,7 @@ def test_a_result_that_is_being_taken_in_is_told_whoever_stops_the_job() -> None
         go.set()
         return await stopping, job.events
 
-    stopped, events = asyncio.run(asyncio.wait_for(stop_late(), 20))
+    stopped, events = run_async(asyncio.wait_for(stop_late(), 20))
     assert not stopped
     assert events == [{"revision": 2}]
 
@@ -176,7 +177,7 @@ def test_who_comes_later_hears_what_was_missed() -> None:
         whole = [number async for number, _ in job.listen()]
         return whole, [number async for number, _ in job.listen(after=3)]
 
-    assert asyncio.run(listen()) == ([0, 1, 2, 3, 4], [3, 4])
+    assert run_async(listen()) == ([0, 1, 2, 3, 4], [3, 4])
 
 
 def alive(process: int) -> bool:
@@ -207,7 +208,7 @@ def test_cancelling_ends_all_processes(stubborn: str, monkeypatch: pytest.Monkey
         return job.events
 
     begun = time.monotonic()
-    first, last = asyncio.run(cancel())
+    first, last = run_async(cancel())
     assert time.monotonic() - begun < 5
     assert last == {"stage": "cancelled", "words": "stopped"}
     time.sleep(0.05)
@@ -224,7 +225,7 @@ def test_closing_ends_what_runs() -> None:
         await jobs.close()
         return job.events
 
-    first, last = asyncio.run(close())
+    first, last = run_async(close())
     assert last["stage"] == "cancelled"
     time.sleep(0.05)
     assert not any(alive(process) for process in first["processes"])
@@ -245,7 +246,7 @@ def test_one_job_runs_at_a_time() -> None:
         with pytest.raises(RefusedError, match="no such job"):
             jobs.named("another")
 
-    asyncio.run(start_two())
+    run_async(start_two())
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are looked up in /proc")
@@ -272,7 +273,7 @@ def test_a_worker_ends_where_its_server_was_killed() -> None:
         await asyncio.sleep(0.05)
         return status
 
-    assert asyncio.run(orphan()) == -9
+    assert run_async(orphan()) == -9
 
 
 @pytest.mark.parametrize(
@@ -294,4 +295,4 @@ def test_of_a_kind_the_last_job_says_what_came_of_it(words: str, failure: str | 
             pass
         return [running, jobs.failure("make"), jobs.failure("other")]
 
-    assert asyncio.run(asyncio.wait_for(end(), 20)) == [None, failure, None]
+    assert run_async(asyncio.wait_for(end(), 20)) == [None, failure, None]

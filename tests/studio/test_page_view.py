@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from page_plate import SIDES
+from page_plate import LARGER, SIDES, plate_table
 from plate_page import Open, on_screen, words_on
 
 if TYPE_CHECKING:
@@ -135,6 +135,8 @@ def test_finer_triangles_cover_the_same_surface_without_gaps(plain: "Page") -> N
 def picture(page: "Page") -> np.ndarray:
     from PIL import Image
 
+    # What was asked for is drawn in the next frame, which takes long on a busy computer.
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     page.wait_for_timeout(400)
     box = page.locator("#stage canvas").bounding_box()
     assert box is not None
@@ -155,6 +157,46 @@ def test_paint_is_seen_and_comes_off(visit: Open, kind: str) -> None:
     page.evaluate("document.getElementById('unpaint').click()")
     assert page.evaluate("document.getElementById('legend').hidden")
     assert (np.abs(picture(page) - bare).max(axis=2) > 40).mean() < 1e-4
+
+
+@pytest.mark.parametrize("kind", ["gaussians", "points"])
+def test_the_surface_is_shown_struck_and_painted_in_the_place_of_the_object(visit: Open, kind: str) -> None:
+    page = visit(kind=kind, surface=True)
+    page.evaluate("document.getElementById('hint').hidden = true")
+    own = picture(page)
+    page.click("text=Show surface")
+    page.wait_for_selector("text=Show " + ("Gaussians" if kind == "gaussians" else "points"))
+    surface = picture(page)
+    # It is a tenth larger than the plate, which shows beside the plate's edges.
+    assert (np.abs(surface - own).max(axis=2) > 20).mean() > 0.01
+    top = (0.6 * SIDES[0], 0.4 * SIDES[1], LARGER * SIDES[2] / 2)
+    spot = (0.3 * SIDES[0], 0.2 * SIDES[1], LARGER * SIDES[2] / 2)
+    assert page.evaluate("(at) => avmsf.pick(...at)", on_screen(page, top)) is None
+    hit = page.evaluate("(at) => avmsf.pick(...at)", on_screen(page, spot))
+    np.testing.assert_allclose(hit["place"], spot, atol=1e-4)
+    page.mouse.click(*on_screen(page, spot))
+    assert page.evaluate("avmsf.studio.row") == hit["row"]
+    contact = plate_table().points[hit["row"]].numpy()
+    assert np.linalg.norm(contact - spot) < 0.006  # meters: contacts are .008 apart
+    page.evaluate("for (const mark of document.querySelectorAll('.mark')) mark.style.display = 'none'")
+    page.click("#tab-modes")
+    page.click("tr[data-mode='1']")
+    page.evaluate("document.getElementById('legend').style.visibility = 'hidden'")
+    painted = picture(page)
+    assert (np.abs(painted - surface).max(axis=2) > 40).mean() > 0.02
+    page.click("#other-look")
+    page.wait_for_selector("text=Show surface")
+    # The paint stays on what is shown instead, and comes off all.
+    assert (np.abs(picture(page) - own).max(axis=2) > 40).mean() > 0.02
+    page.evaluate("document.getElementById('unpaint').click()")
+    assert (np.abs(picture(page) - own).max(axis=2) > 40).mean() < 1e-4
+    page.click("#other-look")
+    page.wait_for_selector("text=Show " + ("Gaussians" if kind == "gaussians" else "points"))
+    assert (np.abs(picture(page) - surface).max(axis=2) > 40).mean() < 1e-4
+
+
+def test_without_a_surface_there_is_nothing_to_choose(plain: "Page") -> None:
+    assert plain.is_hidden("#other-look")
 
 
 def test_an_object_that_is_replaced_leaves_nothing(plain: "Page") -> None:

@@ -6,8 +6,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from typing import TypeVar
 
 from avmsf.errors import AvmsfError, AvmsfWarning
+
+Result = TypeVar("Result")
 
 
 def keep_if_possible(write: Callable[[], object], path: Path) -> None:
@@ -46,6 +49,25 @@ def digest_of_sources(root: Path) -> str:
         digest.update(f"{path.relative_to(root).as_posix()}\0".encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def once(make: Callable[[], Result]) -> Callable[[], Result]:
+    """Return `make`, which is called once: later calls return its result, or raise its AvmsfError, again."""
+    found: list[Result] = []
+    failures: list[AvmsfError] = []
+
+    def kept() -> Result:
+        if failures:
+            raise failures[0]
+        if not found:
+            try:
+                found.append(make())
+            except AvmsfError as error:
+                failures.append(error)
+                raise
+        return found[0]
+
+    return kept
 
 
 @cache

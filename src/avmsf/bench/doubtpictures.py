@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from avmsf.bench.sides import ALL_SIDES, name_axes, view_from
-from avmsf.field.doubt import SpectrumBand
+from avmsf.field.uncertainty import SpectrumBand
 
 _INK, _NEXT = "#1f3b5c", "#19e0c8"
 _RANGE_DB = 100.0
@@ -32,7 +32,7 @@ def draw_doubt(
     suggested: Float[Tensor, "suggested 3"] | None = None,
     directions: Float[Tensor, "suggested 3"] | None = None,
 ) -> Figure:
-    """Draw doubt (of `gain_doubt`, 0 is certainty) on an object's points (object frame, metres), from six sides.
+    """Draw doubt (of `relative_gain_std`, 0 is certainty) on an object's points (object frame, metres), from six sides.
 
     `struck` contacts are marked by crosses, `suggested` ones by their numbers, each where it can be seen: no point is
     in front of it, and the blow, whose `directions` may be given, goes away from the eye, so that the two sides of a

@@ -11,8 +11,8 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import GainModel, estimator_for
 from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.soundfield import SoundField
-from avmsf.field.uninformed import uninformed
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.random_modes import random_modes
 from avmsf.scene.features import FeatureField
 
 QUICK = FitConfig()
@@ -56,9 +56,9 @@ class MixtureField:
 class UninformedField:
     """A field without modal initialisation (the paper's row "w/o init"): no extracted modes and no warm-up.
 
-    It starts from `uninformed`, with as many modes and bands of noise as the extraction has, and is trained end to end
-    for as many steps as the recipe takes in all. Corrections have `correction_rate`, for here they are no corrections:
-    frequencies, dampings and noise have to find where they belong.
+    It starts from `random_modes`, with as many modes and bands of noise as the extraction has, and is trained end to
+    end for as many steps as the recipe takes in all. Corrections have `correction_rate`, for here they are no
+    corrections: frequencies, dampings and noise have to find where they belong.
     """
 
     name: str
@@ -73,7 +73,7 @@ class UninformedField:
     def fit(self, task: Task) -> SoundField:
         """Fit the field. Raises AvmsfError where features or field cannot be made, or no mode can be counted."""
         counted = task.modes()
-        start = uninformed(
+        start = random_modes(
             task.train,
             modes=len(counted.bank),
             bins=len(counted.residual.magnitude),

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any, Protocol, runtime_checkable
 
+from avmsf._utils.caching import source_digest
 from avmsf.bench.judging import Judging
 from avmsf.bench.protocols import EvaluationProtocol
 from avmsf.bench.results import ResultsFolder
@@ -72,6 +73,7 @@ class Evaluation:
         self.judging.prepare()
         identity = {
             "version": version("avmsf"),
+            "source": source_digest(),
             "protocol": self.protocol.name,
             "choosing": repr(self.protocol.choosing),
             "dataset": self.title,

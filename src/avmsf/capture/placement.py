@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.capture.surface import Surface
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, FitError
 
 TOLERANCE = 0.05
 """Distance from the surface, over the object's diagonal, up to which a contact lies on it.
@@ -127,30 +127,27 @@ class Placement:
         rows = torch.argsort(self.distances, descending=True)
         return tuple(row for row in rows.tolist() if float(self.distances[row]) > self.tolerance)
 
-    def describe(self, names: Sequence[str] = (), *, what: str = "contacts") -> str:
-        """Return what to tell the contacts' owner, who knows them by these names or else by rows; "" if all is well.
-
-        `what` are they, where it is something else whose place was judged.
-        """
+    def describe(self, names: Sequence[str] = ()) -> str:
+        """Return what to tell the contacts' owner, who knows them by these names or else by rows; "" if all is well."""
         if self.on_surface:
             return ""
         if self.off:
             farthest = float(self.distances.max())
             few = self.mistake is None and 2 * len(self.off) < len(self.distances) and not self.shrunken
-            which = f"{len(self.off)} of {len(self.distances)} {what} lie" if few else f"the {what} lie"
+            which = f"{len(self.off)} of {len(self.distances)} contacts lie" if few else "the contacts lie"
             relative = _ratio(farthest / self.diagonal)
             found = f"{which} up to {_length(farthest)} ({relative} object diagonals) off the surface"
             if few:
                 shown = ", ".join(names[row] if names else f"row {row}" for row in self.off[:8])
                 return f"{found}, the others on it: check {shown}{', …' * (len(self.off) > 8)}"
         else:
-            found = f"the {what} lie within {_length(self.spread)} on an object {_length(self.diagonal)} across"
+            found = f"the contacts lie within {_length(self.spread)} on an object {_length(self.diagonal)} across"
         if self.mistake is not None:
             return f"{found}; {self.mistake}"
         if not self.off:
             return f"{found}: check that both are in one frame and unit"
         return (
-            f"{found}, and no change of unit, axes or origin that shows from so many {what} brings them onto it: "
+            f"{found}, and no change of unit, axes or origin that shows from so many contacts brings them onto it: "
             "both must be of one object in one frame (that of structure from motion is arbitrary: `align_similarity` "
             "brings it into the contacts')"
         )
@@ -189,6 +186,27 @@ def judge_placement(contacts: Float[Tensor, "contacts 3"], points: Float[Tensor,
         return placement
     search = _Search(cKDTree(some), _some(places, MOST_CONTACTS), placement)
     return replace(placement, mistake=search.find())
+
+
+def expect_placed(
+    contacts: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"], *, names: Sequence[str] = ()
+) -> None:
+    """Raise FitError where contacts are not on a surface, with the transform that would bring them onto it.
+
+    `points` are all over the surface, as `surface_points` has them; both in metres. Contacts are not on it where a
+    mistake made with all of them explains that, of unit, axes or origin, and where half of them lie farther off than
+    `Placement.tolerance`: rough surfaces, glue and single wrong rows pass. `names` are for the message.
+    """
+    placement = judge_placement(contacts, points)
+    if placement.mistake is None and float(placement.distances.median()) <= placement.tolerance:
+        return
+    if placement.mistake is None:
+        advice = "; bring both into one frame, or take a gain model without elastic mode shapes"
+    elif placement.mistake.unit_only:
+        advice = " State each one's unit, as unit and surface_unit in capture.toml do, or give both in metres"
+    else:
+        advice = " Undo this in one of the two, or take a gain model without elastic mode shapes"
+    raise FitError(f"elastic mode shapes need contacts on their surface, and {placement.describe(names)}{advice}")
 
 
 def surface_points(surface: Surface, *, count: int = MOST_POINTS) -> Float[Tensor, "points 3"]:

@@ -26,7 +26,7 @@ VERBS = {
     "fit": "Fit a sound field to a capture and write it to one file.",
     "splat": "Turn photographs, a video or a mesh into Gaussians, as a .ply file that any 3DGS viewer opens.",
     "lift": "Describe what each place of an object looks like, and make that obey the object's symmetries.",
-    "surface": "Write an object's surface alone: its mesh, or what encloses its Gaussians.",
+    "surface": "Write an object's surface alone: its mesh, or without one what its views show.",
     "reconstruct": "Go all the way from a capture folder to a field: views, Gaussians, features, modes, gains.",
     "view-cloud": "Draw Gaussians or features from all sides: colours, features, clusters, symmetries.",
     "render": "Write the sounds of blows anywhere on the object as wav files.",
@@ -41,7 +41,7 @@ VERBS = {
     "simulate": "Simulate objects, how they sound and how they look, as capture folders with their truth.",
     "evaluate": "Judge methods by contacts that they were not trained on, on all objects of a dataset.",
     "efficiency": "Show how the error falls with the number of places learnt from, for several methods.",
-    "demo": "Go all the way on a built-in example: images, Gaussians, features, a field, sounds, pictures.",
+    "demo": "Go all the way on a built-in example: photographs, Gaussians, shape, features, a field, sounds, pictures.",
 }
 """Each verb's module in this package, and the first sentence of its help."""
 CLOSED = 141

@@ -15,6 +15,8 @@ from avmsf.pipeline.scene import Listener
 from avmsf.scene.lift import LiftProgress
 from avmsf.scene.splat import SplatProgress
 
+REFINEMENT = "refinement"
+"""Name of the stage that the steps of a fit are."""
 _PRIOR = 0.15
 """Part of the run by which its pace here counts as much as the usual one in the estimate of the time left."""
 
@@ -66,14 +68,16 @@ class OverallBar:
         stage = words.partition(":")[0]
         if stage in self.stages:
             self._stage = stage
-            self._advance(0.0)
+        self._advance(0.0)
         if self._live:
             self._bar.update(self._task, description=words[:60])
         else:
             say(f"[{100 * self.done:3.0f} %, about {self.left:.0f} s left] {words}")
 
     def fitting(self, progress: FitProgress) -> None:
-        """Take note of a step of the fit."""
+        """Take note of a step of the refinement, which follows the solution for the gains."""
+        if self._stage != REFINEMENT and REFINEMENT in self.stages:
+            self.tell(f"{REFINEMENT}: {progress.steps} steps")
         doing(f"fit: step {progress.step} of {progress.steps}")
         self._advance(progress.step / progress.steps)
 

@@ -21,11 +21,10 @@ from avmsf.cli.modetable import levels, mode_rows
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.scores import quality_words, score_table, score_values
 from avmsf.field.attention import AttentionGains
-from avmsf.field.doubt import gain_doubt, spectrum_band
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.posterior import has_posterior, training_contacts
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
+from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
 from avmsf.scene.points import farthest_points
 
 _DRAWN_POINTS = 4000
@@ -152,7 +151,7 @@ def draw_field(
             title=f"{name}: recorded and rendered",
         )
     if has_posterior(field):
-        doubt = gain_doubt(field, points)
+        doubt = relative_gain_std(field, points)
         title = f"doubt of {name}"
         pictures["doubt"] = draw_doubt(points, doubt, title=title, struck=training_contacts(field))
         pictures["spectrum"] = draw_band(spectrum_band(field, points[0]), title=f"{name}: one blow, and its doubt")

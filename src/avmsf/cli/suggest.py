@@ -16,10 +16,9 @@ from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.writing import expect_writable, write_text
 from avmsf.errors import FitError
-from avmsf.field.doubt import gain_doubt
-from avmsf.field.posterior import unedited_mixture
 from avmsf.field.store import load
 from avmsf.field.suggest import Suggestions, suggest
+from avmsf.field.uncertainty import relative_gain_std, unedited_mixture
 
 TABLE, PICTURE = "suggested.csv", "suggested.png"
 """What the folder of results holds."""
@@ -92,12 +91,10 @@ def run(options: Options) -> int:
         soft_wrap=True,
     )
     if found.unreachable:
-        screen.print(
-            f"left out: {found.unreachable} places that no hammer reaches from outside",
-            soft_wrap=True,
-        )
+        screen.print(f"left out: {found.unreachable} places that no hammer reaches from outside", soft_wrap=True)
     if found.directions is not None:
-        screen.print("nx, ny, nz: the way the hammer moves" + ("" if given else ", straight into the surface"))
+        straight = "" if given else ", as straight into the body as it can where the field has one"
+        screen.print(f"nx, ny, nz: the way the hammer moves{straight}")
     if paths:
         write_text(paths[TABLE], _list(rows))
         doing("drawing the uncertainty")
@@ -105,7 +102,7 @@ def run(options: Options) -> int:
         points = gains.points[::step]
         picture = draw_doubt(
             points,
-            gain_doubt(field, points),
+            relative_gain_std(field, points),
             title=f"{field.origin.capture or 'field'}: doubt, and where to strike next",
             struck=gains.contacts,
             suggested=found.contacts,

@@ -27,10 +27,12 @@ from avmsf.scene.splatconfig import SplatConfig
 
 @dataclass(frozen=True)
 class Options(SceneOptions):
-    """Write an object's surface alone: its mesh, or what encloses its Gaussians.
+    """Write an object's surface alone: its mesh, or without one what its views show.
 
-    It is the surface that `avmsf reconstruct` makes bodies of, in metres and in the frame of the folder. Views and
-    Gaussians are made first where the cache does not have them.
+    In meters and in the frame of the folder. Views show both sides of a wall where both were seen, and cavities as deep
+    as they were seen. `avmsf reconstruct` tries this as one of the bodies that may vibrate; the others have walls of
+    several thicknesses below its outer side, since views do not show how thick a wall is. Views and Gaussians are made
+    first where the cache does not have them.
     """
 
     output: Annotated[Path | None, tyro.conf.arg(metavar="SURFACE.ply")] = None

@@ -360,7 +360,7 @@ class _Problem:
                 break
             if float(value.detach()) < least:
                 least, kept = float(value.detach()), moving.fixed()
-            value.backward()
+            torch.autograd.backward(value)
             optimizer.step()
             schedule.step()
             moving.limit(self.bounds, self.family.thickness)

@@ -1,4 +1,4 @@
-"""A field as a page reads it: `manifest.json`, its tensors in `field.bin`, the object, and the measured strikes.
+"""A field as a page reads it: `manifest.json`, its tensors in `field.bin`, the object, its surface, measured strikes.
 
 The manifest says where in `field.bin` each tensor lies, little endian and row by row: points, normals, frequency,
 damping, sine, noise, and cosine unless all of it is zero. Times and frequencies are float64, for a float32 frequency
@@ -26,6 +26,8 @@ from avmsf.field.soundfield import SoundField
 
 FORMAT = 1
 """Number of this format; it grows with every change that older pages could not read."""
+SURFACE = "surface.glb"
+"""What the file of the surface is called."""
 MOST_POINTS = 20_000
 """Contacts that a page gets unless more are asked for: 128 modes at each are 20 MB."""
 
@@ -46,6 +48,7 @@ def make_bundle(
     *,
     object: Path | Surface | None = None,
     metres: float = 1.0,
+    surface: Path | None = None,
     strikes: Impacts | None = None,
     limit: int = MOST_POINTS,
     live: Mapping[str, Any] | None = None,
@@ -53,8 +56,9 @@ def make_bundle(
 ) -> Bundle:
     """Return a field's bundle, at no more than `limit` contacts.
 
-    `object` is shown for it: a mesh whose coordinates count `metres` each, Gaussians, or the contacts alone. `strikes`
-    are measured ones to compare with, `live` what a server behind the page offers. Raises `ExportError`, for a field
+    `object` is shown for it: a mesh whose coordinates count `metres` each, Gaussians, or the contacts alone. The mesh
+    `surface`, in meters, is what the reader can show instead, as the one that was made of Gaussians. `strikes` are
+    measured ones to compare with, `live` what a server behind the page offers. Raises `ExportError`, for a field
     without a mode too unless it may be `mute`, as an object's that is to be struck first.
     """
     remarks: tuple[str, ...] = ()
@@ -71,9 +75,13 @@ def make_bundle(
     files = {"field.bin": content}
     if shown.name is not None:
         files[shown.name] = shown.content
+    other = read_object(surface, sampled.points)
+    if other.kind == "mesh":
+        files[SURFACE] = other.content
     records, sounds = _strikes(strikes, sampled)
     manifest = _manifest(sampled, tensors, shown, records, live)
-    return Bundle(manifest, {**files, **sounds}, remarks + shown.remarks)
+    manifest["surface"] = {"kind": "mesh", "file": SURFACE} if SURFACE in files else None
+    return Bundle(manifest, {**files, **sounds}, remarks + shown.remarks + other.remarks)
 
 
 def write_bundle(
@@ -82,6 +90,7 @@ def write_bundle(
     *,
     object: Path | Surface | None = None,
     metres: float = 1.0,
+    surface: Path | None = None,
     strikes: Impacts | None = None,
     limit: int = MOST_POINTS,
     live: Mapping[str, Any] | None = None,
@@ -92,7 +101,9 @@ def write_bundle(
 
     A bundle that is there is replaced. Raises `ExportError` for another folder that is not empty, unless with `force`.
     """
-    bundle = make_bundle(field, object=object, metres=metres, strikes=strikes, limit=limit, live=live, mute=mute)
+    bundle = make_bundle(
+        field, object=object, metres=metres, surface=surface, strikes=strikes, limit=limit, live=live, mute=mute
+    )
     sizes = write_folder(
         Path(folder), lambda place: write_files(bundle.files, place), dict(bundle.manifest), force=force
     )

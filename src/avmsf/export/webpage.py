@@ -54,6 +54,7 @@ def write_webpage(
     *,
     object: Path | Surface | None = None,
     metres: float = 1.0,
+    surface: Path | None = None,
     strikes: Impacts | None = None,
     limit: int = MOST_POINTS,
     force: bool = False,
@@ -64,7 +65,7 @@ def write_webpage(
     `force`.
     """
     output = Path(output)
-    bundle = make_bundle(field, object=object, metres=metres, strikes=strikes, limit=limit)
+    bundle = make_bundle(field, object=object, metres=metres, surface=surface, strikes=strikes, limit=limit)
     if output.suffix.lower() in SUFFIXES:
         return Written(write_file(output, single_file(bundle).encode(), force=force), bundle.remarks)
     content = {**page_files(), **bundle.files}

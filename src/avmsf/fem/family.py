@@ -15,7 +15,7 @@ from avmsf.fem.isotropic import IsotropicModes, isotropic_modes
 from avmsf.fem.walls import Wall, wall_of
 from avmsf.simulate.nominal import WALL_TRIAL, WALLS, Shape
 from avmsf.simulate.nominalcheck import CheckedSurface, checked
-from avmsf.simulate.nominalsolid import filled_solid, wall_solids
+from avmsf.simulate.nominalsolid import TRIANGLES, filled_solid, wall_solids
 from avmsf.simulate.solid import Solid
 
 FREEDOMS = WALL_TRIAL
@@ -131,10 +131,10 @@ def _of_shape(shape: Shape, count: int, freedoms: int, filled: int, tell: Callab
 
     def make(thickness: float) -> Solid:
         try:
-            surface = shape.shell(thickness)
+            surface = shape.shell(thickness, faces=round(0.5 * TRIANGLES * freedoms))
         except SceneError as error:
             raise SimulationError(str(error)) from error
-        return filled_solid(checked(surface, tell=tell), freedoms)
+        return filled_solid(checked(surface, tell=tell), freedoms, wall=thickness)
 
     return _of_walls(make, np.geomspace(*between, _THICKNESSES).tolist(), count, tell)
 

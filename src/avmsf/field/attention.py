@@ -1,4 +1,4 @@
-"""How strongly a blow at a place excites each mode: the paper's attention network (section 3.5)."""
+"""How strongly an impact at a place excites each mode: the paper's attention network (section 3.5)."""
 
 import math
 from collections.abc import Mapping
@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from avmsf.field.gainfield import Gains
-from avmsf.field.records import count_of, like, record_of
+from avmsf._utils.records import count_of, like, record_of
+from avmsf.field.gainfield import Gains, TrainableGains
 from avmsf.scene.features import FeatureField, Regions
 
 
@@ -41,7 +41,7 @@ to build before it can be compared with the file's tensors."""
 _EXAMPLE = AttentionShape(clusters=1, bands=0, width=1, hidden=1, layers=0, feature_scale=1.0)
 
 
-class AttentionGains(nn.Module):
+class AttentionGains(TrainableGains):
     """Gains from a contact's own feature and from attention over the object's regions (paper, eqs. 7-11).
 
     Holds the points it looks contacts up in, so that a saved network needs nothing else.
@@ -106,15 +106,6 @@ class AttentionGains(nn.Module):
             nn.init.zeros_(self.to_dampings.weight)
 
     @property
-    def report(self) -> dict[str, Any]:
-        """Return nothing: the network chose nothing beforehand."""
-        return {}
-
-    def used_rows(self, contacts: int) -> list[int]:
-        """Return all contacts: the network doubts none."""
-        return list(range(contacts))
-
-    @property
     def feature_field(self) -> FeatureField:
         """The points and features that the network reads."""
         return FeatureField(self.points, self.features, self.encoder)
@@ -129,7 +120,7 @@ class AttentionGains(nn.Module):
                     layer.bias.copy_(layer.bias[modes])
 
     def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
-        """Return the gains at the contacts, whichever way they are struck, and the factors where dampings vary."""
+        """Return the gains at the contacts, for any direction, and the factors where dampings vary."""
         return self.read(self.feature_field.nearest(contacts))
 
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
@@ -147,12 +138,8 @@ class AttentionGains(nn.Module):
     def deviation(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Float[Tensor, "contacts modes 2"] | None:
-        """Return None: a network knows no doubt."""
+        """Return None: the network has no posterior."""
         return None
-
-    def penalty(self) -> Float[Tensor, ""]:
-        """Return zero: what is known of the network beforehand is in its optimiser's weight decay."""
-        return self.gain_scale.new_zeros(())
 
     def finished(self, order: Int[Tensor, " modes"]) -> "AttentionGains":
         """Return the network with its modes in the given order, ready for use."""
@@ -176,35 +163,29 @@ class AttentionGains(nn.Module):
     @classmethod
     def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return tensors like those of a network of these sizes, which take no memory."""
-        points, dim, modes = (count_of(record[name], name) for name in ("points", "dim", "modes"))
-        shape = record_of(_EXAMPLE, record["shape"], "gain_field.shape")
-        if shape.layers > _MAX_LAYERS or shape.bands > _MAX_LAYERS:
-            raise ValueError(f"layers and bands: expected at most {_MAX_LAYERS}, got {shape.layers} and {shape.bands}")
-        with torch.device("meta"):
-            features = FeatureField(torch.empty(points, 3), torch.empty(points, dim), "")
-            regions = Regions(torch.empty(shape.clusters, 3), torch.empty(shape.clusters, dim))
-            network = cls(
-                features,
-                gain_scale=torch.empty(modes),
-                shape=shape,
-                generator=torch.Generator(device="cpu"),
-                regions=regions,
-            )
-        like(record["encoder"], "", "gain_field.encoder")
-        return dict(network.state_dict())
+        return dict(cls._empty(record).state_dict())
 
     @classmethod
     def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "AttentionGains":
         """Return the network, ready for use."""
-        network = cls(
-            FeatureField(tensors["points"], tensors["features"], record["encoder"]),
-            gain_scale=tensors["gain_scale"],
-            shape=record_of(_EXAMPLE, record["shape"], "gain_field.shape"),
-            generator=torch.Generator(),
-            regions=Regions(tensors["centers"], tensors["descriptors"]),
-        )
-        network.load_state_dict(dict(tensors))
+        network = cls._empty(record)
+        network.load_state_dict(dict(tensors), assign=True)
         return network.eval().requires_grad_(False)
+
+    @classmethod
+    def _empty(cls, record: Mapping[str, Any]) -> "AttentionGains":
+        points, dim, modes = (count_of(record[name], name) for name in ("points", "dim", "modes"))
+        encoder, shape = like(record["encoder"], "", "encoder"), record_of(_EXAMPLE, record["shape"], "shape")
+        if shape.layers > _MAX_LAYERS or shape.bands > _MAX_LAYERS:
+            raise ValueError(f"layers and bands: expected at most {_MAX_LAYERS}, got {shape.layers} and {shape.bands}")
+        with torch.device("meta"):
+            return cls(
+                FeatureField(torch.empty(points, 3), torch.empty(points, dim), encoder),
+                gain_scale=torch.empty(modes),
+                shape=shape,
+                generator=torch.Generator(device="cpu"),
+                regions=Regions(torch.empty(shape.clusters, 3), torch.empty(shape.clusters, dim)),
+            )
 
 
 def encode(offsets: Float[Tensor, "*shape 3"], bands: int) -> Float[Tensor, "*shape encoded"]:

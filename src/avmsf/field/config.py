@@ -1,31 +1,15 @@
 """How a field is fitted: one flat record, which is the command line's options too."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 from avmsf.errors import FitError
 from avmsf.field.attention import AttentionShape
 from avmsf.modal.spectra import scaled_fft_size
 
-_LEAST = {
-    "clusters": 1,
-    "bands": 0,
-    "width": 1,
-    "hidden": 1,
-    "layers": 0,
-    "correction_rate": 0,
-    "noise_rate": 0,
-    "weight_decay": 0,
-    "warmup_steps": 0,
-    "steps": 0,
-    "patience": 0,
-    "hop": 0,
-    "interleave": 1,
-    "early": 1,
-    "early_weight": 0,
-    "seed": 0,
-}
+_COUNTS = ("clusters", "width", "hidden", "interleave", "early")
+_POSITIVE = ("feature_scale", "warmup_rate", "learning_rate")
 
 
 @dataclass(frozen=True)
@@ -79,7 +63,7 @@ class FitConfig:
     phase: Literal["common", "sine"] = "common"
     """How modes start: each with the phase that the training recordings agree on, or as sines (paper, eq. 3)."""
     residual: bool = True
-    """Whether noise is modelled beside the modes."""
+    """Whether noise is modeled in addition to the modes."""
     residual_noise: Literal["low-fluctuation", "gaussian"] = "low-fluctuation"
     """Noise that is filtered to the residual's spectrum when the field is rendered: a fixed sequence whose spectrogram
     hardly fluctuates, 2 dB below a recording's noise, or a random draw at its level (paper)."""
@@ -87,14 +71,14 @@ class FitConfig:
     """Start of all chance in the fit: initial weights, noise in training, and rendered Gaussian noise."""
 
     def __post_init__(self) -> None:
-        for name, least in _LEAST.items():
-            value = getattr(self, name)
-            if not least <= value < math.inf:
-                raise FitError(f"{name} = {value}: expected {least} or more")
-        for name in ("feature_scale", "warmup_rate", "learning_rate"):
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise FitError(f"{name} = {value}: expected more than 0")
+        values = {name: value for name, value in asdict(self).items() if not isinstance(value, bool)}
+        numbers = {name: value for name, value in values.items() if isinstance(value, int | float)}
+        for name, value in numbers.items():
+            least = 1 if name in _COUNTS else 0
+            if not least <= value < math.inf or (name in _POSITIVE and value == 0):
+                raise FitError(
+                    f"{name} = {value}: expected {'more than 0' if name in _POSITIVE else f'{least} or more'}"
+                )
         if self.seed >= 2**63:
             raise FitError(f"seed = {self.seed}: expected less than 2^63")
         if not 0 <= self.validation <= 0.5:
@@ -109,14 +93,7 @@ class FitConfig:
     @property
     def shape(self) -> AttentionShape:
         """Sizes of the network, with shared damping."""
-        return AttentionShape(
-            clusters=self.clusters,
-            bands=self.bands,
-            width=self.width,
-            hidden=self.hidden,
-            layers=self.layers,
-            feature_scale=self.feature_scale,
-        )
+        return AttentionShape(self.clusters, self.bands, self.width, self.hidden, self.layers, self.feature_scale)
 
     def resolutions(self, sample_rate: float) -> tuple[tuple[int, ...], tuple[int, ...], int]:
         """Return FFT sizes, hops and the early length in samples at a sample rate, Hz."""

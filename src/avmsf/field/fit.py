@@ -12,11 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
-from avmsf.field.arguments import expect_fitting, fingerprint
-from avmsf.field.checkpoint import read_checkpoint, write_checkpoint
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField
 from avmsf.field.gains.estimator import MixtureEstimator
@@ -24,21 +23,20 @@ from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.losses import spectral_loss
 from avmsf.field.places import held_out, rows_by_place
 from avmsf.field.quality import with_quality
-from avmsf.field.recipes import GainCase, GainRecipe, along_phase
+from avmsf.field.recipes import GainCase, GainRecipe, along_phase, fingerprint, gain_case
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.extraction.least_squares import fit_gains, fit_sine_gains
-from avmsf.modal.phase import common_phase
+from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual, estimate_residual
 from avmsf.modal.spectra import envelope
 from avmsf.scene.features import FeatureField
 
-_FEWEST_TO_VALIDATE = 6
+_MIN_PLACES = 6
 _CHECKPOINT_SECONDS = 30.0
-_LOOK_EVERY = 10
-"""Steps between looks at the validation contacts."""
+_VALIDATION_STEPS = 10
+"""Steps between validations."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ def fit(
 ) -> SoundField:
     """Fit a sound field to recordings (paper, section 3.5).
 
-    `modes` as extracted from `train`, or `uninformed` where there is no warm-up. `gains` makes the gain model; the
+    `modes` as extracted from `train`, or `random_modes` where there is no warm-up. `gains` makes the gain model; the
     default is the Gaussian process without elastic mode shapes (`MixtureEstimator`), for of the object's shape
     nothing is known here. `settings` are the capture's, which the field keeps: recordings that it is asked about later
     are read by them. What the config leaves open is chosen on a part of the training contacts held out for the purpose,
@@ -85,7 +83,6 @@ def fit(
     if train.before is not None and bool(train.before.isnan().all()):
         # Files that start with their impacts were not cut, and others are to be read alike.
         settings = replace(settings, align=False)
-    expect_fitting(train, modes)
     case = gain_case(train, features, modes, config)
     train = case.train
     recipe = MixtureEstimator() if gains is None else gains
@@ -125,25 +122,6 @@ def _with_measured_residual(field: SoundField, train: Impacts) -> SoundField:
     return replace(field, residual=estimate_residual(train.sounds, modes, bins=bins))
 
 
-def gain_case(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> GainCase:
-    """Return what gain fields are made from: the aligned recordings, with the phases and strengths of their modes."""
-    train = modes.aligned(train)
-    # Amplitudes are float32 from here on, so that a field is the same whichever its recordings came in. The alignment
-    # comes first, as it recognizes recordings by their samples.
-    train = replace(train, sounds=train.sounds.float())
-    modes = replace(modes, residual=Residual(modes.residual.magnitude.float()))
-    phase = torch.zeros_like(modes.bank.frequency)
-    if config.phase == "common":
-        phase = common_phase(modes.gains, modes.quadrature)
-    if config.warmup_steps:
-        gains = fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate, phase=phase)
-    else:
-        # No aim then, they only say how strong the modes are: what of the extraction's own has the phase does.
-        turned = modes.gains * torch.cos(phase) + modes.quadrature * torch.sin(phase)
-        gains = turned.to(train.sounds)
-    return GainCase(train, features, modes, phase, gains, config)
-
-
 @dataclass(frozen=True)
 class _Plan:
     """A run's free choices."""
@@ -164,14 +142,18 @@ class _Job:
     ) -> None:
         self.case, self.recipe, self.checkpoint, self.progress = case, recipe, checkpoint, progress
         self.train = case.train
-        # Where nothing has to be learnt first, the run starts end to end.
+        # Where nothing has to be learned first, the run starts end to end.
         warmup = case.config.warmup_steps if recipe.warms_up else 0
         self.config = case.config if warmup else replace(case.config, warmup_steps=0, steps=max(1, case.config.steps))
         self.steps = case.config.steps
         self.gains = case.gains * case.signs[:, None]
         self.rows = recipe.rows(case)
-        self.fingerprint = fingerprint(case, recipe)
-        saved = read_checkpoint(checkpoint, fingerprint=self.fingerprint) if checkpoint is not None else None
+        self.identity = {"input, configuration or version": fingerprint(case, recipe)}
+        saved = (
+            None
+            if checkpoint is None
+            else read_checkpoint(checkpoint, self.identity, what="a fit", raising=FieldFileError)
+        )
         self.trials: dict[str, Any] = {} if saved is None else saved["trials"]
         self.running: dict[str, Any] | None = None if saved is None else saved["running"]
         self.saved_at = time.monotonic()
@@ -182,13 +164,13 @@ class _Job:
         default = _Plan(dampings[0], self.steps)
         held = held_out(self.train.contacts, self.config.validation)
         undecided = len(dampings) > 1 or (self.config.patience > 0 and self.recipe.warms_up)
-        if len(rows_by_place(self.train.contacts)) < _FEWEST_TO_VALIDATE or not held or not undecided:
+        if len(rows_by_place(self.train.contacts)) < _MIN_PLACES or not held or not undecided:
             return default, {"damping": default.damping, "validated": False}
-        learnt = [row for row in range(len(self.train)) if row not in held]
+        learned = [row for row in range(len(self.train)) if row not in held]
         for damping in dampings:
             name = f"trial with {damping} damping"
             if name not in self.trials:
-                self.run(name, learnt, _Plan(damping, self.steps), held=held)
+                self.run(name, learned, _Plan(damping, self.steps), held=held)
         outcomes = {damping: self.trials[f"trial with {damping} damping"] for damping in dampings}
         best = min(outcomes, key=lambda damping: outcomes[damping]["envelope"])
         steps = outcomes[best]["steps"] if self.config.patience else self.steps
@@ -202,60 +184,54 @@ class _Job:
         }
         return _Plan(best, steps), report
 
-    def run(self, name: str, learnt: list[int], plan: _Plan, *, held: list[int] | None = None) -> TrainingRun:
-        """Train on the rows `learnt`; with `held`, note how well the best step does there."""
-        run = self._start(learnt, plan)
+    def run(self, name: str, learned: list[int], plan: _Plan, *, held: list[int] | None = None) -> TrainingRun:
+        """Train on the rows `learned`; with `held`, note how well the best step does there."""
+        run = self._start(learned, plan)
         # What was struck elsewhere than its label says would pull the others' gains to its sound.
-        targets = self._targets([learnt[place] for place in run.network.used_rows(len(learnt))])
-        look = (
-            None
-            if held is None
-            else _Look(self._targets(held), self.train.sounds[held], keep_best=self.config.patience > 0)
-        )
+        targets = self._targets([learned[place] for place in run.network.used_rows(len(learned))])
+        validation = None if held is None else _Validation(self._targets(held), self.train.sounds[held], self.config)
         if self.running is not None and self.running["name"] == name:
             run.resume(self.running["run"])
-            if look is not None:
-                look.best = self.running["look"]
+            if validation is not None:
+                validation.best = self.running["validation"]
         end = self.config.warmup_steps + plan.steps
         try:
             while True:
-                # First in the loop, so that a run which goes on takes the look that an interruption may have cut off;
-                # a second look at the same step changes nothing.
-                if look is not None and self._due(run.step, end):
-                    look.at(run)
-                    if self.config.patience and run.step - look.best["at"] >= self.config.patience:
-                        break
-                if run.step >= end:
+                # First in the loop, so that a run which goes on takes the validation that an interruption may have cut
+                # off; a second one at the same step changes nothing.
+                if (validation is not None and validation.stops(run, end)) or run.step >= end:
                     break
                 loss = run.advance(targets)
-                _expect_finite_loss(loss, name, run.step)
-                self._tell(name, run, end, loss)
+                if not math.isfinite(loss):
+                    raise FitError(
+                        f"the {name} diverged, its loss at step {run.step} is {loss}: lower learning_rate or "
+                        "warmup_rate, or the correction_rate"
+                    )
+                if self.progress is not None:
+                    self.progress(Progress(name, run.step, end, loss, self.config.warmup_steps))
                 if time.monotonic() - self.saved_at > _CHECKPOINT_SECONDS:
-                    self._save(name, run, look)
+                    self._save(name, run, validation)
         except KeyboardInterrupt:
             # Amid a step's changes there is nothing to keep but what was saved before.
             if run.whole:
-                self._save(name, run, look)
+                self._save(name, run, validation)
             raise
-        if look is not None:
-            self.trials[name] = {
-                "envelope": look.best["envelope"],
-                "spectral": look.best["spectral"],
-                "steps": max(0, look.best["at"] - self.config.warmup_steps),
-            }
+        if validation is not None:
+            best = validation.best
+            self.trials[name] = {**best, "steps": max(0, best["steps"] - self.config.warmup_steps)}
         else:
             # The work is done but the field is not saved yet: should that fail, it need not be done again.
             self._save(name, run, None)
         return run
 
-    def _start(self, learnt: list[int], plan: _Plan) -> TrainingRun:
-        case = self.case.take(learnt)
+    def _start(self, learned: list[int], plan: _Plan) -> TrainingRun:
+        case = self.case.take(learned)
         # The cosine runs out where the plan ends, for a run that is meant to end early as well.
         config = replace(self.config, steps=max(1, plan.steps))
         return TrainingRun(
             self.recipe.start(case, plan.damping),
             case.modes,
-            gains=self.gains[learnt],
+            gains=self.gains[learned],
             phase=case.phase,
             sample_rate=self.train.sample_rate,
             samples=self.train.sounds.shape[1],
@@ -265,37 +241,31 @@ class _Job:
     def _targets(self, rows: list[int]) -> Targets:
         return Targets.of(self.train.take(rows), self.gains[rows], self.rows[rows], self.config)
 
-    def _due(self, step: int, end: int) -> bool:
-        if step < self.config.warmup_steps:
-            return False
-        return (step - self.config.warmup_steps) % _LOOK_EVERY == 0 or step == end
-
-    def _tell(self, name: str, run: TrainingRun, end: int, loss: float) -> None:
-        if self.progress is not None:
-            self.progress(Progress(name, run.step, end, loss, self.config.warmup_steps))
-
-    def _save(self, name: str, run: TrainingRun, look: "_Look | None") -> None:
+    def _save(self, name: str, run: TrainingRun, validation: "_Validation | None") -> None:
         if self.checkpoint is None:
             return
-        running = {"name": name, "run": run.state(), "look": None if look is None else look.best}
-        state = {"fingerprint": self.fingerprint, "trials": self.trials, "running": running}
+        running = {"name": name, "run": run.state(), "validation": None if validation is None else validation.best}
+        state = {"trials": self.trials, "running": running}
         try:
-            write_checkpoint(self.checkpoint, state)
+            write_checkpoint(self.checkpoint, state, self.identity, raising=FieldFileError)
         except FieldFileError as error:
             # A full disk costs the checkpoint, not the fit.
             warnings.warn(f"the fit goes on without a new checkpoint: {error}", AvmsfWarning, stacklevel=2)
         self.saved_at = time.monotonic()
 
 
-class _Look:
-    """Held-out contacts, and how well a run does on them: at its best step, or at its last."""
+class _Validation:
+    """Held-out contacts, and how well a run predicts them: at its best step with patience, or at its last."""
 
-    def __init__(self, targets: Targets, sounds: Float[Tensor, "contacts samples"], *, keep_best: bool) -> None:
-        self.targets, self.envelope, self.keep_best = targets, envelope(sounds), keep_best
-        self.best: dict[str, Any] = {"spectral": float("inf"), "envelope": float("inf"), "at": 0}
+    def __init__(self, targets: Targets, sounds: Float[Tensor, "contacts samples"], config: FitConfig) -> None:
+        self.targets, self.envelope, self.config = targets, envelope(sounds), config
+        self.best: dict[str, Any] = {"spectral": float("inf"), "envelope": float("inf"), "steps": 0}
 
-    def at(self, run: TrainingRun) -> None:
-        """Note the held-out errors, of the best step only where that is kept: relative, and ENV (paper, 4.2)."""
+    def stops(self, run: TrainingRun, end: int) -> bool:
+        """Note the errors where it is time, relative and ENV (paper, 4.2); return whether patience is at its end."""
+        done = run.step - self.config.warmup_steps
+        if done < 0 or (done % _VALIDATION_STEPS and run.step != end):
+            return False
         # Validation must not disturb the run: its noise comes from the same place in the stream every time.
         state = run.generator.get_state()
         with torch.no_grad():
@@ -303,13 +273,6 @@ class _Look:
             spectral = float(spectral_loss(sounds, self.targets.whole)) / len(self.targets.whole.hops)
             distance = float((envelope(sounds) - self.envelope).square().mean(1).sqrt().mean())
         run.generator.set_state(state)
-        if not self.keep_best or spectral < self.best["spectral"]:
-            self.best = {"spectral": spectral, "envelope": distance, "at": run.step}
-
-
-def _expect_finite_loss(loss: float, name: str, step: int) -> None:
-    if not math.isfinite(loss):
-        raise FitError(
-            f"the {name} diverged, its loss at step {step} is {loss}: lower learning_rate or warmup_rate, or the "
-            "correction_rate"
-        )
+        if not self.config.patience or spectral < self.best["spectral"]:
+            self.best = {"spectral": spectral, "envelope": distance, "steps": run.step}
+        return self.config.patience > 0 and run.step - self.best["steps"] >= self.config.patience

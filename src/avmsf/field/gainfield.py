@@ -1,16 +1,17 @@
-"""What every gain field is to the rest of the house: gains at contacts, how sure they are, and nothing about time."""
+"""What every gain field is: gains at contacts, their standard deviation, and nothing about time."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from jaxtyping import Float, Float64
-from torch import Tensor
+import torch
+from jaxtyping import Float, Float64, Int
+from torch import Tensor, nn
 
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """How strongly blows at some contacts excite each mode."""
+    """How strongly impacts at some contacts excite each mode."""
 
     mean: Float[Tensor, "contacts modes"]
     """Signed amplitudes of what starts with each mode's phase, in the unit of the training sounds."""
@@ -20,10 +21,15 @@ class Gains:
     """Factors on the modes' dampings; None where these are the same everywhere."""
 
     @property
+    def parts(self) -> Float64[Tensor, "contacts modes 2"]:
+        """The gains and the quadrature."""
+        quadrature = torch.zeros_like(self.mean) if self.quadrature is None else self.quadrature
+        return torch.stack([self.mean, quadrature], dim=2).double()
+
+    @property
     def power(self) -> Float64[Tensor, "contacts modes"]:
         """Squares of the amplitudes whatever their phase, gains and quadrature together."""
-        power = self.mean.double().square()
-        return power if self.quadrature is None else power + self.quadrature.double().square()
+        return self.parts.square().sum(2)
 
 
 @runtime_checkable
@@ -39,24 +45,24 @@ class GainField(Protocol):
         ...
 
     def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
-        """Return the gains of blows at contacts (object frame, metres).
+        """Return the gains of impacts at contacts (object frame, metres).
 
-        `directions`, the unit vectors along which the hammer moves, are heeded by fields that know of directions; these
-        take a blow straight into the surface where none are given.
+        `directions` are the unit vectors along which the hammer moves. Fields that know of directions take an impact
+        straight into the surface where none are given; the others ignore them.
         """
         ...
 
     def deviation(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Float[Tensor, "contacts modes 2"] | None:
-        """Return the standard deviation of what is believed of the gains and of the quadrature at contacts.
+        """Return the posterior standard deviation of the gains and of the quadrature, without measurement noise.
 
-        Of the gains themselves, without the scatter of blows. None where the field knows no doubt.
+        None for a field without a posterior.
         """
         ...
 
     def record(self) -> dict[str, Any]:
-        """Return what a file holds beside the tensors, as plain values, sizes included, that of `modes` among them."""
+        """Return what a file holds besides the tensors, as plain values, sizes included, that of `modes` among them."""
         ...
 
     def tensors(self) -> dict[str, Tensor]:
@@ -75,3 +81,28 @@ class GainField(Protocol):
     def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "GainField":
         """Return the field of a record and the tensors that belong to it."""
         ...
+
+
+class TrainableGains(nn.Module):
+    """A gain field in training. Its matrices decay towards zero as the config asks for, other parameters do not."""
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What it chose before the training, as plain values."""
+        return {}
+
+    def used_rows(self, contacts: int) -> list[int]:
+        """Return which of the contacts it was started from, as many as `contacts`, are to be trained on."""
+        return list(range(contacts))
+
+    def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
+        """Return the gains at the contacts that `Targets.rows` stands for, differentiable in the parameters."""
+        raise NotImplementedError
+
+    def penalty(self) -> Float[Tensor, ""]:
+        """Return the negative log prior of the parameters, in the unit of the spectral loss."""
+        return torch.zeros(())
+
+    def finished(self, order: Int[Tensor, " modes"]) -> GainField:
+        """Return the gain field as it is, with its modes in the given order."""
+        raise NotImplementedError

@@ -2,18 +2,17 @@
 
 from dataclasses import asdict, replace
 
-import torch
-from jaxtyping import Complex128, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError
+from avmsf.field.gainfield import Gains
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.soundfield import FieldQuality, SoundField
 from avmsf.field.suggest import suggest
 from avmsf.modal.residual import Residual
-from avmsf.modal.synthesis import synthesise_phased
 
 MIN_PLACES = 4
 """Places below which leaving one out says nothing of the field of all."""
@@ -22,17 +21,21 @@ MIN_PLACES = 4
 def with_quality(field: SoundField, train: Impacts, *, advise: bool = True) -> SoundField:
     """Return a field with the residual that predicts its own contacts best, and its quality in the report.
 
-    The residual is the stationary noise of the field, or the mean of what the three nearest recordings have beside
-    their modes; whichever gives the smaller error at contacts left out. `train` holds the recordings that the gain
-    model uses, row for row. A field of fewer than `MIN_PLACES` places keeps its noise and has no quality. `advise`:
-    whether to name the contact to record next, one of the field's points; not if these are not on the object.
+    The residual is the stationary noise of the field, or the mean of what the three nearest recordings have in
+    addition to their modes, by the error at contacts left out. `train` holds the recordings that the gain model uses,
+    row for row. A field of fewer than `MIN_PLACES` places keeps its noise and has no quality. `advise`: whether to name
+    the contact to record next, one of the field's points; not if these are not on the object.
     """
     gains = field.gain_field
     if not isinstance(gains, MixtureGains) or gains.place_count < MIN_PLACES:
         return field
-    places, modes = gains.places, _modes(field, gains.leave_one_out())
-    errors = {"noise": _error(field, modes + field.noise(train.sounds.shape[1]), train)}
-    recordings = (train.sounds - _modes(field, gains.values)).float()
+    samples, places = train.sounds.shape[1], gains.places
+    modes, fitted = (
+        field.modal_sounds(Gains(each.real.float(), each.imag.float()), samples)
+        for each in (gains.leave_one_out(), gains.values)
+    )
+    errors = {"noise": _error(field, modes + field.noise(samples), train)}
+    recordings = (train.sounds - fitted).float()
     rows, signs = gains.nearest(gains.training, places)
     averaged = (train.sounds[rows] * signs[..., None]).float().mean(1)
     if field.origin.config.residual:
@@ -59,19 +62,6 @@ def _next(field: SoundField, gains: MixtureGains) -> tuple[tuple[float, float, f
         return ()
     x, y, z = contact.tolist()
     return (x, y, z), distance
-
-
-def _modes(field: SoundField, gains: Complex128[Tensor, "contacts modes"]) -> Float[Tensor, "contacts samples"]:
-    kept = torch.nonzero(field.audible).flatten()
-    return synthesise_phased(
-        gains.real[:, kept].float(),
-        field.bank.frequency[kept],
-        field.bank.damping[kept],
-        field.phase[kept],
-        samples=field.samples,
-        sample_rate=field.sample_rate,
-        quadrature=gains.imag[:, kept].float(),
-    )
 
 
 def _error(field: SoundField, sounds: Float[Tensor, "contacts samples"], train: Impacts) -> float:

@@ -1,22 +1,36 @@
 """What a gain field is made from, and the ways to make one."""
 
-from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+import hashlib
+import json
+from abc import ABC, abstractmethod
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from typing import ClassVar
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
+from avmsf._utils.caching import source_digest
 from avmsf.capture.impacts import Impacts
+from avmsf.errors import FitError
 from avmsf.field.attention import AttentionGains
 from avmsf.field.config import FitConfig
-from avmsf.field.orientation import orientation_signs
-from avmsf.field.training import TrainableGains, gain_scale
+from avmsf.field.gainfield import TrainableGains
+from avmsf.field.training import gain_scale
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.least_squares import fit_sine_gains
+from avmsf.modal.phase import common_phase
+from avmsf.modal.residual import Residual
 from avmsf.scene.features import FeatureField
 
 SHARED, PER_CONTACT = "shared", "per-contact"
 """Dampings that are the same everywhere, and those that vary with the contact."""
+_OPPOSED = -0.5
+"""Cosine between two neighbors' directions below which one of them comes from the other side: 120 degrees and more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +38,7 @@ class GainCase:
     """Recordings whose gains are known, to be spread over an object."""
 
     train: Impacts
+    """Aligned, in float32."""
     features: FeatureField
     """Points of the object, and what is known of them."""
     modes: Extraction
@@ -36,7 +51,7 @@ class GainCase:
 
     @property
     def signs(self) -> Float[Tensor, " contacts"]:
-        """+1 or -1 a contact: what makes blows from both sides of a wall blows from one."""
+        """+1 or -1 a contact: what makes impacts from both sides of a wall impacts from one."""
         return orientation_signs(self.train.contacts, self.train.directions).to(self.gains)
 
     @property
@@ -50,6 +65,26 @@ class GainCase:
         return replace(self, train=self.train.take(rows), modes=modes, gains=self.gains[rows])
 
 
+def gain_case(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> GainCase:
+    """Return what gain fields are made from. Raises FitError where no field can be fitted to recordings and modes."""
+    _expect_fitting(train, modes)
+    # The alignment comes first, as it recognizes recordings by their samples. Amplitudes are float32 from there on, so
+    # that a field is the same whichever its recordings came in.
+    train = modes.aligned(train)
+    train = replace(train, sounds=train.sounds.float())
+    modes = replace(modes, residual=Residual(modes.residual.magnitude.float()))
+    phase = torch.zeros_like(modes.bank.frequency)
+    if config.phase == "common":
+        phase = common_phase(modes.gains, modes.quadrature)
+    if config.warmup_steps:
+        gains = fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate, phase=phase)
+    else:
+        # No aim then, they only say how strong the modes are: what of the extraction's own has the phase does.
+        turned = modes.gains * torch.cos(phase) + modes.quadrature * torch.sin(phase)
+        gains = turned.to(train.sounds)
+    return GainCase(train, features, modes, phase, gains, config)
+
+
 def along_phase(
     gains: Float[Tensor, "contacts modes"],
     quadrature: Float[Tensor, "contacts modes"],
@@ -60,54 +95,66 @@ def along_phase(
     return torch.view_as_real(both * torch.polar(torch.ones_like(phase), -phase))
 
 
-@runtime_checkable
-class GainRecipe(Protocol):
-    """A way to make a gain field."""
+def orientation_signs(
+    contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None
+) -> Float[Tensor, " contacts"]:
+    """Return +1 or -1 a contact, such that directions times these vary as little as they can from contact to contact.
+
+    A linear object answers an opposite force with the negated sound, so impacts on the two sides of a thin wall have
+    opposite gains. A field that knows places alone can be fitted to the gains times these signs. Along the shortest
+    tree that connects the contacts, a direction opposed to its neighbor's turns the sign. Most contacts keep +1. All
+    ones where `directions` is None.
+    """
+    count = len(contacts)
+    if directions is None or count < 2:
+        return torch.ones(count)
+    places = contacts.detach().double().cpu().numpy()
+    # Contacts in one place are at distance zero, which the sparse graph would take for no edge.
+    tree = minimum_spanning_tree(cdist(places, places) + 1e-9)
+    order, parents = breadth_first_order(tree, 0, directed=False)
+    cosines = (directions.double() @ directions.double().T).cpu().numpy()
+    signs = np.ones(count)
+    for row in order[1:]:
+        signs[row] = signs[parents[row]] * (-1.0 if cosines[row, parents[row]] < _OPPOSED else 1.0)
+    return torch.from_numpy(-signs if signs.sum() < 0 else signs).float()
+
+
+class GainRecipe(ABC):
+    """A way to make a gain field; unless it says otherwise, one that solves for gains with shared dampings."""
+
+    warms_up: ClassVar[bool] = False
+    """Whether gains have to be learned before the end-to-end stage, step by step (paper, eq. 13)."""
 
     @property
+    @abstractmethod
     def name(self) -> str:
         """What reports, tables and the command line call it."""
-        ...
 
-    @property
-    def warms_up(self) -> bool:
-        """Whether gains have to be learnt before the end-to-end stage, step by step."""
-        ...
-
+    @abstractmethod
     def digest(self) -> str:
-        """Return what tells this recipe from others, beside the config."""
-        ...
+        """Return what distinguishes this recipe from others, besides the config."""
+
+    @abstractmethod
+    def start(self, case: GainCase, damping: str) -> TrainableGains:
+        """Return the field as it is before training. Raises AvmsfError where it cannot be had."""
 
     def dampings(self, config: FitConfig) -> tuple[str, ...]:
         """Return the forms of damping to choose from."""
-        ...
-
-    def start(self, case: GainCase, damping: str) -> TrainableGains:
-        """Return the field as it is before training. Raises AvmsfError where it cannot be had."""
-        ...
+        return (SHARED,)
 
     def rows(self, case: GainCase) -> Int[Tensor, " contacts"]:
         """Return what the field reads for the case's contacts."""
-        ...
+        return torch.arange(len(case.train))
 
 
 @dataclass(frozen=True, eq=False)
-class Attention:
+class Attention(GainRecipe):
     """The paper's network, on the features of the fit or on its own."""
 
     features: FeatureField | None = None
     """What it reads in place of the fit's features."""
-    label: str = "attention"
-
-    @property
-    def name(self) -> str:
-        """As labelled."""
-        return self.label
-
-    @property
-    def warms_up(self) -> bool:
-        """The network learns the gains first (paper, eq. 13)."""
-        return True
+    name: str = "attention"
+    warms_up: ClassVar[bool] = True
 
     def digest(self) -> str:
         """Return the name and the digest of the network's own features."""
@@ -119,10 +166,9 @@ class Attention:
 
     def start(self, case: GainCase, damping: str) -> AttentionGains:
         """Return an untrained network."""
-        gains = case.gains * case.signs[:, None]
         return AttentionGains(
             self._features(case),
-            gain_scale=gain_scale(gains),
+            gain_scale=gain_scale(case.gains * case.signs[:, None]),
             shape=replace(case.config.shape, spatial_damping=damping == PER_CONTACT),
             generator=torch.Generator().manual_seed(case.config.seed),
         )
@@ -133,3 +179,47 @@ class Attention:
 
     def _features(self, case: GainCase) -> FeatureField:
         return case.features if self.features is None else self.features
+
+
+def fingerprint(case: GainCase, recipe: GainRecipe) -> str:
+    """Return a digest of all that decides a fit's result, this package's version and code among it."""
+    train, modes = case.train, case.modes
+    words = [version("avmsf"), source_digest(), asdict(case.config), recipe.name, recipe.digest()]
+    words += [train.digest(), case.features.digest()]
+    digest = hashlib.sha256(json.dumps(words, sort_keys=True).encode())
+    tensors = [modes.bank.frequency, modes.bank.damping, modes.residual.magnitude]
+    # Phases, and without a warm-up how strong the modes are, are those of the extraction.
+    for tensor in (*tensors, modes.gains, modes.quadrature):
+        digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _expect_fitting(train: Impacts, modes: Extraction) -> None:
+    if len(train) == 0:
+        raise FitError("expected recordings to fit a field to, found none: strike the object in some places")
+    for name, sound, contact in zip(train.names, train.sounds, train.contacts, strict=True):
+        if not bool(torch.isfinite(sound).all() and torch.isfinite(contact).all()):
+            raise FitError(
+                f"{name}: expected finite samples and coordinates, found NaN or infinity: leave the recording out or "
+                "read it again"
+            )
+    if train.directions is not None and not bool(torch.isfinite(train.directions).all()):
+        row = int(torch.nonzero(~torch.isfinite(train.directions).all(1))[0])
+        raise FitError(
+            f"{train.names[row]}: expected a finite direction, got {train.directions[row].tolist()}: give the way the "
+            "hammer moves, or zeros where it is not known"
+        )
+    if float(train.sounds.abs().max()) == 0.0:
+        raise FitError("all recordings are silent: there is nothing to fit; check the channel that was read")
+    advice = "extract the modes from the recordings that the field is fitted to"
+    if len(modes.gains) != len(train):
+        raise FitError(
+            f"the modes were extracted from {len(modes.gains)} recordings, the field is to be fitted to {len(train)}: "
+            f"{advice}"
+        )
+    if len(modes.bank) == 0:
+        raise FitError("expected modes, found none: a field of noise alone is the same everywhere")
+    highest, limit = float(modes.bank.frequency.max()), train.sample_rate / 2
+    if highest >= limit:
+        raise FitError(f"the highest mode is at {highest:g} Hz, the recordings reach {limit:g} Hz: {advice}")

@@ -9,10 +9,13 @@ import torch
 from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
+from avmsf._utils.records import count_of, like
+from avmsf.field.attention import AttentionGains
 from avmsf.field.gainfield import GainField, Gains
-from avmsf.field.kinds import FITTED
-from avmsf.field.records import count_of, like
+from avmsf.field.gains.model import MixtureGains
 
+FITTED: dict[str, type[GainField]] = {each.kind: each for each in (AttentionGains, MixtureGains)}
+"""The gain fields that are fitted to recordings, by what a file calls them."""
 _INNER = "field."
 
 
@@ -28,7 +31,7 @@ class ScaledGains:
     scale: Float64[Tensor, " modes"]
     """Factors on the gains of each mode; 0 mutes one."""
     length: float = 1.0
-    """Lengths on this object over those on the fitted one: a place here is heard where it is, divided by this."""
+    """Lengths on this object over those on the fitted one: contacts are divided by it."""
 
     kind: ClassVar[str] = "scaled"
 
@@ -61,7 +64,7 @@ class ScaledGains:
     def deviation(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Float[Tensor, "contacts modes 2"] | None:
-        """Return the fitted gains' deviation, scaled like them: what is asked for by an edit is not in doubt."""
+        """Return the fitted gains' deviation, scaled like them."""
         known = self.field.deviation(contacts.double() / self.length, directions)
         return None if known is None else (known.double() * self.scale.abs()[:, None]).float()
 

@@ -31,7 +31,7 @@ class Origin:
     trained_on: tuple[str, ...] = ()
     """Names of the recordings that it was fitted to."""
     per_newton: bool = False
-    """Whether the recordings were divided by the force, so that a force in newtons scales a blow's sound."""
+    """Whether the recordings were divided by the force, so that a force in newtons scales an impact's sound."""
     config: FitConfig = field(default_factory=FitConfig)
     """Settings of the fit."""
     report: dict[str, Any] = field(default_factory=dict)
@@ -92,7 +92,7 @@ class FieldQuality:
 
 @dataclass(frozen=True, eq=False)
 class SoundField:
-    """Renders the sound of a blow anywhere on one object (paper, eq. 4)."""
+    """Renders the sound of an impact anywhere on one object (paper, eq. 4)."""
 
     bank: ModalBank
     """Frequencies and dampings, shared by all contacts."""
@@ -101,7 +101,7 @@ class SoundField:
     phase: Float64[Tensor, " modes"]
     """How each mode starts, radians: mode k sounds as exp(-d t) sin(2 pi f t + phase). Zero in the paper."""
     residual: Residual
-    """Noise beside the modes."""
+    """Noise in addition to the modes."""
     sample_rate: float
     """Samples per second of rendered sounds, Hz."""
     samples: int
@@ -127,7 +127,7 @@ class SoundField:
     ) -> Float[Tensor, "contacts modes"]:
         """Return the signed amplitudes at the contacts (object frame, metres), in the unit of the training sounds.
 
-        `directions`, unit vectors, are those of the blows; without them they go straight into the surface.
+        `directions`, unit vectors, are those of the impacts; without them they go straight into the surface.
         """
         return self.known(contacts, directions=directions).mean
 
@@ -138,9 +138,8 @@ class SoundField:
 
         Contacts, directions and unit as in `gains`; dampings d are those of the contacts.
         """
-        known = self.known(contacts, directions=directions)
-        quadrature = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
-        return torch.complex(quadrature.double(), -known.mean.double()) * torch.exp(1j * self.phase)
+        sines, cosines = self.known(contacts, directions=directions).parts.unbind(2)
+        return torch.complex(cosines, -sines) * torch.exp(1j * self.phase)
 
     def known(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
@@ -164,22 +163,22 @@ class SoundField:
         samples: int | None = None,
         pulse: ForcePulse | None = None,
     ) -> Float[Tensor, "contacts samples"]:
-        """Return the sound of a blow at each contact, along `directions` as in `gains`, times `force`.
+        """Return the sound of an impact at each contact, along `directions` as in `gains`, times `force`.
 
         `force` in newtons where the recordings were divided by theirs, else relative to an average one of them. Of
         `samples` samples, or as long as the training sounds. The noise is the same at every contact and in every call,
         so that a contact's sound depends on nothing else. Modes that are not `audible` are silent.
 
-        `pulse` is what a softer hammer adds to the recorded blows' own pulses, in which the modes answer it; it has
-        the same impulse, however long it is. The noise grows with `force` as the modes do, which is a simplification:
-        recorded background noise does not depend on the force of an impact. The pulse leaves the noise as it is.
+        `pulse` is what a softer hammer adds to the recorded impacts' own pulses; it has the same impulse, however long
+        it is, and leaves the noise as it is. The noise grows with `force` as the modes do, which is a simplification:
+        recorded background noise does not depend on the force of an impact.
         """
         length = self.samples if samples is None else samples
         noise = None if self.residual.recordings is not None else self.noise(samples)
         parts = []
         for rows in torch.split(torch.arange(len(contacts)), _BATCH):
             known = self.known(contacts[rows], directions=None if directions is None else directions[rows])
-            modes = self._modes(known, length)
+            modes = self.modal_sounds(known, length)
             sounds = modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate)
             way = None if directions is None else directions[rows]
             parts.append(sounds + (self._recorded(contacts[rows], way, length) if noise is None else noise))
@@ -191,7 +190,7 @@ class SoundField:
         directions: Float[Tensor, "contacts 3"] | None,
         samples: int,
     ) -> Float[Tensor, "contacts samples"]:
-        """Return the mean of what the nearest recordings have beside their modes; silence after their end."""
+        """Return the mean of what the nearest recordings have in addition to their modes; silence after their end."""
         gains, recordings = fitted_gains(self.gain_field), self.residual.recordings
         assert isinstance(gains, MixtureGains)
         assert recordings is not None
@@ -212,15 +211,16 @@ class SoundField:
         generator = torch.Generator().manual_seed(self.origin.config.seed)
         return shape_noise(self.residual.magnitude, contacts=1, samples=length, generator=generator)[0]
 
-    def _modes(self, known: Gains, samples: int) -> Float[Tensor, "contacts samples"]:
+    def modal_sounds(self, known: Gains, samples: int) -> Float[Tensor, "contacts samples"]:
+        """Return the sounds of the audible modes with these gains, without noise."""
         damping = self.bank.damping if known.damping is None else self.bank.damping * known.damping
-        heard = torch.nonzero(self.audible).flatten()
+        rows = torch.nonzero(self.audible).flatten()
         return synthesise_phased(
-            known.mean[:, heard],
-            self.bank.frequency[heard],
-            damping[..., heard],
-            self.phase[heard],
+            known.mean[:, rows],
+            self.bank.frequency[rows],
+            damping[..., rows],
+            self.phase[rows],
             samples=samples,
             sample_rate=self.sample_rate,
-            quadrature=None if known.quadrature is None else known.quadrature[:, heard],
+            quadrature=None if known.quadrature is None else known.quadrature[:, rows],
         )

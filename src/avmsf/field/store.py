@@ -1,35 +1,52 @@
 """A sound field as one file: safetensors, and one JSON in its header for all that is no tensor.
 
 Tensors are named by the path of their field: `bank.frequency`, `phase`, `gain_field.points`. The header's metadata
-holds under the key `avmsf` the record that `avmsf.field.header` describes.
+holds under the key `avmsf` a record:
+
+{"format": 7, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
+ "sizes": {"modes": 43, "bins": 1025, "recordings": [8, 132300]},
+ "gain_field": {"kind": "attention", what the gain field says of itself},
+ "config": {FitConfig}, "origin": {"capture": "bowl", "trained_on": [...], "per_newton": true, "report": {...},
+                                   "settings": {CaptureSettings}}}
 """
 
+import json
 import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from avmsf.capture.audio import MAX_PEAK
-from avmsf.errors import FieldFileError
+from avmsf._utils.records import count_of, like, record_of
+from avmsf._utils.state import read_tensors
+from avmsf._utils.text_files import parse_json
+from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
+from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import CaptureError, FieldFileError, FitError
+from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField
-from avmsf.field.header import FORMAT, Header, broken, read_header
-from avmsf.field.kinds import FITTED
-from avmsf.field.scaledgains import ScaledGains
-from avmsf.field.soundfield import SoundField
+from avmsf.field.scaledgains import FITTED, ScaledGains
+from avmsf.field.soundfield import Origin, SoundField
 from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 
+FORMAT = 7
+"""Number of this format; it grows with every change that older versions could not read."""
 _KEY = "avmsf"
 _GAIN_FIELD = "gain_field."
 _POSITIVE = ("bank.frequency", "bank.damping")
-_MOST = {"bank.frequency": 1e9, "bank.damping": 1e9, "residual.magnitude": MAX_PEAK}
+_MAX = {"bank.frequency": 1e9, "bank.damping": 1e9, "residual.magnitude": MAX_PEAK}
 """Largest values: hertz and 1/s beyond any solid's modes, and noise as loud as the loudest recording."""
 _KINDS: dict[str, type[GainField]] = {**FITTED, ScaledGains.kind: ScaledGains}
 """The gain fields that a file may hold, by what it calls them."""
+_UNREADABLE = (ValueError, TypeError, KeyError, RuntimeError, FitError, CaptureError)
+"""What a record of another form raises; RuntimeError: torch, of sizes beyond 2^63 and of damaged values."""
 
 
 def save(field: SoundField, path: str | Path) -> None:
@@ -39,12 +56,20 @@ def save(field: SoundField, path: str | Path) -> None:
     `FieldFileError` where the file cannot be written, and for a field that could not be read back.
     """
     path = Path(path)
+    record, tensors = _record(field), _tensors(field)
     try:
-        header, tensors = Header.of(field), _tensors(field)
-    except ValueError as error:
+        words = json.dumps(record, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise FieldFileError(
+            f"{path}: expected origin.report to hold finite numbers, words, lists and dicts ({error}): take the rest "
+            "out of it"
+        ) from error
+    try:
+        header = _Header.of(json.loads(words))
+    except _UNREADABLE as error:
         raise FieldFileError(f"{path}: {error}: such a field cannot be kept") from error
-    _expect_tensors(tensors, header, path)
-    content = to_bytes(tensors, {_KEY: header.to_json(path)})
+    _expect_tensors(tensors, header.skeleton, path)
+    content = to_bytes(tensors, {_KEY: words})
     write_whole(path, lambda place: place.write_bytes(content))
 
 
@@ -55,13 +80,27 @@ def load(path: str | Path) -> SoundField:
     tensor is missing, unexpected, of another shape or dtype, or not finite.
     """
     path = Path(path)
-    words, tensors = _read(path)
-    header = read_header(words, path)
-    _expect_tensors(tensors, header, path)
+    words, tensors = read_tensors(
+        path, _KEY, what="a sound field", advice="fit and save it again", raising=FieldFileError
+    )
     try:
-        gains = _KINDS[header.kind].restore(header.gain_field, _of_gain_field(tensors))
-    except (ValueError, RuntimeError) as error:  # RuntimeError: torch's decompositions, of damaged values
-        raise broken(path, error) from error
+        record = parse_json(words)
+        found, writer = record["format"], record["version"]
+        if found != FORMAT:
+            raise FieldFileError(
+                f"{path}: expected a sound field of format {FORMAT}, found format {found}, written by avmsf {writer} "
+                f"(this is avmsf {version('avmsf')}): "
+                + ("fit the field again" if isinstance(found, int) and found < FORMAT else "install a newer avmsf")
+            )
+        header = _Header.of(record)
+        _expect_tensors(tensors, header.skeleton, path)
+        named = {name.removeprefix(_GAIN_FIELD): each for name, each in tensors.items() if name.startswith(_GAIN_FIELD)}
+        gains = _KINDS[header.kind].restore(header.gain_field, named)
+    except _UNREADABLE as error:
+        raise FieldFileError(
+            f"{path}: expected the header of a sound field of format {FORMAT}, found another or a damaged one "
+            f"({type(error).__name__}: {error}): fit and save the field again"
+        ) from error
     return SoundField(
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
         gains,
@@ -71,6 +110,74 @@ def load(path: str | Path) -> SoundField:
         header.samples,
         header.origin,
     )
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What a field's file says about its tensors."""
+
+    sample_rate: float
+    samples: int
+    kind: str
+    gain_field: Mapping[str, Any]
+    """What the gain field says of itself."""
+    origin: Origin
+    skeleton: dict[str, Tensor]
+    """Tensors of the names, shapes and dtypes of a field with these sizes, which take no memory."""
+
+    @classmethod
+    def of(cls, record: Mapping[str, Any]) -> "_Header":
+        """Return the header of a file's record. Raises one of `_UNREADABLE`, also for sounds that no recording has."""
+        sizes, gains, origin = record["sizes"], dict(record["gain_field"]), record["origin"]
+        rate, samples = float(like(record["sample_rate"], 1.0, "sample_rate")), count_of(record["samples"], "samples")
+        # Those of the recordings that a field is fitted to.
+        if not LOWEST_RATE <= rate <= HIGHEST_RATE:
+            raise ValueError(f"sample_rate: expected {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz, got {rate:g}")
+        if samples > MAX_SAMPLES:
+            raise ValueError(f"samples: expected at most {MAX_SAMPLES:,}, got {samples:,}")
+        modes, bins = (count_of(sizes[name], f"sizes.{name}") for name in ("modes", "bins"))
+        kind = like(gains.pop("kind"), "", "gain_field.kind")
+        if kind not in _KINDS:
+            raise ValueError(f"gain_field.kind is {kind!r}, not {', '.join(_KINDS)}")
+        bank = torch.empty(modes, dtype=torch.float64, device="meta")
+        skeleton = {"bank.frequency": bank, "bank.damping": bank, "phase": bank}
+        skeleton["residual.magnitude"] = torch.empty(bins, device="meta")
+        if sizes["recordings"] is not None:
+            contacts, length = (count_of(each, "sizes.recordings") for each in sizes["recordings"])
+            if gains.get("contacts") != contacts:
+                raise ValueError(f"sizes.recordings is {sizes['recordings']}, of other contacts than the gains")
+            skeleton["residual.recordings"] = torch.empty(contacts, length, device="meta")
+        skeleton |= {_GAIN_FIELD + name: each for name, each in _KINDS[kind].skeleton(gains).items()}
+        if gains["modes"] != modes:
+            raise ValueError(f"{gains['modes']} modes have gains, {modes} have frequencies")
+        read = Origin(
+            capture=like(origin["capture"], "", "origin.capture"),
+            trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
+            per_newton=like(origin["per_newton"], True, "origin.per_newton"),
+            config=record_of(FitConfig(), record["config"], "config"),
+            report=like(origin["report"], {}, "origin.report"),
+            settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
+        )
+        return cls(rate, samples, kind, gains, read, skeleton)
+
+
+def _record(field: SoundField) -> dict[str, Any]:
+    origin = {name: getattr(field.origin, name) for name in ("capture", "trained_on", "per_newton", "report")}
+    recordings = field.residual.recordings
+    return {
+        "format": FORMAT,
+        "version": version("avmsf"),
+        "sample_rate": field.sample_rate,
+        "samples": field.samples,
+        "sizes": {
+            "modes": len(field.bank),
+            "bins": len(field.residual.magnitude),
+            "recordings": None if recordings is None else list(recordings.shape),
+        },
+        "gain_field": {"kind": field.gain_field.kind, **field.gain_field.record()},
+        "config": asdict(field.origin.config),
+        "origin": origin | {"settings": asdict(field.origin.settings)},
+    }
 
 
 def _tensors(field: SoundField) -> dict[str, Tensor]:
@@ -87,90 +194,27 @@ def _tensors(field: SoundField) -> dict[str, Tensor]:
     return {name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in named.items()}
 
 
-def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
-    """Return the header's record and the tensors of a file that is ours."""
-    if not path.exists():
-        raise FieldFileError(f"{path}: expected a sound field, found no such file: check the name, or fit and save one")
-    try:
-        with safe_open(path, framework="pt") as file:
-            words = (file.metadata() or {}).get(_KEY)
-            if words is None:
-                raise FieldFileError(
-                    f"{path}: expected a sound field, found a safetensors file of something else (its metadata has no "
-                    f"entry {_KEY!r}): name a file that avmsf saved"
-                )
-            # Clones, for what the file maps into memory would change with it.
-            return words, {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise FieldFileError(f"{path}: expected a sound field, found {_guess(path)}") from error
-
-
-def _guess(path: Path) -> str:
-    """Return what a file is that safetensors cannot read, and what to do."""
-    if path.is_dir():
-        return "a folder: name the file in it"
-    try:
-        with open(path, "rb") as file:
-            start = file.read(9)
-    except OSError as error:
-        return f"a file that cannot be read ({error.strerror}): check its permissions"
-    if not start:
-        return "an empty file: copy it again, or fit and save it again"
-    # Eight bytes of length, then the header's opening brace.
-    if start[8:] == b"{":
-        return "one that is cut short or damaged: copy it again, or fit and save it again"
-    return f"a file of another kind, which starts with {start[:8]!r}: name a file that avmsf saved"
-
-
-def _expect_tensors(tensors: dict[str, Tensor], header: Header, path: Path) -> None:
-    """Compare names, shapes and dtypes with what the header's sizes ask for, and the values with what they mean."""
-    expected = _skeleton(header, path)
-    missing, unexpected = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
+def _expect_tensors(tensors: dict[str, Tensor], skeleton: dict[str, Tensor], path: Path) -> None:
+    """Compare names, shapes and dtypes with those of the skeleton, and the values with what they mean."""
+    missing, unexpected = sorted(skeleton.keys() - tensors.keys()), sorted(tensors.keys() - skeleton.keys())
     if missing or unexpected:
         raise FieldFileError(
             f"{path}: the tensors are not those of format {FORMAT}: missing {', '.join(missing) or 'none'}; unexpected "
             f"{', '.join(unexpected) or 'none'}: the file was changed after it was saved, fit and save it again"
         )
     for name, tensor in tensors.items():
-        like = expected[name]
-        if tensor.shape != like.shape or tensor.dtype != like.dtype:
+        if tensor.shape != skeleton[name].shape or tensor.dtype != skeleton[name].dtype:
             raise FieldFileError(
-                f"{path}: expected {name} as {_named(like)}, found {_named(tensor)}: the header and the tensors do not "
-                "belong together, fit and save the field again"
+                f"{path}: expected {name} as {_named(skeleton[name])}, found {_named(tensor)}: the header and the "
+                "tensors do not belong together, fit and save the field again"
             )
-        least, most = (float(each) for each in tensor.aminmax()) if tensor.numel() else (0.0, 0.0)
-        negative = least < 0 and name == "residual.magnitude"
-        if not bool(torch.isfinite(tensor).all()) or (name in _POSITIVE and least <= 0) or negative:
+        low, high = (float(each) for each in tensor.aminmax()) if tensor.numel() else (0.0, 0.0)
+        negative = low < 0 and name == "residual.magnitude"
+        if not bool(torch.isfinite(tensor).all()) or (name in _POSITIVE and low <= 0) or negative:
             wanted = "positive" if name in _POSITIVE else "not negative" if negative else "finite"
             raise FieldFileError(f"{path}: expected {name} to be {wanted} throughout, found otherwise: fit it again")
-        if most > _MOST.get(name, math.inf):
-            raise FieldFileError(f"{path}: expected {name} up to {_MOST[name]:g}, got {most:.3g}: fit the field again")
-
-
-def _skeleton(header: Header, path: Path) -> dict[str, Tensor]:
-    """Return tensors of the names, shapes and dtypes of a field with these sizes, which take no memory."""
-    if header.kind not in _KINDS:
-        raise broken(path, ValueError(f"gain_field.kind is {header.kind!r}, not {', '.join(_KINDS)}"))
-    try:
-        gains = _KINDS[header.kind].skeleton(header.gain_field)
-    except (ValueError, TypeError, KeyError, RuntimeError) as error:  # RuntimeError: torch, of sizes beyond 2^63
-        raise broken(path, error) from error
-    if header.gain_field["modes"] != header.modes:
-        raise broken(
-            path, ValueError(f"{header.gain_field['modes']} modes have gains, {header.modes} have frequencies")
-        )
-    bank = torch.empty(header.modes, dtype=torch.float64, device="meta")
-    named = {"bank.frequency": bank, "bank.damping": bank, "phase": bank}
-    named["residual.magnitude"] = torch.empty(header.bins, device="meta")
-    if header.recordings is not None:
-        if header.gain_field.get("contacts") != header.recordings[0]:
-            raise broken(path, ValueError(f"sizes.recordings is {header.recordings}, of other contacts than the gains"))
-        named["residual.recordings"] = torch.empty(header.recordings, device="meta")
-    return named | {_GAIN_FIELD + name: tensor for name, tensor in gains.items()}
-
-
-def _of_gain_field(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name.removeprefix(_GAIN_FIELD): each for name, each in tensors.items() if name.startswith(_GAIN_FIELD)}
+        if high > _MAX.get(name, math.inf):
+            raise FieldFileError(f"{path}: expected {name} up to {_MAX[name]:g}, got {high:.3g}: fit the field again")
 
 
 def _named(tensor: Tensor) -> str:

@@ -1,24 +1,25 @@
-"""Where to strike next: the places whose sounds would tell most of the sounds everywhere else."""
+"""Where to strike next: the places whose recordings would reduce the expected error of the whole field most."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.errors import FitError
-from avmsf.field.gains.model import MixtureGains, PlaceCovariance
-from avmsf.field.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
-from avmsf.field.posterior import energy_of, parts_of, unedited_mixture
+from avmsf.field.gains.family import Sites
+from avmsf.field.gains.model import MixtureGains
 from avmsf.field.soundfield import SoundField
+from avmsf.field.uncertainty import energy_of, parts_of, unedited_mixture
+from avmsf.geometry.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
 from avmsf.scene.points import farthest_points
 
 PLACES = 400
 """Points of the surface that the expected error is summed over, and that are candidates unless others are given."""
-MOST = 500
-"""Candidates that are weighed; of more, as many that lie far apart. What is kept of them grows with their square."""
+MAX_CANDIDATES = 500
+"""Candidates that are weighed; of more, as many that lie far apart. The memory grows with their square."""
 _OFF = 0.05
 """Distance of a candidate from the surface over the object's size, from which on it is not on the object."""
 _SAME = 1e-6
@@ -36,8 +37,8 @@ class Suggestions:
     contacts: Float64[Tensor, "contacts 3"]
     """Object frame, metres."""
     directions: Float64[Tensor, "contacts 3"] | None
-    """Unit vectors along which to strike: as given, or straight into the body; None where the field knows nothing of
-    directions."""
+    """Unit vectors along which to strike: as given, or the nearest to straight into the field's body that a hammer can
+    take; without a body that of the nearest recording; None where the field knows nothing of directions."""
     rows: Int[Tensor, " contacts"]
     """Which of the candidates they are."""
     before: float
@@ -64,73 +65,112 @@ def suggest(
 ) -> Suggestions:
     """Return the `count` contacts that lower the expected error of the whole field most, each given those before it.
 
-    Gains at two places hang together as far as the field believes they do, so a blow tells of other places too; its
-    expected gain is known before it is struck, for in a Gaussian field it does not depend on what will be heard.
-    `candidates` are the places to choose from (metres, on the surface; places that have been struck are passed over,
-    but for those of strikes whose labels the field holds for wrong), by itself points spread over the surface that a
-    hammer can strike from outside (`hammer_access`); `directions` the unit vectors along which they can be struck,
-    straight into the surface where not given. Of more than `MOST` candidates as many are weighed, spread as far apart
-    as they go. A field made of photographs has points where they show the object; with `unseen`, error and candidates
-    are those of all of the surface of the field's body instead.
+    `candidates` are the places to choose from (metres, on the surface; contacts of the fit are passed over); without
+    them they are points spread over the surface that a hammer can strike from outside (`hammer_access`). `directions`
+    are the unit vectors along which candidates can be struck, straight into the surface where not given. A field made
+    of photographs has points where they show the object; with `unseen`, error and candidates are those of all of the
+    surface of the field's body instead.
 
-    Raises FitError for gains that know no doubt, a count below 1, candidates that are not finite or not on the object,
-    directions that are not one a candidate, fewer candidates than contacts asked for, places none of which a hammer
-    gets to, and `unseen` without a body.
+    Raises FitError for gains without a posterior, unfit arguments, fewer candidates than contacts asked for, places
+    none of which a hammer gets to, and `unseen` without a body.
     """
     gains = unedited_mixture(field)
+    if count < 1:
+        raise FitError(f"count = {count}: expected 1 contact or more")
     surface = _body_nodes(gains) if unseen else gains.points
     points = surface[farthest_points(surface, min(PLACES, len(surface)))].double()
-    _expect(gains.points, count, candidates)
     _expect_directions(directions, candidates)
     if candidates is None:
-        chosen_from = reachable(gains, points)
-        unreachable = len(points) - len(chosen_from)
+        pool, directions = _reachable(gains, points)
+        unreachable = len(points) - len(pool)
     else:
-        chosen_from, unreachable = candidates.double(), 0
-    size = float((points.amax(0) - points.amin(0)).norm())
-    allowed = _apart(chosen_from, gains.contacts, size=size)
+        _expect_on_surface(candidates.double(), gains.points.double())
+        pool, unreachable = candidates.double(), 0
+    same = _SAME * float((points.amax(0) - points.amin(0)).norm())
+    allowed = (pool[:, None] - gains.contacts).norm(dim=2).amin(1) > same
     if int(allowed.sum()) < count:
         raise FitError(
-            f"{count} contacts are asked for and {int(allowed.sum())} of the {len(chosen_from)} candidates have not "
-            "been struck yet: ask for fewer, or give more candidates"
+            f"{count} contacts are asked for and {int(allowed.sum())} of the {len(pool)} candidates have not been "
+            "struck yet: ask for fewer, or give more candidates"
         )
-    kept = _weighed(chosen_from, allowed, max(MOST, count))
-    chosen_from, allowed = chosen_from[kept], allowed[kept]
-    along = gains.sites(chosen_from, None if directions is None else directions[kept]).directions
-    places = torch.cat([points, chosen_from])
-    ways = torch.cat([gains.sites(points).directions, along])
-    ledger = _Ledger(
-        gains.covariances(places, ways), 1.0 / (4.0 * field.bank.damping.double()), len(points), len(chosen_from)
-    )
-    energy = float(energy_of(field, parts_of(field, points.float())).mean()) + float(ledger.open.mean())
-    before, rows, after = ledger.open, [], []
-    for _ in range(count):
-        row = int(torch.where(allowed, ledger.worth(), -math.inf).argmax())
-        ledger.strike(row)
-        allowed &= _apart(chosen_from, chosen_from[row : row + 1], size=size)
-        rows.append(row)
-        after.append(math.sqrt(float(ledger.open.mean()) / energy))
-        if not bool(allowed.any()):
-            break
+    kept = _weighed(pool, allowed, max(MAX_CANDIDATES, count))
+    sites = gains.sites(pool[kept], None if directions is None else directions[kept])
+    error = _ExpectedError(field, gains, points, sites)
+    before, allowed = error.map(), allowed[kept]
+    rows, after = list[int](), list[float]()
+    while len(rows) < count and bool(allowed.any()):
+        rows.append(int(torch.where(allowed, error.reductions(), -math.inf).argmax()))
+        error.add(rows[-1])
+        allowed &= (sites.points - sites.points[rows[-1]]).norm(dim=1) > same
+        after.append(float(error.map().square().mean().sqrt()))
     if len(rows) < count:
         raise FitError(f"{count} contacts are asked for and the candidates are only {len(rows)} different places")
     return Suggestions(
-        chosen_from[rows],
-        along[rows] if gains.directional else None,
+        sites.points[rows],
+        sites.directions[rows] if gains.directional else None,
         kept[rows],
-        math.sqrt(float(before.mean()) / energy),
+        float(before.square().mean().sqrt()),
         tuple(after),
         points,
-        (before / energy).sqrt(),
-        (ledger.open / energy).sqrt(),
+        before,
+        error.map(),
         unreachable,
     )
 
 
-def reachable(gains: MixtureGains, points: Float64[Tensor, "points 3"]) -> Float64[Tensor, "places 3"]:
-    """Return those of the points, moved onto the surface of the gains' body, that a hammer can strike from outside.
+class _ExpectedError:
+    """Posterior variances and covariances, mode by mode, while contacts are added that have not been measured."""
 
-    Without a body they are judged by the object's points, and stay where they are. Raises FitError where none can be.
+    def __init__(
+        self, field: SoundField, gains: MixtureGains, points: Float64[Tensor, "points 3"], candidates: Sites
+    ) -> None:
+        self.points, self.candidates = len(points), len(candidates)
+        self.noise: list[float] = []
+        self.shared: list[Float64[Tensor, "places candidates"]] = []
+        """Covariances between all places and the candidates, which are the last of the places."""
+        self.variance = torch.zeros(len(points), dtype=torch.float64)
+        """At the points, all modes together."""
+        places = torch.cat([points, candidates.points])
+        directions = torch.cat([gains.sites(points).directions, candidates.directions])
+        weights = (1.0 / (4.0 * field.bank.damping.double())).tolist()
+        for weight, known in zip(weights, gains.covariances(places, directions), strict=True):
+            self.variance = self.variance + weight * torch.diagonal(known.covariance)[: self.points].clamp_min(0.0)
+            self.shared.append(weight * known.covariance[:, -self.candidates :])
+            self.noise.append(weight * known.noise)
+        expected = float(energy_of(field, parts_of(field, points.float())).mean())
+        self.energy = expected + float(self.variance.mean())
+
+    def map(self) -> Float64[Tensor, " points"]:
+        """Return the expected relative error at each of the points."""
+        return (self.variance / self.energy).sqrt()
+
+    def reductions(self) -> Float64[Tensor, " candidates"]:
+        """Return by how much each candidate would lower the variance, summed over the points."""
+        total = torch.zeros(self.candidates, dtype=torch.float64)
+        for shared, noise in zip(self.shared, self.noise, strict=True):
+            total += shared[: self.points].square().sum(0) / self._measured(shared, noise)
+        return total
+
+    def add(self, row: int) -> None:
+        """Take a candidate as measured."""
+        for shared, noise in zip(self.shared, self.noise, strict=True):
+            column = shared[:, row].clone()
+            measured = self._measured(shared, noise)[row]
+            self.variance = (self.variance - column[: self.points].square() / measured).clamp_min(0.0)
+            shared -= torch.outer(column, column[-self.candidates :]) / measured
+
+    def _measured(self, shared: Tensor, noise: float) -> Float64[Tensor, " candidates"]:
+        own = torch.diagonal(shared[-self.candidates :]).clamp_min(0.0)
+        return (own + noise).clamp_min(torch.finfo(torch.float64).tiny)
+
+
+def _reachable(
+    gains: MixtureGains, points: Float64[Tensor, "points 3"]
+) -> tuple[Float64[Tensor, "places 3"], Float64[Tensor, "places 3"] | None]:
+    """Return those of the points, moved onto the body's surface, that a hammer can strike, and along which direction.
+
+    Without a body they are judged by the object's points, stay where they are, and have no directions. Raises FitError
+    where none can be struck.
     """
     body = gains.body
     judge = (
@@ -138,13 +178,13 @@ def reachable(gains: MixtureGains, points: Float64[Tensor, "points 3"]) -> Float
         if body is None
         else MeshAccess(body.nodes.double().numpy(), body.triangles[:, :3].numpy())
     )
-    struck, places = judge(points.numpy())
-    if not struck.any():
+    reached, places, axes = judge(points.numpy())
+    if not reached.any():
         raise FitError(
             f"expected places that a hammer of {1000 * HAMMER_DIAMETER:g} mm can strike from outside, got none of "
             f"{len(points)}: the object's shape is wrong or closed; give candidates"
         )
-    return torch.from_numpy(places[struck])
+    return torch.from_numpy(places[reached]), None if axes is None else -torch.from_numpy(axes[reached])
 
 
 def _body_nodes(gains: MixtureGains) -> Float64[Tensor, "nodes 3"]:
@@ -157,47 +197,6 @@ def _body_nodes(gains: MixtureGains) -> Float64[Tensor, "nodes 3"]:
     return gains.body.nodes
 
 
-class _Ledger:
-    """What is not known yet, mode by mode, while strikes are added that have not been made."""
-
-    def __init__(
-        self,
-        covariances: Iterator[PlaceCovariance],
-        weights: Float64[Tensor, " modes"],
-        points: int,
-        candidates: int,
-    ) -> None:
-        self.scatter: list[float] = []
-        self.shared: list[Float64[Tensor, "places candidates"]] = []
-        """Covariances between all places and the candidates, which are the last of the places."""
-        self.points, self.candidates = points, candidates
-        self.open = torch.zeros(points, dtype=torch.float64)
-        """Variance at the points, all modes together."""
-        for weight, known in zip(weights.tolist(), covariances, strict=True):
-            self.open = self.open + weight * torch.diagonal(known.covariance)[:points].clamp_min(0.0)
-            self.shared.append(weight * known.covariance[:, -candidates:])
-            self.scatter.append(weight * known.noise)
-
-    def worth(self) -> Float64[Tensor, " candidates"]:
-        """Return by how much each candidate would lower the variance, summed over the points."""
-        total = torch.zeros(self.candidates, dtype=torch.float64)
-        for shared, scatter in zip(self.shared, self.scatter, strict=True):
-            total += shared[: self.points].square().sum(0) / self._measured(shared, scatter)
-        return total
-
-    def strike(self, row: int) -> None:
-        """Take account of a blow at a candidate."""
-        for shared, scatter in zip(self.shared, self.scatter, strict=True):
-            column = shared[:, row].clone()
-            measured = self._measured(shared, scatter)[row]
-            self.open = (self.open - column[: self.points].square() / measured).clamp_min(0.0)
-            shared -= torch.outer(column, column[-self.candidates :]) / measured
-
-    def _measured(self, shared: Tensor, scatter: float) -> Float64[Tensor, " candidates"]:
-        own = torch.diagonal(shared[-self.candidates :]).clamp_min(0.0)
-        return (own + scatter).clamp_min(torch.finfo(torch.float64).tiny)
-
-
 def _weighed(
     places: Float64[Tensor, "candidates 3"], allowed: Bool[Tensor, " candidates"], most: int
 ) -> Int[Tensor, " weighed"]:
@@ -206,14 +205,6 @@ def _weighed(
         return torch.arange(len(places))
     open_to = torch.nonzero(allowed).flatten()
     return open_to[farthest_points(places[open_to], min(most, len(open_to)))].sort().values
-
-
-def _apart(
-    places: Float64[Tensor, "places 3"], others: Float64[Tensor, "others 3"], *, size: float
-) -> Bool[Tensor, " places"]:
-    """Return whether each place is none of the others."""
-    distance = (places[:, None, :] - others).square().sum(2).sqrt()
-    return distance.amin(1) > _SAME * size
 
 
 def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates: Tensor | None) -> None:
@@ -225,29 +216,20 @@ def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates:
         raise FitError(
             f"expected a direction for each of the {len(candidates)} candidates, found {len(directions)} directions"
         )
-    still = torch.nonzero(~(directions.norm(dim=1) > 0)).flatten().tolist()
-    if still:
-        raise FitError(f"candidate {still[0]}: its direction is a vector of length zero: give the way the hammer moves")
+    zero = torch.nonzero(~(directions.norm(dim=1) > 0)).flatten().tolist()
+    if zero:
+        raise FitError(f"candidate {zero[0]}: its direction is a vector of length zero: give the way the hammer moves")
 
 
-def _expect(surface: Float[Tensor, "points 3"], count: int, given: Float[Tensor, "candidates 3"] | None) -> None:
-    if count < 1:
-        raise FitError(f"count = {count}: expected 1 contact or more")
-    if given is None:
-        return
-    candidates = given.double()
-    if len(candidates) == 0:
+def _expect_on_surface(candidates: Float64[Tensor, "candidates 3"], surface: Float64[Tensor, "points 3"]) -> None:
+    if not len(candidates):
         raise FitError("candidates is empty: give places on the surface, in metres, or none at all")
     if not bool(torch.isfinite(candidates).all()):
         row = int(torch.nonzero(~torch.isfinite(candidates).all(1))[0])
         raise FitError(f"candidate {row} is {candidates[row].tolist()}: expected finite coordinates in metres")
-    points = surface.double()
-    size = float((points.amax(0) - points.amin(0)).norm())
-    distance = torch.cat(
-        [(part[:, None, :] - points).square().sum(2).amin(1).sqrt() for part in torch.split(candidates, 256)]
-    )
+    distance = torch.from_numpy(cKDTree(surface.numpy()).query(candidates.numpy())[0])
     worst = int(distance.argmax())
-    if float(distance[worst]) > _OFF * size:
+    if float(distance[worst]) > _OFF * float((surface.amax(0) - surface.amin(0)).norm()):
         raise FitError(
             f"candidate {worst} at {[round(each, 4) for each in candidates[worst].tolist()]} m is "
             f"{float(distance[worst]):.2g} m from the object's surface: candidates lie on it, in metres, in the "

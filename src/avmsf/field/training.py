@@ -1,18 +1,18 @@
 """One training run: warm-up on extracted gains, then all parameters end to end (paper, section 3.5)."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor, nn
+from torch.optim.adamw import adamw
 
 from avmsf.capture.impacts import Impacts
 from avmsf.field.config import FitConfig
-from avmsf.field.descent import Descent, Group
-from avmsf.field.gainfield import GainField, Gains
+from avmsf.field.gainfield import TrainableGains
 from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
@@ -49,42 +49,53 @@ class Targets:
         )
 
 
-@runtime_checkable
-class TrainableGains(Protocol):
-    """A gain field on its way; a torch module, whose parameters the training moves."""
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Parameters with the same settings."""
 
-    @property
-    def report(self) -> dict[str, Any]:
-        """What it chose before the training, as plain values."""
-        ...
+    parameters: Sequence[nn.Parameter]
+    rate: float
+    """Length of a step at first."""
+    weight_decay: float = 0.0
+    """Part of the rate by which parameters shrink at each step."""
 
-    def used_rows(self, contacts: int) -> list[int]:
-        """Return which of the contacts it was started from, as many as `contacts`, are to be trained on."""
-        ...
 
-    def parameters(self) -> Iterator[nn.Parameter]:
-        """Yield what the training moves; matrices decay towards zero as the config asks for, the others do not."""
-        ...
+class AdamW:
+    """Steps of AdamW (Loshchilov and Hutter, ICLR 2019), by torch's function.
 
-    def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
-        """Return the gains at the contacts that `Targets.rows` stands for, differentiable in the parameters."""
-        ...
+    Torch's class imports torch's compiler when it is first made, which takes two seconds, a sixth of a fit.
+    """
 
-    def penalty(self) -> Float[Tensor, ""]:
-        """Return what speaks against the parameters beforehand, in the unit of the spectral loss."""
-        ...
+    def __init__(self, groups: Sequence[Group]) -> None:
+        self.groups = tuple(groups)
+        self.moments = [
+            [[torch.zeros_like(each, requires_grad=False) for each in group.parameters] for _ in range(2)]
+            + [[torch.zeros(()) for _ in group.parameters]]
+            for group in self.groups
+        ]
+        """All that changes besides the parameters: means of the gradients and of their squares, and steps."""
 
-    def finished(self, order: Int[Tensor, " modes"]) -> GainField:
-        """Return the gain field as it stands, with its modes in the given order."""
-        ...
+    def zero_grad(self) -> None:
+        """Take the parameters' gradients away."""
+        for parameter in (each for group in self.groups for each in group.parameters):
+            parameter.grad = None
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return all that changes."""
-        ...
+    @torch.no_grad()
+    def step(self, factor: float) -> None:
+        """Move all parameters that have gradients, at `factor` times their groups' rates."""
+        for group, moments in zip(self.groups, self.moments, strict=True):
+            rows = [row for row, parameter in enumerate(group.parameters) if parameter.grad is not None]
+            means, squares, steps = ([each[row] for row in rows] for each in moments)
+            adamw(
+                [group.parameters[row] for row in rows],
+                [parameter.grad for parameter in group.parameters if parameter.grad is not None],
+                means, squares, [], steps, lr=factor * group.rate, weight_decay=group.weight_decay, beta1=0.9,
+                beta2=0.999, eps=1e-8, amsgrad=False, maximize=False,
+            )  # fmt: skip
 
-    def load_state_dict(self, state: dict[str, Tensor]) -> object:
-        """Go back to what `state_dict` returned."""
-        ...
+    def resume(self, moments: list[list[list[Tensor]]]) -> None:
+        """Go back to `moments` of before."""
+        self.moments = [[[tensor.clone() for tensor in each] for each in group] for group in moments]
 
 
 class TrainingRun:
@@ -124,8 +135,8 @@ class TrainingRun:
         corrections = [Group([self.shift, self.decay], config.correction_rate)]
         if config.residual and config.noise_rate:
             corrections.append(Group([self.noise], config.noise_rate))
-        self.warmup = Descent(groups(config.warmup_rate))
-        self.joint = Descent([*groups(config.learning_rate), *corrections])
+        self.warmup = AdamW(groups(config.warmup_rate))
+        self.joint = AdamW([*groups(config.learning_rate), *corrections])
         self.step = 0
         self.whole = True
         """False while parameters are being moved: an interruption then leaves a state that nothing can go on from."""
@@ -168,14 +179,14 @@ class TrainingRun:
         """Take one step on all contacts and return the loss before it, of the frames whose turn it is."""
         if self.step < self.config.warmup_steps:
             loss = self._warmup_loss(targets)
-            descent, done = self.warmup, self.step / self.config.warmup_steps
+            optimizer, done = self.warmup, self.step / self.config.warmup_steps
         else:
             loss = self.spectral_loss(targets)
-            descent, done = self.joint, (self.step - self.config.warmup_steps) / self.config.steps
-        descent.forget_slopes()
+            optimizer, done = self.joint, (self.step - self.config.warmup_steps) / self.config.steps
+        optimizer.zero_grad()
         torch.autograd.backward(loss)
         self.whole = False
-        descent.step(0.55 + 0.45 * math.cos(math.pi * done))
+        optimizer.step(0.55 + 0.45 * math.cos(math.pi * done))
         self.step += 1
         self._chance = self.generator.get_state()
         self.whole = True
@@ -209,8 +220,8 @@ class TrainingRun:
         return {
             "network": self.network.state_dict(),
             "corrections": [each.detach().clone() for each in (self.shift, self.decay, self.noise)],
-            "warmup": self.warmup.state(),
-            "joint": self.joint.state(),
+            "warmup": self.warmup.moments,
+            "joint": self.joint.moments,
             "generator": self._chance,
             "step": self.step,
         }

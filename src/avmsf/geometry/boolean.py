@@ -1,4 +1,4 @@
-"""One closed surface cut out of another."""
+"""The difference of what two closed surfaces enclose."""
 
 import manifold3d
 import numpy as np
@@ -9,7 +9,7 @@ from avmsf.errors import SceneError
 
 
 def difference(surface: Surface, cut: Surface) -> Surface:
-    """Return the largest part that is left of what one closed surface encloses without what the other one does.
+    """Return the largest connected part of what `surface` encloses and `cut` does not, as a closed surface.
 
     It has no triangles where nothing is left. Raises SceneError for surfaces that are not closed.
     """

@@ -9,27 +9,23 @@ from scipy import ndimage
 from torch import Tensor
 
 from avmsf.capture.cameras import Camera, View
-from avmsf.capture.levelset import enclose
 from avmsf.capture.meshviews import MeshTracer
 from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.errors import SceneError
 from avmsf.geometry.convex import depth_in_convex_hull
+from avmsf.geometry.extent import masked_views, object_extent
 from avmsf.geometry.fusion import SeenDepth, fused_depth
 from avmsf.geometry.grid import Grid
-from avmsf.geometry.shape import ObjectShape, ShapeReport
+from avmsf.geometry.masks import DISSENT, agreeing, edge_offset
+from avmsf.geometry.shape import ObjectShape, ShapeReport, closed_surface
 from avmsf.geometry.silhouettes import Outline, hull_distance
 from avmsf.geometry.taut import drawn_taut
-from avmsf.geometry.whereabouts import masked_views, whereabouts
 
 DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
 """What gives the depth of the first surface that each pixel of a camera sees, meters along the axis; 0 where none."""
 
 _ROUGH = 48
-"""Cells along an edge of the first grid, which finds where the object is and which masks are wrong."""
-_DISSENT = 0.05
-"""Part of the views that may be wrong there."""
-_WRONG = 0.1
-"""Part of the rough hull that a view's mask leaves out, from which on the mask is wrong, if four times the median."""
+"""Cells along an edge of the first grids, which find where the object is and which masks are wrong."""
 _FINER = 4.0
 """Times as many cells along the longest side of a slender object, at most."""
 _MARGIN = 4
@@ -63,20 +59,26 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     """Return the shape of the object that views with masks show, and whose depth `depth_map` gives.
 
     `cells` count along the longest side; slender objects have up to four times as many. Views whose masks contradict
-    the others' are left out. Depth may lie behind the surface by the same length everywhere: that is found where the
-    masks' outlines touch the surface, and taken off. Raises SceneError where fewer than 3 views have masks, where masks
-    have nothing in common, and where an image cuts the object so that its extent is not known.
+    the others' are left out, and all outlines are moved to the edges in the photographs by the same number of pixels.
+    Depth may lie behind the surface by the same length everywhere: that is found where the masks' outlines touch the
+    surface, and taken off. Raises SceneError where fewer than 3 views have masks, where masks have nothing in common,
+    and where views do not bound the object: an image cuts it, or all are from one side.
     """
     if cells < 16:
         raise SceneError(f"cells = {cells}: expected 16 or more")
     masked = masked_views(views)
     outlines = [Outline.of(view) for view in masked]
-    low, high, right = _rough(masked, outlines)
+    offset = edge_offset(masked, outlines)
+    outlines = [outline.moved_in(offset) for outline in outlines]
+    rough = Grid.around(*_rough(masked, outlines), cells=_ROUGH, finest=_FINER, margin=2)
+    right = agreeing(masked, outlines, rough)
     kept = [view for view, each in zip(masked, right, strict=True) if each]
-    grid = Grid.around(low, high, cells=cells, finest=_FINER, margin=_MARGIN)
     outlines = [outline for outline, each in zip(outlines, right, strict=True) if each]
+    low, high = _box(hull_distance(outlines, rough, rank=0) > -rough.spacing, rough, len(kept))
+    grid = Grid.around(low, high, cells=cells, finest=_FINER, margin=_MARGIN)
     hull = _hull(outlines, grid)
-    diagonal = _extent(hull > 0, grid, len(kept))
+    low, high = _box(hull > 0, grid, len(kept))
+    diagonal = float(np.linalg.norm(high - low))
     hull, untouched = drawn_taut(hull, outlines, grid, diagonal)
     depths = [_Depth(view, depth_map(view.camera).detach().cpu().float().numpy()) for view in kept]
     bias = _bias(hull, grid, depths, diagonal)
@@ -91,7 +93,7 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     if not supposed:
         outer = np.where(_covered(hollow > 0, (bound > 0) & (seen <= 0)), np.maximum(seen, bound), seen)
     rejected = tuple(view.name for view, each in zip(masked, right, strict=True) if not each)
-    report = ShapeReport(len(kept), rejected, bias, unseen, direction)
+    report = ShapeReport(len(kept), rejected, offset, bias, unseen, direction)
     return ObjectShape(grid, outer, seen, hollow, supposed, diagonal, report)
 
 
@@ -108,42 +110,19 @@ class _Depth:
 
 def _rough(
     views: Sequence[View], outlines: Sequence[Outline]
-) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"], Bool[np.ndarray, " views"]]:
-    """Return the box around the object, and which views' masks agree with the others'."""
-    middle, reach = whereabouts(views)
-    right = np.ones(len(views), dtype=bool)
-    for attempt in range(5):
+) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
+    """Return the lowest and highest corner of a box around what all but a few masks keep, meters."""
+    middle, reach = object_extent(views)
+    for _ in range(5):
         grid = Grid(middle - reach, 2 * reach / (_ROUGH - 1), (_ROUGH,) * 3)
-        used = [outline for outline, each in zip(outlines, right, strict=True) if each]
-        rank = int(_DISSENT * len(used)) if right.all() else 0
-        solid = hull_distance(used, grid, rank=rank) > -grid.spacing
-        if not solid.any():
-            raise SceneError(
-                f"the masks of {len(views)} views have no place in common: check that cameras and masks belong "
-                "together, and that the poses are camera-to-world in the convention that their file promises"
-            )
-        if any(solid.take(end, axis=axis).any() for axis in range(3) for end in (0, -1)) and attempt < 4:
-            reach *= 1.5
-            continue
-        if right.all():
-            right = _agreeing(outlines, grid, solid)
-            if not right.all():
-                continue
-        break
-    rows = np.argwhere(solid)
-    return grid.places(rows.min(axis=0)), grid.places(rows.max(axis=0)), right
-
-
-def _agreeing(outlines: Sequence[Outline], grid: Grid, solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, " views"]:
-    """Return which outlines leave out little of what the others keep."""
-    core = ndimage.binary_erosion(solid, iterations=2)
-    left_out = np.array(
-        [float((hull_distance([each], grid, core, rank=0)[core] < 0).mean()) for each in outlines]
-        if core.any()
-        else [0.0] * len(outlines)
+        solid = hull_distance(outlines, grid, rank=round(DISSENT * len(outlines))) > -grid.spacing
+        if not any(solid.take(end, axis=axis).any() for axis in range(3) for end in (0, -1)):
+            return _box(solid, grid, len(views))
+        reach *= 1.5
+    raise SceneError(
+        f"expected views from several sides, whose masks bound the object, got {len(views)} whose masks leave it open "
+        f"{reach / 1.5:.3g} m from its middle: add views from other sides, with the whole object in them"
     )
-    right = left_out < max(_WRONG, 4.0 * float(np.median(left_out)))
-    return right if int(right.sum()) >= 3 else np.ones(len(outlines), dtype=bool)
 
 
 def _hull(outlines: Sequence[Outline], grid: Grid) -> Float32[np.ndarray, "x y z"]:
@@ -157,14 +136,18 @@ def _hull(outlines: Sequence[Outline], grid: Grid) -> Float32[np.ndarray, "x y z
     return np.where(near, fine, rough)
 
 
-def _extent(inside: Bool[np.ndarray, "x y z"], grid: Grid, views: int) -> float:
-    """Return the diagonal of the box around what is inside, meters."""
-    if not inside.any():
+def _box(
+    inside: Bool[np.ndarray, "x y z"], grid: Grid, views: int
+) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
+    """Return the lowest and highest corner of the box around what is inside, meters."""
+    rows = np.argwhere(inside)
+    if not len(rows):
         raise SceneError(
-            f"nothing is in the masks of all {views} views: check the masks and the cameras' poses; masks that are "
-            "shifted or too small leave thin objects out"
+            f"the masks of {views} views have no place in common: check that cameras and masks belong together, and "
+            "that the poses are camera-to-world in the convention that their file promises; masks that are shifted or "
+            "too small leave thin objects out"
         )
-    return grid.spacing * float(np.linalg.norm(np.ptp(np.argwhere(inside), axis=0)))
+    return grid.places(rows.min(axis=0)), grid.places(rows.max(axis=0))
 
 
 def _bias(hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[_Depth], diagonal: float) -> float:
@@ -172,7 +155,7 @@ def _bias(hull: Float32[np.ndarray, "x y z"], grid: Grid, depths: Sequence[_Dept
 
     Most of a surface touches its hull; the depth of cavities lies behind it by lengths of all kinds.
     """
-    tracer = MeshTracer(TexturedMesh.plain(enclose(hull, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=40_000)))
+    tracer = MeshTracer(TexturedMesh.plain(closed_surface(hull, grid, 40_000)))
     behind = []
     for each in depths[:: max(1, len(depths) // 24)]:
         front = tracer.look(each.camera).depth.numpy()
@@ -232,7 +215,7 @@ def _closed(
     Return the cut solid, the hull cut likewise, which lids cavities, the part of the surface that no view saw, and the
     direction in which it lies.
     """
-    surface = enclose(seen, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=_CLOSED)
+    surface = closed_surface(seen, grid, _CLOSED)
     places = surface.vertices.double().numpy()
     rows = np.rint((places - grid.lowest) / grid.spacing).astype(int)
     known = ndimage.maximum_filter(sights, 3)[tuple(rows.T)] >= 1

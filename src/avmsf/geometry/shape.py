@@ -25,8 +25,11 @@ _LID_TURN = 0.8
 _LID_REACH = 0.6
 """How far a lid grows over the rim, and over floors that were not seen to lie below it, over the radius of a disc of
 its area."""
-_THINNEST, _THICKEST = 0.003, 0.06
-"""Wall thicknesses over the diagonal that are worth trying at all."""
+_SHIFTED = 0.5
+"""Pixels by which outlines are moved, from which on the user hears of it; masks that the package finds take .2."""
+_THINNEST, _THICKEST = 0.0025, 0.06
+"""Wall thicknesses over the diagonal that are worth trying. Of the 20 simulated objects a tube has the least, .0027,
+and thinner walls take more elements than a model has."""
 _BLUR = 0.6
 """Standard deviation of the blur that takes steps out of surfaces, cells."""
 
@@ -53,6 +56,8 @@ class ShapeReport:
     """Views whose masks were used."""
     rejected: tuple[str, ...]
     """Names of the views whose masks contradict the others'."""
+    mask_offset: float
+    """How far inside the masks' outlines the photographs' edges lay, pixels; outlines were moved there."""
     depth_bias: float
     """How far depth lay behind the surface, meters; it was taken off."""
     unseen: float
@@ -113,9 +118,13 @@ class ObjectShape:
         """Return the outer side, cavities filled."""
         return self._enclose(self.outer, self.grid, faces)
 
-    def as_seen(self, *, faces: int = 2 * FACES) -> Surface:
+    def as_seen(self) -> Surface:
         """Return what views show: both sides of walls where both were seen."""
-        return self._enclose(self.seen, self.grid, faces)
+        return self._as_seen
+
+    @cached_property
+    def _as_seen(self) -> Surface:
+        return self._enclose(self.seen, self.grid, 2 * FACES)
 
     def shell(self, thickness: float, *, faces: int = FACES) -> Surface:
         """Return the body whose walls around its cavities are `thickness` meters thick, measured from outside.
@@ -199,12 +208,7 @@ class ObjectShape:
         # Triangles without area, where the surface passes through the middle of a cell, pinch coarser ones.
         least = np.float32(0.02 * grid.spacing)
         smooth = np.where(smooth > 0, np.maximum(smooth, least), np.minimum(smooth, -least))
-        try:
-            return enclose(smooth, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
-        except CaptureError as error:
-            raise SceneError(
-                f"expected a shape with an inside, found none on a grid of {grid.shape}: {error}"
-            ) from error
+        return closed_surface(smooth, grid, faces)
 
     def describe(self) -> str:
         """Say what is known of the shape: its cavities, what no view saw, and masks that were left out."""
@@ -213,6 +217,9 @@ class ObjectShape:
         parts = [f"{cavities}{', supposed behind faces that no outline touches' if self.supposed and count else ''}"]
         if self.report.unseen > 0:
             parts.append(f"{self.report.unseen:.0%} of the surface was seen by no view and is closed")
+        if abs(self.report.mask_offset) >= _SHIFTED:
+            way = "inwards" if self.report.mask_offset > 0 else "outwards"
+            parts.append(f"outlines of masks moved {way} by {abs(self.report.mask_offset):.1f} pixels")
         if self.report.rejected:
             parts.append(f"masks left out, which contradict the others: {', '.join(self.report.rejected)}")
         return "; ".join(parts)
@@ -223,3 +230,14 @@ class ObjectShape:
         for values in (self.outer, self.seen, self.hollow):
             content.update(np.ascontiguousarray(values).tobytes())
         return content.hexdigest()
+
+
+def closed_surface(values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int | None = None) -> Surface:
+    """Return the closed surface where values on a grid are zero, positive inside, of about `faces` triangles.
+
+    Raises SceneError where nothing is inside, and where the inside touches the grid's edge.
+    """
+    try:
+        return enclose(values, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
+    except CaptureError as error:
+        raise SceneError(f"expected a shape with an inside, got none on a grid of {grid.shape}: {error}") from error

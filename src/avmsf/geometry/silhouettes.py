@@ -1,7 +1,7 @@
 """The visual hull as a signed distance: how far inside the outlines of all masks each place lies."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import no_type_check
 
 import cv2
@@ -37,6 +37,10 @@ class Outline:
         camera = view.camera
         projection = (camera.intrinsics @ camera.world_to_camera[:3]).numpy()
         return cls(projection, float(np.sqrt(camera.focal[0] * camera.focal[1])), _inside(view.mask.numpy()))
+
+    def moved_in(self, pixels: float) -> "Outline":
+        """Return the outline moved inwards by so many pixels."""
+        return replace(self, inside=self.inside - np.float32(pixels))
 
 
 def _inside(mask: np.ndarray) -> Float32[np.ndarray, "height width"]:

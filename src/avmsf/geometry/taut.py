@@ -1,8 +1,9 @@
-"""A visual hull drawn taut: where no outline touches it, it is as small as what does allows.
+"""A visual hull made smaller where no outline touches it: the surface there is a stretched membrane.
 
-Cameras that stand below a flat top see its near edge against the sky, so that the hull bears a low roof over it. Every
-line of sight along an outline touches the object somewhere; it is taken to do so where the hull is bent most, and
-between these places the surface is that of a stretched membrane.
+Cameras below a flat top see only its near edge, so that the hull has a low pyramid above it. Every line of sight along
+an outline touches the object somewhere. It is assumed to do so where many other outlines pass as well, which meet at
+edges of the object but hardly on a pyramid, and of these places where the hull is bent most. Between these places the
+surface is a membrane that is fixed at them.
 """
 
 from collections.abc import Sequence
@@ -13,34 +14,37 @@ import scipy.sparse.linalg
 from jaxtyping import Bool, Float32, Float64, Int
 from scipy import ndimage
 
-from avmsf.capture.levelset import enclose
 from avmsf.geometry.grid import Grid
+from avmsf.geometry.shape import closed_surface
 from avmsf.geometry.silhouettes import Outline
 
 _ROUND = 0.015
-"""Standard deviation of the ball in which the hull's part says how bent it is, over the diagonal."""
+"""Standard deviation of the Gaussian blur of the hull that measures how bent its surface is, over the diagonal."""
 _TOUCHING = 0.75
 """Distance from an outline, pixels, within which a place is on it."""
 _EVEN = 0.03
-"""Difference in the hull's part of a ball up to which two places are bent alike: half a ball is .5, an edge .25."""
+"""Difference of the blurred hull up to which two places are equally bent: a plane has .5, a right-angled edge .25."""
+_ALIKE = 0.5
+"""Part of the most outlines that pass a place on a line of sight, from which on another place is touched as well. On a
+bracket with a hole, 15 to 23 of 72 pass the places of the hole's edge and 3 to 9 the pyramid's around it."""
+_COUNTS = 2
+"""Times that the outlines which pass a place are counted, the second time only those that chose it. On that bracket the
+mean distance is .43 % of the diagonal with one, .34 with two, .35 with four."""
 _HELD = 1e-3
-"""Weight of where the hull was, beside the membrane's: parts that no outline touches stay about where they are."""
-
+"""Weight of the hull's own position, relative to the membrane's: parts that no outline touches stay about there."""
 _ROUNDS = 300
-"""Most steps of the conjugate gradients that stretch the membrane."""
+"""Iterations of the conjugate gradient method at most."""
 
 
 def drawn_taut(
     hull: Float32[np.ndarray, "x y z"], outlines: Sequence[Outline], grid: Grid, diagonal: float
 ) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
-    """Return how far inside the taut hull each cell lies, meters, and how far from any outline's touch it lies."""
-    surface = enclose(hull, 0.0, lowest=grid.lowest, spacing=grid.spacing)
+    """Return how far inside the smaller hull each cell lies, and how far from the nearest touched place, meters."""
+    surface = closed_surface(hull, grid)
     places, faces = surface.vertices.double().numpy(), surface.faces.numpy()
     full = ndimage.gaussian_filter((hull > 0).astype(np.float32), _ROUND * diagonal / grid.spacing)
-    bent = ndimage.map_coordinates(full, ((places - grid.lowest) / grid.spacing).T, order=1)
-    touched = np.zeros(len(places), dtype=bool)
-    for each in outlines:
-        touched[_touching(each, places, bent)] = True
+    bent = ndimage.map_coordinates(full, ((places - grid.lowest) / grid.spacing).T, order=1, output=np.float64)
+    touched = _touched(outlines, places, bent)
     if not touched.any():
         return hull, np.full(grid.shape, diagonal, dtype=np.float32)
     drawn = _membrane(places, faces, touched)
@@ -52,33 +56,56 @@ def drawn_taut(
     far[cells] = False
     nearest = ndimage.distance_transform_edt(far, return_distances=False, return_indices=True)
     fall = fall[tuple(nearest)]
-    # A flat roof is lowered as it is; far below it nothing changes.
+    # A low pyramid is lowered with what lies just below it; farther below nothing changes.
     taut = np.where((hull > 0) & (hull < 2.0 * (fall + grid.spacing)), hull - fall, hull)
     away = np.ones(grid.shape, dtype=bool)
     away[tuple(each[touched] for each in cells)] = False
     return taut, ndimage.distance_transform_edt(away).astype(np.float32) * np.float32(grid.spacing)
 
 
-def _touching(outline: Outline, places: Float64[np.ndarray, "places 3"], bent: np.ndarray) -> Int[np.ndarray, " found"]:
-    """Return, for each line of sight along an outline, where on it the hull is bent most."""
+def _touched(
+    outlines: Sequence[Outline], places: Float64[np.ndarray, "places 3"], bent: Float64[np.ndarray, " places"]
+) -> Bool[np.ndarray, " places"]:
+    """Return which places of a hull's surface the object is taken to touch."""
+    passing = [_passing(each, places) for each in outlines]
+    votes = np.bincount(np.concatenate([rows for rows, _ in passing]), minlength=len(places)).astype(np.float64)
+    for _ in range(_COUNTS):
+        chosen = np.zeros(len(places))
+        for each, (rows, pixels) in zip(outlines, passing, strict=True):
+            often = votes[rows] >= _ALIKE * _largest(votes[rows], pixels, each.inside.shape)
+            few, where = rows[often], pixels[:, often]
+            chosen[few[bent[few] <= _EVEN - _largest(-bent[few], where, each.inside.shape)]] += 1
+        votes = chosen
+    return votes > 0
+
+
+def _passing(
+    outline: Outline, places: Float64[np.ndarray, "places 3"]
+) -> tuple[Int[np.ndarray, " found"], Int[np.ndarray, "2 found"]]:
+    """Return which places an outline passes, and the rows and columns of their pixels."""
     seen = places @ outline.projection[:, :3].T + outline.projection[:, 3]
     pixels = seen[:, :2] / np.maximum(seen[:, 2:], 1e-12)
     height, width = outline.inside.shape
-    inside = (seen[:, 2] > 0) & (pixels > 0).all(axis=1) & (pixels < [width, height]).all(axis=1)
-    rows = np.flatnonzero(inside)
+    rows = np.flatnonzero((seen[:, 2] > 0) & (pixels > 0).all(axis=1) & (pixels < [width, height]).all(axis=1))
     apart = ndimage.map_coordinates(outline.inside, pixels[rows, ::-1].T - 0.5, order=1, mode="nearest")
     rows = rows[np.abs(apart) < _TOUCHING]
-    column, row = pixels[rows].astype(int).T
-    least = np.ones((height, width))
-    np.minimum.at(least, (row, column), bent[rows])
-    # Lines of sight through neighboring pixels touch in the same place.
-    return rows[bent[rows] <= ndimage.minimum_filter(least, 3)[row, column] + _EVEN]
+    return rows, pixels[rows, ::-1].astype(int).T
+
+
+def _largest(
+    values: Float64[np.ndarray, " found"], pixels: Int[np.ndarray, "2 found"], shape: tuple[int, int]
+) -> Float64[np.ndarray, " found"]:
+    """Return the largest value in each one's pixel and those around: their lines of sight touch in the same place."""
+    found = np.full(shape, -np.inf)
+    np.maximum.at(found, tuple(pixels), values)
+    largest: Float64[np.ndarray, " found"] = ndimage.maximum_filter(found, 3)[tuple(pixels)]
+    return largest
 
 
 def _membrane(
     places: Float64[np.ndarray, "places 3"], faces: Int[np.ndarray, "faces 3"], fixed: Bool[np.ndarray, " places"]
 ) -> Float64[np.ndarray, "places 3"]:
-    """Return where the vertices of a stretched membrane lie that is fixed at some."""
+    """Return where the vertices of a stretched membrane lie that is `fixed` at some of them, meters."""
     ends = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     count = len(places)
     links = scipy.sparse.csr_array((np.ones(len(ends)), ends.T), shape=(count, count))

@@ -9,12 +9,11 @@ import numpy as np
 import torch
 
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.placement import surface_points
+from avmsf.capture.placement import expect_placed, surface_points
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.fem.supports import Support
 from avmsf.field.gains.bodies import CandidateBodies
-from avmsf.field.placed import expect_placed
 from avmsf.simulate.nominal import NominalBody, Shape, nominal_bodies, refined, supported, with_wall
 
 

@@ -3,9 +3,7 @@
 import hashlib
 import warnings
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache as cache_result
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.caching import once
 from avmsf.capture import Capture, Impacts, Surface
 from avmsf.capture.placement import judge_placement
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import write_surface
+from avmsf.capture.surface import read_surface, write_surface
 from avmsf.capture.views import read_views
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import AvmsfError, CaptureError, SceneError
@@ -26,10 +25,11 @@ from avmsf.field.fit import Progress, fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import NETWORK, GainModel, estimator_for
-from avmsf.field.gains.visual import Visual
+from avmsf.field.gains.positional import Visual
 from avmsf.field.store import load, save
 from avmsf.files import write_whole
 from avmsf.geometry import ObjectShape
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
@@ -39,12 +39,11 @@ from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.symmetry import Symmetries
-from avmsf.simulate.closest import ClosestPoints
 
 CACHE = ".avmsf"
 """Folder inside the capture's that keeps what each stage made."""
 SURFACE = "surface.ply"
-"""What the stage of the object's surface calls its output, in metres."""
+"""What the stage of the object's surface calls its output, in meters."""
 MODES, FIELD = "modes.safetensors", "field.safetensors"
 """What the last stages call their outputs."""
 OFF_MESH = 0.02
@@ -143,17 +142,17 @@ def _reconstruct(
     modes = extract_once(train, method, found.path)
     basis = {**heard, "features": shape.digest, "fit": asdict(config.fit)}
 
-    @cache_result
+    @once
     def bodies() -> CandidateBodies:
         listener.tell("bodies: what the object may be behind its surface")
         cache = stages.folder / BODIES
         return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, tell=listener.tell)
 
     def make(path: Path) -> None:
-        listener.tell(f"fit: a field of {len(modes.bank)} modes")
         gains = estimator_for(
             config.gain_model, bodies, symmetries=shape.symmetries, features=shape.features, log=listener.tell
         )
+        listener.tell(f"fit: a field of {len(modes.bank)} modes")
         fitted = fit(
             train,
             shape.features if config.gain_model == Visual.kind else shape.points,
@@ -180,13 +179,9 @@ def _reconstruct(
     recipe = {**basis, "modes": found.digest, "gain_model": config.gain_model, "name": capture.name}
     recipe |= {"body": asdict(config.body), "settings": asdict(capture.settings), "surface": shape.surface_digest}
     kept = stages.keep(FIELD, recipe, make, usable=is_final)
-    surface: dict[str, Kept] = {}
-    if config.gain_model != NETWORK:
-        with suppress(AvmsfError):
-            surface["surface"] = keep_surface(stages, shape.surface, shape.surface_digest)
-    made = {**shape.made, **surface, "modes": found, "fit": kept}
+    made = {**shape.made, "modes": found, "fit": kept}
     times = tuple(StageTime(name, each.seconds, each.fresh) for name, each in made.items())
-    path = surface["surface"].path if surface else None
+    path = shape.made["surface"].path if "surface" in shape.made else None
     return Reconstruction(kept.path, times, shape.report, modes, path)
 
 
@@ -249,15 +244,22 @@ def _shape(
         else:
             features = FeatureField.from_points(capture.surface.vertices)
         surface, digest = object_shape(capture.surface, None)
-        return _Shape({"positions": features}, {}, {}, surface, digest)
+        made = _surface_stage(stages, config, surface, digest, listener)
+        return _Shape({"positions": features}, made, {}, surface, digest)
     if capture.surface is not None and scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
         words = judge_outlines(capture.surface, read_views(scene.views.path), settings)
         if words is not None:
             warnings.warn(words, CaptureWarning, stacklevel=2)
     features = load_features(scene.features.path)
-    if capture.surface is not None and "cloud" in scene.made():
-        features = moved_onto(features, capture.surface)
+    surface, digest = object_shape(capture.surface, scene)
+    made = scene.made() | _surface_stage(stages, config, surface, digest, listener)
+    seen = capture.surface
+    if seen is None and "surface" in made:
+        # Gaussians lie up to a wall's thickness below the surface, where a wall's other side may be nearer.
+        seen = read_surface(made["surface"].path)
+    if seen is not None and "cloud" in made:
+        features = moved_onto(features, seen)
     candidates = {}
     candidates["positions"] = FeatureField.from_points(features.points)
     candidates["visual"] = features
@@ -265,8 +267,24 @@ def _shape(
     found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
     expect_on_object(capture.impacts, features.points, strict=found_frame)
     report = read_report(scene.features.path)
-    surface, digest = object_shape(capture.surface, scene)
-    return _Shape(candidates, scene.made(), report, surface, digest)
+    return _Shape(candidates, made, report, surface, digest)
+
+
+def _surface_stage(
+    stages: StageFolder,
+    config: ReconstructConfig,
+    surface: Callable[[], Surface | ObjectShape],
+    digest: str,
+    listener: Listener,
+) -> dict[str, Kept]:
+    """Return the stage of the object's surface; none where its shape is unknown or the gain model needs none."""
+    if config.gain_model == NETWORK:
+        return {}
+    try:
+        return {"surface": keep_surface(stages, surface, digest)}
+    except SceneError as error:
+        listener.tell(f"no surface is written: {error}")
+        return {}
 
 
 def moved_onto(features: FeatureField, surface: Surface) -> FeatureField:
@@ -304,7 +322,7 @@ def object_shape(found: Surface | None, scene: SceneStages | None) -> tuple[Call
             raise SceneError("the folder holds neither a mesh nor pictures of the object, so its shape is unknown")
 
         return unknown, ""
-    return cache_result(scene.shape), f"{scene.cloud.digest} {scene.views.digest}"
+    return once(scene.shape), f"{scene.cloud.digest} {scene.views.digest}"
 
 
 def keep_surface(stages: StageFolder, make: Callable[[], Surface | ObjectShape], digest: str) -> Kept:

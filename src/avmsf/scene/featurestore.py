@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
+from avmsf._utils.state import read_tensors
 from avmsf._utils.text_files import parse_json
 from avmsf.errors import SceneError
 from avmsf.files import write_whole
@@ -80,23 +80,7 @@ def read_report(path: str | Path) -> dict[str, Any]:
 
 
 def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
-    if not path.is_file():
-        raise SceneError(f"{path}: expected a file of features, found no such file: check the name, or lift them first")
-    try:
-        with safe_open(path, framework="pt") as file:
-            words = (file.metadata() or {}).get(_KEY)
-            # Clones, for what the file maps into memory would change with it.
-            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise SceneError(
-            f"{path}: expected a file of features, found one of another kind or cut short ({error}): lift them again"
-        ) from error
-    if words is None:
-        raise SceneError(
-            f"{path}: expected a file of features, found a safetensors file of something else (its metadata has no "
-            f"entry {_KEY!r}): name a file that `avmsf lift` wrote"
-        )
-    return words, tensors
+    return read_tensors(path, _KEY, what="a file of features", advice="lift the features again", raising=SceneError)
 
 
 def _understand(words: str, path: Path) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from torch import Tensor
 from avmsf.capture.cameras import View
 from avmsf.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import SceneError
-from avmsf.geometry.whereabouts import masked_views, whereabouts
+from avmsf.geometry.extent import masked_views, object_extent
 
 _ROUGH = 48
 """Voxels along the longest side of the first carving, which finds where the object is."""
@@ -45,7 +45,7 @@ def visual_hull(views: Sequence[View], *, points: int, dissent: float = 0.05) ->
     that have nothing in common.
     """
     masked = masked_views(views)
-    middle, reach = whereabouts(masked)
+    middle, reach = object_extent(masked)
     lowest, spacing = middle - reach, 2 * reach / _ROUGH
     shape = (_ROUGH,) * 3
     # The rough box is a guess: where the object touches its edge, it grows.

@@ -70,7 +70,7 @@ def supported(lifted: Lifted, views: Sequence[View]) -> Lifted:
 
     That are at least one view and `LEAST_SEEN` of those that have the point in their image: what the views agree to be
     hidden is inside the object or behind its surface. And at least as many as see a surface behind the point, which is
-    then afloat before it.
+    then afloat before it. Raises SceneError where no point is left.
     """
     points = lifted.features.points
     held = torch.zeros(len(points), device=points.device)
@@ -79,6 +79,13 @@ def supported(lifted: Lifted, views: Sequence[View]) -> Lifted:
         size = places.new_tensor([view.camera.width, view.camera.height])
         held += ((depth > 0) & (places >= 0).all(1) & (places <= size).all(1)).to(held)
     kept = (lifted.seen >= (LEAST_SEEN * held).clamp_min(1.0)) & (2 * lifted.past <= lifted.seen)
+    if not bool(kept.any()):
+        raise SceneError(
+            f"expected points on the surface that the views see, got {len(points)} of which "
+            f"{int((lifted.seen > 0).sum())} are seen, none by {100 * LEAST_SEEN:g} % of the views that have it in "
+            "their image and at its depth: check that cameras and points are in one frame and unit, and that the "
+            "Gaussians were fitted to these views"
+        )
     features = replace(lifted.features, points=points[kept], features=lifted.features.features[kept])
     return replace(
         lifted, features=features, seen=lifted.seen[kept], past=lifted.past[kept], dropped=int((~kept).sum())

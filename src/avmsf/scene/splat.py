@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.capture.cameras import View
 from avmsf.errors import AvmsfWarning, SceneError
 from avmsf.scene.gaussians import GaussianCloud
@@ -16,7 +17,7 @@ from avmsf.scene.hull import visual_hull
 from avmsf.scene.keep import keep_object
 from avmsf.scene.photographs import choose_backdrop, prepare_photographs
 from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
-from avmsf.scene.splatcheckpoint import fingerprint, read_checkpoint, write_checkpoint
+from avmsf.scene.splatcheckpoint import fingerprint
 from avmsf.scene.splatconfig import SplatConfig
 from avmsf.scene.splatrun import SplatRun
 from avmsf.scene.ssim import psnr
@@ -107,10 +108,15 @@ class _Keeper:
     """Saves a run's state now and then."""
 
     def __init__(self, path: Path | None, fingerprint: str) -> None:
-        self.path, self.fingerprint, self.saved_at = path, fingerprint, time.monotonic()
+        self.path, self.saved_at = path, time.monotonic()
+        self.identity = {"view, start or setting": fingerprint}
 
     def resume(self, run: SplatRun) -> None:
-        state = None if self.path is None else read_checkpoint(self.path, fingerprint=self.fingerprint)
+        state = (
+            None
+            if self.path is None
+            else read_checkpoint(self.path, self.identity, what="a splatting", raising=SceneError)
+        )
         if state is not None:
             run.resume(state["run"])
 
@@ -122,7 +128,7 @@ class _Keeper:
         if self.path is None:
             return
         try:
-            write_checkpoint(self.path, {"fingerprint": self.fingerprint, "run": run.state()})
+            write_checkpoint(self.path, {"run": run.state()}, self.identity, raising=SceneError)
         except SceneError as error:
             # A full disk costs the checkpoint, not the run.
             warnings.warn(f"splatting goes on without a new checkpoint: {error}", AvmsfWarning, stacklevel=3)

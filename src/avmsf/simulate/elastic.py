@@ -11,9 +11,11 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
+from avmsf.capture.placement import surface_points
+from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.fem.perturbation import Perturbations, perturbations
-from avmsf.simulate.closest import Closest, ClosestPoints
+from avmsf.geometry.closest import Closest, ClosestPoints
 from avmsf.simulate.eigen import Vibrations, lowest_vibrations, rigid_motions
 from avmsf.simulate.elements import SecondOrder, elements_of, mass, stiffness
 from avmsf.simulate.material import Material
@@ -113,6 +115,11 @@ class ElasticModes:
         return self.triangles[torch.from_numpy(found.rows)], weights
 
     @cached_property
+    def points(self) -> Float64[Tensor, "points 3"]:
+        """Points all over the surface."""
+        return surface_points(Surface(self.nodes, self.triangles[:, :3]))
+
+    @cached_property
     def _closest(self) -> ClosestPoints:
         return ClosestPoints(self.nodes[self.triangles[:, :3]].numpy())
 
@@ -146,33 +153,14 @@ def elastic_modes(
     if perturbed and (stiffness_factor is not None or density_factor is not None):
         raise SimulationError("perturbed: expected a body without factors, got factors: ask for the modes alone")
     expect_whole(solid)
-    stiff, light = (
-        _factor(solid, factor, name)
-        for factor, name in ((stiffness_factor, "stiffness_factor"), (density_factor, "density_factor"))
-    )
+    light = _factor(solid, density_factor, "density_factor")
     mesh = SecondOrder.of(solid)
     weights = mass(mesh, material.density * light)
-    forces = stiffness(mesh, material, stiff)
+    forces = stiffness(mesh, material, _factor(solid, stiffness_factor, "stiffness_factor"))
     if springs:
         forces = forces + _support(mesh, springs)
-    rigid = rigid_motions(mesh.nodes, weights)
-    free = np.arange(len(mesh.nodes)) if fixed is None else np.setdiff1d(np.arange(len(mesh.nodes)), fixed)
-    moving = (3 * free[:, None] + np.arange(3)).ravel()
-    if fixed is not None:
-        forces, weights = forces.tocsr()[moving][:, moving], weights[free][:, free]
-        # A cantilever's lowest mode is mostly a turn, and yet none of a rigid body.
-        rigid = np.zeros_like(rigid)
-    found = lowest_vibrations(
-        forces,
-        weights,
-        rigid[moving],
-        count=count,
-        shift=_SHIFT * material.young / (material.density * solid.size**2),
-        supported=bool(springs) or fixed is not None,
-    )
-    if fixed is not None:
-        bending = found.squares > _PENDULUM * found.squares.max()
-        found = Vibrations(found.squares[bending], found.shapes[:, bending])
+    shift = _SHIFT * material.young / (material.density * solid.size**2)
+    found = _vibrations(mesh, forces, weights, count=count, shift=shift, supported=bool(springs), fixed=fixed)
     frequency = torch.from_numpy(np.sqrt(found.squares) / (2.0 * math.pi))
     kept = len(frequency) if highest is None else int((frequency <= highest).sum())
     if not kept:
@@ -180,15 +168,11 @@ def elastic_modes(
             f"no mode up to {highest:g} Hz, the lowest is at {float(frequency[0]):g} Hz: raise `highest`, or make the "
             "body larger or thinner"
         )
-    motions = np.zeros((3 * len(mesh.nodes), kept))
-    motions[moving] = found.shapes[:, :kept]
-    whole = motions.reshape(len(mesh.nodes), 3, -1)
-    changes = None
-    if perturbed:
-        changes = perturbations(
-            elements_of(mesh), whole, size=float(solid.size), young=material.young, poisson=material.poisson,
-            density=material.density,
-        )  # fmt: skip
+    whole = found.shapes[:, :kept].reshape(len(mesh.nodes), 3, -1)
+    changes = None if not perturbed else perturbations(
+        elements_of(mesh), whole, size=float(solid.size), young=material.young, poisson=material.poisson,
+        density=material.density,
+    )  # fmt: skip
     outer, triangles = np.unique(mesh.boundary, return_inverse=True)
     shapes = whole[outer].transpose(0, 2, 1)
     return ElasticModes(
@@ -200,6 +184,32 @@ def elastic_modes(
         mass=float((solid.volumes * light).sum()) * material.density,
         perturbations=changes,
     )
+
+
+def _vibrations(
+    mesh: SecondOrder,
+    forces: scipy.sparse.sparray,
+    weights: scipy.sparse.csr_array,
+    *,
+    count: int,
+    shift: float,
+    supported: bool,
+    fixed: Int[np.ndarray, " fixed"] | None,
+) -> Vibrations:
+    """Return the lowest vibrations from the matrices of all nodes, whether or not some of these are fixed."""
+    rigid = rigid_motions(mesh.nodes, weights)
+    if fixed is None:
+        return lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=supported)
+    free = np.setdiff1d(np.arange(len(mesh.nodes)), fixed)
+    moving = (3 * free[:, None] + np.arange(3)).ravel()
+    forces, weights = forces.tocsr()[moving][:, moving], weights[free][:, free]
+    # A cantilever's lowest mode is mostly a turn, and yet none of a rigid body.
+    rigid = np.zeros_like(rigid[moving])
+    found = lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=True)
+    bending = found.squares > _PENDULUM * found.squares.max()
+    shapes = np.zeros((3 * len(mesh.nodes), int(bending.sum())))
+    shapes[moving] = found.shapes[:, bending]
+    return Vibrations(found.squares[bending], shapes)
 
 
 def _support(mesh: SecondOrder, springs: Sequence[tuple[Tensor, float]]) -> scipy.sparse.csr_array:

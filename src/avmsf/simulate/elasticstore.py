@@ -13,11 +13,11 @@ from importlib.metadata import version
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from avmsf._utils.caching import keep_if_possible
+from avmsf._utils.state import read_tensors
 from avmsf._utils.text_files import parse_json
 from avmsf.errors import SimulationError
 from avmsf.fem.perturbation import Perturbations
@@ -123,20 +123,7 @@ def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, tell: 
 
 
 def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
-    if not path.is_file():
-        raise SimulationError(f"{path}: expected a file of elastic modes, found no such file: check the name")
-    try:
-        with safe_open(path, framework="pt") as file:
-            words = (file.metadata() or {}).get(_KEY)
-            if words is None:
-                raise SimulationError(f"{path}: expected elastic modes, found a safetensors file of something else")
-            # Clones, for what the file maps into memory would change with it.
-            return words, {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise SimulationError(
-            f"{path}: expected elastic modes, found a file that is cut short, damaged or of another kind: compute "
-            "them again"
-        ) from error
+    return read_tensors(path, _KEY, what="elastic modes", advice="compute them again", raising=SimulationError)
 
 
 def _told(tensors: dict[str, tuple[tuple[int, ...], torch.dtype]]) -> str:

@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
+from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.simulate.recipe import ObjectRecipe
+from avmsf.simulate.shapes import make_shape, textured
 
 EXAMPLE = ObjectRecipe(
     kind="mug",
@@ -14,7 +16,14 @@ EXAMPLE = ObjectRecipe(
     noise_db=-40.0,
     views=48,
     view_size=192,
+    surface=False,
 )
-"""`avmsf simulate example` makes it anew."""
+"""`avmsf simulate example` makes it anew; `--surface` adds the mesh."""
 EXAMPLE_FOLDER = Path(__file__).parents[1] / "example"
-"""The capture folder that the package ships, made of that recipe."""
+"""The capture folder that the package ships, made of that recipe: recordings and photographs, no mesh."""
+
+
+def example_mesh() -> TexturedMesh:
+    """Return the mesh, in its colors, that the example's recordings and photographs were computed from."""
+    shape = make_shape(EXAMPLE.kind, seed=EXAMPLE.seed, size=EXAMPLE.size, wall=EXAMPLE.thickness)
+    return textured(shape)

@@ -21,7 +21,7 @@ from avmsf.simulate.elasticstore import modes_once
 from avmsf.simulate.elements import SecondOrder
 from avmsf.simulate.material import Material
 from avmsf.simulate.nominalcheck import CheckedSurface, checked
-from avmsf.simulate.nominalsolid import FEWEST, expect_memory, filled_solid, freedoms_of, wall_solids
+from avmsf.simulate.nominalsolid import FEWEST, TRIANGLES, expect_memory, filled_solid, freedoms_of, wall_solids
 from avmsf.simulate.recipe import key_of
 from avmsf.simulate.solid import Solid
 
@@ -59,8 +59,11 @@ class Shape(Protocol):
         """Return the closed surface of what was seen, both sides of walls included."""
         ...
 
-    def shell(self, thickness: float) -> Surface:
-        """Return the closed surface of a wall, meters thick, behind the outer side. Raises SceneError without one."""
+    def shell(self, thickness: float, *, faces: int) -> Surface:
+        """Return the closed surface of a wall, meters thick, behind the outer side. Raises SceneError without one.
+
+        Each of its sides has about so many triangles.
+        """
         ...
 
     def digest(self) -> str:
@@ -347,10 +350,10 @@ class _Maker:
             return filled_solid(self.checked, freedoms)
         if self._shape is not None:
             try:
-                surface = self._shape.shell(wall)
+                surface = self._shape.shell(wall, faces=round(0.5 * TRIANGLES * freedoms))
             except SceneError as error:
                 raise SimulationError(str(error)) from error
-            return filled_solid(checked(surface, tell=self._tell), freedoms)
+            return filled_solid(checked(surface, tell=self._tell), freedoms, wall=wall)
         if freedoms not in self._walls:
             self._walls[freedoms] = wall_solids(self.checked, freedoms)
         return self._walls[freedoms](wall)

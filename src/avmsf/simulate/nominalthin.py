@@ -30,14 +30,25 @@ def thinned(skin: Skin, *, tell: Callable[[str], None]) -> Skin:
     rough = roughness(skin)
     # Quadrics follow each noisy corner, and tie the skin into knots.
     even = averaged(skin, math.ceil(_ROUNDS * count / MOST)) if rough >= ROUGH else skin
-    opened, crowded = skin.open_edges, skin.crowded_edges
-    wanted = MOST
-    while wanted < count:
-        points, faces = fast_simplification.simplify(even.points, even.faces, target_count=wanted)
+    found = simplified(even, MOST, like=skin)
+    if found is even:
+        return skin
+    noise = "" if even is skin else f", its noise of {rough:.0f} degrees from one to the next averaged out"
+    tell(f"the mesh was thinned to {len(found.faces)} triangles{noise}")
+    return found
+
+
+def simplified(skin: Skin, count: int, *, like: Skin | None = None) -> Skin:
+    """Return a skin of about `count` triangles by quadrics, its volume about the same; as it is if it has no more.
+
+    More are left where fewer would open a seam or share an edge among three, compared with the skin that it is `like`.
+    """
+    reference = skin if like is None else like
+    opened, crowded, count = reference.open_edges, reference.crowded_edges, max(count, 4)
+    while count < len(skin.faces):
+        points, faces = fast_simplification.simplify(skin.points, skin.faces, target_count=count)
         found = Skin.compact(points.astype(np.float64), faces.astype(np.int64))
-        if found.open_edges <= opened and found.crowded_edges <= crowded:
-            noise = "" if even is skin else f", its noise of {rough:.0f} degrees from one to the next averaged out"
-            tell(f"the mesh was thinned to {len(found.faces)} triangles{noise}")
+        if len(found.faces) >= 4 and found.open_edges <= opened and found.crowded_edges <= crowded:
             return found
-        wanted *= 2
+        count *= 2
     return skin

@@ -54,6 +54,8 @@ class ObjectRecipe:
     """Pictures to render, on three circles around the object; 0 for none."""
     view_size: int = 256
     """Pixels along each side of a picture."""
+    surface: bool = True
+    """Whether the folder holds the object's mesh; without it, the shape has to be found in the pictures."""
     hammer: Hammer = field(default_factory=Hammer)
     imperfections: Imperfections = field(default_factory=Imperfections)
 

@@ -70,7 +70,8 @@ def simulate_object(
         body.surface, recipe.contacts, up=up_of(recipe), imperfections=recipe.imperfections, seed=recipe.seed
     )
     recordings, forces, truth = record(recipe, sounding, strikes)
-    capture = _captured(recipe, recordings, strikes, forces, truth, name=name or name_of(recipe), surface=body.surface)
+    seen = body.surface if recipe.surface else None
+    capture = _captured(recipe, recordings, strikes, forces, truth, name=name or name_of(recipe), surface=seen)
     return Simulation(recipe, capture, recordings, truth, body.mesh, sounding)
 
 
@@ -130,7 +131,7 @@ def _captured(
     truth: Truth,
     *,
     name: str,
-    surface: Surface,
+    surface: Surface | None,
 ) -> Capture:
     """Return what reading the written recordings gives. Onsets are found, unless all recordings start with theirs."""
     assert truth.starts is not None

@@ -29,8 +29,8 @@ def write_simulation(
 ) -> None:
     """Write a folder that `read_capture`, `read_views` and `read_truth` read, and any tool that takes captures.
 
-    It holds impacts.csv, the wav files, capture.toml, the surface in its colours (surface.ply, or surface.glb where it
-    has textures), transforms.json with images and masks where the recipe asks for views, and truth.safetensors. The
+    It holds impacts.csv, the wav files, capture.toml, truth.safetensors, and where the recipe asks for them the surface
+    in its colors (surface.ply, or surface.glb where it has textures) and transforms.json with images and masks. The
     folder appears whole or not at all. `progress` is called with the number of pictures rendered and their total.
     Raises SimulationError where the folder exists and is not empty, and where it cannot be written.
     """
@@ -42,7 +42,8 @@ def write_simulation(
         _write_recordings(simulation, begun)
         for sound in begun.glob("*.wav"):
             _forget_the_hour(sound)
-        write_textured(simulation.mesh, begun)
+        if simulation.recipe.surface:
+            write_textured(simulation.mesh, begun)
         _write_views(simulation, begun, progress)
         write_truth(simulation.truth, begun / TRUTH)
         if folder.exists():

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
-from avmsf.simulate.closest import ClosestPoints
+from avmsf.geometry.closest import ClosestPoints
 from avmsf.simulate.imperfections import Imperfections, stream
 
 STEEPEST = -0.35

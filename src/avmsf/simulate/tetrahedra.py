@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64
 
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
-from avmsf.simulate.closest import Closest, ClosestPoints
+from avmsf.geometry.closest import Closest, ClosestPoints
 from avmsf.simulate.skin import Skin
 from avmsf.simulate.solid import Solid
 

@@ -15,10 +15,10 @@ from typing import Any
 
 import torch
 from jaxtyping import Complex128, Float64
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
+from avmsf._utils.state import read_tensors
 from avmsf._utils.text_files import parse_json
 from avmsf.errors import SimulationError
 from avmsf.files import write_whole
@@ -109,27 +109,8 @@ def read_truth(path: str | Path) -> Truth:
 
 
 def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
-    if not path.is_file():
-        raise SimulationError(
-            f"{path}: expected the truth of a simulated object, found no such file: only objects that `avmsf simulate` "
-            "made have one"
-        )
-    try:
-        with safe_open(path, framework="pt") as file:
-            words = (file.metadata() or {}).get(_KEY)
-            # Clones, for what the file maps into memory would change with it.
-            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise SimulationError(
-            f"{path}: expected the truth of a simulated object, found a file of another kind or one cut short "
-            f"({error}): simulate the object again"
-        ) from error
-    if words is None:
-        raise SimulationError(
-            f"{path}: expected the truth of a simulated object, found a safetensors file of something else (its "
-            f"metadata has no entry {_KEY!r}): name a file that `avmsf simulate` wrote"
-        )
-    return words, tensors
+    what, advice = "the truth of a simulated object", "simulate it: only objects that `avmsf simulate` made have one"
+    return read_tensors(path, _KEY, what=what, advice=advice, raising=SimulationError)
 
 
 def _understand(words: str, path: Path) -> dict[str, Any]:

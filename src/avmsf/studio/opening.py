@@ -13,7 +13,7 @@ from avmsf.capture.table import TABLE
 from avmsf.errors import StudioError
 from avmsf.export.objectfile import holds_gaussians
 from avmsf.files import copy_whole
-from avmsf.pipeline.reconstruct import CACHE, FIELD
+from avmsf.pipeline.reconstruct import CACHE, FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
 from avmsf.pipeline.sources import SPLATS, find_source, find_splats
 
@@ -79,6 +79,13 @@ def find_object(opened: Opened) -> Path | None:
         return surface
     made = opened.capture / CACHE / CLOUD
     return made if made.is_file() else find_splats(opened.capture)
+
+
+def find_reconstructed(opened: Opened) -> Path | None:
+    """Return the mesh, in meters, that was made of the object's views; None without one, and where its own is shown."""
+    made = None if opened.capture is None else opened.capture / CACHE / SURFACE
+    shown = find_object(opened)
+    return None if made is None or not made.is_file() or (shown and not is_gaussians(shown)) else made
 
 
 def shows_more(opened: Opened) -> bool:

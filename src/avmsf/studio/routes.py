@@ -106,12 +106,14 @@ class Calls:
         return _file(self.studio.showcase.files_of(request.path_params["number"]), request)
 
     async def send_shown(self, request: Request) -> Response:
-        """The table of the current revision, or the object's file; and what the capture holds."""
+        """The table of the current revision, or a file that shows the object; and what the capture holds."""
         name = request.path_params["path"]
         if name == "capture":
             return Answer(await self.studio.capture())
         showcase = self.studio.showcase
-        return _file(showcase.object_folder if name.startswith("object.") else showcase.current.folder, request)
+        return _file(
+            showcase.object_folder if name.startswith(("object.", "surface.")) else showcase.current.folder, request
+        )
 
     async def send_measured(self, request: Request) -> Response:
         """The sound of a measured strike, as it is read."""

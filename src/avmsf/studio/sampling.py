@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.export.sampledfield import SampledField
-from avmsf.field.posterior import scale_of
 from avmsf.field.scaledgains import ScaledGains, fitted_gains
 from avmsf.field.soundfield import SoundField
+from avmsf.field.uncertainty import scale_of
 
 
 def length_of(field: SoundField) -> float:

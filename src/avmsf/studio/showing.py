@@ -27,7 +27,7 @@ from avmsf.field.soundfield import SoundField
 from avmsf.scene.features import FeatureField
 from avmsf.scene.ply import read_splats
 from avmsf.studio.capturing import StrikeBook
-from avmsf.studio.opening import Opened, find_object, is_gaussians
+from avmsf.studio.opening import Opened, find_object, find_reconstructed, is_gaussians
 from avmsf.studio.sampling import length_of, resample, sample
 from avmsf.studio.session import Revision
 
@@ -70,7 +70,7 @@ class Showcase:
 
     @property
     def object_folder(self) -> Path:
-        """The folder of the object's file and the measured strikes' sounds."""
+        """The folder of the files that show the object, and of the measured strikes' sounds."""
         assert self._first_of_field is not None
         return self._first_of_field.folder
 
@@ -83,13 +83,16 @@ class Showcase:
             shown = find_object(self.opened) if fresh else None
             strikes, remarks = self._strikes(revision.field) if fresh else (None, ())
             mute = revision.field is None
-            remarks += write_bundle(sampled, path, object=shown, metres=self.metres, strikes=strikes, mute=mute).remarks
+            surface = find_reconstructed(self.opened) if fresh else None
+            remarks += write_bundle(
+                sampled, path, object=shown, metres=self.metres, surface=surface, strikes=strikes, mute=mute
+            ).remarks
             manifest = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
             manifest["name"] = revision.name or manifest["name"] or self.opened.name
             if fresh:
                 self._first_of_field = Shown(path, manifest, sampled, revision, remarks)
             assert self._first_of_field is not None
-            for part in ("object", "strikes"):
+            for part in ("object", "surface", "strikes"):
                 manifest[part] = self._first_of_field.manifest[part]
             for tensor in manifest["tensors"].values():
                 # By revision, so that a page never reads one's manifest with another's numbers.

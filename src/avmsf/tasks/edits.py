@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from avmsf.errors import EditError
-from avmsf.field.posterior import scale_of
 from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import SoundField
+from avmsf.field.uncertainty import scale_of
 from avmsf.modal.bank import ModalBank
 
 EDITS = "edits"

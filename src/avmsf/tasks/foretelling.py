@@ -7,8 +7,8 @@ from jaxtyping import Complex64, Float, Float32
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.field.posterior import fitted_mixture, has_posterior
 from avmsf.field.soundfield import SoundField
+from avmsf.field.uncertainty import fitted_mixture, has_posterior
 
 _BATCH = 2048
 """Points whose gains are asked for at once."""

@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.posterior import fitted_mixture, scale_of
 from avmsf.field.soundfield import SoundField
+from avmsf.field.uncertainty import fitted_mixture, scale_of
 from avmsf.scene.points import farthest_points
 from avmsf.tasks.foretelling import foretell, judges_itself, patches, unknown, widened
 from avmsf.tasks.posterior import Foretold, judge

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.soundfield import SoundField
@@ -20,7 +21,7 @@ from avmsf.scene.points import farthest_points
 from avmsf.tasks.clips import level
 from avmsf.tasks.modaledit import ModalEdit, Struck
 from avmsf.tasks.parameters import HIERARCHICAL, EditVariables, Parameterisation
-from avmsf.tasks.steercheckpoint import asked, read_steering, write_steering
+from avmsf.tasks.steercheckpoint import asked
 
 _PROBES = 16
 """Contacts, far apart, at which the loudest modes, the start and the level are judged."""
@@ -176,7 +177,9 @@ class _Steering:
         # How often one listens changes nothing.
         del settings["preview_every"]
         self.asked = asked(field, probes, guide.describe(), settings)
-        state = None if checkpoint is None else read_steering(checkpoint, wanted=self.asked)
+        state = (
+            None if checkpoint is None else read_checkpoint(checkpoint, self.asked, what="an edit", raising=EditError)
+        )
         searching = state is None and parameters.searches
         start = guide.start(self.probes) if searching else ModalEdit.none(self.probes.bank)
         self.variables = EditVariables(start, self.probes.loudest(config.modes), parameters)
@@ -273,13 +276,12 @@ class _Steering:
         if self.checkpoint is None:
             return
         state = {
-            "asked": self.asked,
             "variables": self.variables.state(),
             "step": self.step,
             "spoilt": self.spoilt,
         }
         try:
-            write_steering(self.checkpoint, state)
+            write_checkpoint(self.checkpoint, state, self.asked, raising=EditError)
         except EditError as error:
             # A full disk costs the checkpoint, not the edit.
             warnings.warn(f"the edit goes on without a new checkpoint: {error}", AvmsfWarning, stacklevel=2)

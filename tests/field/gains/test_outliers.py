@@ -17,12 +17,12 @@ from avmsf.field.gains.outliers import (
     Credibility,
     Fit,
     Outlier,
+    PredictiveRatios,
     judge_contacts,
     predicts_better,
     set_aside,
 )
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
-from avmsf.field.gains.ratios import PredictiveRatios
 
 CONTACTS, MODES = 20, 12
 

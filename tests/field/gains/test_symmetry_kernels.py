@@ -10,8 +10,9 @@ from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
-from avmsf.field.gains.symmetry import Symmetric, groups_of
+from avmsf.field.gains.symmetry import Symmetric
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
+from avmsf.scene.symmetrycharacters import groups_of
 
 SIZE = 1.0
 

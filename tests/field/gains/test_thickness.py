@@ -37,7 +37,7 @@ def test_the_posterior_of_a_normal_evidence_is_normal_with_the_variance_of_shape
     assert min(abs(math.log(body.wall / true)) for body in found if body.wall) < 0.04
 
 
-def test_the_range_is_not_left() -> None:
+def test_thicker_walls_than_the_views_allow_are_not_tried() -> None:
     asked: list[float] = []
 
     def wall(thickness: float) -> NominalBody:
@@ -48,8 +48,15 @@ def test_the_range_is_not_left() -> None:
     _, thickness = search_thickness([walled(each) for each in GRID], rising, wall)
     assert thickness is not None
     assert asked
-    assert GRID[0] < min(asked)
     assert max(asked) < GRID[-1] == pytest.approx(thickness.median, rel=0.1)
+
+
+def test_walls_thinner_than_the_first_ones_are_found() -> None:
+    true = 0.55 * GRID[0]
+    normal = partial(evidence, of=lambda log: -0.5 * ((log - math.log(true)) / 0.1) ** 2, filled=-500.0)
+    _, thickness = search_thickness([walled(each) for each in GRID], normal, walled)
+    assert thickness is not None
+    assert thickness.median == pytest.approx(true, rel=0.03)
 
 
 def test_no_thickness_is_looked_for_where_the_filled_body_is_the_most_probable() -> None:
@@ -61,8 +68,10 @@ def test_no_thickness_is_looked_for_where_the_filled_body_is_the_most_probable()
     assert [body.wall for body in found] == [None]
 
 
-def test_bodies_that_cannot_be_had_end_the_search() -> None:
+def test_other_thicknesses_are_tried_where_a_body_cannot_be_had() -> None:
     normal = partial(evidence, of=lambda log: -((log - math.log(0.0029)) ** 2), filled=-50.0)
-    _, thickness = search_thickness([walled(each) for each in GRID], normal, lambda wall: None)
+    asked: list[float] = []
+    _, thickness = search_thickness([walled(each) for each in GRID], normal, lambda wall: asked.append(wall))
+    assert len({round(each, 9) for each in asked}) == len(asked) > 1
     assert thickness is not None
     assert thickness.low < 0.0029 < thickness.high

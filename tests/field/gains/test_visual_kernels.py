@@ -5,8 +5,7 @@ import torch
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.gains.positional import Unstructured
-from avmsf.field.gains.visual import Visual
+from avmsf.field.gains.positional import Unstructured, Visual
 
 SIZE = 1.0
 

@@ -7,7 +7,7 @@ frequencies (Fox and Kapoor, AIAA Journal 6, 1968). So if a mode is shape k, per
     K = (1 - p) sum_j g_kj phi_j phi_j' + p R,   g_kj = 1 / (1 + (2 log(f_k / f_j) / tau)^2),
 
 where phi_j is the component of shape j along the impacts, R a smooth kernel for what no shape of the basis has, and p
-its share. Shapes nearer in frequency than the perturbation mix freely. Where shapes cannot be told one from another, a
+its share. Shapes nearer in frequency than the perturbation mix freely. Where shapes cannot be distinguished, a
 broader profile serves, g_kj = exp(-log(f_k / f_j)^2 / 2 w^2) + 1/1000: whatever lies near in frequency.
 
 Which shape a mode is follows from its gains and from its frequency f: given shape k and a factor c on all nominal

@@ -7,36 +7,31 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from typing import Any, Literal
-from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
-from avmsf.capture.placement import surface_points
-from avmsf.capture.surface import Surface
+from avmsf.capture.placement import expect_placed
 from avmsf.errors import AvmsfError, FitError
 from avmsf.fem.supports import FREE, FREE_PRIOR
-from avmsf.field.config import FitConfig
+from avmsf.fem.updating import update
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import FACTORS, Elastic
-from avmsf.field.gains.family import KernelFamily, Sites
+from avmsf.field.gains.family import KernelFamily, Sites, sites_along
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.gains.outliers import Fit, Judgment, judge_contacts, predicts_better
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.refinement import RefinedGains
-from avmsf.field.gains.symmetry import Group, Symmetric, groups_of
+from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.gains.thickness import search_thickness
-from avmsf.field.gains.updating import update
-from avmsf.field.gains.visual import Visual
-from avmsf.field.placed import expect_placed
-from avmsf.field.recipes import SHARED, Attention, GainCase, GainRecipe
+from avmsf.field.recipes import Attention, GainCase, GainRecipe
 from avmsf.scene.features import GEOMETRY, FeatureField
 from avmsf.scene.points import farthest_points
 from avmsf.scene.symmetry import Symmetries
-from avmsf.simulate.elastic import ElasticModes
+from avmsf.scene.symmetrycharacters import Group, groups_of
 from avmsf.simulate.nominal import NominalBody, body_name
 
 POSITIONAL: dict[str, type[KernelFamily]] = {Smooth.kind: Smooth, ThinPlate.kind: ThinPlate}
@@ -45,10 +40,10 @@ AUTO, NETWORK = "auto", "network"
 GainModel = Literal["auto", "network", "smooth", "thin-plate", "symmetry", "visual", "elastic"]
 """The Gaussian process over all kernel families, the paper's attention network, or the process over one family."""
 FAMILIES = (*POSITIONAL, Symmetric.kind, Elastic.kind)
-"""What the model is made of beside the unstructured family, which is always there."""
+"""What the model is made of besides the unstructured family, which is always there."""
 KNOWN = (*FAMILIES, Visual.kind)
 """All families. Looks must be asked for by name: with the built-in descriptors of four simulated objects they made the
-errors between 0.4 % smaller and 1.7 % larger without a body, and changed nothing beside one."""
+errors between 0.4 % smaller and 1.7 % larger without a body, and changed nothing with one."""
 _UPDATED = 64
 """Contacts that a body is updated from, at most."""
 _PREDICTS = 1.0
@@ -59,7 +54,7 @@ _PLACES = 500
 
 
 @dataclass(frozen=True, eq=False)
-class MixtureEstimator:
+class MixtureEstimator(GainRecipe):
     """Fits a Gaussian process whose kernel families are weighed by evidence."""
 
     kinds: tuple[str, ...] = FAMILIES
@@ -71,7 +66,7 @@ class MixtureEstimator:
     symmetries: Symmetries | None = None
     """Of the object's geometry; without any there is no symmetry family.
 
-    Nor is there where a body is usable, whose mode shapes have the symmetries already: beside them the family made the
+    Nor is there where a body is usable, whose mode shapes have the symmetries already: with them the family made the
     error of one of 11 splits of captures 6 % larger, and none smaller than by 2 %.
     """
 
@@ -85,24 +80,11 @@ class MixtureEstimator:
         """The family's name where there is one alone, else `auto`."""
         return AUTO if len(self.kinds) > 1 else self.kinds[0]
 
-    @property
-    def warms_up(self) -> bool:
-        """The model is solved for."""
-        return False
-
     def digest(self) -> str:
         """Return a digest of the families, the bodies and the symmetries."""
         bodies = "" if self.bodies is None else self.bodies.digest()
         symmetries = "" if self.symmetries is None else json.dumps(self.symmetries.to_dict())
         return hashlib.sha256(f"{' '.join(self.kinds)} {bodies} {symmetries}".encode()).hexdigest()
-
-    def dampings(self, config: FitConfig) -> tuple[str, ...]:
-        """Return shared dampings alone: a mode's damping does not depend on the contact."""
-        return (SHARED,)
-
-    def rows(self, case: GainCase) -> Int[Tensor, " contacts"]:
-        """Return the contacts themselves."""
-        return torch.arange(len(case.train))
 
     def start(self, case: GainCase, damping: str) -> RefinedGains:
         """Return the gain model, to be refined end to end.
@@ -122,7 +104,8 @@ class MixtureEstimator:
         density updated becomes one more hypothesis.
         """
         bodies, missing = self._usable_bodies(case)
-        directional, every = bool(bodies) or _has_directions(case), torch.arange(len(case.train))
+        given, every = case.train.directions, torch.arange(len(case.train))
+        directional = bool(bodies) or (given is not None and bool(given.any()))
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
         if self.name == Symmetric.kind and not groups:
             raise FitError("symmetry: expected symmetries of the object's shape, found none: take another gain model")
@@ -178,7 +161,7 @@ class MixtureEstimator:
                 raise FitError(f"elastic mode shapes need the object's shape: {self.missing or 'give its mesh'}")
             return [], {Elastic.kind: self.missing} if self.missing else {}
         try:
-            _expect_on_body(case, self.bodies.bodies.bodies[0].elastic)
+            expect_placed(case.train.contacts, self.bodies.bodies.bodies[0].elastic.points, names=case.train.names)
         except FitError as error:
             if self.name == Elastic.kind:
                 raise
@@ -210,7 +193,7 @@ def estimator_for(
     """Return the estimator of this name; the network reads `features`, or the fit's own.
 
     `bodies` computes what may lie behind the object's surface. Where it raises an AvmsfError, `auto` has no elastic
-    family, which `log` is told, and takes the `symmetries` of the object's shape; with `elastic` the error passes.
+    family, which `log` reports, and takes the `symmetries` of the object's shape; with `elastic` the error passes.
     """
     if name == NETWORK:
         return Attention(features, NETWORK)
@@ -242,8 +225,9 @@ class _Fit:
 
     @cached_property
     def measured(self) -> MeasuredGains:
-        """The gains at all contacts."""
-        return measured_gains(self.case)
+        """The gains at all contacts, with the variance that background noise gives them."""
+        values, bank = torch.view_as_complex(self.case.parts.contiguous()), self.case.modes.bank
+        return MeasuredGains(values, gain_variance(self.case), bank.frequency, bank.damping)
 
     def at(self, rows: Int[Tensor, " rows"]) -> MeasuredGains:
         """Return the gains at some contacts."""
@@ -289,16 +273,11 @@ class _Fit:
         measured = self.at(rows)
         others = [WeighedFamily.of(family, measured, NOISE_SHARES) for family in self.families(rows, [])]
         found = update(
-            body.elastic, sites, measured.frequency, measured.values.real, measured.informative.chunk(2)[0],
+            body.elastic, sites.points, sites.directions, measured.frequency, measured.values.real,
+            measured.informative.chunk(2)[0],
             lambda modes: matched(others, Elastic(sites, size, modes), measured),
         )  # fmt: skip
         return None if found is None else replace(body, elastic=found[0], updated=found[1])
-
-
-def measured_gains(case: GainCase) -> MeasuredGains:
-    """Return a case's gains, with the variance that its background noise gives them."""
-    values = torch.view_as_complex(case.parts.contiguous())
-    return MeasuredGains(values, gain_variance(case), case.modes.bank.frequency, case.modes.bank.damping)
 
 
 def gain_variance(case: GainCase) -> Float64[Tensor, " modes"]:
@@ -320,30 +299,18 @@ def _sites(case: GainCase, bodies: Sequence[NominalBody]) -> Sites:
 
     Without a body they are that of the nearest impact whose direction is known, or all alike where none is.
     """
-    points = case.train.contacts.double()
-    given = torch.zeros_like(points) if case.train.directions is None else case.train.directions.double()
-    length = given.norm(dim=1, keepdim=True)
-    known = length[:, 0] > 0
-    used = given / length.clamp_min(torch.finfo(torch.float64).tiny)
-    if bodies:
-        used[~known] = -bodies[0].elastic.normals(points[~known])
-    elif bool(known.any()):
-        apart = (points[~known, None] - points[known]).square().sum(2)
-        used[~known] = used[known][apart.argmin(1)]
-    else:
-        used[:] = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    return Sites(points, used)
+    points, given = case.train.contacts.double(), case.train.directions
 
+    def otherwise(unknown: Float64[Tensor, "unknown 3"]) -> Float64[Tensor, "unknown 3"]:
+        if bodies:
+            return -bodies[0].elastic.normals(unknown)
+        known = torch.zeros(len(points), dtype=torch.bool) if given is None else given.any(1)
+        if given is None or not bool(known.any()):
+            return torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(len(unknown), 3)
+        nearest = (unknown[:, None] - points[known]).square().sum(2).argmin(1)
+        return torch.nn.functional.normalize(given[known][nearest].double(), dim=1)
 
-def _has_directions(case: GainCase) -> bool:
-    return case.train.directions is not None and bool(case.train.directions.any())
-
-
-def _expect_on_body(case: GainCase, elastic: ElasticModes) -> None:
-    """Raise FitError where the contacts are not on the body's surface."""
-    if elastic not in _POINTS:
-        _POINTS[elastic] = surface_points(Surface(elastic.nodes, elastic.triangles[:, :3]))
-    expect_placed(case.train.contacts, _POINTS[elastic], names=case.train.names)
+    return sites_along(points, given, otherwise)
 
 
 def _judged(fit: _Fit, model: MixtureGains, body: NominalBody | None) -> Judgment:
@@ -412,7 +379,3 @@ def _judgment_report(judgment: Judgment, case: GainCase, used: Int[Tensor, " use
         "excluded": [name for row, name in enumerate(names) if row not in kept],
         "credibility": None if credibility is None else asdict(credibility) | {"credible": credibility.credible},
     }
-
-
-_POINTS: WeakKeyDictionary[ElasticModes, Tensor] = WeakKeyDictionary()
-"""Points all over bodies' surfaces."""

@@ -1,11 +1,12 @@
 """What every kernel family is: kernels that are weighted sums of a basis, among contacts and to other places."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import torch
-from jaxtyping import Bool, Float64, Int
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 _PERPENDICULAR = 1e-6
@@ -37,6 +38,21 @@ class Sites:
         perpendicular impacts say nothing of each other, and an opposite one changes the gain's sign.
         """
         return self.directions @ other.directions.T
+
+
+def sites_along(
+    points: Float64[Tensor, "sites 3"],
+    directions: Float[Tensor, "sites 3"] | None,
+    otherwise: Callable[[Float64[Tensor, "unknown 3"]], Float64[Tensor, "unknown 3"]],
+) -> Sites:
+    """Return impacts at points; `otherwise` gives the directions where they are not known, None or of length zero."""
+    given = torch.zeros_like(points) if directions is None else directions.double()
+    length = given.norm(dim=1, keepdim=True)
+    unknown = ~(length[:, 0] > 0)
+    used = given / length.clamp_min(torch.finfo(torch.float64).tiny)
+    if bool(unknown.any()):
+        used[unknown] = otherwise(points[unknown])
+    return Sites(points, used)
 
 
 def nearest_sites(
@@ -121,6 +137,9 @@ class KernelFamily(ABC):
     ) -> Float64[Tensor, "sites series"]:
         """Return the family's part of the means at impacts, whose coefficients are those of the known impacts."""
         return torch.einsum("bpc,bcs->ps", self.basis(sites, known), coefficients)
+
+
+Family = TypeVar("Family", bound=KernelFamily)
 
 
 def scaled(

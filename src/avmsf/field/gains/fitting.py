@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Complex128, Float32, Float64
 from torch import Tensor
 
+from avmsf.fem.updating import Matched
 from avmsf.field.gains.elastic import FACTORS, Elastic, factor_log_prior
 from avmsf.field.gains.family import KernelFamily
 from avmsf.field.gains.mixture import (
@@ -19,7 +20,6 @@ from avmsf.field.gains.mixture import (
     log_joint,
 )
 from avmsf.field.gains.model import MixtureGains, series_of
-from avmsf.field.gains.updating import Matched
 
 _STRONGEST = 16
 """Modes of the most energy, which decide on the factor on nominal frequencies: many weak ones are not the body's."""

@@ -10,15 +10,15 @@ from jaxtyping import Bool, Complex128, Float, Float32, Float64, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from avmsf._utils.records import count_of, like
 from avmsf.field.gainfield import Gains
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.family import KernelFamily, Sites, nearest_sites
+from avmsf.field.gains.family import Family, KernelFamily, Sites, nearest_sites, sites_along
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
-from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
-from avmsf.field.gains.symmetry import Group, Symmetric
-from avmsf.field.gains.visual import Visual
+from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
+from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.places import places_of
-from avmsf.field.records import count_of, like
+from avmsf.scene.symmetrycharacters import Group
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.nominal import NOMINAL
 
@@ -33,12 +33,12 @@ _OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "symmetries", Visual.kind:
 
 @dataclass(frozen=True, eq=False)
 class PlaceCovariance:
-    """What is not known of one mode's gains at some places."""
+    """The posterior of one mode's gains at some places."""
 
     covariance: Float64[Tensor, "places places"]
     """Between the gains at places, summed over their two parts."""
     noise: float
-    """Variance that one more measured gain has of its own, likewise."""
+    """Variance of the noise of one more measured gain, likewise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,19 +92,7 @@ class MixtureGains:
         Where there is no body they go as the nearest training impact does. Where the model knows nothing of directions,
         all are alike.
         """
-        points = contacts.double()
-        given = torch.zeros_like(points) if directions is None or not self.directional else directions.double()
-        length = given.norm(dim=1, keepdim=True)
-        unknown = length[:, 0] == 0
-        used = given / length.clamp_min(torch.finfo(torch.float64).tiny)
-        if bool(unknown.any()):
-            outward = self.normals(points[unknown]) if self.directional else None
-            if outward is not None:
-                used[unknown] = -outward
-            else:
-                near = cKDTree(self.contacts.numpy()).query(points[unknown].numpy())[1]
-                used[unknown] = self.training.directions[torch.from_numpy(near)]
-        return Sites(points, used)
+        return sites_along(contacts.double(), directions if self.directional else None, self._straight)
 
     def nearest(
         self, sites: Sites, others: Int[Tensor, " sites"] | None = None
@@ -122,8 +110,11 @@ class MixtureGains:
 
     @property
     def body(self) -> ElasticModes | None:
-        """The elastic modes of the (first) body that the gains know, with its surface; None without one."""
-        return next((each.modes for each in self.families if isinstance(each, Elastic)), None)
+        """The elastic modes of the first body that the gains know, which gives the surface; None without one.
+
+        Predictions are means over all bodies, whose surfaces are alike but for the resolution of their elements.
+        """
+        return next((each.modes for each in self._of(Elastic)), None)
 
     def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
         """Return the mean gains of impacts at contacts (metres) along unit vectors, see `sites`."""
@@ -170,7 +161,7 @@ class MixtureGains:
     def covariances(
         self, contacts: Float64[Tensor, "places 3"], directions: Float64[Tensor, "places 3"] | None
     ) -> Iterator[PlaceCovariance]:
-        """Yield what is not known of each mode's gains at places, by the mode's most probable hypothesis."""
+        """Yield the posterior of each mode's gains at places, by the mode's most probable hypothesis."""
         sites, count = self.sites(contacts, directions), len(self.contacts)
         modes = self.mixture.values.shape[1] // 2
         energy = self.mixture.values.square().sum(0)
@@ -226,20 +217,11 @@ class MixtureGains:
             "families": [family.kind for family in self.families],
             "kept": [len(each) for each in self.kept],
             "bodies": [
-                {
-                    "nodes": len(family.modes.nodes),
-                    "triangles": len(family.modes.triangles),
-                    "shapes": len(family.modes),
-                }
-                for family in self.families
-                if isinstance(family, Elastic)
+                {"nodes": len(each.nodes), "triangles": len(each.triangles), "shapes": len(each)}
+                for each in (family.modes for family in self._of(Elastic))
             ],
-            "symmetries": [
-                [list(group.characters.shape) for group in family.groups]
-                for family in self.families
-                if isinstance(family, Symmetric)
-            ],
-            "features": [family.features.shape[1] for family in self.families if isinstance(family, Visual)],
+            "symmetries": [[list(group.characters.shape) for group in family.groups] for family in self._of(Symmetric)],
+            "features": [family.features.shape[1] for family in self._of(Visual)],
         }
 
     def tensors(self) -> dict[str, Tensor]:
@@ -255,20 +237,13 @@ class MixtureGains:
             "kept": torch.cat(self.kept),
             "weights": self.mixture.weights,
         }
-        for family in self.families:
-            if isinstance(family, Symmetric):
-                for row, group in enumerate(family.groups):
-                    named |= {f"groups.{row}.motions": group.motions, f"groups.{row}.characters": group.characters}
-            elif isinstance(family, Visual):
-                named["features"] = family.features
-        bodies = [family.modes for family in self.families if isinstance(family, Elastic)]
-        for row, body in enumerate(bodies):
-            named |= {
-                f"bodies.{row}.frequency": body.frequency,
-                f"bodies.{row}.nodes": body.nodes,
-                f"bodies.{row}.triangles": body.triangles,
-                f"bodies.{row}.shapes": body.shapes.float(),
-            }
+        for family in self._of(Visual):
+            named["features"] = family.features
+        for row, group in enumerate(group for family in self._of(Symmetric) for group in family.groups):
+            named |= {f"groups.{row}.{name}": getattr(group, name) for name in ("motions", "characters")}
+        for row, body in enumerate(family.modes for family in self._of(Elastic)):
+            named |= {f"bodies.{row}.{name}": getattr(body, name) for name in ("frequency", "nodes", "triangles")}
+            named[f"bodies.{row}.shapes"] = body.shapes.float()
         return named
 
     @classmethod
@@ -285,31 +260,30 @@ class MixtureGains:
             if given != families.count(kind) or (kind != Elastic.kind and given > 1):
                 raise ValueError(f"families are {families}, with {given} {name}")
         like(record["directional"], True, "directional")
-        sizes: dict[str, tuple[int, ...]] = {
-            "contacts": (contacts, 3),
-            "directions": (contacts, 3),
-            "scale": (len(families),),
-            "values": (contacts, modes, 2),
-            "measured": (contacts, modes, 2),
-            "floor": (2 * modes,),
-            "weights": (sum(kept), len(NOISE_SHARES), 2 * modes),
+        single, double, integer = torch.float32, torch.float64, torch.int64
+        sizes: dict[str, tuple[torch.dtype, *tuple[int, ...]]] = {
+            "points": (single, points, 3),
+            "contacts": (double, contacts, 3),
+            "directions": (double, contacts, 3),
+            "scale": (double, len(families)),
+            "values": (double, contacts, modes, 2),
+            "measured": (double, contacts, modes, 2),
+            "floor": (double, 2 * modes),
+            "kept": (integer, sum(kept)),
+            "weights": (double, sum(kept), len(NOISE_SHARES), 2 * modes),
         }
-        for row, (characters, order) in enumerate(group for family in record["symmetries"] for group in family):
-            sizes[f"groups.{row}.motions"] = (count_of(order, "motions"), 3, 4)
-            sizes[f"groups.{row}.characters"] = (count_of(characters, "characters"), order)
-        for row, body in enumerate(bodies):
-            nodes, shapes = count_of(body["nodes"], "nodes"), count_of(body["shapes"], "shapes")
-            sizes |= {f"bodies.{row}.frequency": (shapes,), f"bodies.{row}.nodes": (nodes, 3)}
-        named = {name: torch.empty(size, dtype=torch.float64, device="meta") for name, size in sizes.items()}
-        named |= {"points": torch.empty(points, 3, device="meta")}
         for dim in record["features"]:
-            named["features"] = torch.empty(points, count_of(dim, "features"), device="meta")
-        named |= {"kept": torch.empty(sum(kept), dtype=torch.int64, device="meta")}
+            sizes["features"] = (single, points, count_of(dim, "features"))
+        for row, (characters, order) in enumerate(group for family in record["symmetries"] for group in family):
+            sizes[f"groups.{row}.motions"] = (double, count_of(order, "motions"), 3, 4)
+            sizes[f"groups.{row}.characters"] = (double, count_of(characters, "characters"), order)
         for row, body in enumerate(bodies):
-            triangles = count_of(body["triangles"], "triangles")
-            named[f"bodies.{row}.triangles"] = torch.empty(triangles, 6, dtype=torch.int64, device="meta")
-            named[f"bodies.{row}.shapes"] = torch.empty(body["nodes"], body["shapes"], 3, device="meta")
-        return named
+            nodes, triangles, shapes = (count_of(body[name], name) for name in ("nodes", "triangles", "shapes"))
+            sizes[f"bodies.{row}.frequency"] = (double, shapes)
+            sizes[f"bodies.{row}.nodes"] = (double, nodes, 3)
+            sizes[f"bodies.{row}.triangles"] = (integer, triangles, 6)
+            sizes[f"bodies.{row}.shapes"] = (single, nodes, shapes, 3)
+        return {name: torch.empty(*size, dtype=dtype, device="meta") for name, (dtype, *size) in sizes.items()}
 
     @classmethod
     def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "MixtureGains":
@@ -318,15 +292,11 @@ class MixtureGains:
         _expect_sound(tensors, len(record["bodies"]))
         bodies = iter(
             ElasticModes(
-                tensors[f"bodies.{row}.frequency"],
-                tensors[f"bodies.{row}.nodes"],
-                tensors[f"bodies.{row}.triangles"],
-                tensors[f"bodies.{row}.shapes"].double(),
-                NOMINAL,
-                mass=0.0,
+                tensors[f"{body}.frequency"], tensors[f"{body}.nodes"], tensors[f"{body}.triangles"],
+                tensors[f"{body}.shapes"].double(), NOMINAL, mass=0.0,
             )
-            for row in range(len(record["bodies"]))
-        )
+            for body in (f"bodies.{row}" for row in range(len(record["bodies"])))
+        )  # fmt: skip
 
         def family_of(kind: str, size: float) -> KernelFamily:
             if kind == Elastic.kind:
@@ -348,6 +318,18 @@ class MixtureGains:
         values, measured = (torch.view_as_complex(tensors[name].contiguous()) for name in ("values", "measured"))
         mixture = KernelMixture(kernels, series_of(values), tensors["floor"], tensors["weights"])
         return cls(tensors["points"], training, families, tuple(kept), mixture, record["directional"], measured)
+
+    def _of(self, kind: type[Family]) -> list[Family]:
+        """Return the families of a kind."""
+        return [each for each in self.families if isinstance(each, kind)]
+
+    def _straight(self, points: Float64[Tensor, "points 3"]) -> Float64[Tensor, "points 3"]:
+        """Return directions straight into the body, or without one those of the nearest training impacts."""
+        outward = self.normals(points) if self.directional else None
+        if outward is not None:
+            return -outward
+        near = cKDTree(self.contacts.numpy()).query(points.numpy())[1]
+        return self.training.directions[torch.from_numpy(near)]
 
     @cached_property
     def _coefficients(self) -> list[Float64[Tensor, "_basis contacts series"]]:

@@ -1,20 +1,25 @@
-"""Kernel families that know positions and directions alone: unstructured, smooth, thin plate."""
+"""Kernel families without a body: unstructured, smooth and thin plate from positions, and visual from features."""
 
 from functools import cached_property
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from avmsf.field.gains.family import KernelFamily, Sites, scaled, squared_exponential
+from avmsf.scene.points import nearest_points
 
 LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Lengths of the smooth kernels over the object's size, the diagonal of the box around it."""
 AFFINE_SHARES = (0.5, 0.9)
-"""Shares of an affine function of the position beside a smooth one."""
+"""Shares of an affine function of the position in its sum with a smooth one."""
 DRIFT_SHARES = (0.3, 0.7, 0.95)
 """Shares of the thin plate's affine part."""
+FEATURE_LENGTHS = (0.25, 0.5, 1.0)
+"""Lengths of the visual kernels over the root mean square distance between the features of points."""
+VISUAL_LENGTHS = (0.2, 0.4, 0.8)
+"""Lengths over the object's size of the positions' kernels that multiply the visual ones."""
 _ROUNDING = 1e-6
 """Distance over the object's size up to which float32 and a change of scale may move a point."""
 _FLAT = 1e-3
@@ -152,3 +157,43 @@ class Axes:
     def standardized(self, points: Float64[Tensor, "sites 3"]) -> Float64[Tensor, "sites dim"]:
         """Return points along the axes, of mean square one over the contacts along each."""
         return self.along(points) / self._deviation
+
+
+class Visual(KernelFamily):
+    """Squared exponential kernels in the distance between features, by themselves and times those of positions.
+
+    An impact has the features of the nearest point of the object.
+    """
+
+    kind: ClassVar[str] = "visual"
+
+    def __init__(
+        self,
+        reference: Sites,
+        size: float,
+        points: Float32[Tensor, "points 3"],
+        features: Float32[Tensor, "points dim"],
+    ) -> None:
+        """Set up from an object's points, metres, and their features, in any unit."""
+        super().__init__(reference, size)
+        self.points, self.features = points, features
+        spread = features.double().var(0, correction=0).sum()
+        self._unit = float((2.0 * spread).sqrt()) or 1.0
+        self._feature_lengths = torch.tensor(FEATURE_LENGTHS, dtype=torch.float64)
+        self._lengths = size * torch.tensor(VISUAL_LENGTHS, dtype=torch.float64)
+        shares = torch.eye(len(FEATURE_LENGTHS) * (1 + len(VISUAL_LENGTHS)), dtype=torch.float64)
+        self.shares = scaled(shares, self.diagonal(reference))
+
+    def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
+        """Return the features' kernels, then their products with each of the positions'."""
+        one, other = self._features_at(sites), self._features_at(others)
+        similar = squared_exponential(one, other, self._feature_lengths) * sites.cosine(others)
+        near = squared_exponential(sites.points, others.points, self._lengths)
+        return torch.cat([similar, (near[:, None] * similar).flatten(0, 1)])
+
+    def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
+        """Return ones."""
+        return torch.ones(len(FEATURE_LENGTHS) * (1 + len(VISUAL_LENGTHS)), len(sites), dtype=torch.float64)
+
+    def _features_at(self, sites: Sites) -> Float64[Tensor, "sites dim"]:
+        return self.features[nearest_points(self.points, sites.points)[:, 0]].double() / self._unit

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Complex128, Float, Float32, Float64, Int
 from torch import Tensor, nn
 
-from avmsf.field.gainfield import Gains
+from avmsf.field.gainfield import Gains, TrainableGains
 from avmsf.field.gains.model import MixtureGains
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.phase import turned_like
@@ -17,7 +17,7 @@ _STRENGTH = 0.1
 """Spectral loss that gains are worth which are off by one standard error each: about what it measures of them."""
 
 
-class RefinedGains(nn.Module):
+class RefinedGains(TrainableGains):
     """A gain model whose measured gains may move, each as far as its standard error allows.
 
     With the hypotheses' weights kept, the mean gains are linear in the measured ones. So the gain model is the prior of

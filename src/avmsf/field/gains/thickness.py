@@ -1,8 +1,9 @@
 """The thickness of an object's wall, found by the evidence of the gains of all modes.
 
 The log evidence of bodies with walls of different thickness is a function of the log thickness, which is computed where
-the next body says most: at the top of the parabola through the three thicknesses around the most probable one, or half
-way to the neighbor of a wide gap. The prior is uniform in the log thickness over the range that was computed.
+the next body says most: at the top of the parabola through the three thicknesses around the most probable one, half way
+to a likely neighbor, or a step below the thinnest where that is the most probable one. The prior is uniform in
+the log thickness over the range that was computed.
 """
 
 import math
@@ -17,7 +18,7 @@ from avmsf.simulate.nominal import NominalBody
 _RESOLUTION = 0.06
 """Difference of log thickness below which no body is computed between two: real walls vary by 3 to 5 %."""
 _MOST = 6
-"""Bodies computed at most."""
+"""Bodies computed at most, failures included."""
 _UNLIKELY = math.log(100.0)
 """Log evidence (nats) below the most probable body's, from which on a body is no hypothesis."""
 _DISCREPANCY = 0.15
@@ -47,18 +48,21 @@ def search_thickness(
     """Return the bodies that are not improbable, the most probable one first, and the posterior of the thickness.
 
     `evidence` has the log evidence of the gains with each body by itself, nats. `with_wall` computes a body with a wall
-    of a thickness in meters, None where that fails. There is no posterior where a body without a wall is the most
-    probable one, or where fewer than two thicknesses are known.
+    of a thickness in meters, None where that fails, and another thickness is tried then. There is no posterior where a
+    body without a wall is the most probable one, or where fewer than two thicknesses are known.
     """
-    found = dict(zip(bodies, evidence(bodies), strict=True))
+    found, failed = dict(zip(bodies, evidence(bodies), strict=True)), list[float]()
     for _ in range(_MOST):
         walls = _walls(found)
         if len(walls) < 2 or max(found, key=found.__getitem__).wall is None:
             break
-        wall = _next(np.log([wall for wall, _ in walls]), np.array([each for _, each in walls]))
-        body = None if wall is None else with_wall(wall)
-        if body is None:
+        wall = _next(np.log([wall for wall, _ in walls]), np.array([each for _, each in walls]), np.log(failed))
+        if wall is None:
             break
+        body = with_wall(wall)
+        if body is None:
+            failed.append(wall)
+            continue
         [found[body]] = evidence([body])
     best = max(found, key=found.__getitem__)
     likely = sorted((body for body, each in found.items() if each > found[best] - _UNLIKELY), key=found.__getitem__)
@@ -71,7 +75,7 @@ def _walls(found: dict[NominalBody, float]) -> list[tuple[float, float]]:
     return sorted((body.wall, each) for body, each in found.items() if body.wall is not None)
 
 
-def _next(places: np.ndarray, values: np.ndarray) -> float | None:
+def _next(places: np.ndarray, values: np.ndarray, failed: np.ndarray) -> float | None:
     """Return the thickness to compute next, meters; None where all that are likely have near neighbors."""
     best = int(values.argmax())
     proposals = []
@@ -82,10 +86,14 @@ def _next(places: np.ndarray, values: np.ndarray) -> float | None:
             proposals.append(places[best] - 0.5 * slope / curve)
     # Half way to a neighbor, the likelier one first; on a parabola a quarter of the neighbor's fall is lost there.
     near = [row for row in (best - 1, best + 1) if 0 <= row < len(places)]
+    if best == 0:
+        # The first range is a guess below; above, the views or the object's width bound it.
+        proposals += [places[0] - part * (places[1] - places[0]) for part in (1.0, 0.5)]
     near = [row for row in near if values[best] - values[row] < 4.0 * _UNLIKELY]
     proposals += [0.5 * (places[best] + places[row]) for row in sorted(near, key=lambda row: -values[row])]
+    known = np.concatenate([places, failed])
     for each in proposals:
-        if places[0] < each < places[-1] and float(np.abs(places - each).min()) >= _RESOLUTION:
+        if float(np.abs(known - each).min()) >= _RESOLUTION:
             return math.exp(each)
     return None
 

@@ -157,6 +157,18 @@ async function showObject(studio, { atPress, struck }, library) {
     studio.view.look(up);
     at("upright").textContent = `Up: ${up}`;
   });
+  const { view } = studio;
+  const names = { gaussians: "Gaussians", mesh: "mesh", points: "points" };
+  const label = () => {
+    const { object, surface } = view.bundle.manifest;
+    at("other-look").hidden = !surface;
+    at("other-look").textContent = `Show ${view.source === "surface" ? names[object.kind] : "surface"}`;
+  };
+  studio.on("bundle", label);
+  at("other-look").addEventListener("click", async () => {
+    await attempt(() => view.showAs(view.source === "surface" ? "object" : "surface"), "view");
+    label();
+  });
   at("unpaint").addEventListener("click", () => {
     studio.choose(null);
     studio.paint(null);

@@ -67,29 +67,51 @@ export class ObjectView {
       );
     }
     const same = this.grid?.count === points.length / 3 && points.every((value, at) => value === this.grid.points[at]);
-    if (same && this.object?.file === bundle.manifest.object.file) {
+    const files = ({ object, surface }) => `${object.file} ${surface?.file}`;
+    if (this.bundle && same && files(this.bundle.manifest) === files(bundle.manifest)) {
       this.normals = bundle.tensors.normals;
       return;
     }
     this.grid = new PointGrid(points);
     this.spacing = this.grid.spacing;
     this.normals = bundle.tensors.normals;
-    const layer = await this.#layer(bundle);
+    const layers = { object: this.#layer(bundle, "object") };
+    await layers.object;
     if (this.layer) {
       this.scene.remove(this.layer.object);
-      this.layer.dispose();
+      for (const each of Object.values(this.layers)) (await each).dispose();
       // A new layer bears no paint, and a legend without paint would tell nothing.
-      this.painted = null;
+      this.layer = this.painted = null;
       document.getElementById("legend").hidden = true;
     }
-    this.layer = layer;
-    this.object = bundle.manifest.object;
-    this.scene.add(layer.object);
+    this.layers = layers;
+    this.bundle = bundle;
+    await this.showAs("object");
     this.look();
   }
 
-  async #layer(bundle) {
-    const { kind, file } = bundle.manifest.object;
+  /** Show the object as its own file has it, "object", or the "surface" that was reconstructed, in the same paint. */
+  async showAs(source) {
+    const { bundle, layers } = this;
+    layers[source] ??= this.#layer(bundle, source);
+    let layer;
+    try {
+      layer = await layers[source];
+    } catch (error) {
+      delete layers[source];
+      throw error;
+    }
+    if (this.bundle !== bundle) return;
+    if (this.layer) this.scene.remove(this.layer.object);
+    this.layer = layer;
+    this.source = source;
+    this.scene.add(layer.object);
+    layer.paint(this.painted?.colours ?? null);
+    this.redraw();
+  }
+
+  async #layer(bundle, source) {
+    const { kind, file } = bundle.manifest[source];
     if (kind === "points" || !file) return new PointLayer(this.grid, this.spacing);
     const answer = await fetch(bundle.url(file));
     if (!answer.ok) throw new ViewError(`The object's file ${file} cannot be read (${answer.status}).`);

@@ -1,4 +1,4 @@
-"""Which views have masks, and whereabouts their object is."""
+"""Which views have masks, and where their object is and how large."""
 
 import warnings
 from collections.abc import Sequence
@@ -19,28 +19,29 @@ def masked_views(views: Sequence[View]) -> list[View]:
     empty = [view.name for view in known if view.mask is not None and not bool((view.mask > 127).any())]
     if known and len(empty) == len(known):
         raise SceneError(
-            f"the masks of all {len(known)} views are background alone; expected the object in them: check that white "
+            f"expected the object in the masks, got background alone in all {len(known)} of them: check that white "
             "stands for the object, or leave the masks out and let the foreground be found"
         )
     if empty:
         warnings.warn(
-            f"the object is in no pixel of the masks of {', '.join(empty)}; these views are passed over",
+            f"the object is in no pixel of the masks of {', '.join(empty)}; these views are not used",
             CaptureWarning,
             stacklevel=3,
         )
     kept = [view for view in known if view.name not in empty]
     if len(kept) < 3:
         raise SceneError(
-            f"{len(kept)} of {len(views)} views have a mask; a visual hull takes 3 or more: give masks, images with "
+            f"expected 3 or more views with a mask, got {len(kept)} of {len(views)}: give masks, images with "
             "alpha or a plain background whose foreground can be found, or points to start from"
         )
     return kept
 
 
-def whereabouts(views: Sequence[View]) -> tuple[np.ndarray, float]:
-    """Return about where the object's middle is, and how far it reaches from there, meters.
+def object_extent(views: Sequence[View]) -> tuple[np.ndarray, float]:
+    """Return about where the object's middle is, [3] in the object frame, and how far it reaches from there, meters.
 
-    The place nearest to the lines of sight through the masks' middles, without those that miss it by far.
+    The middle is the point nearest to the lines of sight through the masks' middles; those that miss it by far have
+    little weight (iteratively reweighted least squares).
     """
     positions, directions, sizes = [], [], []
     for view in views:
@@ -58,7 +59,7 @@ def whereabouts(views: Sequence[View]) -> tuple[np.ndarray, float]:
     weight = np.ones(len(views))
     for _ in range(10):
         weighted = across * weight[:, None, None]
-        # A little pull towards the cameras' side of infinity keeps parallel lines of sight solvable.
+        # Parallel lines of sight leave one direction open, which the minimum norm solution sets to 0.
         middle = np.linalg.lstsq(weighted.sum(0), np.einsum("vij,vj->i", weighted, starts), rcond=1e-9)[0]
         missed = np.linalg.norm(np.einsum("vij,vj->vi", across, middle - starts), axis=1)
         weight = 1.0 / (missed + 1e-3 * np.median(np.linalg.norm(middle - starts, axis=1)))

@@ -27,7 +27,6 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from avmsf.fem.perturbation import Perturbations
-from avmsf.field.gains.family import Sites
 from avmsf.simulate.elastic import ElasticModes
 
 STIFFNESS, DENSITY, POISSON, FACTOR = 0.10, 0.04, 1.0, 0.5
@@ -65,7 +64,8 @@ class Matched:
 
 def update(
     modes: ElasticModes,
-    sites: Sites,
+    points: Float64[Tensor, "contacts 3"],
+    directions: Float64[Tensor, "contacts 3"],
     frequency: Float64[Tensor, " modes"],
     values: Float64[Tensor, "contacts modes"],
     usable: Bool[Tensor, " modes"],
@@ -73,13 +73,13 @@ def update(
 ) -> tuple[ElasticModes, float] | None:
     """Return the updated modes and the log evidence that they gain, or None where the nominal ones have the highest.
 
-    `modes` have `perturbations`; `frequency` (Hz) and `values` are those measured at `sites`, along each mode's common
-    phase; modes that are not `usable`, silent or doubled ones, say nothing of the body. `match` weighs a body, known at
-    least at the sites, against the other families.
+    `modes` have `perturbations`; `frequency` (Hz) and `values`, along each mode's common phase, are those measured for
+    impacts at `points` (metres) along `directions` (unit vectors); modes that are not `usable`, silent or doubled ones,
+    say nothing of the body. `match` weighs a body, known at least at the points, against the other families.
     """
     assert modes.perturbations is not None
-    local = modes.near(sites.points)
-    known = local.gains(sites.points, sites.directions).numpy()
+    local = modes.near(points)
+    known = local.gains(points, directions).numpy()
     measured = frequency[usable].numpy(), values[:, usable].numpy()
     problem = _Problem(modes.frequency.numpy(), modes.perturbations, known, *measured)
     theta, spread, best = np.zeros(len(problem.deviation)), _FREQUENCY[0], None

@@ -15,7 +15,7 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float64, Int
 from scipy.spatial import cKDTree
 
-from avmsf.simulate.closest import ClosestPoints
+from avmsf.geometry.closest import ClosestPoints
 
 HAMMER_DIAMETER = 0.01
 """Metres. A pencil has 7 mm, the head of the usual modal hammer (PCB 086C03) 16 mm and its tip 6 mm."""
@@ -50,18 +50,22 @@ class MeshAccess:
 
     def __call__(
         self, places: Float64[np.ndarray, "places 3"]
-    ) -> tuple[Bool[np.ndarray, " places"], Float64[np.ndarray, "places 3"]]:
-        """Return which places, metres, can be struck, and the points of the surface that are nearest to them."""
+    ) -> tuple[Bool[np.ndarray, " places"], Float64[np.ndarray, "places 3"], Float64[np.ndarray, "places 3"]]:
+        """Return which places, metres, can be struck, the surface's nearest points, and the hammer's axis there.
+
+        The axis is a unit vector away from the surface: of those that lie clear the one nearest to the normal.
+        """
         found = self._closest((places - self._middle) / self._size)
         feet = (self._triangles[found.rows] * found.weights[:, :, None]).sum(axis=1)
         normals = self._normals[found.rows]
         tips = feet + (self._radius + _GAP) * normals
         open_to = (found.distances <= MAX_DISTANCE) & (self._free(feet + _GAP * normals, normals) > self._radius)
-        reached = np.zeros(len(places), dtype=bool)
+        reached, used = np.zeros(len(places), dtype=bool), normals.copy()
         for axes in _axes(normals):
             left = np.flatnonzero(open_to & ~reached)
             reached[left] = self._clear(tips[left], axes[left])
-        return reached, feet * self._size + self._middle
+            used[left] = axes[left]
+        return reached, feet * self._size + self._middle, used
 
     @cached_property
     def _closest(self) -> ClosestPoints:
@@ -109,8 +113,8 @@ class PointAccess:
 
     def __call__(
         self, places: Float64[np.ndarray, "places 3"]
-    ) -> tuple[Bool[np.ndarray, " places"], Float64[np.ndarray, "places 3"]]:
-        """Return which places, metres, can be struck, and the places."""
+    ) -> tuple[Bool[np.ndarray, " places"], Float64[np.ndarray, "places 3"], None]:
+        """Return which places, metres, can be struck, the places, and no axes: a normal of a few points is rough."""
         normals = self._normals(places)
         reached = np.zeros(len(places), dtype=bool)
         for side in (normals, -normals):
@@ -120,7 +124,7 @@ class PointAccess:
             axes = np.stack(_axes(side), axis=1)
             for row in np.flatnonzero(above & ~reached):
                 reached[row] = self._clear(tips[row], axes[row]).any()
-        return reached, places
+        return reached, places, None
 
     def _clear(self, tip: Float64[np.ndarray, "3"], axes: Float64[np.ndarray, "axes 3"]) -> Bool[np.ndarray, " axes"]:
         offsets = self._points - tip

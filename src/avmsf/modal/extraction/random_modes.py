@@ -1,4 +1,4 @@
-"""Where a field starts that is told nothing of the object's modes: the paper's row without initialisation."""
+"""Random modes in place of extracted ones: the paper's row without initialisation."""
 
 import math
 
@@ -11,15 +11,15 @@ from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.finders import lowest_frequency
 from avmsf.modal.residual import Residual
 
-_HIGHEST = 0.9
+_MAX_FREQUENCY = 0.9
 """Highest frequency over half the sample rate."""
-_LEAST_QUALITY = 10.0
+_MIN_QUALITY = 10.0
 """Quality factor, pi f / d, of the fastest decay."""
 _NOISE = 0.01
 """Noise over the sounds' root mean square: 40 dB down."""
 
 
-def uninformed(train: Impacts, *, modes: int, bins: int, generator: torch.Generator) -> Extraction:
+def random_modes(train: Impacts, *, modes: int, bins: int, generator: torch.Generator) -> Extraction:
     """Return modes drawn at random in place of extracted ones, with flat noise of `bins` bands.
 
     Frequencies are spread evenly over their logarithm, from the lowest that the sounds' length allows (17 Hz in 3 s) to
@@ -32,13 +32,13 @@ def uninformed(train: Impacts, *, modes: int, bins: int, generator: torch.Genera
             f"{modes} modes and {bins} bands of noise were asked for; a field has at least 1 mode and 2 bands"
         )
     rate, samples = train.sample_rate, train.sounds.shape[1]
-    lowest, highest = lowest_frequency(samples, rate), _HIGHEST * rate / 2
+    lowest, highest = lowest_frequency(samples, rate), _MAX_FREQUENCY * rate / 2
     if lowest >= highest:
         raise FitError(f"sounds of {samples} samples are too short for modes; keep more seconds after the onset")
     chance = torch.rand(2, modes, dtype=torch.float64, generator=generator)
     frequency = torch.sort(lowest * (highest / lowest) ** chance[0]).values
     slowest = rate / samples
-    fastest = torch.clamp(math.pi * frequency / _LEAST_QUALITY, min=slowest)
+    fastest = torch.clamp(math.pi * frequency / _MIN_QUALITY, min=slowest)
     damping = slowest * (fastest / slowest) ** chance[1]
     power = float(train.sounds.double().square().mean())
     # A mode of gain one has the energy 1 / (4 d) over time, and so the mean power 1 / (4 d) over the duration.

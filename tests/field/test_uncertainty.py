@@ -9,10 +9,18 @@ from matplotlib.figure import Figure
 
 from avmsf.bench.doubtpictures import draw_band, draw_doubt
 from avmsf.errors import FitError
-from avmsf.field.doubt import coverage, gain_doubt, spectrum_band
 from avmsf.field.gains.model import MixtureGains
-from avmsf.field.posterior import fitted_mixture, has_posterior, std_of, training_contacts, unedited_mixture
 from avmsf.field.scaledgains import ScaledGains
+from avmsf.field.uncertainty import (
+    coverage,
+    fitted_mixture,
+    has_posterior,
+    relative_gain_std,
+    spectrum_band,
+    std_of,
+    training_contacts,
+    unedited_mixture,
+)
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.tasks.locator import Locator
@@ -111,10 +119,10 @@ def test_doubt_grows_away_from_contacts_and_has_no_unit(made: type) -> None:
     contacts = contacts[contacts[:, 0] < 0.4 * LENGTH]
     values = drawn_gains(contacts, seed=6)
     points = bar_points()
-    doubt = gain_doubt(sound_field(made(contacts, values)), points)
+    doubt = relative_gain_std(sound_field(made(contacts, values)), points)
     near, far = doubt[points[:, 0] < 0.3 * LENGTH].mean(), doubt[points[:, 0] > 0.8 * LENGTH].mean()
     assert float(far) > 2.0 * float(near)
-    louder = gain_doubt(sound_field(made(contacts, 7.0 * values)), points)
+    louder = relative_gain_std(sound_field(made(contacts, 7.0 * values)), points)
     assert torch.allclose(louder, doubt, rtol=1e-4, atol=1e-6)
 
 
@@ -164,7 +172,7 @@ def test_an_edited_field_is_as_sure_of_itself_as_before(made: type) -> None:
     points, same = bar_points()[::5], retune(field)
     assert has_posterior(same)
     assert fitted_mixture(same) is field.gain_field
-    assert torch.equal(gain_doubt(same, points), gain_doubt(field, points))
+    assert torch.equal(relative_gain_std(same, points), relative_gain_std(field, points))
     assert torch.equal(spectrum_band(same, others[0]).upper_db, spectrum_band(field, others[0]).upper_db)
     maps = [Locator.of(each, points=points).locate(field.render(others[:1])[0]) for each in (field, same)]
     assert torch.equal(maps[0].probability, maps[1].probability)
@@ -187,7 +195,7 @@ def test_modes_that_an_edit_has_silenced_are_in_no_doubt() -> None:
     above = retune(field, pitch=[1.0, 1.0, 4.0, 4.0])
     mute = retune(field, gains_db=[0.0, 0.0, -math.inf, -math.inf])
     points = bar_points()[::5]
-    assert torch.equal(gain_doubt(above, points), gain_doubt(mute, points))
+    assert torch.equal(relative_gain_std(above, points), relative_gain_std(mute, points))
     torch.testing.assert_close(
         spectrum_band(above, points[3]).upper_db, spectrum_band(mute, points[3]).upper_db, rtol=0, atol=1e-9
     )
@@ -208,7 +216,7 @@ def test_pictures_are_drawn_of_solids_and_of_sheets() -> None:
     contacts = bar_contacts(8)
     field = sound_field(elastic_field(contacts, drawn_gains(contacts, seed=9)))
     points = bar_points()
-    doubt = gain_doubt(field, points)
+    doubt = relative_gain_std(field, points)
     sheet = draw_doubt(points, doubt, title="bar", struck=contacts, suggested=contacts[:2])
     assert len(sheet.axes) == 2  # the sheet and its colours
     bent = points + torch.tensor([0.0, 0.0, 1.0]) * points[:, :1].square()

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from avmsf.fem.perturbation import smooth_fields
+from avmsf.fem.updating import DENSITY, STIFFNESS, Matched, update
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, matched
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.positional import Smooth, Unstructured
-from avmsf.field.gains.updating import DENSITY, STIFFNESS, Matched, update
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.elements import SecondOrder, elements_of
@@ -60,7 +60,8 @@ def updated(true: ElasticModes) -> tuple[ElasticModes, float] | None:
         WeighedFamily.of(family, measured, NOISE_SHARES) for family in (Unstructured(known, size), Smooth(known, size))
     ]
     return update(
-        nominal(), known, measured.frequency, values + noise[0], measured.informative[:MODES],
+        nominal(), known.points, known.directions, measured.frequency, values + noise[0],
+        measured.informative[:MODES],
         lambda modes: matched(others, Elastic(known, size, modes), measured),
     )  # fmt: skip
 
@@ -105,6 +106,6 @@ def test_silent_and_doubled_modes_say_nothing_of_the_body():
     def match(modes: ElasticModes) -> Matched:
         return matched([family], Elastic(known, 0.24, modes), measured)
 
-    found = update(nominal(), known, frequency, twice, usable, match)
+    found = update(nominal(), known.points, known.directions, frequency, twice, usable, match)
     assert found is not None
     assert bool(torch.isfinite(found[0].shapes).all())

@@ -1,0 +1,221 @@
+"""The posterior of a field's gains: over the object, in a sound's spectrum, and against measured gains.
+
+All functions take edited fields as well as fitted ones.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from statistics import NormalDist
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from avmsf.errors import FitError
+from avmsf.field.gains.model import MixtureGains
+from avmsf.field.scaledgains import ScaledGains, fitted_gains
+from avmsf.field.soundfield import SoundField
+from avmsf.modal.phase import turned_like
+from avmsf.modal.synthesis import synthesise_phased
+
+LEVEL = 0.9
+"""Default probability of credible intervals."""
+_MAPPED = 1000
+"""Points that the mean over the surface is taken over, at most."""
+_DRAWS = 200
+"""Sounds that a band is drawn from."""
+_BANDS = 400
+"""Bands of a spectrum, evenly spaced up to half the sample rate."""
+_BATCH = 16
+"""Modes whose spectra are made at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class SpectrumBand:
+    """Credible intervals of the spectrum of the sound of one impact."""
+
+    frequencies: Float64[Tensor, " bands"]
+    """Middles of the bands, Hz."""
+    lower_db: Float64[Tensor, " bands"]
+    """Lower end of the interval of each band's level, dB over the loudest band's median."""
+    middle_db: Float64[Tensor, " bands"]
+    """Median level."""
+    upper_db: Float64[Tensor, " bands"]
+    """Upper end of the interval."""
+    level: float
+    """Probability of the interval of each band."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How many measured gains lie within their credible intervals."""
+
+    plain: float
+    """Part of the gains, each counted alike."""
+    by_energy: float
+    """The same, each counted by its mode's energy."""
+
+
+def has_posterior(field: SoundField) -> bool:
+    """Return whether the uncertainty of the field's gains is known."""
+    try:
+        fitted_mixture(field)
+    except FitError:
+        return False
+    return True
+
+
+def unedited_mixture(field: SoundField) -> MixtureGains:
+    """Return the field's gain model, to plan measurements for. Raises as `fitted_mixture`, and for an edited field."""
+    if isinstance(field.gain_field, ScaledGains):
+        raise FitError("expected a fitted field, got an edited one, which nobody can record: ask the unedited field")
+    return fitted_mixture(field)
+
+
+def fitted_mixture(field: SoundField) -> MixtureGains:
+    """Return the gain model that the field was fitted with, beneath its edits.
+
+    Raises FitError where its uncertainty is not known: for the attention network, and for contacts in a single place.
+    """
+    gains = fitted_gains(field.gain_field)
+    if not isinstance(gains, MixtureGains):
+        raise FitError(
+            f"expected gains of the kind {MixtureGains.kind!r}, got {gains.kind!r}: fit with --gain-model auto"
+        )
+    if gains.place_count < 2:
+        raise FitError("expected gains from 2 places or more, got 1: record impacts in a second place")
+    return gains
+
+
+def scale_of(field: SoundField) -> Float64[Tensor, " modes"]:
+    """Return the field's gains over the fitted ones: 1, or what an edit has made of each mode."""
+    gains = field.gain_field
+    return gains.scale if isinstance(gains, ScaledGains) else torch.ones(len(field.bank), dtype=torch.float64)
+
+
+def training_contacts(field: SoundField) -> Float64[Tensor, "contacts 3"]:
+    """Return the contacts that the gains were fitted to, metres, on the object as it is. Raises as `fitted_mixture`."""
+    fitted, gains = fitted_mixture(field), field.gain_field
+    return gains.contacts.double() if isinstance(gains, ScaledGains) else fitted.contacts
+
+
+def std_of(
+    field: SoundField, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+) -> Float64[Tensor, "contacts modes 2"]:
+    """Return the posterior standard deviation of both parts of the gains. Raises as `fitted_mixture`."""
+    fitted_mixture(field)
+    deviation = field.gain_field.deviation(contacts, directions)
+    assert deviation is not None
+    return deviation.double()
+
+
+def energy_of(field: SoundField, gains: Float[Tensor, "contacts modes 2"]) -> Float64[Tensor, " contacts"]:
+    """Return the energy of gains in two parts: the sum over audible modes of squares over four times the damping."""
+    return (gains.double().square().sum(2) * field.audible / (4.0 * field.bank.damping.double())).sum(1)
+
+
+def parts_of(
+    field: SoundField, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+) -> Float64[Tensor, "contacts modes 2"]:
+    """Return both parts of the mean gains."""
+    return field.known(contacts, directions=directions).parts
+
+
+def relative_gain_std(field: SoundField, points: Float[Tensor, "points 3"]) -> Float64[Tensor, " points"]:
+    """Return the standard deviation of the gains at points (metres) over their root mean square on the object.
+
+    Both as energy over all modes: 0 is certainty; places that may be louder than the mean can have more than 1. Raises
+    as `fitted_mixture`.
+    """
+    surface = field.gain_field.points
+    step = max(1, len(surface) // _MAPPED)
+    energy = energy_of(field, parts_of(field, surface[::step])).mean()
+    variance = energy_of(field, std_of(field, points))
+    return (variance / energy.clamp_min(torch.finfo(torch.float64).tiny)).sqrt()
+
+
+def spectrum_band(
+    field: SoundField,
+    contact: Float[Tensor, " 3"],
+    *,
+    direction: Float[Tensor, " 3"] | None = None,
+    level: float = LEVEL,
+    seed: int = 0,
+) -> SpectrumBand:
+    """Return the interval of probability `level` of each band of the spectrum of an impact's sound.
+
+    By drawing sounds: gains from their posterior, and the noise's mean energy added. `contact` in metres, `direction`
+    as in `SoundField.render`, `seed` for the draws. Raises as `fitted_mixture`, and FitError for a level that is not
+    between 0 and 1.
+    """
+    _expect_level(level)
+    contacts, along = contact[None], None if direction is None else direction[None]
+    mean, spread = parts_of(field, contacts, along)[0], std_of(field, contacts, along)[0]
+    generator = torch.Generator().manual_seed(seed)
+    drawn = mean + spread * torch.randn(_DRAWS, *mean.shape, generator=generator, dtype=torch.float64)
+    spectra = torch.zeros(_DRAWS, field.samples // 2 + 1, dtype=torch.complex128)
+    for modes in torch.split(torch.nonzero(field.audible).flatten(), _BATCH):
+        spectra += torch.einsum("amd,mdf->af", drawn[:, modes].to(spectra), _spectra(field, modes))
+    place = torch.linspace(0, len(field.residual.magnitude) - 1, spectra.shape[1])
+    left = place.floor().long().clamp_max(len(field.residual.magnitude) - 2)
+    noise = torch.lerp(field.residual.magnitude[left], field.residual.magnitude[left + 1], place - left)
+    power = spectra.abs().square() + field.samples * noise.double().square()
+    edges = torch.linspace(0, power.shape[1], min(_BANDS, power.shape[1]) + 1).round().long()
+    bands = torch.stack([power[:, first:last].mean(1) for first, last in pairwise(edges.tolist())], dim=1)
+    tail = (1.0 - level) / 2.0
+    ordered = torch.quantile(bands, torch.tensor([tail, 0.5, 1.0 - tail], dtype=torch.float64), dim=0)
+    tiny = torch.finfo(torch.float64).tiny
+    lower, middle, upper = 10.0 * torch.log10((ordered / ordered[1].max().clamp_min(tiny)).clamp_min(tiny))
+    middles = (edges[:-1] + edges[1:] - 1).double() / 2.0 * field.sample_rate / field.samples
+    return SpectrumBand(middles, lower, middle, upper, level)
+
+
+def coverage(
+    field: SoundField,
+    contacts: Float[Tensor, "contacts 3"],
+    parts: Float64[Tensor, "contacts modes 2"],
+    *,
+    directions: Float[Tensor, "contacts 3"] | None = None,
+    level: float = LEVEL,
+) -> Coverage:
+    """Return which part of the gains measured at other contacts lies in the interval of this level.
+
+    `parts` as `GainCase.parts`: amplitudes along each of the field's modes' phases and a quarter of a period ahead, of
+    each mode up to a phase that all contacts share, of each contact up to their common sign where the field knows no
+    directions of impacts. The interval is normal, with the posterior standard deviation of a measured gain, so it holds
+    the scatter of an impact as well. Raises as `fitted_mixture`, and FitError for gains of other modes.
+    """
+    _expect_level(level)
+    gains, scale = fitted_mixture(field), scale_of(field).square()[:, None]
+    if parts.shape != (len(contacts), len(field.bank), 2):
+        raise FitError(
+            f"gains are of shape {tuple(parts.shape)}: expected {len(contacts)} contacts, the field's "
+            f"{len(field.bank)} modes and 2 parts"
+        )
+    deviation = std_of(field, contacts, directions)
+    spread = (deviation.square() + scale * gains.noise().square()).sqrt()
+    predicted = parts_of(field, contacts, directions)
+    parts = turned_like(parts, predicted)
+    within = (parts - predicted).abs() <= NormalDist().inv_cdf(0.5 + level / 2.0) * spread
+    energy = (
+        scale * torch.view_as_real(gains.values).square().mean(0) / (4.0 * field.bank.damping.double())[:, None]
+    ).expand_as(parts)
+    return Coverage(float(within.double().mean()), float((within * energy).sum() / energy.sum()))
+
+
+def _spectra(field: SoundField, modes: Tensor) -> Tensor:
+    """Return the spectrum of each mode by itself, [modes, 2, frequencies], of a gain of one in either part."""
+    one = torch.eye(len(modes), dtype=torch.float64)
+    sounds = [
+        synthesise_phased(
+            first, field.bank.frequency[modes], field.bank.damping[modes], field.phase[modes],
+            samples=field.samples, sample_rate=field.sample_rate, quadrature=second,
+        )
+        for first, second in ((one, torch.zeros_like(one)), (torch.zeros_like(one), one))
+    ]  # fmt: skip
+    return torch.fft.rfft(torch.stack(sounds, dim=1))
+
+
+def _expect_level(level: float) -> None:
+    if not 0.0 < level < 1.0:
+        raise FitError(f"level = {level:g}: expected a probability between 0 and 1, as .9")

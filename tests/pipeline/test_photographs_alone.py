@@ -1,0 +1,71 @@
+"""A field from photographs and impacts alone: its shape becomes bodies, and its wall's thickness reaches the report."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from avmsf.capture import read_surface
+from avmsf.capture.views.write import write_views
+from avmsf.cli import main
+from avmsf.cli.fit import summary
+from avmsf.field.gains.elastic import Elastic
+from avmsf.field.store import load
+from avmsf.geometry.closest import ClosestPoints
+from avmsf.pipeline.reconstruct import CACHE, SURFACE
+from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
+from plate_capture import TINY, fill_plate
+from small_scene import SMALL_SPLAT, slab_views
+
+Streams = pytest.CaptureFixture[str]
+SMALL = (
+    *SMALL_SPLAT,
+    *("--lift.encoder", "descriptors", "--lift.points", "600", "--modes", "12"),
+    *(f"--fit.{word[2:]}" if word.startswith("--") else word for word in TINY[:-2]),
+)
+
+
+@pytest.fixture(scope="module")
+def slab(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a capture folder with photographs of the slab and impacts on it."""
+    folder = fill_plate(tmp_path_factory.mktemp("photographs") / "slab", surface=False)
+    write_views(slab_views(), folder / "views")
+    for each in (folder / "views").iterdir():
+        each.rename(folder / each.name)
+    return folder
+
+
+@pytest.mark.slow
+def test_photographs_alone_give_elastic_mode_shapes(slab: Path, capsys: Streams) -> None:
+    bodies = ("--body.wall", "0", "--body.shapes", "12", "--body.freedoms", "3000", "--body.supports", "free")
+    assert main(["reconstruct", str(slab), *SMALL, *bodies, "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    report = made["report"]
+    assert Elastic.kind not in report["missing"]
+    assert report["bodies"][0]["body"].startswith("filled")
+    assert report["bodies"][0]["weight"] > 0
+    assert main(["reconstruct", str(slab), *SMALL, *bodies, "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert [each["stage"] for each in again["stages"]] == ["views", "cloud", "features", "surface", "modes", "fit"]
+    assert not any(each["fresh"] for each in again["stages"])
+
+
+@pytest.mark.slow
+def test_the_thickness_of_a_wall_reaches_the_report_and_the_summary(tmp_path: Path, capsys: Streams) -> None:
+    folder = tmp_path / "mug"
+    shutil.copytree(EXAMPLE_FOLDER, folder)
+    words = ["--splat.steps", "200", "--lift.encoder", "descriptors", "--fit.steps", "2", "--train-count", "12"]
+    assert main(["reconstruct", str(folder), *words, "--body.shapes", "40", "--body.supports", "free", "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    found = made["report"]["thickness"]
+    assert found["low"] < found["median"] < found["high"]
+    assert found["median"] == pytest.approx(EXAMPLE.thickness, rel=0.4)
+    field = load(made["field"])
+    assert field.origin.report["thickness"] == found
+    interval = f"{1000 * found['low']:.2g} to {1000 * found['high']:.2g} mm"
+    assert interval in summary(field, 12)
+    # Gaussians lie below the surface; the field's points are on it.
+    surface = read_surface(folder / CACHE / SURFACE)
+    nearest = ClosestPoints(surface.vertices.double().numpy()[surface.faces.numpy()])
+    assert nearest(field.gain_field.points.double().numpy()).distances.max() < 1e-6
