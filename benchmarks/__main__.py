@@ -70,8 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--sim-20",
         type=Path,
         metavar="FOLDER",
-        help="baselines, residual, surface: objects that `avmsf simulate sim-20` has made; surface needs it, and without "
-        "it the others simulate them again",
+        help="baselines, residual, surface: objects that `avmsf simulate sim-20` has made; without it baselines and "
+        "residual simulate them again",
     )
     parser.add_argument(
         "--clouds",
