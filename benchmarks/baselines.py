@@ -1,4 +1,4 @@
-"""DiffSound: what it recovers of bodies that sound as it assumes, and its errors with fewer and fewer impacts."""
+"""DiffSound: what it recovers of bodies that sound as it assumes, its errors by training impacts, and where it locates."""
 
 import math
 import tempfile

@@ -49,7 +49,7 @@ def struck() -> Impacts:
 def tiny(method: Method) -> Method:
     """Return a method of the same kind that is fitted in a moment."""
     if isinstance(method, DiffSoundMethod):
-        return replace(method, config=DiffSoundConfig(transport_steps=1, difference_steps=2, scan=False))
+        return replace(method, config=DiffSoundConfig(transport_steps=1, difference_steps=2, search=0))
     if isinstance(method, GridField):
         return replace(method, base=TINY, grid=Grid((4, 8), (1e-2,), (2,), (1.0,), ("shared",)))
     if isinstance(method, MixtureField):

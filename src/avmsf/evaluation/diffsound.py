@@ -13,6 +13,7 @@ the object's vibration modes" and add their learned residual noise, as here.
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -103,9 +104,16 @@ def fit_diffsound(
 
     Raises EvaluationError as `clip_spectra`, `DampingCurve.of` and `fit_material` do.
     """
-    curve = DampingCurve.of(extraction.bank)
-    fit = fit_material(clip_spectra(train), curve, family, config)
-    return leveled(fit, curve, train, extraction.residual, weighted=weighted)
+    return leveled(
+        _fitted(train, family, extraction, config), DampingCurve.of(extraction.bank), train, extraction.residual,
+        weighted=weighted,
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=1)
+def _fitted(train: Impacts, family: BodyFamily, extraction: Extraction, config: DiffSoundConfig | None) -> MaterialFit:
+    """Return the material; of the same objects as the last time, as with and without weights, without a new fit."""
+    return fit_material(clip_spectra(train), DampingCurve.of(extraction.bank), family, config)
 
 
 def leveled(fit: MaterialFit, curve: DampingCurve, train: Impacts, residual: Residual, *, weighted: bool) -> DiffSound:
