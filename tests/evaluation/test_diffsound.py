@@ -195,11 +195,11 @@ def test_weights_make_training_spectra_no_worse_and_find_the_strengths_of_modes(
         return float((renderer.gains(CONTACTS).abs() @ parts - recorded).square().sum())
 
     assert misfit(weighted) <= misfit(plain)
-    strength = torch.linspace(1.0, 3.0, 12, dtype=torch.float64)
-    ratio = weighted.weight / strength
+    moving = plain.gains(CONTACTS).abs().amax(dim=0)
+    moving = moving > 0.05 * moving.max()
+    ratio = (weighted.weight / torch.linspace(1.0, 3.0, 12, dtype=torch.float64))[moving]
     # Where spectra of modes overlap, magnitudes do not add up.
-    alike = (ratio / ratio.median() - 1.0).abs() < 0.1
-    assert int(alike.sum()) >= 8
+    torch.testing.assert_close(ratio / ratio.median(), torch.ones_like(ratio), rtol=0.15, atol=0.0)
 
 
 def test_a_rendered_sound_is_located_where_it_was_struck():
