@@ -221,7 +221,9 @@ def _figures(part: str, records: _Records) -> dict[str, float]:
 
 def _errors(part: str, records: _Records) -> tuple[Table, ...]:
     figures = _figures(part, records)
-    rows = [[key, value, figures[f"{key}.relative_stft"]] for key, value in figures.items() if not key.endswith("stft")]
+    rows: list[list[str | float]] = [
+        [key, value, figures[f"{key}.relative_stft"]] for key, value in figures.items() if not key.endswith("stft")
+    ]
     return (Table(f"{part}: means over objects", ("method", "L1", "relative STFT error"), rows),)
 
 
