@@ -48,7 +48,7 @@ OWN = (("blob-polycarbonate", 1.0), ("dish-ceramic", 1.13), ("pot-steel", 1.13))
 STIFFER, POISSON = 1.37, 0.27
 """The true material: so much stiffer than the table's, and its Poisson's ratio."""
 FEW = ("mug-ceramic", "blob-polycarbonate", "bowl-glass")
-"""Objects of curves over impacts, and of locating: a filled mesh with a handle, a lump, and a wall."""
+"""Objects of curves over impacts, and of locating; all are filled: a handle, a lump, and a foot that prisms miss."""
 MORE = (*FEW, "spoon-wood", "bracket-steel", "dish-ceramic")
 METHODS = ("knn3", "diffsound", "diffsound-weighted")
 LOCATING = ("random", "nearest", "cosine", "diffsound")

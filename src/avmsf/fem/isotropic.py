@@ -61,10 +61,6 @@ class IsotropicModes:
         """Return the squared angular frequencies for E / rho = 1 m2/s2, ascending; differentiable in `poisson`."""
         return torch.linalg.eigvalsh(self._stiffness(poisson))[: self.count]
 
-    def frequencies(self, stiffness: Float[Tensor, ""], poisson: Float[Tensor, ""]) -> Float64[Tensor, " modes"]:
-        """Return the undamped natural frequencies, Hz, for `stiffness` = E / rho, m2/s2; differentiable in both."""
-        return (stiffness * self.squares(poisson)).sqrt() / (2.0 * math.pi)
-
     def modes(self, material: Material) -> ElasticModes:
         """Return the modes of the body made of a material."""
         squares, mixed = torch.linalg.eigh(self._stiffness(torch.tensor(material.poisson, dtype=torch.float64)))
