@@ -12,6 +12,7 @@ from avmsf.errors import AvmsfError
 from avmsf.simulate.sim20 import SIM20
 from benchmarks import (
     align,
+    baselines,
     extract,
     field,
     gains,
@@ -32,6 +33,7 @@ from benchmarks.report import Options, show
 
 BENCHMARKS: dict[str, ModuleType] = {
     "align": align,
+    "baselines": baselines,
     "field": field,
     "gains": gains,
     "extract": extract,
@@ -69,8 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--sim-20",
         type=Path,
         metavar="FOLDER",
-        help="gains, residual, surface: objects that `avmsf simulate sim-20` has made; surface and the photographs of "
-        "gains need it, the others simulate them again without it",
+        help="baselines, gains, residual, surface: objects that `avmsf simulate sim-20` has made; surface and the "
+        "photographs of gains need it, the others simulate them again without it",
     )
     parser.add_argument(
         "--objects", nargs="+", default=(), choices=tuple(SIM20), metavar="NAME", help="gains: some of these objects"

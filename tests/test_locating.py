@@ -18,7 +18,8 @@ from avmsf.bench.locatingbaselines import NearestSpectrum, random_distance
 from avmsf.bench.locatingimages import Images, symmetries_of
 from avmsf.bench.pictures import save_picture
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError
+from avmsf.errors import EvaluationError, LocationError
+from avmsf.evaluation.diffsound_locator import DiffSoundLocator
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise
@@ -212,6 +213,35 @@ def test_what_the_locator_refuses_counts_as_chance_and_says_why() -> None:
     assert posterior.refusal is not None
     assert "noise" in posterior.refusal
     assert "covered" not in judged.figures("posterior")
+
+
+class Simulated(DiffSoundLocator):
+    """Places every sound at one point, and refuses silence."""
+
+    def __init__(self) -> None:
+        object.__setattr__(self, "points", PLACE[None])
+
+    def place(self, sound: Tensor) -> Tensor:
+        if not bool(sound.any()):
+            raise LocationError("silent")
+        return self.points[0]
+
+
+def test_diffsound_is_judged_where_its_locator_is_given() -> None:
+    quiet = strikes().sounds.clone()
+    quiet[1] = 0.0
+    test = replace(strikes(), sounds=quiet)
+    judged = judge_locating(
+        locator(), strikes(), test, name="plate", methods=("random", "diffsound"), diffsound=Simulated()
+    )
+    rows = {row.recording: row for row in judged.rows if row.method == "diffsound"}
+    chance = {row.recording: row.rmed for row in judged.rows if row.method == "random"}
+    for row, (name, contact) in enumerate(zip(strikes().names, strikes().contacts.double(), strict=True)):
+        apart = float((contact - PLACE).norm()) / judged.diagonal
+        assert rows[name].rmed == pytest.approx(chance[name] if row == 1 else apart)
+        assert rows[name].refusal == ("silent" if row == 1 else None)
+    with pytest.raises(EvaluationError):
+        judge_locating(locator(), strikes(), strikes(), name="plate", methods=("diffsound",))
 
 
 def test_rows_are_written_with_all_that_decided_them(tmp_path: Path) -> None:

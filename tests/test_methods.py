@@ -10,6 +10,7 @@ import pytest
 import soundfile
 import torch
 
+from avmsf.bench.diffsoundmethod import DiffSoundMethod
 from avmsf.bench.evaluation import split
 from avmsf.bench.fieldmethods import FieldMethod, MixtureField, UninformedField
 from avmsf.bench.gridfield import PAPER_GRID, Grid, GridField
@@ -19,6 +20,9 @@ from avmsf.bench.task import Method, Task
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import Surface
 from avmsf.errors import EvaluationError, FitError, SceneError
+from avmsf.evaluation.material_fit import DiffSoundConfig
+from avmsf.fem.family import BodyFamily
+from avmsf.fem.isotropic import isotropic_modes
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.recipes import Attention
@@ -27,6 +31,7 @@ from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.random_modes import random_modes
 from avmsf.modal.synthesis import synthesise
 from avmsf.scene.features import FeatureField
+from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
 from avmsf.simulate.nominal import NOMINAL, NominalBodies, NominalBody
 from avmsf.simulate.shell import shell
@@ -43,6 +48,8 @@ def struck() -> Impacts:
 
 def tiny(method: Method) -> Method:
     """Return a method of the same kind that is fitted in a moment."""
+    if isinstance(method, DiffSoundMethod):
+        return replace(method, config=DiffSoundConfig(transport_steps=1, difference_steps=2, search=0))
     if isinstance(method, GridField):
         return replace(method, base=TINY, grid=Grid((4, 8), (1e-2,), (2,), (1.0,), ("shared",)))
     if isinstance(method, MixtureField):
@@ -65,6 +72,13 @@ def plate_bodies() -> CandidateBodies:
     return CandidateBodies(NominalBodies((NominalBody(PLATE.thickness, elastic_modes(solid, NOMINAL, count=12)),), {}))
 
 
+@cache
+def plate_family() -> BodyFamily:
+    """Return the plate as a filled body."""
+    solid = block((PLATE.length, PLATE.width, PLATE.thickness), (6, 5, 1))
+    return BodyFamily((isotropic_modes(solid, count=8),), ())
+
+
 def plate_task(train: Impacts, *, impacts: Impacts | None = None, seed: int = 0) -> Task:
     known = struck() if impacts is None else impacts
     return Task(
@@ -77,6 +91,7 @@ def plate_task(train: Impacts, *, impacts: Impacts | None = None, seed: int = 0)
         features=lambda look: plate_features(200),
         bodies=plate_bodies,
         stranger=lambda: torch.linspace(-1, 1, SAMPLES),
+        family=plate_family,
     )
 
 
@@ -355,8 +370,8 @@ def test_unknown_names_are_refused_with_the_known_ones(tmp_path):
         EvaluationError, match=r"'spline-gain': there are white-noise, .*recorded:FOLDER; did you mean "
     ):
         method_named("spline-gain")
-    with pytest.raises(EvaluationError, match=r"no method is called 'diffsound': there are .*field-grid"):
-        method_named("diffsound")
+    with pytest.raises(EvaluationError, match=r"no method is called 'sonicgauss': there are .*field-grid"):
+        method_named("sonicgauss")
     for name in ("recorded:", f"recorded:{tmp_path}/none"):
         with pytest.raises(EvaluationError, match="expected a folder after `recorded:`"):
             method_named(name)

@@ -20,6 +20,7 @@ from avmsf.bench.results import CaseRecord, Outcome, one_line
 from avmsf.bench.task import Look, Method, Task
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, ExtractionError
+from avmsf.fem.family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.scene.features import FeatureField
@@ -46,6 +47,8 @@ class CaseRun:
         place: str,
         look: Callable[[Look], FeatureField],
         bodies: Callable[[], CandidateBodies | AvmsfError],
+        family: Callable[[], BodyFamily | AvmsfError],
+        material: str | None,
         stranger: Callable[[], Float[Tensor, " samples"]],
         listened: bool,
     ) -> None:
@@ -54,7 +57,7 @@ class CaseRun:
         self.train, self.test = impacts.take(case.train), impacts.take(case.test)
         self.truth = None if truth is None else truth_at(truth, self.test.names)
         self.folder, self.place, self.look, self.stranger = folder, place, look, stranger
-        self.bodies = bodies
+        self.bodies, self.family, self.material = bodies, family, material
         self.listened = spread(len(case.test), LISTENED) if listened else []
         self.shared = 0.0
         self.found: Extraction | None = None
@@ -105,6 +108,8 @@ class CaseRun:
             features=self._features,
             bodies=self._bodies,
             stranger=self._stranger,
+            family=self._family,
+            material=self.material,
         )
 
     def _modes(self) -> Extraction:
@@ -132,6 +137,13 @@ class CaseRun:
     def _bodies(self) -> CandidateBodies:
         with self._sharing():
             found = self.bodies()
+        if isinstance(found, AvmsfError):
+            raise found
+        return found
+
+    def _family(self) -> BodyFamily:
+        with self._sharing():
+            found = self.family()
         if isinstance(found, AvmsfError):
             raise found
         return found

@@ -7,6 +7,8 @@ may sound the same at all of them. The methods:
 - `random`: a point drawn evenly from the object's, and of it no draw but the expected error;
 - `nearest`: the contact of the training recording whose spectrum is most like the sound's;
 - `cosine`: the point whose gains have the least cosine distance from the sound's (the paper);
+- `diffsound`: the point whose gains, simulated by DiffSound, have the least cosine distance from the sound's; where its
+  locator is given;
 - `posterior`: the likeliest place by all that is known of noise and doubt, with the region that holds the truth with a
   stated probability.
 
@@ -28,10 +30,12 @@ from avmsf.bench.locatingimages import Images
 from avmsf.bench.results import write_json
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError
+from avmsf.evaluation.diffsound_locator import DiffSoundLocator
 from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locator import Locator
 
 METHODS = ("random", "nearest", "cosine", "posterior")
+DIFFSOUND = "diffsound"
 LEVEL = 0.9
 """Probability of the region whose calibration is judged."""
 
@@ -113,6 +117,7 @@ def judge_locating(
     images: Images | None = None,
     truth: Float[Tensor, "contacts 3"] | None = None,
     methods: Sequence[str] = METHODS,
+    diffsound: DiffSoundLocator | None = None,
     level: float = LEVEL,
     scale: float | None = None,
     settings: Mapping[str, Any] | None = None,
@@ -120,12 +125,14 @@ def judge_locating(
     """Locate every strike of `test` by every method and compare.
 
     `images` are those of the object's symmetries; `truth` is where the blows fell, metres, where that is known better
-    than by the recordings' table; `scale`, metres, is what contact errors are relative to, the diagonal unless told.
+    than by the recordings' table; `diffsound` is needed for the method of this name; `scale`, metres, is what contact
+    errors are relative to, the diagonal unless told.
     Raises EvaluationError for unknown methods, sounds at another rate than the field's, and objects without a size.
     """
-    unknown = [method for method in methods if method not in METHODS]
+    known = METHODS if diffsound is None else (*METHODS, DIFFSOUND)
+    unknown = [method for method in methods if method not in known]
     if unknown or not methods:
-        raise EvaluationError(f"expected methods of {', '.join(METHODS)}, found {', '.join(unknown) or 'none'}")
+        raise EvaluationError(f"expected methods of {', '.join(known)}, found {', '.join(unknown) or 'none'}")
     if test.sample_rate != locator.field.sample_rate:
         raise EvaluationError(
             f"{name}: recordings at {test.sample_rate:g} Hz cannot be located by a field of "
@@ -145,7 +152,9 @@ def judge_locating(
     rows: list[StrikeRow] = []
     for row in sorted(range(len(test)), key=lambda each: test.names[each]):
         sound, place = test.sounds[row], right[row].double()
-        rows += _located(locator, alike, ground, sound, place, name=test.names[row], methods=methods)
+        rows += _located(
+            locator, alike, ground, sound, place, name=test.names[row], methods=methods, diffsound=diffsound
+        )
     return LocatingScores(name, tuple(rows), ground.diagonal, size, level, dict(settings or {}))
 
 
@@ -187,6 +196,7 @@ def _located(
     *,
     name: str,
     methods: Sequence[str],
+    diffsound: DiffSoundLocator | None,
 ) -> list[StrikeRow]:
     """Return one strike's rows."""
     found: ContactMap | LocationError | None = None
@@ -204,6 +214,11 @@ def _located(
                 place = alike.place(sound)
             else:
                 more = {"refusal": "the recording is silent"}
+        elif method == DIFFSOUND and diffsound is not None:
+            try:
+                place = diffsound.place(sound)
+            except LocationError as error:
+                more = {"refusal": " ".join(str(error).split())}
         elif method != "random" and isinstance(found, ContactMap):
             place = ground.points[int(found.distance.argmin())] if method == "cosine" else found.place.double()
             more = {"explained": found.explained}

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, RandomImpact, WhiteNoise
+from avmsf.bench.diffsoundmethod import DiffSoundMethod
 from avmsf.bench.fieldmethods import QUICK, FieldMethod, MixtureField, UninformedField
 from avmsf.bench.gridfield import PAPER_GRID, QUICK_GRID, GridField
 from avmsf.bench.interpolation import SplineGains
@@ -16,6 +17,7 @@ from avmsf.bench.renderer import Renderer
 from avmsf.bench.spectralmean import MeanSpectra
 from avmsf.bench.task import Method, Task
 from avmsf.errors import EvaluationError
+from avmsf.evaluation.diffsound import DiffSound
 from avmsf.field.config import PAPER
 from avmsf.field.soundfield import SoundField
 
@@ -136,7 +138,10 @@ FIELDS = (
 """Fields by the quick recipe unless told otherwise: the paper's form, other gains, ablations, the paper's settings and
 grids."""
 
-METHODS: dict[str, Method] = {method.name: method for method in (*BASELINES, *FIELDS)}
+SIMULATIONS = (DiffSoundMethod("diffsound"), DiffSoundMethod("diffsound-weighted", weighted=True))
+"""Other systems, built from their publications."""
+
+METHODS: dict[str, Method] = {method.name: method for method in (*BASELINES, *SIMULATIONS, *FIELDS)}
 """All methods but `recorded:FOLDER`, in the order of tables."""
 
 
@@ -161,7 +166,7 @@ def report_of(renderer: Renderer) -> dict[str, Any]:
     """Return what a method chose on its way to a renderer, as plain values; empty where it had no choice."""
     if isinstance(renderer, SoundField):
         return renderer.origin.report
-    if isinstance(renderer, SplineGains):
+    if isinstance(renderer, SplineGains | DiffSound):
         return renderer.report
     if isinstance(renderer, MeanGains | MeanSpectra | MeanWaveform):
         return {"neighbours": renderer.count}

@@ -11,6 +11,7 @@ from avmsf.bench.protocols import EvaluationProtocol
 from avmsf.bench.results import ResultsFolder
 from avmsf.bench.task import Look, Method
 from avmsf.capture.datasets.dataset import Dataset
+from avmsf.fem.family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
 from avmsf.scene.features import FeatureField
@@ -34,6 +35,15 @@ class BodyMaker(Protocol):
         ...
 
 
+@runtime_checkable
+class FamilyMaker(Protocol):
+    """Makes what simulations know of an object's shape."""
+
+    def __call__(self, identifier: str) -> BodyFamily:
+        """Return an object's bodies of any material. Raises AvmsfError where its shape is unknown or unfit."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """What is evaluated, on what, and how."""
@@ -52,6 +62,8 @@ class Evaluation:
     """How modes are found, once a case."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Plain values that decide the features."""
+    families: FamilyMaker | None = None
+    """None where no method simulates the object."""
 
     def begin(self, results: ResultsFolder) -> None:
         """Take a folder for this evaluation's results.

@@ -20,6 +20,7 @@ from avmsf.bench.results import CaseRecord, ObjectRecord, ResultsFolder, one_lin
 from avmsf.bench.task import Look
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.fem.family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.truth import Truth
@@ -84,6 +85,15 @@ def run_object(
             except AvmsfError as error:
                 return error
 
+        @cache
+        def family() -> BodyFamily | AvmsfError:
+            if evaluation.families is None:
+                return EvaluationError(f"{identifier}: its shape is not known: expected a mesh, or views of it")
+            try:
+                return evaluation.families(identifier)
+            except AvmsfError as error:
+                return error
+
         firsts = {case.label: case.key for case in reversed(cases)}
         for number, case in enumerate(cases, 1):
             record = _run_case(
@@ -97,6 +107,8 @@ def run_object(
                     place=f"{identifier}/{number:02d}",
                     look=looks.of(case.views),
                     bodies=bodies,
+                    family=family,
+                    material=facts.material,
                     stranger=stranger,
                     listened=firsts[case.label] == case.key,
                 ),

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from avmsf.bench.renderer import Renderer
 from avmsf.capture.impacts import Impacts
+from avmsf.errors import EvaluationError
+from avmsf.fem.family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.scene.features import FeatureField
@@ -16,6 +18,10 @@ from avmsf.scene.features import FeatureField
 Look = Literal["positions", "visual", "unaligned"]
 """What a field reads of an object's points: positions alone; positions with what the places look like, made to obey the
 object's symmetries (the paper's form); the same without that."""
+
+
+def _no_family() -> BodyFamily:
+    raise EvaluationError("the object's shape is not known: expected a mesh, or views of it")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +50,10 @@ class Task:
     stranger: Callable[[], Float[Tensor, " samples"]]
     """Draws, by `seed`, the recording of another object, at the sample rate and of the length of `train`. Raises
     EvaluationError where there is no other object."""
+    family: Callable[[], BodyFamily] = _no_family
+    """Computes the bodies that the object's surface may enclose, of any material. Raises AvmsfError likewise."""
+    material: str | None = None
+    """What the dataset says that the object is made of, in lower case; None where it does not."""
 
 
 @runtime_checkable

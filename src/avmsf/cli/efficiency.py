@@ -82,17 +82,19 @@ def run(options: Options) -> int:
     title = title_of(dataset, options.data)
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
     scene = SceneConfig()
+    bodies = ObjectBodies(dataset, folder / "features", config=options.body, scene=scene)
     evaluation = Evaluation(
         dataset,
         title,
         protocol,
         methods,
         ObjectLooks(dataset, folder / "features", scene),
-        ObjectBodies(dataset, folder / "features", config=options.body, scene=scene),
+        bodies,
         options.seed,
         Judging(cdpam=False),
         HighResolution(modes=options.modes),
         {"scene": asdict(scene), "body": asdict(options.body)},
+        bodies.family,
     )
     results = ResultsFolder(folder)
     say(f"{protocol.name} of {len(methods)} methods on {chosen}, results in {folder}")

@@ -103,17 +103,19 @@ def run(options: Options) -> int:
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
     scene = SceneConfig(views=ViewsConfig(source=options.look))
     kept = (options.features or folder / "features").resolve()
+    bodies = ObjectBodies(dataset, kept, options.geometry, options.body, scene)
     evaluation = Evaluation(
         dataset,
         title,
         protocol,
         methods,
         ObjectLooks(dataset, kept, scene),
-        ObjectBodies(dataset, kept, options.geometry, options.body, scene),
+        bodies,
         options.seed,
         Judging(level=options.level, cdpam=options.cdpam, cdpam_contacts=options.cdpam_contacts),
         HighResolution(modes=options.modes),
         {"scene": asdict(scene), "geometry": options.geometry, "body": asdict(options.body)},
+        bodies.family,
     )
     results, groups = ResultsFolder(folder), members(dataset)
     say(f"{protocol.name} on {title}: {len(objects)} objects, {len(methods)} methods, results in {folder}")

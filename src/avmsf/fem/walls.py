@@ -7,6 +7,7 @@ degrees of freedom and 2 % with 85,000, but 2 % with 31,000 in prisms. Elements 
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,12 +90,28 @@ class Wall:
 
         Raises SimulationError where they do not fill the mesh.
         """
+        return self.solids(length)(1.0)
+
+    def solids(self, length: float) -> Callable[[float], Solid]:
+        """Return what makes such prisms with the wall's thickness times a factor, behind the larger side.
+
+        Raises SimulationError where those of the factor 1 do not fill the mesh; what it returns does where prisms fold.
+        """
         coarse = self.sheet.remeshed(length)
         thickness = np.full(len(coarse.points), self.thickness) if self.even else self._thickness_at(coarse)
-        solid = None if thickness is None else prisms(coarse, thickness, layers=self._layers(length))
-        if solid is None or not self._fills(solid):
+
+        def scaled(factor: float) -> Solid:
+            assert thickness is not None
+            solid = prisms(coarse, factor * thickness, layers=self._layers(length))
+            if solid is None:
+                raise SimulationError(
+                    f"a wall of {1000 * factor * self.thickness:.2g} mm folds where the mesh bends: take a thinner one"
+                )
+            return solid
+
+        if thickness is None or not self._fills(scaled(1.0)):
             raise SimulationError(f"prisms of {1000 * length:.2g} mm do not fill the mesh: make them finer")
-        return solid
+        return scaled
 
     def _thickness_at(self, sheet: Skin) -> Float64[np.ndarray, " points"] | None:
         """Return the distance to the other side behind each point of a sheet, filled in from neighbors at rims."""

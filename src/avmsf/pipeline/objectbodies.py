@@ -8,6 +8,8 @@ from avmsf._utils.locks import NO_LIMIT
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.capture.surface import Surface
 from avmsf.errors import SceneError
+from avmsf.evaluation.material_fit import MODES as DIFFSOUND_MODES
+from avmsf.fem.family import BodyFamily, body_family
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.geometry import ObjectShape
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies, roughened
@@ -37,6 +39,10 @@ class ObjectBodies:
     def __call__(self, identifier: str) -> CandidateBodies:
         """Return an object's bodies. Raises SceneError where its shape is unknown, SimulationError for an unfit one."""
         return candidate_bodies(self._surface(identifier), self.config, cache=self.cache / identifier / "bodies")
+
+    def family(self, identifier: str) -> BodyFamily:
+        """Return an object's bodies for DiffSound. Raises SceneError and SimulationError likewise."""
+        return body_family(self._surface(identifier), count=DIFFSOUND_MODES)
 
     def _surface(self, identifier: str) -> Surface | ObjectShape:
         if self.geometry == "gaussians":

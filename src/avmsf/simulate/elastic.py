@@ -152,7 +152,7 @@ def elastic_modes(
         raise SimulationError(f"count = {count}: expected 1 mode or more")
     if perturbed and (stiffness_factor is not None or density_factor is not None):
         raise SimulationError("perturbed: expected a body without factors, got factors: ask for the modes alone")
-    _expect_whole(solid)
+    expect_whole(solid)
     light = _factor(solid, density_factor, "density_factor")
     mesh = SecondOrder.of(solid)
     weights = mass(mesh, material.density * light)
@@ -241,7 +241,8 @@ def _factor(solid: Solid, factor: Float[Tensor, " cells"] | None, name: str) -> 
     return factor.double()
 
 
-def _expect_whole(solid: Solid) -> None:
+def expect_whole(solid: Solid) -> None:
+    """Raise SimulationError for a body without volume, with flat tetrahedra, or of several parts."""
     if not len(solid.cells):
         raise SimulationError("expected tetrahedra, found none: the body has no volume; give a sheet a thickness")
     solid.expect_volume()
