@@ -395,3 +395,14 @@ def test_points_without_sense_are_refused():
         Locator.of(true_field(), points=torch.zeros(3, 3), areas=torch.zeros(3))
     with pytest.raises(LocationError, match="none of the object's 43 modes lies below 50 Hz"):
         locator_of().locate(struck(1, seed=0).sounds[0], highest=50.0)
+
+
+def test_of_several_recordings_only_the_first_waits_for_the_fields_gains(monkeypatch: pytest.MonkeyPatch):
+    field, sounds = true_field(300), struck(2, seed=3).sounds
+    made = []
+    of = Locator.of
+    monkeypatch.setattr(Locator, "of", lambda *given, **named: made.append(given) or of(*given, **named))
+    first, second = (locate(field, sound) for sound in sounds)
+    assert len(made) == 1
+    assert torch.equal(second.probability, locate(field, sounds[1], points=field.gain_field.points).probability)
+    assert not torch.equal(first.probability, second.probability)

@@ -1,6 +1,7 @@
 """One recording, one answer: where on the object the blow fell, or why that cannot be told."""
 
 from dataclasses import replace
+from functools import lru_cache
 
 from jaxtyping import Float
 from torch import Tensor
@@ -36,17 +37,25 @@ def locate(
 
     Bare samples are at `sample_rate` Hz, or at the field's rate. `settings` take the place of those of the capture
     that the field was fitted to (see `hear`), `points` and `directions` as for `Locator.of`, `force` as for
-    `Locator.locate`; `locator`, made of the field before, saves making one for each recording, and has points of its
-    own. The sound of another object has a `refusal` in place of a place, see `judged`. Raises LocationError as `hear`
-    and `Locator.locate`, and for a locator of another field or given with points.
+    `Locator.locate`; `locator` is one made of the field before, with points of its own. That of the last field and its
+    own points is kept, so that of several recordings only the first waits for it. The sound of another object has a
+    `refusal` in place of a place, see `judged`. Raises LocationError as `hear` and `Locator.locate`, and for a locator
+    of another field or given with points.
     """
     if locator is not None and (locator.field is not field or points is not None or directions is not None):
         what = "points or directions" if locator.field is field else "another field"
         raise LocationError(f"a locator is of one field and its points, and was given with {what}: leave it out")
     heard = hear(recording, field, sample_rate=sample_rate, settings=settings)
+    if locator is None and points is None and directions is None:
+        locator = _locator_of(field)
     finder = Locator.of(field, points=points, directions=directions) if locator is None else locator
     found = finder.locate(heard.sound, highest=heard.highest, force=force)
     return judged(replace(found, notes=(*heard.notes, *found.notes)))
+
+
+@lru_cache(maxsize=1)
+def _locator_of(field: SoundField) -> Locator:
+    return Locator.of(field)
 
 
 def judged(found: ContactMap) -> ContactMap:
