@@ -38,6 +38,8 @@ class LiftConfig:
     `descriptors` (built in, no download), or `auto`: DINOv2 base where it is to be had, else the built-in ones."""
     longest: int = 518
     """Pixels of an image's longer side as DINOv2 sees it."""
+    background: Literal["inpainted", "kept"] = "inpainted"
+    """What the encoder sees outside an object's mask: the object's colors carried on, or the image as it is (paper)."""
     weighting: Literal["plain", "visibility"] = "visibility"
     """How the views that see a point are averaged: by how well they see it, or plainly (paper)."""
     components: int = 32
@@ -51,6 +53,8 @@ class LiftConfig:
     """How often features are pooled over the symmetries (paper: T)."""
     angles: int = ANGLES
     """Angles that stand for all of a continuous rotation (paper: the size of Theta)."""
+    reach: float = 3.0
+    """Point spacings within which the nearest point is a symmetric counterpart; 0 takes it at any distance (paper)."""
     positions: bool = True
     """Whether the points' positions, relative to the object's size, stand before the features."""
     size: float = 0.3
@@ -68,6 +72,8 @@ class LiftConfig:
                 raise SceneError(f"{name} = {getattr(self, name)}: expected {least} or more")
         if not 0 <= self.missing <= 0.45:
             raise SceneError(f"missing = {self.missing}: expected 0 to 0.45")
+        if not 0 <= self.reach < math.inf:
+            raise SceneError(f"reach = {self.reach}: expected a number of point spacings, or 0 for any distance")
         if not 0 < self.size < math.inf:
             raise SceneError(f"size = {self.size}: expected more than 0")
 
@@ -109,7 +115,15 @@ def lift_to_cloud(
 ) -> Lifted:
     """Lift features onto the Gaussians that views see, as the settings say."""
     weighting = _WEIGHTINGS[config.weighting]
-    lifted = lift(cloud, views, encoder, rasteriser=rasteriser, weighting=weighting, progress=progress)
+    lifted = lift(
+        cloud,
+        views,
+        encoder,
+        rasteriser=rasteriser,
+        weighting=weighting,
+        inpainted=config.background == "inpainted",
+        progress=progress,
+    )
     return supported(lifted, views)
 
 
@@ -126,7 +140,15 @@ def lift_to_surface(
     points = sample_surface(surface.vertices, surface.faces, config.points, generator=generator).points
     weighting = _WEIGHTINGS[config.weighting]
     depth_map = depth_of_surface(surface)
-    return lift_points(points, views, encoder, depth_map=depth_map, weighting=weighting, progress=progress)
+    return lift_points(
+        points,
+        views,
+        encoder,
+        depth_map=depth_map,
+        weighting=weighting,
+        inpainted=config.background == "inpainted",
+        progress=progress,
+    )
 
 
 def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
@@ -149,7 +171,9 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
         symmetries = find_symmetries(features.points, generator=generator, missing=config.missing)
         report["symmetries"] = symmetries.to_dict()
         if symmetries:
-            pooled = refine(features, symmetries, iterations=config.iterations, angles=config.angles)
+            pooled = refine(
+                features, symmetries, iterations=config.iterations, angles=config.angles, reach=config.reach
+            )
             spreads = (orbit_spread(each, symmetries, angles=config.angles) for each in (features, pooled))
             report["orbit_spread"] = list(spreads)
             features = pooled
