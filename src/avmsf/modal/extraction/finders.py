@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Float64
@@ -26,6 +26,9 @@ _LEAST_TURN = 0.5
 nothing in sine phase, and the gain of what is heard would be enormous."""
 _PERIODS = 50
 """How many periods of the lowest frequency the sounds last: with fewer, a mode is not told from rumble."""
+
+ExtractionMethod = Literal["high-resolution", "short-time"]
+"""Finders by name."""
 
 
 @runtime_checkable
@@ -178,6 +181,11 @@ class ShortTime:
         """Return the transform's length and hop, samples."""
         fft_size = _power_of_two(self.fft_seconds * sample_rate, least=32)
         return fft_size, min(_power_of_two(self.hop_seconds * sample_rate, least=1), fft_size // 4)
+
+
+def finder_named(method: ExtractionMethod, modes: int) -> ModeFinder:
+    """Return the finder of that name, which keeps at most so many modes."""
+    return HighResolution(modes=modes) if method == "high-resolution" else ShortTime(modes=modes)
 
 
 def expect_modes(modes: int) -> None:
