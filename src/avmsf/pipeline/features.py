@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -26,6 +26,7 @@ from avmsf.scene.visibility import depth_of_surface
 
 DINO = "facebook/dinov2-base"
 DESCRIPTORS = "descriptors"
+AUTO = "auto"
 _WEIGHTINGS = {"plain": by_presence, "visibility": by_visibility}
 
 
@@ -33,7 +34,7 @@ _WEIGHTINGS = {"plain": by_presence, "visibility": by_visibility}
 class LiftConfig:
     """Settings of the features."""
 
-    encoder: str = "auto"
+    encoder: str = AUTO
     """What describes the images: the name of a DINOv2 model (such as facebook/dinov2-base), a folder that holds one,
     `descriptors` (built in, no download), or `auto`: DINOv2 base where it is to be had, else the built-in ones."""
     longest: int = 518
@@ -94,7 +95,7 @@ def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None]) -> Encode
     """Return the encoder that the settings name. Raises SceneError where it is not to be had."""
     if config.encoder == DESCRIPTORS:
         return ImageDescriptors()
-    if config.encoder != "auto":
+    if config.encoder != AUTO:
         return DinoEncoder.load(config.encoder, longest=config.longest, device=_device())
     try:
         return DinoEncoder.load(DINO, longest=config.longest, device=_device())
@@ -102,6 +103,14 @@ def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None]) -> Encode
         reason = str(error).split(":")[0]
         tell(f"encoder: the built-in descriptors, for {DINO} is not to be had: {reason}")
         return ImageDescriptors()
+
+
+def settled(config: LiftConfig, *, tell: Callable[[str], None]) -> LiftConfig:
+    """Return the settings with the encoder that `auto` means here, which `tell` hears of if it is not DINOv2."""
+    if config.encoder != AUTO:
+        return config
+    found = choose_encoder(config, tell=tell)
+    return replace(config, encoder=DESCRIPTORS if isinstance(found, ImageDescriptors) else DINO)
 
 
 def lift_to_cloud(

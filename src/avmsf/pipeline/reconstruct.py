@@ -243,7 +243,9 @@ def _shape(
     if seen is None and "surface" in made:
         # Gaussians lie up to a wall's thickness below the surface, where a wall's other side may be nearer.
         seen = read_surface(made["surface"].path)
-    if seen is not None and "cloud" in made:
+    # The paper's network reads the Gaussians' own centers.
+    centers = config.gain_model == NETWORK and config.scene.lift.onto == "gaussians"
+    if seen is not None and "cloud" in made and not centers:
         features = moved_onto(features, seen)
     candidates = {}
     candidates["positions"] = FeatureField.from_points(features.points)
