@@ -11,6 +11,7 @@ import tyro
 from avmsf._utils.caching import discard
 from avmsf.bench.evaluation import split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
+from avmsf.capture.folder import settings_of
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.heartbeat import doing
@@ -29,8 +30,9 @@ from avmsf.field.store import save
 from avmsf.modal.extraction.extract import extract_once
 from avmsf.modal.extraction.finders import ExtractionMethod, finder_named
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
-from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, with_record
+from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero, with_record
 from avmsf.pipeline.reconstruct import expect_on_object
+from avmsf.pipeline.scene import SceneConfig
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.symmetry import Symmetries
@@ -73,6 +75,8 @@ class Options:
     """How modes are found; see `avmsf modes --help`."""
     modes: int = 128
     """Most modes to keep."""
+    time_zero: TimeZero | None = None
+    """Where sounds start: onset, or peak (paper); capture.toml decides where this does not."""
     json: bool = False
     """Print one JSON object on the standard output, all else on the standard error."""
     preset: Preset = "default"
@@ -82,6 +86,12 @@ class Options:
     config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)
     """Settings of the fit."""
 
+    @property
+    def pipeline(self) -> PipelineConfig:
+        """All settings as one; those of views and features are the features' file's own."""
+        scene = SceneConfig()
+        return PipelineConfig(self.gain_model, self.body, scene, self.config, self.method, self.modes, self.time_zero)
+
 
 @dataclass(frozen=True)
 class PaperOptions(Options):
@@ -89,6 +99,7 @@ class PaperOptions(Options):
 
     gain_model: GainModel = PRESETS["paper"].gain_model
     method: ExtractionMethod = PRESETS["paper"].method
+    time_zero: TimeZero | None = PRESETS["paper"].time_zero
     preset: Preset = "paper"
     config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=lambda: PRESETS["paper"].fit)
 
@@ -115,8 +126,8 @@ def preset_of(words: Sequence[str]) -> Preset:
 def run(options: Options) -> int:
     """Fit, write, and say what came of it; return 130 where Ctrl-C stopped it."""
     expect_writable(options.output)
-    settings = None if options.settings is None else CaptureSettings.read(options.settings)
-    capture = read_capture(options.capture, settings)
+    known = settings_of(options.capture) if options.settings is None else CaptureSettings.read(options.settings)
+    capture = read_capture(options.capture, options.pipeline.capture_settings(known))
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
     )
@@ -155,10 +166,7 @@ def run(options: Options) -> int:
     except FitError:
         discard(_beside(options.output, "modes"))
         raise
-    settled = PipelineConfig(
-        options.gain_model, options.body, fit=options.config, method=options.method, modes=options.modes
-    )
-    fitted = with_record(fitted, settled, made)
+    fitted = with_record(fitted, options.pipeline, made)
     save(fitted, options.output)
     for ending in ("modes", "checkpoint"):
         discard(_beside(options.output, ending))

@@ -25,7 +25,7 @@ from avmsf.field.store import load
 from avmsf.files import copy_whole
 from avmsf.modal.extraction.finders import ExtractionMethod
 from avmsf.pipeline.bodies import BodyConfig
-from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset
+from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
 from avmsf.pipeline.features import LiftConfig
 from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.scene import SceneConfig
@@ -55,6 +55,8 @@ class Options(SceneOptions):
     """How modes are found; see `avmsf modes --help`."""
     modes: int = 128
     """Most modes to keep."""
+    time_zero: TimeZero | None = None
+    """Where sounds start: onset, or peak (paper); capture.toml decides where this does not."""
     json: bool = False
     """Print one JSON object on the standard output, all else on the standard error."""
     gain_model: GainModel = "auto"
@@ -72,7 +74,7 @@ class Options(SceneOptions):
     def pipeline(self) -> PipelineConfig:
         """All settings as one."""
         scene = SceneConfig(self.views, self.splat, self.lift)
-        return PipelineConfig(self.gain_model, self.body, scene, self.fit, self.method, self.modes)
+        return PipelineConfig(self.gain_model, self.body, scene, self.fit, self.method, self.modes, self.time_zero)
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,7 @@ class PaperOptions(Options):
     gain_model: GainModel = PRESETS["paper"].gain_model
     method: ExtractionMethod = PRESETS["paper"].method
     lift: LiftConfig = field(default_factory=lambda: PRESETS["paper"].scene.lift)
+    time_zero: TimeZero | None = PRESETS["paper"].time_zero
     preset: Preset = "paper"
     fit: FitConfig = field(default_factory=lambda: PRESETS["paper"].fit)
 
@@ -101,7 +104,7 @@ def run(options: Options) -> int:
     """Reconstruct, and say what came of it; return 130 where Ctrl-C stopped it."""
     if options.output is not None:
         expect_writable(options.output)
-    settings = options.read_settings()
+    settings = options.pipeline.capture_settings(options.read_settings())
     capture = read_capture(options.folder, settings)
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start

@@ -4,8 +4,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
+from avmsf.capture.settings import CaptureSettings
 from avmsf.field.config import PAPER, FitConfig
-from avmsf.field.gains.estimator import NETWORK, GainModel
+from avmsf.field.gains.estimator import GainModel
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.finders import ExtractionMethod, ModeFinder, finder_named
 from avmsf.pipeline.bodies import BodyConfig
@@ -13,6 +14,7 @@ from avmsf.pipeline.features import DINO, LiftConfig
 from avmsf.pipeline.scene import SceneConfig
 
 Preset = Literal["default", "paper"]
+TimeZero = Literal["onset", "peak"]
 RECORD = "pipeline"
 """What a field's report calls the configuration that made it."""
 
@@ -33,17 +35,23 @@ class PipelineConfig:
     """How modes are found."""
     modes: int = 128
     """Most modes to keep."""
+    time_zero: TimeZero | None = None
+    """Where sounds start; None leaves that to the capture's settings."""
 
     @property
     def finder(self) -> ModeFinder:
         """What finds the modes."""
         return finder_named(self.method, self.modes)
 
+    def capture_settings(self, settings: CaptureSettings) -> CaptureSettings:
+        """Return a capture's settings with this configuration's start of sounds."""
+        return settings if self.time_zero is None else replace(settings, time_zero=self.time_zero)
+
 
 PRESETS: Mapping[Preset, PipelineConfig] = {
     "default": PipelineConfig(),
     "paper": PipelineConfig(
-        gain_model=NETWORK,
+        gain_model="network",
         scene=SceneConfig(
             lift=LiftConfig(
                 encoder=DINO,
@@ -57,6 +65,7 @@ PRESETS: Mapping[Preset, PipelineConfig] = {
         ),
         fit=PAPER,
         method="short-time",
+        time_zero="peak",
     ),
 }
 """`paper` has every stage as published, and of each published list the middle value; docs/equations.md lists what the
