@@ -1,5 +1,9 @@
 """Presets: what `paper` selects, that it is complete, and that the options of the commands start from it."""
 
+import re
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 
 from avmsf.cli.fit import parse as parse_fit
@@ -42,6 +46,15 @@ def test_commands_start_from_the_preset_and_change_what_is_said() -> None:
     assert (mixed.scene.lift.encoder, mixed.scene.lift.onto) == ("descriptors", "gaussians")
     fitted = parse_fit(["mug", "--output", "mug.safetensors", "--preset", "paper"])
     assert (fitted.config, fitted.method, fitted.gain_model) == (PRESETS["paper"].fit, "short-time", "network")
+
+
+def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_open() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "equations.md").read_text(encoding="utf-8")
+    table = page.partition("## The paper's form of each stage")[2].partition("\n\n`evaluate`")[0]
+    words = [word for options in re.findall(r"`(--[^`]*)`", table.partition("|---|")[2]) for word in options.split()]
+    found, paper = parse_reconstruct(["mug", *words]).pipeline, PRESETS["paper"]
+    silent = {name: getattr(paper.fit, name) for name in ("width", "hidden", "layers", "warmup_rate")}
+    assert replace(found, fit=replace(found.fit, **silent)) == paper
 
 
 def test_a_preset_that_there_is_not_is_refused() -> None:
