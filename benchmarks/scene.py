@@ -15,9 +15,9 @@ from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.capture.views.write import write_views
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load
-from avmsf.modal.extraction.finders import HighResolution
+from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.features import LiftConfig
-from avmsf.pipeline.reconstruct import ReconstructConfig, reconstruct
+from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.scene import Listener, SceneConfig
 from avmsf.pipeline.sources import ViewsConfig
 from avmsf.scene.refine import orbit_spread, refine
@@ -81,10 +81,10 @@ def _pipeline(options: Options) -> Report:
         write_views(pictures(speckled(slab(STRUCK.plate), seed=0), count=count, size=size), Path(place) / "views")
         for part in sorted((Path(place) / "views").iterdir()):
             part.rename(folder / part.name)
-        config = ReconstructConfig(scene=SceneConfig(ViewsConfig(), SplatConfig(), LiftConfig(encoder="descriptors")))
+        config = PipelineConfig(scene=SceneConfig(ViewsConfig(), SplatConfig(), LiftConfig(encoder="descriptors")))
         if options.quick_look:
             quick = SceneConfig(ViewsConfig(), SplatConfig(steps=30, start_points=500), config.scene.lift)
-            config = ReconstructConfig(scene=quick, fit=FitConfig(warmup_steps=20, steps=2, damping="shared"))
+            config = PipelineConfig(scene=quick, fit=FitConfig(warmup_steps=20, steps=2, damping="shared"))
         begun = time.perf_counter()
         capture = read_capture(folder)
         made = reconstruct(
@@ -92,7 +92,6 @@ def _pipeline(options: Options) -> Report:
             capture,
             capture.impacts,
             config,
-            method=HighResolution(),
             cache=Path(place) / "cache",
             settings=CaptureSettings(),
             listener=Listener(tell),

@@ -298,14 +298,15 @@ def test_a_surface_in_another_unit_is_refused_once(tmp_path: Path, capsys: Strea
     assert not (tmp_path / "field").exists()
 
 
-def test_a_recipes_settings_hold_where_the_options_say_nothing() -> None:
+def test_a_presets_settings_hold_where_the_options_say_nothing() -> None:
     from avmsf.cli.fit import parse
 
     words = ["bowl", "--output", "bowl.safetensors"]
     assert parse(words).config == avmsf.FitConfig()
-    assert parse([*words, "--recipe", "paper"]).config == avmsf.PAPER
-    mixed = parse(["--recipe", "paper", *words, "--steps", "7"]).config
-    assert (mixed.steps, mixed.clusters) == (7, avmsf.PAPER.clusters)
+    paper = parse([*words, "--preset", "paper"])
+    assert (paper.config, paper.gain_model, paper.method) == (avmsf.PAPER, "network", "short-time")
+    mixed = parse(["--preset", "paper", *words, "--steps", "7", "--method", "high-resolution"])
+    assert (mixed.config.steps, mixed.config.clusters, mixed.method) == (7, avmsf.PAPER.clusters, "high-resolution")
 
 
 def test_without_a_surface_the_contacts_box_stands_for_the_object(tmp_path: Path, capsys: Streams) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from avmsf.capture.surface import write_surface
 from avmsf.capture.views.write import write_views
 from avmsf.cli import main, view_cloud
 from avmsf.cli.scenebar import SceneBar
+from avmsf.cli.show import describe
 from avmsf.field.store import load
 from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.ply import read_splats
@@ -67,6 +69,11 @@ def test_pictures_and_blows_become_a_field_on_gaussians(kept: Path) -> None:
     assert field.gain_field.encoder == features.encoder
     assert "descriptors" in features.encoder
     assert "dino" not in features.encoder
+    made = describe(field)["pipeline"]
+    assert (made["method"], made["gain_model"]) == ("high-resolution", "network")
+    assert made["encoder"] in features.encoder
+    assert (made["scene"]["splat"]["steps"], made["scene"]["lift"]["encoder"]) == (60, "descriptors")
+    assert made["fit"] == asdict(field.origin.config)
     # The slab's box, widened by the reach of Gaussians that its pictures of 48 pixels leave unsure: a pixel is 9 mm.
     a, b, c = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
     assert (a, b) == (pytest.approx(0.24, abs=0.02), pytest.approx(0.17, abs=0.02))

@@ -292,6 +292,10 @@ def test_the_encoder_never_sees_the_background():
     encoder = painted_sphere(AROUND[:1])
     lift_points(sphere_points(50), [View("v", image, AROUND[0], mask)], encoder, depth_map=sphere_depth)
     torch.testing.assert_close(encoder.images[0], torch.full((HEIGHT, WIDTH, 3), 100 / 255))
+    plain = painted_sphere(AROUND[:1])
+    view = View("v", image, AROUND[0], mask)
+    lift_points(sphere_points(50), [view], plain, depth_map=sphere_depth, inpainted=False)
+    torch.testing.assert_close(plain.images[0].float(), view.color.float())
 
 
 def test_cameras_that_look_elsewhere_are_told():

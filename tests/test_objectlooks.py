@@ -1,5 +1,6 @@
 """What a dataset's objects look like is made once, from the views that were asked for."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,10 +12,13 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.views.write import write_views
 from avmsf.errors import SceneError
+from avmsf.pipeline.config import PRESETS
 from avmsf.pipeline.features import LiftConfig
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig, find_source
+from avmsf.scene.ply import read_splats
+from avmsf.scene.splatconfig import SplatConfig
 from small_scene import slab_views, write_surface_file
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*neither texture nor colours")
@@ -70,6 +74,20 @@ def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tm
     assert len(before) == 2
     looks("slab", "visual")
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")} == before
+
+
+@pytest.mark.slow
+def test_the_papers_features_are_of_gaussians_even_where_a_mesh_is_there(seen: Path, tmp_path: Path) -> None:
+    scene = replace(CONFIG, splat=SplatConfig(steps=30, start_points=400))
+    paper = replace(PRESETS["paper"].scene.lift, encoder="descriptors")
+    looks = ObjectLooks(OneObject(seen), tmp_path, scene, paper)
+    features = looks("slab", "paper")
+    (cloud,) = tmp_path.rglob("cloud.ply")
+    assert {*map(tuple, features.points.tolist())} <= {*map(tuple, read_splats(cloud).centers.tolist())}
+    # All that the encoder says, and no positions.
+    assert features.features.shape[1] > 4 + 3
+    assert "components" not in features.encoder
+    assert len(looks("slab", "visual").points) == 400
 
 
 @pytest.mark.slow

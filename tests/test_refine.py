@@ -89,6 +89,15 @@ def test_a_hole_is_left_out_of_the_mean():
     assert int((~moved).sum()) == 2 * 30
 
 
+def test_without_a_reach_the_nearest_point_counts_however_far_it_is():
+    points = tube(along=4)
+    given = field(points[points[:, 0] < 0.5])
+    pooled = refine(given, symmetries(UPRIGHT), iterations=1, reach=0.0).features
+    image = UPRIGHT.reflect(given.points.double())
+    nearest = torch.cdist(image, given.points.double()).argmin(dim=1)
+    assert torch.allclose(pooled, (given.features + given.features[nearest]) / 2, atol=1e-6)
+
+
 def test_a_continuous_orbit_has_as_many_angles_as_asked():
     given = field(tube())
     assert torch.allclose(

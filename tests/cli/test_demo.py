@@ -16,8 +16,8 @@ from avmsf.cli.demo import verdict, wall_words
 from avmsf.cli.overallbar import REFINEMENT, OverallBar
 from avmsf.field.fit import Progress
 from avmsf.field.store import load
+from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.features import LiftConfig
-from avmsf.pipeline.reconstruct import ReconstructConfig
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig
 from avmsf.scene.ply import read_splats
@@ -38,7 +38,7 @@ def test_the_demo_goes_all_the_way(
     small = SceneConfig(
         ViewsConfig(count=6), SplatConfig(steps=30, start_points=400), LiftConfig(encoder="descriptors")
     )
-    monkeypatch.setattr(demo, "CONFIG", ReconstructConfig("network", scene=small, fit=QUICK))
+    monkeypatch.setattr(demo, "CONFIG", PipelineConfig("network", scene=small, fit=QUICK))
     folder = tmp_path / "demo"
     assert main(["demo", str(folder)]) == 0
     out, err = capsys.readouterr()

@@ -36,6 +36,8 @@ def run_of(impacts: Impacts, folder: Path) -> CaseRun:
         place="a/01",
         look=lambda look: looks("a", look),
         bodies=lambda: SimulationError("the plate has no shape here"),
+        family=lambda: SimulationError("the plate has no shape here"),
+        material=None,
         stranger=lambda: torch.zeros(impacts.sounds.shape[1]),
         listened=False,
     )

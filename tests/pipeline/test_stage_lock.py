@@ -11,8 +11,8 @@ import trimesh
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import main
 from avmsf.errors import FolderInUseError
-from avmsf.modal.extraction.finders import HighResolution
-from avmsf.pipeline.reconstruct import CACHE, ReconstructConfig, reconstruct
+from avmsf.pipeline.config import PipelineConfig
+from avmsf.pipeline.reconstruct import CACHE, reconstruct
 from avmsf.pipeline.scene import Listener
 from avmsf.pipeline.stages import StageFolder
 from plate_capture import fill_plate
@@ -67,8 +67,7 @@ def test_reconstruct_is_refused_before_it_reads_what_another_one_writes(tmp_path
             tmp_path / "plate",
             capture,
             capture.impacts,
-            ReconstructConfig("smooth"),
-            method=HighResolution(modes=4),
+            PipelineConfig("smooth", modes=4),
             cache=tmp_path / "cache",
             settings=CaptureSettings(),
             listener=Listener(),

@@ -19,10 +19,10 @@ from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import fingerprint, gain_case
 from avmsf.field.store import load
-from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline import reconstruct as module
 from avmsf.pipeline import stages
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
+from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.scene import Listener
 from avmsf.pipeline.stages import StageFolder
 from avmsf.simulate import nominal, recipe
@@ -115,11 +115,11 @@ def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are
             tmp_path / "plate",
             capture,
             capture.impacts,
-            module.ReconstructConfig(
+            PipelineConfig(
                 body=BodyConfig(wall=0.004, shapes=8, freedoms=1000),
                 fit=FitConfig(steps=2, fft_sizes=(1024, 256)),
+                modes=6,
             ),
-            method=HighResolution(modes=6),
             cache=tmp_path / "cache",
             settings=CaptureSettings(),
             listener=Listener(),

@@ -11,7 +11,8 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import GainModel, estimator_for
 from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.soundfield import SoundField
-from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.extract import Extraction, extract_sounds
+from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.modal.extraction.random_modes import random_modes
 from avmsf.scene.features import FeatureField
 
@@ -29,10 +30,17 @@ class FieldMethod:
     """Settings of the fit, but for the seed, which is the task's."""
     look: Look = "visual"
     """What the network reads of the object's points."""
+    finder: ModeFinder | None = None
+    """How modes are found; None takes those that all methods share."""
 
     def fit(self, task: Task) -> SoundField:
         """Fit the field. Raises AvmsfError where modes, features or field cannot be made."""
-        return fit_field(task, task.train, task.features(self.look), task.modes(), self.config)
+        features = task.features(self.look)
+        if self.finder is None:
+            modes = task.modes()
+        else:
+            modes = extract_sounds(task.train.sounds, sample_rate=task.train.sample_rate, method=self.finder)
+        return fit_field(task, task.train, features, modes, self.config)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from avmsf.errors import EvaluationError
 from avmsf.evaluation.diffsound import DiffSound
 from avmsf.field.config import PAPER
 from avmsf.field.soundfield import SoundField
+from avmsf.modal.extraction.finders import ShortTime
 
 NEIGHBOURS = 3
 """Nearest strikes that are averaged (the paper's KNN), or all where there are fewer."""
@@ -131,7 +132,8 @@ FIELDS = (
     FieldMethod("field-no-residual", replace(QUICK, residual=False)),
     # The warm-up moves no damping, so there is nothing to choose between.
     FieldMethod("field-warmup", replace(QUICK, steps=0, damping="shared")),
-    FieldMethod("field-paper", PAPER),
+    FieldMethod("paper", replace(PAPER, damping="shared"), "paper", ShortTime()),
+    FieldMethod("paper-per-contact", replace(PAPER, damping="per-contact"), "paper", ShortTime()),
     GridField("field-grid", QUICK_GRID),
     GridField("field-paper-grid", PAPER_GRID, PAPER),
 )

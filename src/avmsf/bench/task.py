@@ -15,9 +15,9 @@ from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.scene.features import FeatureField
 
-Look = Literal["positions", "visual", "unaligned"]
+Look = Literal["positions", "visual", "unaligned", "paper"]
 """What a field reads of an object's points: positions alone; positions with what the places look like, made to obey the
-object's symmetries (the paper's form); the same without that."""
+object's symmetries; the same without that; features of Gaussians as the paper has them."""
 
 
 def _no_family() -> BodyFamily:

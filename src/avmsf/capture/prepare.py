@@ -72,6 +72,11 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
         before, kept = deconvolve(sound, force, pulse=pulse, regularisation=settings.regularisation)
     else:
         before, kept = np.split(sound, [onset if settings.align else 0])
+    if settings.from_peaks:
+        whole = np.concatenate([before, kept])
+        peak = int(np.argmax(np.abs(whole)))
+        onset += peak - len(before)
+        before, kept = np.split(whole, [peak])
     refuse_short(kept, recording)
     if manner in ("peak", "deconvolve") and newtons is not None:
         before, kept = before / newtons, kept / newtons

@@ -14,6 +14,7 @@ from avmsf.errors import CaptureError
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 USUAL_SECONDS = 3.0
+TIME_ZEROS = ("onset", "peak")
 NORMALISATIONS = ("auto", "peak", "deconvolve", "none", "done")
 
 
@@ -60,6 +61,9 @@ class CaptureSettings:
     """Find where the impact begins in each file, and align the recordings with one another. Recordings that all start
     with the impact, as impulse responses do, are recognized and not cut. False takes every file from its first sample
     as it is: for recordings that have one time zero already."""
+    time_zero: str = "onset"
+    """Where a sound starts, with `align`: onset, where the impact begins; peak, at its largest sample, as in the paper.
+    Recordings that start at their peaks are not aligned with one another."""
 
     def __post_init__(self) -> None:
         for key in ("unit", "surface_unit", "views_unit"):
@@ -79,6 +83,8 @@ class CaptureSettings:
                 raise CaptureError(f"{key} is {value}; channels count from 1, as in a sound editor")
         if self.force_channel is not None and self.force_channel == self.response_channel:
             raise CaptureError(f"force_channel and response_channel are both {self.force_channel}")
+        if self.time_zero not in TIME_ZEROS:
+            raise CaptureError(f"time_zero is {self.time_zero!r}; expected one of {', '.join(TIME_ZEROS)}")
         if self.normalise not in NORMALISATIONS:
             raise CaptureError(f"normalise is {self.normalise!r}; expected one of {', '.join(NORMALISATIONS)}")
         if self.normalise == "deconvolve" and self.force_channel is None:
@@ -91,6 +97,11 @@ class CaptureSettings:
         rings for long (a structure of 19 Hz at 400 Hz still after 6 s).
         """
         return max(USUAL_SECONDS, USUAL_SECONDS * 44100.0 / rate) if self.seconds is None else self.seconds
+
+    @property
+    def from_peaks(self) -> bool:
+        """Whether sounds start at their largest samples."""
+        return self.align and self.time_zero == "peak"
 
     @property
     def metres(self) -> float:

@@ -65,9 +65,14 @@ def start_with_impact(recordings: Sequence[Prepared], *, rate: float) -> bool:
 def stay_uncut(recordings: Sequence[Prepared], *, rate: float, settings: CaptureSettings) -> bool:
     """Return whether the recordings of a capture are taken from their files' first sample on, though `align` is set.
 
-    A force channel and `align = false` say where the sounds start.
+    A force channel, `align = false` and `time_zero = "peak"` say where the sounds start.
     """
-    return settings.align and settings.force_channel is None and start_with_impact(recordings, rate=rate)
+    return (
+        settings.align
+        and not settings.from_peaks
+        and settings.force_channel is None
+        and start_with_impact(recordings, rate=rate)
+    )
 
 
 def settle_starts(recordings: Sequence[Prepared], *, rate: float, settings: CaptureSettings) -> list[Prepared]:
@@ -92,12 +97,13 @@ def cut_together(
 ) -> Sounds:
     """Return the sounds from their starts on, cut to one length, and what the files hold on either side of them.
 
-    Without `align` nothing will be moved later, so that both sides are None. Raises `CaptureError` as `common_length`.
+    Without `align`, or from the peaks on, nothing will be moved later, so that both sides are None. Raises
+    `CaptureError` as `common_length`.
     """
     settled = settle_starts(recordings, rate=rate, settings=settings)
     length, remarks = common_length([len(each.sound) for each in settled], names, rate=rate, settings=settings)
     sounds = torch.from_numpy(np.stack([each.sound[:length] for each in settled]).astype(np.float32))
-    if not settings.align:
+    if not settings.align or settings.from_peaks:
         return Sounds(sounds, None, None, remarks)
     size = margin_length(rate)
     before = np.full((len(settled), size), np.nan, dtype=np.float32)

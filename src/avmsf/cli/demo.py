@@ -25,9 +25,9 @@ from avmsf.export.webpage import write_webpage
 from avmsf.field.config import FitConfig
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
-from avmsf.modal.extraction.finders import HighResolution
+from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.features import DESCRIPTORS, LiftConfig
-from avmsf.pipeline.reconstruct import CACHE, ReconstructConfig, reconstruct
+from avmsf.pipeline.reconstruct import CACHE, reconstruct
 from avmsf.pipeline.scene import CLOUD, SceneConfig
 from avmsf.scene.points import farthest_points
 from avmsf.scene.splatconfig import SplatConfig
@@ -35,7 +35,7 @@ from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
 
 TRAIN = 12
 """Strikes that the field is fitted to; it is judged by the others."""
-CONFIG = ReconstructConfig(
+CONFIG = PipelineConfig(
     # With four times as many steps, the field's error is the same within the scatter of runs (.328; .321 to .340 with
     # these). The built-in descriptors need no download.
     scene=SceneConfig(splat=SplatConfig(steps=500), lift=LiftConfig(encoder=DESCRIPTORS)),
@@ -101,7 +101,6 @@ def _go_all_the_way(
         capture,
         train,
         CONFIG,
-        method=HighResolution(),
         cache=folder / CACHE,
         settings=CaptureSettings.read(folder / "capture" / "capture.toml"),
         listener=bar.listener,

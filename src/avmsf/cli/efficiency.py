@@ -16,12 +16,13 @@ from avmsf.bench.plan import Evaluation
 from avmsf.bench.results import ResultsFolder, write_json
 from avmsf.capture.datasets import open_dataset
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.evaluate import title_of
+from avmsf.cli.evaluate import settled_lifts, title_of
 from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.errors import EvaluationError
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline.bodies import BodyConfig
+from avmsf.pipeline.features import LiftConfig
 from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.pipeline.scene import SceneConfig
@@ -81,19 +82,20 @@ def run(options: Options) -> int:
     chosen = objects[0] if options.object is None else dataset.facts(options.object).identifier
     title = title_of(dataset, options.data)
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
-    scene = SceneConfig()
+    lift, paper = settled_lifts(LiftConfig(), methods)
+    scene = SceneConfig(lift=lift)
     bodies = ObjectBodies(dataset, folder / "features", config=options.body, scene=scene)
     evaluation = Evaluation(
         dataset,
         title,
         protocol,
         methods,
-        ObjectLooks(dataset, folder / "features", scene),
+        ObjectLooks(dataset, folder / "features", scene, paper),
         bodies,
         options.seed,
         Judging(cdpam=False),
         HighResolution(modes=options.modes),
-        {"scene": asdict(scene), "body": asdict(options.body)},
+        {"scene": asdict(scene), "paper": asdict(paper), "body": asdict(options.body)},
         bodies.family,
     )
     results = ResultsFolder(folder)

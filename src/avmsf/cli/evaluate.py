@@ -1,7 +1,7 @@
 """`avmsf evaluate`: how good methods are on a dataset, as tables and as a page."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +17,7 @@ from avmsf.bench.report import PAGE, SUMMARY, TABLES, write_page, write_summary
 from avmsf.bench.reporttables import Section
 from avmsf.bench.results import ResultsFolder
 from avmsf.bench.subsets import choose_objects, members
+from avmsf.bench.task import Method
 from avmsf.capture.datasets import CaptureCollection, open_dataset
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.cli import INTERRUPTED
@@ -25,10 +26,13 @@ from avmsf.cli.printing import console, print_json, say, table
 from avmsf.errors import EvaluationError
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline.bodies import BodyConfig
+from avmsf.pipeline.config import PRESETS
+from avmsf.pipeline.features import AUTO, LiftConfig, choose_encoder, settled
 from avmsf.pipeline.objectbodies import Geometry, ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig
+from avmsf.scene.splatconfig import SplatConfig
 
 _SHOWN = 5
 """Failures that are printed; the report lists all."""
@@ -58,6 +62,10 @@ class Options:
     look: Literal["best", "mesh"] = "best"
     """What looks are lifted from: the best of what shows an object, photographs before a mesh, which takes Gaussians;
     or its mesh, onto whose own surface they go."""
+    splat: SplatConfig = field(default_factory=SplatConfig)
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    """Settings of the features. The methods `paper` have the paper's own, of which they take the encoder alone from
+    here: DINOv2 without `--lift.encoder`, which then must be there."""
     workers: int = 1
     """Objects at a time, each on one thread; more than one needs the extra `scale`."""
     ray: str | None = None
@@ -101,7 +109,8 @@ def run(options: Options) -> int:
     title = title_of(dataset, options.data)
     objects = choose_objects(dataset, protocol, _words(options.objects))
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
-    scene = SceneConfig(views=ViewsConfig(source=options.look))
+    lift, paper = settled_lifts(options.lift, methods)
+    scene = SceneConfig(ViewsConfig(source=options.look), options.splat, lift)
     kept = (options.features or folder / "features").resolve()
     bodies = ObjectBodies(dataset, kept, options.geometry, options.body, scene)
     evaluation = Evaluation(
@@ -109,12 +118,17 @@ def run(options: Options) -> int:
         title,
         protocol,
         methods,
-        ObjectLooks(dataset, kept, scene),
+        ObjectLooks(dataset, kept, scene, paper),
         bodies,
         options.seed,
         Judging(level=options.level, cdpam=options.cdpam, cdpam_contacts=options.cdpam_contacts),
         HighResolution(modes=options.modes),
-        {"scene": asdict(scene), "geometry": options.geometry, "body": asdict(options.body)},
+        {
+            "scene": asdict(scene),
+            "paper": asdict(paper),
+            "geometry": options.geometry,
+            "body": asdict(options.body),
+        },
         bodies.family,
     )
     results, groups = ResultsFolder(folder), members(dataset)
@@ -148,6 +162,20 @@ def run(options: Options) -> int:
     if options.json:
         print_json({**summary, "results": str(folder)})
     return 0
+
+
+def settled_lifts(lift: LiftConfig, methods: Sequence[Method]) -> tuple[LiftConfig, LiftConfig]:
+    """Return how features are made, and how in the paper's form, with the encoders that will be taken.
+
+    What replaces DINOv2 is said, and is part of what results are stored under. Raises SceneError where a method needs
+    the paper's encoder and it is not to be had.
+    """
+    paper = PRESETS["paper"].scene.lift
+    if lift.encoder != AUTO:
+        return lift, replace(paper, encoder=lift.encoder)
+    if any(getattr(method, "look", None) == "paper" for method in methods):
+        choose_encoder(paper, tell=say)
+    return settled(lift, tell=say), paper
 
 
 def title_of(dataset: Dataset, folder: Path) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 import tyro
@@ -11,16 +11,16 @@ import tyro
 from avmsf._utils.caching import discard
 from avmsf.bench.evaluation import split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
+from avmsf.capture.folder import settings_of
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.heartbeat import doing
-from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
-from avmsf.field.config import PAPER, FitConfig
+from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import GainModel, estimator_for
@@ -28,10 +28,13 @@ from avmsf.field.recipes import GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
 from avmsf.modal.extraction.extract import extract_once
+from avmsf.modal.extraction.finders import ExtractionMethod, finder_named
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
+from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero, with_record
 from avmsf.pipeline.reconstruct import expect_on_object
+from avmsf.pipeline.scene import SceneConfig
 from avmsf.scene.features import FeatureField
-from avmsf.scene.featurestore import load_features
+from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.wording import counted
@@ -69,65 +72,77 @@ class Options:
     elastic one needs a mesh. network: the paper's attention network on the features. The others: the Gaussian process
     over one family, for study; symmetry needs a mesh, visual needs --features."""
     body: BodyConfig = field(default_factory=BodyConfig)
-    method: Method = "high-resolution"
+    method: ExtractionMethod = "high-resolution"
     """How modes are found; see `avmsf modes --help`."""
     modes: int = 128
     """Most modes to keep."""
+    time_zero: TimeZero | None = None
+    """Where sounds start: onset, or peak (paper); capture.toml decides where this does not."""
     json: bool = False
     """Print one JSON object on the standard output, all else on the standard error."""
-    recipe: Literal["quick", "paper"] = "quick"
-    """Where the settings below start from: quick takes seconds to minutes, paper has the paper's settings and takes
-    hours without an accelerator. `--recipe paper --help` shows its values."""
+    preset: Preset = "default"
+    """Where all settings start from. default: takes seconds to minutes. paper: everything as published, the middle of
+    each published list; it takes hours. `--preset paper --help` shows its values. `avmsf reconstruct` also has its
+    features; here they are those of --features."""
     config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)
     """Settings of the fit."""
+
+    @property
+    def pipeline(self) -> PipelineConfig:
+        """All settings as one; those of views and features are the features' file's own."""
+        scene = SceneConfig()
+        return PipelineConfig(self.gain_model, self.body, scene, self.config, self.method, self.modes, self.time_zero)
 
 
 @dataclass(frozen=True)
 class PaperOptions(Options):
-    """The same, starting from the paper's settings."""
+    """The same, starting from what the preset `paper` has otherwise."""
 
-    recipe: Literal["quick", "paper"] = "paper"
-    config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=lambda: PAPER)
+    gain_model: GainModel = PRESETS["paper"].gain_model
+    method: ExtractionMethod = PRESETS["paper"].method
+    time_zero: TimeZero | None = PRESETS["paper"].time_zero
+    preset: Preset = "paper"
+    config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=lambda: PRESETS["paper"].fit)
 
 
 @dataclass(frozen=True)
-class _Recipe:
-    recipe: Literal["quick", "paper"] = "quick"
+class _Preset:
+    preset: Preset = "default"
 
 
 def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell, with the recipe's settings where they say nothing."""
-    kind = {"quick": Options, "paper": PaperOptions}[recipe_of(words)]
+    """Return the options that the words spell, with the preset's settings where they say nothing."""
+    kind = {"default": Options, "paper": PaperOptions}[preset_of(words)]
     return tyro.cli(
         kind, prog="avmsf fit", args=words, description=Options.__doc__, config=(tyro.conf.FlagCreatePairsOff,)
     )
 
 
-def recipe_of(words: Sequence[str]) -> str:
-    """Return the recipe that the words name; it is read first, for it decides what all others start from."""
-    chosen, _ = tyro.cli(_Recipe, args=words, add_help=False, return_unknown_args=True)
-    return chosen.recipe
+def preset_of(words: Sequence[str]) -> Preset:
+    """Return the preset that the words name; it is read first, for it decides what all others start from."""
+    chosen, _ = tyro.cli(_Preset, args=words, add_help=False, return_unknown_args=True)
+    return chosen.preset
 
 
 def run(options: Options) -> int:
     """Fit, write, and say what came of it; return 130 where Ctrl-C stopped it."""
     expect_writable(options.output)
-    settings = None if options.settings is None else CaptureSettings.read(options.settings)
-    capture = read_capture(options.capture, settings)
+    known = settings_of(options.capture) if options.settings is None else CaptureSettings.read(options.settings)
+    capture = read_capture(options.capture, options.pipeline.capture_settings(known))
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
     )
     if options.features is None:
-        features = features_of(capture, options.config)
+        features, made = features_of(capture, options.config), {}
     else:
-        features = load_features(options.features)
+        features, made = load_features(options.features), read_report(options.features)
         expect_on_object(capture.impacts, features.points)
     if len(train) < _FEW:
         say(f"{len(train)} recordings tell little of how loud modes are between contacts; {_FEW} or more tell much")
     # Before the modes: what is wrong with the object's shape shows in less time than they take.
     gains = _estimator(options, capture, train)
     say(f"finding the modes of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
-    modes = extract_once(train, finder(options.method, options.modes), _beside(options.output, "modes"))
+    modes = extract_once(train, finder_named(options.method, options.modes), _beside(options.output, "modes"))
     for sentence in describe_alignment(modes, train):
         say(sentence)
     say(f"fitting a field of {len(modes.bank)} modes")
@@ -152,6 +167,7 @@ def run(options: Options) -> int:
     except FitError:
         discard(_beside(options.output, "modes"))
         raise
+    fitted = with_record(fitted, options.pipeline, made)
     save(fitted, options.output)
     for ending in ("modes", "checkpoint"):
         discard(_beside(options.output, ending))
@@ -175,7 +191,7 @@ def run(options: Options) -> int:
             {
                 "field": str(options.output),
                 "capture": capture.name,
-                "recipe": options.recipe,
+                "preset": options.preset,
                 "config": asdict(options.config),
                 "modes": len(fitted.bank),
                 "sample_rate": fitted.sample_rate,

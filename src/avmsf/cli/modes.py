@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
@@ -13,11 +12,9 @@ from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_rows, quality_rows
 from avmsf.cli.printing import console, decimals, figure, print_json, say, table
 from avmsf.modal.extraction.extract import extract
-from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
+from avmsf.modal.extraction.finders import ExtractionMethod, finder_named
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.wording import counted
-
-Method = Literal["high-resolution", "short-time"]
 
 _EXPLANATION = """\
 ±: spread over recordings. energy: share of all. phase: coherence over recordings, 1 if the same in
@@ -31,7 +28,7 @@ class Options:
 
     capture: tyro.conf.Positional[Path]
     """Folder with impacts.csv and the wav files it names."""
-    method: Method = "high-resolution"
+    method: ExtractionMethod = "high-resolution"
     """high-resolution: matrix pencils in subbands, which part modes a few hertz apart. short-time: the paper's, bin by
     bin of a short-time spectrum."""
     modes: int = 128
@@ -58,7 +55,7 @@ def run(options: Options) -> int:
     impacts = capture.impacts
     count = counted(len(impacts), "recording")
     say(f"finding the modes of {count}, {impacts.duration:.3g} s at {impacts.sample_rate:g} Hz")
-    extraction = extract(impacts, finder(options.method, options.modes))
+    extraction = extract(impacts, finder_named(options.method, options.modes))
     level = levels(amplitudes(extraction))
     rows = mode_rows(extraction.bank, level)
     quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)
@@ -91,11 +88,6 @@ def run(options: Options) -> int:
             }
         )
     return 0
-
-
-def finder(method: Method, modes: int) -> ModeFinder:
-    """Return the method of that name, which keeps at most so many modes."""
-    return HighResolution(modes=modes) if method == "high-resolution" else ShortTime(modes=modes)
 
 
 def mode_table(title: str, rows: Sequence[ModeRow]) -> object:

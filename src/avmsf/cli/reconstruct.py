@@ -3,30 +3,31 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from avmsf.capture import read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
-from avmsf.cli.fit import describe_outliers, part_contacts, recipe_of, summary
+from avmsf.cli.fit import describe_outliers, part_contacts, preset_of, summary
 from avmsf.cli.heartbeat import doing
-from avmsf.cli.modes import Method, finder
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import SceneOptions, features_words
 from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
 from avmsf.cli.writing import expect_writable
-from avmsf.field.config import PAPER, FitConfig
+from avmsf.field.config import FitConfig
 from avmsf.field.fit import Progress
 from avmsf.field.gains.estimator import GainModel
 from avmsf.field.store import load
 from avmsf.files import copy_whole
+from avmsf.modal.extraction.finders import ExtractionMethod
 from avmsf.pipeline.bodies import BodyConfig
+from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
 from avmsf.pipeline.features import LiftConfig
-from avmsf.pipeline.reconstruct import ReconstructConfig, reconstruct
+from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig
 from avmsf.pipeline.stages import StageFolder
@@ -50,10 +51,12 @@ class Options(SceneOptions):
     """Likewise with so many places."""
     start: int = 0
     """Row of impacts.csv, counted from 0, whose place this choice starts from."""
-    method: Method = "high-resolution"
+    method: ExtractionMethod = "high-resolution"
     """How modes are found; see `avmsf modes --help`."""
     modes: int = 128
     """Most modes to keep."""
+    time_zero: TimeZero | None = None
+    """Where sounds start: onset, or peak (paper); capture.toml decides where this does not."""
     json: bool = False
     """Print one JSON object on the standard output, all else on the standard error."""
     gain_model: GainModel = "auto"
@@ -62,23 +65,34 @@ class Options(SceneOptions):
     views: ViewsConfig = field(default_factory=ViewsConfig)
     splat: SplatConfig = field(default_factory=SplatConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
-    recipe: Literal["quick", "paper"] = "quick"
-    """Where the settings of the fit start from; see `avmsf fit --help`."""
+    preset: Preset = "default"
+    """Where all settings start from, from views to the fit; see `avmsf fit --help`. `--preset paper --help` shows its
+    values."""
     fit: FitConfig = field(default_factory=FitConfig)
+
+    @property
+    def pipeline(self) -> PipelineConfig:
+        """All settings as one."""
+        scene = SceneConfig(self.views, self.splat, self.lift)
+        return PipelineConfig(self.gain_model, self.body, scene, self.fit, self.method, self.modes, self.time_zero)
 
 
 @dataclass(frozen=True)
 class PaperOptions(Options):
-    """The same, starting from the paper's settings of the fit."""
+    """The same, starting from what the preset `paper` has otherwise."""
 
-    recipe: Literal["quick", "paper"] = "paper"
-    fit: FitConfig = field(default_factory=lambda: PAPER)
+    gain_model: GainModel = PRESETS["paper"].gain_model
+    method: ExtractionMethod = PRESETS["paper"].method
+    lift: LiftConfig = field(default_factory=lambda: PRESETS["paper"].scene.lift)
+    time_zero: TimeZero | None = PRESETS["paper"].time_zero
+    preset: Preset = "paper"
+    fit: FitConfig = field(default_factory=lambda: PRESETS["paper"].fit)
 
 
 def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell, with the recipe's settings where they say nothing."""
+    """Return the options that the words spell, with the preset's settings where they say nothing."""
     return tyro.cli(
-        {"quick": Options, "paper": PaperOptions}[recipe_of(words)],
+        {"default": Options, "paper": PaperOptions}[preset_of(words)],
         prog="avmsf reconstruct",
         args=words,
         description=Options.__doc__,
@@ -90,7 +104,7 @@ def run(options: Options) -> int:
     """Reconstruct, and say what came of it; return 130 where Ctrl-C stopped it."""
     if options.output is not None:
         expect_writable(options.output)
-    settings = options.read_settings()
+    settings = options.pipeline.capture_settings(options.read_settings())
     capture = read_capture(options.folder, settings)
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
@@ -101,13 +115,7 @@ def run(options: Options) -> int:
                 options.folder,
                 capture,
                 train,
-                ReconstructConfig(
-                    options.gain_model,
-                    options.body,
-                    SceneConfig(options.views, options.splat, options.lift),
-                    options.fit,
-                ),
-                method=finder(options.method, options.modes),
+                options.pipeline,
                 cache=options.kept,
                 settings=settings,
                 listener=scene_bar.listener,
@@ -147,6 +155,7 @@ def run(options: Options) -> int:
                 "field": str(options.output or made.field),
                 "surface": None if made.surface is None else str(made.surface),
                 "capture": capture.name,
+                "preset": options.preset,
                 "features_report": made.report,
                 "stages": [asdict(each) for each in made.stages],
                 "modes": len(fitted.bank),

@@ -25,6 +25,7 @@ from avmsf.field.gains.model import MixtureGains
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
+from avmsf.pipeline.config import RECORD
 from avmsf.scene.points import farthest_points
 
 _DRAWN_POINTS = 4000
@@ -116,8 +117,8 @@ def describe(field: SoundField) -> dict[str, Any]:
         "residual_rms": noise,
         "per_newton": field.origin.per_newton,
         "trained_on": list(field.origin.trained_on),
-        "config": asdict(field.origin.config),
-        "report": field.origin.report,
+        "pipeline": {**field.origin.report.get(RECORD, {}), "fit": asdict(field.origin.config)},
+        "report": {name: value for name, value in field.origin.report.items() if name != RECORD},
     }
 
 
@@ -200,6 +201,7 @@ def _words(values: dict[str, Any], quality: list[str]) -> str:
         f"  gains      {_gains_words(values['gain_field'])}",
         f"  fitted to  {len(values['trained_on'])} recordings",
     ]
+    lines += [f"  made by    {words}" for words in _pipeline_words(values["pipeline"])]
     lines += [f"  quality    {words}" for words in quality]
     excluded = report.get("excluded", ())
     for name, words in report.get("outliers", {}).items():
@@ -211,6 +213,26 @@ def _words(values: dict[str, Any], quality: list[str]) -> str:
         errors = ", ".join(f"{name} {float(error):.3g}" for name, error in held.items())
         lines.append(f"  chosen on  {len(report['validation_contacts'])} validation contacts, spectral error {errors}")
     return "\n".join(lines)
+
+
+def _pipeline_words(pipeline: dict[str, Any]) -> list[str]:
+    """Return lines on the stages that made the field, as far as its file names them."""
+    fit, scene = pipeline["fit"], pipeline.get("scene")
+    lines = []
+    if "method" in pipeline:
+        model = pipeline["gain_model"]
+        lines.append(f"{pipeline['method']} extraction, at most {pipeline['modes']} modes; gain model {model}")
+    if scene is not None:
+        lift, views = scene["lift"], scene["views"]
+        lines.append(
+            f"features of {pipeline['encoder']}, averaged {lift['weighting']}, {lift['components'] or 'all'} components"
+            f"; views {views['count'] or 'all'}, onto {lift['onto']}, splat steps {scene['splat']['steps']}"
+        )
+    rates = f"rates {fit['warmup_rate']:g} and {fit['learning_rate']:g}"
+    lines.append(
+        f"{fit['warmup_steps']} + {fit['steps']} steps, {fit['clusters']} clusters, {rates}, seed {fit['seed']}"
+    )
+    return lines
 
 
 def _edit_words(edit: dict[str, Any]) -> str:

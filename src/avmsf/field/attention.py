@@ -33,6 +33,8 @@ class AttentionShape:
     """Factor on the features as the network reads them."""
     spatial_damping: bool = False
     """Whether damping, too, depends on the contact."""
+    projection: bool = False
+    """Whether what attention reads is projected before it is joined with the contact's feature."""
 
 
 _MAX_LAYERS = 64
@@ -86,6 +88,7 @@ class AttentionGains(TrainableGains):
         self.query = nn.Linear(encoded + dim, shape.width, bias=False)
         self.key = nn.Linear(dim, shape.width, bias=False)
         self.value = nn.Linear(dim, shape.width, bias=False)
+        self.project = nn.Linear(shape.width, shape.width, bias=False) if shape.projection else nn.Identity()
         sizes = [shape.width + dim] + [shape.hidden] * shape.layers
         stack: list[nn.Module] = []
         for before, after in pairwise(sizes):
@@ -131,7 +134,7 @@ class AttentionGains(TrainableGains):
         descriptors = self.descriptors * self.shape.feature_scale
         key, value = self.key(descriptors), self.value(descriptors)
         attention = torch.softmax(query @ key.T / math.sqrt(self.shape.width), dim=1)
-        hidden = self.head(torch.cat([attention @ value, feature], dim=1))
+        hidden = self.head(torch.cat([self.project(attention @ value), feature], dim=1))
         factors = None if self.to_dampings is None else torch.exp(self.to_dampings(hidden))
         return Gains(self.to_gains(hidden) * self.gain_scale, damping=factors)
 
@@ -175,7 +178,8 @@ class AttentionGains(TrainableGains):
     @classmethod
     def _empty(cls, record: Mapping[str, Any]) -> "AttentionGains":
         points, dim, modes = (count_of(record[name], name) for name in ("points", "dim", "modes"))
-        encoder, shape = like(record["encoder"], "", "encoder"), record_of(_EXAMPLE, record["shape"], "shape")
+        encoder = like(record["encoder"], "", "encoder")
+        shape = record_of(_EXAMPLE, record["shape"], "shape", later=("projection",))
         if shape.layers > _MAX_LAYERS or shape.bands > _MAX_LAYERS:
             raise ValueError(f"layers and bands: expected at most {_MAX_LAYERS}, got {shape.layers} and {shape.bands}")
         with torch.device("meta"):

@@ -11,6 +11,9 @@ from avmsf.modal.spectra import scaled_fft_size
 _COUNTS = ("clusters", "width", "hidden", "interleave", "early")
 _POSITIVE = ("feature_scale", "warmup_rate", "learning_rate")
 
+LATER = ("warmup_gains", "warmup_weights", "spectral_norm", "residual_start", "projection")
+"""Settings that the first files of the current format lack."""
+
 
 @dataclass(frozen=True)
 class FitConfig:
@@ -26,6 +29,8 @@ class FitConfig:
     """Neurons in each hidden layer."""
     layers: int = 3
     """Hidden layers."""
+    projection: bool = False
+    """Whether what attention reads is projected before it is joined with the contact's feature (paper)."""
     feature_scale: float = 4.0
     """Factor on the features as the network reads them: larger lets gains change over shorter distances."""
     warmup_rate: float = 3e-3
@@ -41,6 +46,10 @@ class FitConfig:
     """Decoupled weight decay on the network's matrices."""
     warmup_steps: int = 1000
     """Steps on the extracted gains alone (paper, eq. 13)."""
+    warmup_gains: Literal["least-squares", "regression"] = "least-squares"
+    """What these are: signed amplitudes by least squares, or each bin's own regression (paper, eq. 5)."""
+    warmup_weights: Literal["energy", "equal"] = "energy"
+    """How the modes' squared errors weigh: by the energy that a gain makes over time, or alike (paper)."""
     steps: int = 150
     """Steps end to end on spectra (paper, eq. 14)."""
     patience: int = 0
@@ -52,6 +61,8 @@ class FitConfig:
     """Samples between frames at 44.1 and 48 kHz; 0 takes a quarter of each FFT size (paper: 64)."""
     interleave: int = 2
     """Steps among which the frames are shared out in turn; 1 compares all of them at every step, as the paper does."""
+    spectral_norm: Literal["each", "common"] = "each"
+    """Whether each resolution's distance is divided by its recordings' norm, or all by one number (paper)."""
     early: int = 8192
     """Length of the beginning that is compared once more, samples at 44.1 and 48 kHz."""
     early_weight: float = 1.0
@@ -64,6 +75,8 @@ class FitConfig:
     """How modes start: each with the phase that the training recordings agree on, or as sines (paper, eq. 3)."""
     residual: bool = True
     """Whether noise is modeled in addition to the modes."""
+    residual_start: Literal["beneath-modes", "quietest"] = "beneath-modes"
+    """What its training starts from: what modes leave over, or the recordings' lowest-energy segments (paper)."""
     residual_noise: Literal["low-fluctuation", "gaussian"] = "low-fluctuation"
     """Noise that is filtered to the residual's spectrum when the field is rendered: a fixed sequence whose spectrogram
     hardly fluctuates, 2 dB below a recording's noise, or a random draw at its level (paper)."""
@@ -93,7 +106,8 @@ class FitConfig:
     @property
     def shape(self) -> AttentionShape:
         """Sizes of the network, with shared damping."""
-        return AttentionShape(self.clusters, self.bands, self.width, self.hidden, self.layers, self.feature_scale)
+        sizes = (self.clusters, self.bands, self.width, self.hidden, self.layers, self.feature_scale)
+        return AttentionShape(*sizes, projection=self.projection)
 
     def resolutions(self, sample_rate: float) -> tuple[tuple[int, ...], tuple[int, ...], int]:
         """Return FFT sizes, hops and the early length in samples at a sample rate, Hz."""
@@ -111,19 +125,23 @@ PAPER = FitConfig(
     width=128,
     hidden=256,
     layers=2,
+    projection=True,
     feature_scale=1.0,
     warmup_rate=5e-3,
     learning_rate=5e-3,
     correction_rate=5e-3,
     noise_rate=5e-3,
     weight_decay=0.0,
-    warmup_steps=1000,
+    warmup_gains="regression",
+    warmup_weights="equal",
     steps=10000,
     fft_sizes=(2048, 1024, 512, 256),
     hop=64,
     interleave=1,
+    spectral_norm="common",
     early_weight=1.0,
     phase="sine",
+    residual_start="quietest",
     residual_noise="gaussian",
 )
 """The paper's settings where it states them (supplement, training setup), the middle of each of its lists: clusters,

@@ -147,7 +147,6 @@ class _Job:
         warmup = case.config.warmup_steps if recipe.warms_up else 0
         self.config = case.config if warmup else replace(case.config, warmup_steps=0, steps=max(1, case.config.steps))
         self.steps = case.config.steps
-        self.gains = case.gains * case.signs[:, None]
         self.rows = recipe.rows(case)
         self.identity = {"input, configuration or version": fingerprint(case, recipe)}
         saved = (
@@ -232,7 +231,7 @@ class _Job:
         return TrainingRun(
             self.recipe.start(case, plan.damping),
             case.modes,
-            gains=self.gains[learned],
+            gains=case.gains,
             phase=case.phase,
             sample_rate=self.train.sample_rate,
             samples=self.train.sounds.shape[1],
@@ -240,7 +239,7 @@ class _Job:
         )
 
     def _targets(self, rows: list[int]) -> Targets:
-        return Targets.of(self.train.take(rows), self.gains[rows], self.rows[rows], self.config)
+        return Targets.of(self.train.take(rows), self.case.gains[rows], self.rows[rows], self.config)
 
     def _save(self, name: str, run: TrainingRun, validation: "_Validation | None") -> None:
         if self.checkpoint is None:

@@ -31,7 +31,7 @@ class SpectralTarget:
     magnitudes: tuple[Float[Tensor, "contacts _frames _bins"], ...]
     """One a resolution, each with its own numbers of frames and bins."""
     norms: tuple[Float[Tensor, " _frames"], ...]
-    """Their sums over contacts and bins."""
+    """What the distances in their frames are divided by: their sums over contacts and bins."""
     hops: tuple[int, ...]
     """Samples between frames, one a resolution."""
     windows: tuple[Float[Tensor, " _size"], ...]
@@ -76,9 +76,9 @@ def spectral_target(
 def spectral_loss(
     sounds: Float[Tensor, "contacts samples"], target: SpectralTarget, *, first: int = 0, every: int = 1
 ) -> Float[Tensor, ""]:
-    """Return the L1 distance of magnitudes over the target's L1 norm, summed over resolutions (paper, eq. 14).
+    """Return the L1 distance of magnitudes over the target's norm, summed over resolutions (paper, eq. 14).
 
-    The division makes the resolutions weigh alike and the loss read as a relative error; differentiable in `sounds`.
+    Their L1 norms make the resolutions weigh alike and the loss read as a relative error; differentiable in `sounds`.
     Only frame `first` and `every` so many after it are compared: the mean of the losses from each first frame below
     `every` on is the loss of all frames, about, for an `every`th of the work each. Raises ValueError for other sounds
     than the target's, in number, or shorter ones.

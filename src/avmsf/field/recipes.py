@@ -22,9 +22,10 @@ from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import TrainableGains
 from avmsf.field.training import gain_scale
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.phase import common_phase
-from avmsf.modal.residual import Residual
+from avmsf.modal.residual import Residual, noise_power
 from avmsf.scene.features import FeatureField
 
 SHARED, PER_CONTACT = "shared", "per-contact"
@@ -46,13 +47,8 @@ class GainCase:
     phase: Float64[Tensor, " modes"]
     """How each mode starts, radians."""
     gains: Float[Tensor, "contacts modes"]
-    """Amplitudes in each recording of what starts with the phase alone, the network's aim."""
+    """The network's aim: amplitudes of what starts with the phase, times `orientation_signs`, or regressed ones."""
     config: FitConfig
-
-    @property
-    def signs(self) -> Float[Tensor, " contacts"]:
-        """+1 or -1 a contact: what makes impacts from both sides of a wall impacts from one."""
-        return orientation_signs(self.train.contacts, self.train.directions).to(self.gains)
 
     @property
     def parts(self) -> Float64[Tensor, "contacts modes 2"]:
@@ -76,12 +72,18 @@ def gain_case(train: Impacts, features: FeatureField, modes: Extraction, config:
     phase = torch.zeros_like(modes.bank.frequency)
     if config.phase == "common":
         phase = common_phase(modes.gains, modes.quadrature)
-    if config.warmup_steps:
-        gains = fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate, phase=phase)
+    if config.residual_start == "quietest":
+        power = noise_power(train.sounds, bins=len(modes.residual.magnitude)).mean(0)
+        modes = replace(modes, residual=Residual(power.sqrt()))
+    signs = orientation_signs(train.contacts, train.directions)[:, None]
+    if config.warmup_steps and config.warmup_gains == "regression":
+        gains = ShortTime().gains(train.sounds, modes.bank, train.sample_rate).float()
+    elif config.warmup_steps:
+        gains = signs * fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate, phase=phase)
     else:
         # No aim then, they only say how strong the modes are: what of the extraction's own has the phase does.
         turned = modes.gains * torch.cos(phase) + modes.quadrature * torch.sin(phase)
-        gains = turned.to(train.sounds)
+        gains = signs * turned.to(train.sounds)
     return GainCase(train, features, modes, phase, gains, config)
 
 
@@ -168,7 +170,7 @@ class Attention(GainRecipe):
         """Return an untrained network."""
         return AttentionGains(
             self._features(case),
-            gain_scale=gain_scale(case.gains * case.signs[:, None]),
+            gain_scale=gain_scale(case.gains),
             shape=replace(case.config.shape, spatial_damping=damping == PER_CONTACT),
             generator=torch.Generator().manual_seed(case.config.seed),
         )

@@ -28,7 +28,7 @@ from avmsf._utils.text_files import parse_json
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, FieldFileError, FitError
-from avmsf.field.config import FitConfig
+from avmsf.field.config import LATER, FitConfig
 from avmsf.field.gainfield import GainField
 from avmsf.field.scaledgains import FITTED, ScaledGains
 from avmsf.field.soundfield import FieldQuality, Origin, SoundField
@@ -154,7 +154,7 @@ class _Header:
             capture=like(origin["capture"], "", "origin.capture"),
             trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
             per_newton=like(origin["per_newton"], True, "origin.per_newton"),
-            config=record_of(FitConfig(), record["config"], "config"),
+            config=record_of(FitConfig(), record["config"], "config", later=LATER),
             report=like(origin["report"], {}, "origin.report"),
             settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
         )

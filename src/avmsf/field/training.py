@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -40,13 +40,14 @@ class Targets:
         config: FitConfig,
     ) -> "Targets":
         """Prepare recordings with the config's resolutions."""
-        sizes, hops, early = config.resolutions(impacts.sample_rate)
-        return cls(
-            rows,
-            gains,
-            spectral_target(impacts.sounds, fft_sizes=sizes, hops=hops),
-            spectral_target(impacts.sounds, fft_sizes=sizes, hops=hops, samples=early),
-        )
+        sizes, hops, length = config.resolutions(impacts.sample_rate)
+        whole = spectral_target(impacts.sounds, fft_sizes=sizes, hops=hops)
+        early = spectral_target(impacts.sounds, fft_sizes=sizes, hops=hops, samples=length)
+        if config.spectral_norm == "common":
+            mean = sum(float(each.sum()) for each in whole.norms) / len(sizes)
+            parts = ([torch.full_like(each, mean / len(each)) for each in target.norms] for target in (whole, early))
+            whole, early = replace(whole, norms=tuple(next(parts))), replace(early, norms=tuple(next(parts)))
+        return cls(rows, gains, whole, early)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +120,7 @@ class TrainingRun:
         self.network, self.config, self.phase = network, config, phase
         self.sample_rate, self.samples = sample_rate, samples
         self.start = modes
-        self.weight = _mode_weight(modes.bank, gains)
+        self.weight = _mode_weight(modes.bank, gains, config)
         self.width = torch.clamp(modes.bank.damping / (2 * math.pi), min=sample_rate / samples)
         count, bins = len(modes.bank), len(modes.residual.magnitude)
         self.shift = nn.Parameter(torch.zeros(count, dtype=torch.float64))
@@ -207,7 +208,7 @@ class TrainingRun:
     def _warmup_loss(self, targets: Targets) -> Float[Tensor, ""]:
         """Return the squared error of the gains (paper, eq. 13), over their mean square.
 
-        Each mode weighs as its energy over time does, gain^2 / (4 d): a gain counts by the sound that it makes.
+        Each mode weighs as its energy over time does, gain^2 / (4 d): by the sound that it makes; or alike (paper).
         """
         gains = self.network.read(targets.rows).mean
         return ((gains - targets.gains).square() * self.weight).sum(1).mean()
@@ -239,8 +240,9 @@ class TrainingRun:
         self.step = state["step"]
 
 
-def _mode_weight(bank: ModalBank, gains: Float[Tensor, "contacts modes"]) -> Float[Tensor, " modes"]:
-    energy = (1 / (4 * bank.damping)).to(gains.dtype)
+def _mode_weight(bank: ModalBank, gains: Float[Tensor, "contacts modes"], config: FitConfig) -> Float[Tensor, " modes"]:
+    alike = config.warmup_weights == "equal"
+    energy = (torch.ones_like(bank.damping) if alike else 1 / (4 * bank.damping)).to(gains.dtype)
     total = (gains.square().mean(0) * energy).sum()
     return energy / total.clamp_min(torch.finfo(gains.dtype).tiny)
 

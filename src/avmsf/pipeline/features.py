@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -26,6 +26,7 @@ from avmsf.scene.visibility import depth_of_surface
 
 DINO = "facebook/dinov2-base"
 DESCRIPTORS = "descriptors"
+AUTO = "auto"
 _WEIGHTINGS = {"plain": by_presence, "visibility": by_visibility}
 
 
@@ -33,11 +34,13 @@ _WEIGHTINGS = {"plain": by_presence, "visibility": by_visibility}
 class LiftConfig:
     """Settings of the features."""
 
-    encoder: str = "auto"
+    encoder: str = AUTO
     """What describes the images: the name of a DINOv2 model (such as facebook/dinov2-base), a folder that holds one,
     `descriptors` (built in, no download), or `auto`: DINOv2 base where it is to be had, else the built-in ones."""
     longest: int = 518
     """Pixels of an image's longer side as DINOv2 sees it."""
+    background: Literal["inpainted", "kept"] = "inpainted"
+    """What the encoder sees outside an object's mask: the object's colors carried on, or the image as it is (paper)."""
     weighting: Literal["plain", "visibility"] = "visibility"
     """How the views that see a point are averaged: by how well they see it, or plainly (paper)."""
     components: int = 32
@@ -51,6 +54,8 @@ class LiftConfig:
     """How often features are pooled over the symmetries (paper: T)."""
     angles: int = ANGLES
     """Angles that stand for all of a continuous rotation (paper: the size of Theta)."""
+    reach: float = 3.0
+    """Point spacings within which the nearest point is a symmetric counterpart; 0 takes it at any distance (paper)."""
     positions: bool = True
     """Whether the points' positions, relative to the object's size, stand before the features."""
     size: float = 0.3
@@ -68,6 +73,8 @@ class LiftConfig:
                 raise SceneError(f"{name} = {getattr(self, name)}: expected {least} or more")
         if not 0 <= self.missing <= 0.45:
             raise SceneError(f"missing = {self.missing}: expected 0 to 0.45")
+        if not 0 <= self.reach < math.inf:
+            raise SceneError(f"reach = {self.reach}: expected a number of point spacings, or 0 for any distance")
         if not 0 < self.size < math.inf:
             raise SceneError(f"size = {self.size}: expected more than 0")
 
@@ -88,7 +95,7 @@ def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None]) -> Encode
     """Return the encoder that the settings name. Raises SceneError where it is not to be had."""
     if config.encoder == DESCRIPTORS:
         return ImageDescriptors()
-    if config.encoder != "auto":
+    if config.encoder != AUTO:
         return DinoEncoder.load(config.encoder, longest=config.longest, device=_device())
     try:
         return DinoEncoder.load(DINO, longest=config.longest, device=_device())
@@ -96,6 +103,14 @@ def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None]) -> Encode
         reason = str(error).split(":")[0]
         tell(f"encoder: the built-in descriptors, for {DINO} is not to be had: {reason}")
         return ImageDescriptors()
+
+
+def settled(config: LiftConfig, *, tell: Callable[[str], None]) -> LiftConfig:
+    """Return the settings with the encoder that `auto` means here, which `tell` hears of if it is not DINOv2."""
+    if config.encoder != AUTO:
+        return config
+    found = choose_encoder(config, tell=tell)
+    return replace(config, encoder=DESCRIPTORS if isinstance(found, ImageDescriptors) else DINO)
 
 
 def lift_to_cloud(
@@ -109,7 +124,15 @@ def lift_to_cloud(
 ) -> Lifted:
     """Lift features onto the Gaussians that views see, as the settings say."""
     weighting = _WEIGHTINGS[config.weighting]
-    lifted = lift(cloud, views, encoder, rasteriser=rasteriser, weighting=weighting, progress=progress)
+    lifted = lift(
+        cloud,
+        views,
+        encoder,
+        rasteriser=rasteriser,
+        weighting=weighting,
+        inpainted=config.background == "inpainted",
+        progress=progress,
+    )
     return supported(lifted, views)
 
 
@@ -126,7 +149,15 @@ def lift_to_surface(
     points = sample_surface(surface.vertices, surface.faces, config.points, generator=generator).points
     weighting = _WEIGHTINGS[config.weighting]
     depth_map = depth_of_surface(surface)
-    return lift_points(points, views, encoder, depth_map=depth_map, weighting=weighting, progress=progress)
+    return lift_points(
+        points,
+        views,
+        encoder,
+        depth_map=depth_map,
+        weighting=weighting,
+        inpainted=config.background == "inpainted",
+        progress=progress,
+    )
 
 
 def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
@@ -149,7 +180,9 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
         symmetries = find_symmetries(features.points, generator=generator, missing=config.missing)
         report["symmetries"] = symmetries.to_dict()
         if symmetries:
-            pooled = refine(features, symmetries, iterations=config.iterations, angles=config.angles)
+            pooled = refine(
+                features, symmetries, iterations=config.iterations, angles=config.angles, reach=config.reach
+            )
             spreads = (orbit_spread(each, symmetries, angles=config.angles) for each in (features, pooled))
             report["orbit_spread"] = list(spreads)
             features = pooled

@@ -1,5 +1,6 @@
 """What fields may read of the objects of a dataset: made once an object, kept, and the same for every method."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -7,12 +8,15 @@ from avmsf._utils.locks import NO_LIMIT
 from avmsf.bench.task import Look
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.errors import SceneError
+from avmsf.pipeline.config import PRESETS
+from avmsf.pipeline.features import LiftConfig
 from avmsf.pipeline.scene import FEATURES, SceneConfig, SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features
 
-UNALIGNED = "unaligned.safetensors"
+NAMES: Mapping[Look, str] = {"unaligned": "unaligned.safetensors", "paper": "paper.safetensors"}
+"""What the files of features are called, where they are not those of the fields without ablation."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +26,8 @@ class ObjectLooks:
     dataset: Dataset
     cache: Path
     config: SceneConfig = field(default_factory=SceneConfig)
+    paper: LiftConfig = PRESETS["paper"].scene.lift
+    """How features are made in the paper's form."""
 
     def __call__(self, identifier: str, look: Look, views: int | None = None) -> FeatureField:
         """Return what `look` means for an object, from at most `views` views, or from all for None.
@@ -35,7 +41,7 @@ class ObjectLooks:
             return self._bare(identifier)
         if seen is None:
             raise SceneError(f"{identifier}: the dataset holds neither a mesh nor pictures of it, so it has no looks")
-        lift = replace(self.config.lift, symmetry=look != "unaligned")
+        lift = self.paper if look == "paper" else replace(self.config.lift, symmetry=look != "unaligned")
         config = replace(self.config, lift=lift, views=replace(self.config.views, count=views or 0))
         place = self.cache / identifier / ("all views" if views is None else f"{views} views")
         stages = SceneStages(
@@ -43,7 +49,7 @@ class ObjectLooks:
             StageFolder(place),
             config,
             settings=seen.settings,
-            name=UNALIGNED if look == "unaligned" else FEATURES,
+            name=NAMES.get(look, FEATURES),
         )
         with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
             features = load_features(stages.features.path)

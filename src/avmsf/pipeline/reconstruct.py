@@ -3,7 +3,7 @@
 import hashlib
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +20,19 @@ from avmsf.capture.surface import read_surface, write_surface
 from avmsf.capture.views import read_views
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import AvmsfError, CaptureError, SceneError
-from avmsf.field.config import FitConfig
 from avmsf.field.fit import Progress, fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.estimator import NETWORK, GainModel, estimator_for
+from avmsf.field.gains.estimator import NETWORK, estimator_for
 from avmsf.field.gains.positional import Visual
 from avmsf.field.store import load, save
 from avmsf.files import write_whole
 from avmsf.geometry import ObjectShape
 from avmsf.geometry.closest import ClosestPoints
 from avmsf.modal.extraction.extract import Extraction, extract_once
-from avmsf.modal.extraction.finders import ModeFinder
-from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
-from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages
+from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import PipelineConfig, with_record
+from avmsf.pipeline.scene import Listener, SceneStages
 from avmsf.pipeline.silhouettes import judge_outlines
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
@@ -80,25 +79,12 @@ class Reconstruction:
     """The object's surface in the cache; None where its shape is unknown or the gain model needs none."""
 
 
-@dataclass(frozen=True)
-class ReconstructConfig:
-    """Settings of all stages."""
-
-    gain_model: GainModel = "auto"
-    """How gains vary over the object."""
-    body: BodyConfig = field(default_factory=BodyConfig)
-    """How the object's shape becomes bodies that vibrate."""
-    scene: SceneConfig = field(default_factory=SceneConfig)
-    fit: FitConfig = field(default_factory=FitConfig)
-
-
 def reconstruct(
     folder: Path,
     capture: Capture,
     train: Impacts,
-    config: ReconstructConfig,
+    config: PipelineConfig,
     *,
-    method: ModeFinder,
     cache: Path,
     settings: CaptureSettings,
     listener: Listener,
@@ -116,7 +102,6 @@ def reconstruct(
             capture,
             train,
             config,
-            method=method,
             stages=StageFolder(cache),
             settings=settings,
             listener=listener,
@@ -128,15 +113,15 @@ def _reconstruct(
     folder: Path,
     capture: Capture,
     train: Impacts,
-    config: ReconstructConfig,
+    config: PipelineConfig,
     *,
-    method: ModeFinder,
     stages: StageFolder,
     settings: CaptureSettings,
     listener: Listener,
     fitting: Callable[[Progress], None] | None,
 ) -> Reconstruction:
     shape = _shape(folder, capture, config, stages, settings=settings, listener=listener)
+    method = config.finder
     heard = {"impacts": train.digest(), "method": repr(method)}
     listener.tell(f"modes: of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path, needed=True))
@@ -165,7 +150,7 @@ def _reconstruct(
             checkpoint=stages.checkpoint(FIELD),
             progress=fitting,
         )
-        save(fitted, path)
+        save(with_record(fitted, config, shape.report), path)
 
     def is_final(path: Path) -> bool:
         """Whether a kept field has the elastic family, or there is still none, as for want of memory."""
@@ -228,7 +213,7 @@ class _Shape:
 def _shape(
     folder: Path,
     capture: Capture,
-    config: ReconstructConfig,
+    config: PipelineConfig,
     stages: StageFolder,
     *,
     settings: CaptureSettings,
@@ -259,7 +244,9 @@ def _shape(
     if seen is None and "surface" in made:
         # Gaussians lie up to a wall's thickness below the surface, where a wall's other side may be nearer.
         seen = read_surface(made["surface"].path)
-    if seen is not None and "cloud" in made:
+    # The paper's network reads the Gaussians' own centers.
+    centers = config.gain_model == NETWORK and config.scene.lift.onto == "gaussians"
+    if seen is not None and "cloud" in made and not centers:
         features = moved_onto(features, seen)
     candidates = {}
     candidates["positions"] = FeatureField.from_points(features.points)
@@ -273,7 +260,7 @@ def _shape(
 
 def _surface_stage(
     stages: StageFolder,
-    config: ReconstructConfig,
+    config: PipelineConfig,
     surface: Callable[[], Surface | ObjectShape],
     digest: str,
     listener: Listener,

@@ -142,7 +142,7 @@ class SceneStages:
             views = read_views(self.views.path)
             lifted = self._lift_to_mesh(views, encoder) if on_mesh else self._lift_to_cloud(views, encoder)
             made = finish_features(lifted, self.config.lift)
-            save_features(made.features, path, report=made.report)
+            save_features(made.features, path, report={**made.report, "scene": asdict(self.config)})
 
         return self.stages.keep(self.name, recipe, make)
 

@@ -110,6 +110,7 @@ def lift(
     *,
     rasteriser: Rasteriser | None = None,
     weighting: Weighting = by_presence,
+    inpainted: bool = True,
     progress: Callable[[LiftProgress], None] | None = None,
 ) -> Lifted:
     """Give every Gaussian the mean of the features at its places in the views that see it.
@@ -126,6 +127,7 @@ def lift(
         depth_map=depth_of_cloud(cloud, rasteriser),
         reach=lambda camera: _REACH * depth_reach(cloud, camera),
         weighting=weighting,
+        inpainted=inpainted,
         progress=progress,
     )
 
@@ -138,11 +140,13 @@ def lift_points(
     depth_map: DepthMap,
     reach: Callable[[Camera], Float[Tensor, " points"]] | None = None,
     weighting: Weighting = by_presence,
+    inpainted: bool = True,
     progress: Callable[[LiftProgress], None] | None = None,
 ) -> Lifted:
     """Give points of a surface, whose depth in a camera `depth_map` knows, the mean of the features in their views.
 
-    `reach` says how far behind that depth a point may lie, metres; without it, points lie on the surface. One view is
+    `reach` says how far behind that depth a point may lie, metres; without it, points lie on the surface. Images are
+    `inpainted` outside their masks with the object's colors, or described as they are (paper). One view is
     described at a time. Raises SceneError where there is nothing to lift or where no view sees any point.
     """
     if not len(points) or not len(views):
@@ -151,7 +155,7 @@ def lift_points(
     for done, view in enumerate(views, start=1):
         behind = points.new_zeros(len(points)) if reach is None else reach(view.camera)
         sight = look(points.detach(), view, depth_map(view.camera), reach=behind)
-        found = _sample(_describe(view, encoder), sight)
+        found = _sample(_describe(view, encoder, inpainted=inpainted), sight)
         tally.add(found, torch.where(sight.seen, weighting(sight), 0.0).float(), view.name)
         tally.past += sight.seen & (sight.past > 0.5)
         if progress is not None:
@@ -209,9 +213,9 @@ class _Tally:
         return 1.0 - own / total if total > 0 else 1.0
 
 
-def _describe(view: View, encoder: Encoder) -> Float[Tensor, "dim rows columns"]:
+def _describe(view: View, encoder: Encoder, *, inpainted: bool) -> Float[Tensor, "dim rows columns"]:
     coverage = view.coverage
-    color = view.color if coverage is None else continue_outside(view.color, coverage)
+    color = view.color if coverage is None or not inpainted else continue_outside(view.color, coverage)
     found = encoder.describe(color)
     if found.ndim != 3 or not found.numel() or not bool(torch.isfinite(found).all()):
         raise SceneError(

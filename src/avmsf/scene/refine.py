@@ -1,5 +1,6 @@
 """Features that obey an object's symmetries: each point takes the mean over its counterparts (paper, supplement)."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -31,6 +32,7 @@ def refine(
     *,
     iterations: int = ITERATIONS,
     angles: int = ANGLES,
+    reach: float = REACH,
     tell: Callable[[str], None] | None = None,
 ) -> FeatureField:
     """Return the same points with features that agree between symmetric places.
@@ -39,16 +41,16 @@ def refine(
     (the point itself included), and then for each mirror plane the mean of a point's own feature and that of the point
     nearest to its image. An orbit has the turns of the rotation's order, or `angles` even ones about a continuous axis.
 
-    The paper takes the nearest point however far it is. Here a turned place without a point within 3 point spacings, in
-    a hole of the cloud, is left out of the mean, lest features of another part be mixed in. Without symmetries the
-    features come back as they are. `tell` hears of each symmetry whose counterparts are found. Raises SceneError for
-    fewer than one iteration or angle.
+    A turned place without a point within `reach` point spacings, in a hole of the cloud, is left out of the mean, lest
+    features of another part be mixed in; `reach` 0 takes the nearest point however far it is (paper). Without
+    symmetries the features come back as they are. `tell` hears of each symmetry whose counterparts are found. Raises
+    SceneError for fewer than one iteration or angle.
     """
     if iterations < 1 or angles < 1:
         raise SceneError(
             f"expected at least one iteration and one angle to refine with, found {iterations} and {angles}"
         )
-    orbits = _orbits(features.points, symmetries, angles=angles, tell=tell or _silent)
+    orbits = _orbits(features.points, symmetries, angles=angles, reach=reach, tell=tell or _silent)
     pools = [_pool(rows, found) for rows, found in orbits]
     values = features.features.detach().cpu().numpy()
     for _ in range(iterations):
@@ -94,22 +96,28 @@ def _pool(rows: Int[Tensor, "members points"], found: Bool[Tensor, "members poin
 
 
 def _orbits(
-    points: Float[Tensor, "points 3"], symmetries: Symmetries, *, angles: int, tell: Callable[[str], None]
+    points: Float[Tensor, "points 3"],
+    symmetries: Symmetries,
+    *,
+    angles: int,
+    tell: Callable[[str], None],
+    reach: float = REACH,
 ) -> list[Counterparts]:
     """Return the counterparts under every rotation, and then under every mirror plane."""
     if not symmetries:
         return []
     places = points.detach().double().cpu()
     tree = cKDTree(places.numpy())
-    reach = REACH * read_neighbourhoods(places.numpy()).spacing
+    spacing = torch.from_numpy(read_neighbourhoods(places.numpy()).spacing)
+    limit = reach * spacing if reach else torch.full_like(spacing, math.inf)
     orbits = []
     for rotation in symmetries.rotations:
         tell(f"counterparts under {rotation}")
         turned = [rotation.turn(places, angle) for angle in rotation.angles(angles)[1:]]
-        orbits.append(_counterparts(turned, tree, torch.from_numpy(reach)))
+        orbits.append(_counterparts(turned, tree, limit))
     for mirror in symmetries.mirrors:
         tell(f"counterparts under {mirror}")
-        orbits.append(_counterparts([mirror.reflect(places)], tree, torch.from_numpy(reach)))
+        orbits.append(_counterparts([mirror.reflect(places)], tree, limit))
     return orbits
 
 

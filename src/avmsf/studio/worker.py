@@ -23,8 +23,8 @@ from avmsf.errors import AvmsfError
 from avmsf.field.fit import Progress
 from avmsf.field.store import load, save
 from avmsf.files import copy_whole
-from avmsf.modal.extraction.finders import HighResolution
-from avmsf.pipeline.reconstruct import CACHE, ReconstructConfig, reconstruct
+from avmsf.pipeline.config import PipelineConfig
+from avmsf.pipeline.reconstruct import CACHE, reconstruct
 from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.lift import LiftProgress
@@ -100,8 +100,7 @@ def make_field(task: Values, voice: Voice) -> Values:
             folder,
             capture,
             capture.impacts,
-            ReconstructConfig(),
-            method=HighResolution(modes=int(task["modes"])),
+            PipelineConfig(modes=int(task["modes"])),
             cache=folder / CACHE,
             settings=settings,
             listener=voice.listener,

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Float64
@@ -13,7 +13,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.esprit import SHORTEST, candidates
 from avmsf.modal.extraction.least_squares import refine
 from avmsf.modal.extraction.selection import Candidates, chance_ratio, merge, prune, select
-from avmsf.modal.extraction.stft import consensus_modes
+from avmsf.modal.extraction.stft import consensus_modes, regressed_gains
 from avmsf.modal.residual import noise_power
 
 _EMPTY = ModalBank(torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
@@ -26,6 +26,9 @@ _LEAST_TURN = 0.5
 nothing in sine phase, and the gain of what is heard would be enormous."""
 _PERIODS = 50
 """How many periods of the lowest frequency the sounds last: with fewer, a mode is not told from rumble."""
+
+ExtractionMethod = Literal["high-resolution", "short-time"]
+"""Finders by name."""
 
 
 @runtime_checkable
@@ -148,8 +151,7 @@ class ShortTime:
 
     def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:
         """Return the modes of `sounds`, at most `modes` of them."""
-        fft_size = _power_of_two(self.fft_seconds * sample_rate, least=32)
-        hop = min(_power_of_two(self.hop_seconds * sample_rate, least=1), fft_size // 4)
+        fft_size, hop = self._transform(sample_rate)
         return consensus_modes(
             sounds,
             sample_rate=sample_rate,
@@ -159,6 +161,31 @@ class ShortTime:
             least_damping=self.least_damping,
             count=self.modes,
         )
+
+    def gains(
+        self, sounds: Float[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float
+    ) -> Float64[Tensor, "contacts modes"]:
+        """Return the gains that the regression itself gives for a bank's modes, as `regressed_gains` does."""
+        fft_size, hop = self._transform(sample_rate)
+        return regressed_gains(
+            sounds,
+            bank,
+            sample_rate=sample_rate,
+            fft_size=fft_size,
+            hop=hop,
+            latest_peak=self.latest_peak,
+            least_damping=self.least_damping,
+        )
+
+    def _transform(self, sample_rate: float) -> tuple[int, int]:
+        """Return the transform's length and hop, samples."""
+        fft_size = _power_of_two(self.fft_seconds * sample_rate, least=32)
+        return fft_size, min(_power_of_two(self.hop_seconds * sample_rate, least=1), fft_size // 4)
+
+
+def finder_named(method: ExtractionMethod, modes: int) -> ModeFinder:
+    """Return the finder of that name, which keeps at most so many modes."""
+    return HighResolution(modes=modes) if method == "high-resolution" else ShortTime(modes=modes)
 
 
 def expect_modes(modes: int) -> None:

@@ -67,15 +67,14 @@ def consensus_modes(
     logarithm (paper, eq. 5). A mode's damping is the mean over the recordings that show it, its frequency likewise,
     from the slope of each narrow-band signal's phase. Strength is the mean fitted gain.
     """
-    lines = [
-        _regress(narrow_band(sound[None], fft_size=fft_size, hop=hop)[0], hop / sample_rate, fft_size // hop)
-        for sound in sounds
-    ]
-    gain, damping, advance, peak = (torch.stack(part) for part in zip(*lines, strict=True))
-    # The line of a bin of noise, extended to the onset from its late peak, may start anywhere: reject before ranking.
-    # An envelope that falls as fast as the window itself is the window's, not a mode's.
-    ringing = (damping >= least_damping) & (damping < _WINDOW_FALL * sample_rate / fft_size)
-    gain = torch.where((peak <= latest_peak) & ringing, gain, 0.0)
+    gain, damping, advance = _lines(
+        sounds,
+        sample_rate=sample_rate,
+        fft_size=fft_size,
+        hop=hop,
+        latest_peak=latest_peak,
+        least_damping=least_damping,
+    )
     beside = torch.nn.functional.pad(gain, (1, 1))
     candidate = (gain >= beside[:, :-2]) & (gain > beside[:, 2:])
     candidate &= gain > gain.amax(1, keepdim=True) * 10 ** (-_PEAK_DB / 20)
@@ -87,6 +86,53 @@ def consensus_modes(
         centre + torch.remainder(advance - centre + sample_rate / hop / 2, sample_rate / hop) - sample_rate / hop / 2
     )
     return _agree(candidate, gain, damping, frequency, sample_rate=sample_rate, count=count)
+
+
+def regressed_gains(
+    sounds: Float[Tensor, "contacts samples"],
+    bank: ModalBank,
+    *,
+    sample_rate: float,
+    fft_size: int,
+    hop: int,
+    latest_peak: float,
+    least_damping: float,
+) -> Float64[Tensor, "contacts modes"]:
+    """Return the gain g of eq. 5 in each recording at the bins nearest to the modes: not negative, without a sign.
+
+    It is that of the bin's narrow-band signal, two thirds of a steady sine's amplitude at most. It is 0 where the line
+    is no mode's by the rules of `consensus_modes`: it peaks late, or falls too slowly or as fast as the window.
+    """
+    gain, _, _ = _lines(
+        sounds,
+        sample_rate=sample_rate,
+        fft_size=fft_size,
+        hop=hop,
+        latest_peak=latest_peak,
+        least_damping=least_damping,
+    )
+    return gain[:, torch.round(bank.frequency * (fft_size / sample_rate)).long()]
+
+
+def _lines(
+    sounds: Float[Tensor, "contacts samples"],
+    *,
+    sample_rate: float,
+    fft_size: int,
+    hop: int,
+    latest_peak: float,
+    least_damping: float,
+) -> tuple[Float64[Tensor, "contacts bins"], Float64[Tensor, "contacts bins"], Float64[Tensor, "contacts bins"]]:
+    """Return gain, damping (1/s) and frequency (Hz, up to whole turns a frame) of each bin; gain 0 for no mode's."""
+    lines = [
+        _regress(narrow_band(sound[None], fft_size=fft_size, hop=hop)[0], hop / sample_rate, fft_size // hop)
+        for sound in sounds
+    ]
+    gain, damping, advance, peak = (torch.stack(part) for part in zip(*lines, strict=True))
+    # The line of a bin of noise, extended to the onset from its late peak, may start anywhere: reject before ranking.
+    # An envelope that falls as fast as the window itself is the window's, not a mode's.
+    ringing = (damping >= least_damping) & (damping < _WINDOW_FALL * sample_rate / fft_size)
+    return torch.where((peak <= latest_peak) & ringing, gain, 0.0), damping, advance
 
 
 def _regress(

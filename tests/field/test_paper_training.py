@@ -1,0 +1,146 @@
+"""The network and its training in the paper's own form: each switch against the equation that it selects."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from safetensors.torch import load as from_bytes
+from safetensors.torch import save as to_bytes
+
+from avmsf.field.attention import AttentionGains, AttentionShape
+from avmsf.field.config import FitConfig
+from avmsf.field.fit import fit
+from avmsf.field.recipes import Attention, gain_case
+from avmsf.field.store import load, save
+from avmsf.field.training import Targets, TrainingRun
+from avmsf.modal.residual import noise_power
+from avmsf.modal.spectra import magnitude_stft
+from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
+
+SHORT = replace(QUICK, warmup_steps=2, steps=2)
+
+
+def start(config: FitConfig) -> tuple[TrainingRun, Targets]:
+    impacts = plate_impacts()
+    case = gain_case(impacts, plate_features(), plate_extraction(impacts), config)
+    recipe = Attention()
+    run = TrainingRun(
+        recipe.start(case, "shared"),
+        case.modes,
+        gains=case.gains,
+        phase=case.phase,
+        sample_rate=impacts.sample_rate,
+        samples=impacts.sounds.shape[1],
+        config=config,
+    )
+    return run, Targets.of(case.train, case.gains, recipe.rows(case), config)
+
+
+def warmup_loss(config: FitConfig, offset: torch.Tensor) -> float:
+    """Return the loss of a network whose gains are off by `offset` at every contact."""
+    run, targets = start(config)
+    targets = replace(targets, gains=run.network.read(targets.rows).mean.detach() + offset)
+    return run.advance(targets)
+
+
+def test_equal_weights_make_equation_13_of_the_warm_up() -> None:
+    modes = len(plate_extraction(plate_impacts()).bank)
+    offsets = 1e-3 * torch.eye(modes)
+    # One squared error, whichever mode makes it, and otherwise the energies of modes of unequal damping.
+    plain, weighed = (
+        [warmup_loss(replace(SHORT, warmup_weights=weights), offset) for offset in offsets]
+        for weights in ("equal", "energy")
+    )
+    assert plain == pytest.approx([plain[0]] * modes, rel=1e-3)
+    assert max(weighed) > 1.2 * min(weighed)
+
+
+def test_one_norm_leaves_the_resolutions_of_equation_14_in_proportion() -> None:
+    config = replace(SHORT, spectral_norm="common", interleave=1, early_weight=0.5, residual=False, hop=64)
+    run, targets = start(config)
+    sizes, hops, early = config.resolutions(run.sample_rate)
+    recorded = plate_impacts().sounds
+    made = run.sounds(targets.rows).detach()
+
+    def distance(samples: int | None, fft_size: int, hop: int) -> float:
+        spectra = (magnitude_stft(each[:, :samples], fft_size=fft_size, hop=hop) for each in (made, recorded))
+        return float((next(spectra) - next(spectra)).abs().sum())
+
+    equation = sum(
+        distance(None, *each) + config.early_weight * distance(early, *each) for each in zip(sizes, hops, strict=True)
+    )
+    norm = sum(
+        float(magnitude_stft(recorded, fft_size=size, hop=hop).sum()) for size, hop in zip(sizes, hops, strict=True)
+    )
+    found = float(run.spectral_loss(targets).detach())
+    assert found == pytest.approx(equation * len(sizes) / norm, rel=1e-4)
+    relative, each = start(replace(config, spectral_norm="each"))
+    assert float(relative.spectral_loss(each).detach()) != pytest.approx(found, rel=0.01)
+
+
+def test_regressed_gains_are_the_warm_ups_aim_without_signs() -> None:
+    impacts = plate_impacts()
+    turned = replace(impacts, directions=torch.tensor([[0.0, 0.0, 1.0]] * len(impacts)))
+    turned.directions[::2] *= -1
+    case = gain_case(turned, plate_features(), plate_extraction(impacts), replace(SHORT, warmup_gains="regression"))
+    signed = gain_case(turned, plate_features(), plate_extraction(impacts), SHORT)
+    assert float(case.gains.min()) >= 0
+    assert float(signed.gains.min()) < 0
+    # Modes that are far apart have the modulus of their bin, of a steady sine's two thirds at most.
+    strong = signed.gains.abs() > 0.3 * signed.gains.abs().amax(1, keepdim=True)
+    ratio = (case.gains / signed.gains.abs())[strong & (case.gains > 0)]
+    assert 0.2 < float(ratio.median()) < 0.75
+
+
+def test_the_residual_may_start_from_the_quietest_segments() -> None:
+    impacts, modes = plate_impacts(), plate_extraction(plate_impacts())
+    bins = len(modes.residual.magnitude)
+    case = gain_case(impacts, plate_features(), modes, replace(SHORT, residual_start="quietest"))
+    expected = noise_power(impacts.sounds.float(), bins=bins).mean(0).sqrt()
+    assert torch.equal(case.modes.residual.magnitude, expected)
+    assert torch.equal(
+        gain_case(impacts, plate_features(), modes, SHORT).modes.residual.magnitude, modes.residual.magnitude
+    )
+
+
+def test_the_context_is_projected_where_it_is_asked_for() -> None:
+    shape = AttentionShape(clusters=4, bands=1, width=8, hidden=12, layers=1, feature_scale=1.0)
+
+    def network(projection: bool) -> AttentionGains:
+        made = AttentionGains(
+            plate_features(),
+            gain_scale=torch.ones(3),
+            shape=replace(shape, projection=projection),
+            generator=torch.Generator().manual_seed(0),
+        )
+        return made.requires_grad_(False)
+
+    plain, projected = network(False), network(True)
+    assert not [name for name in plain.state_dict() if name.startswith("project")]
+    # With the same weights besides, the projection by the identity changes nothing, by zero it leaves no context.
+    projected.load_state_dict({**plain.state_dict(), "project.weight": torch.eye(8)})
+    rows = torch.arange(5)
+    assert torch.allclose(projected.read(rows).mean, plain.read(rows).mean, atol=1e-6)
+    projected.load_state_dict({**plain.state_dict(), "project.weight": torch.zeros(8, 8)})
+    assert not torch.allclose(projected.read(rows).mean, plain.read(rows).mean, atol=1e-3)
+
+
+def test_a_projected_field_and_one_from_before_there_were_such_settings_are_read(tmp_path) -> None:
+    impacts = plate_impacts()
+    config = replace(SHORT, projection=True, warmup_gains="regression", warmup_weights="equal", spectral_norm="common")
+    field = fit(impacts, plate_features(), plate_extraction(impacts), config, gains=Attention())
+    save(field, tmp_path / "new.safetensors")
+    read = load(tmp_path / "new.safetensors")
+    assert read.origin.config == field.origin.config
+    assert torch.equal(read.render(impacts.contacts), field.render(impacts.contacts))
+    old = fit(impacts, plate_features(), plate_extraction(impacts), SHORT, gains=Attention())
+    path = tmp_path / "old.safetensors"
+    save(old, path)
+    header = path.read_bytes()
+    record = json.loads(json.loads(header[8 : 8 + int.from_bytes(header[:8], "little")])["__metadata__"]["avmsf"])
+    for name in ("projection", "warmup_gains", "warmup_weights", "spectral_norm", "residual_start"):
+        del record["config"][name]
+    del record["gain_field"]["shape"]["projection"]
+    path.write_bytes(to_bytes(from_bytes(header), {"avmsf": json.dumps(record)}))
+    assert load(path).origin.config == old.origin.config

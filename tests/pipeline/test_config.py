@@ -1,0 +1,62 @@
+"""Presets: what `paper` selects, that it is complete, and that the options of the commands start from it."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from avmsf.cli.fit import parse as parse_fit
+from avmsf.cli.reconstruct import parse as parse_reconstruct
+from avmsf.field.config import LATER, FitConfig
+from avmsf.modal.extraction.finders import ShortTime
+from avmsf.pipeline.config import PRESETS, PipelineConfig
+
+
+def test_the_default_preset_is_the_default() -> None:
+    assert PRESETS["default"] == PipelineConfig()
+    assert parse_reconstruct(["mug"]).pipeline == PRESETS["default"]
+
+
+def test_the_paper_preset_deviates_nowhere_that_there_is_a_switch_for() -> None:
+    paper, usual = PRESETS["paper"], FitConfig()
+    assert paper.finder == ShortTime(modes=128)
+    assert paper.gain_model == "network"
+    assert all(getattr(paper.fit, name) != getattr(usual, name) for name in LATER)
+    assert (paper.fit.clusters, paper.fit.learning_rate, paper.fit.steps, paper.fit.early_weight) == (
+        256,
+        5e-3,
+        10000,
+        1,
+    )
+    assert (paper.fit.phase, paper.fit.residual_noise) == ("sine", "gaussian")
+    assert paper.fit.bands > 0
+    lift = paper.scene.lift
+    assert (lift.onto, lift.weighting, lift.background) == ("gaussians", "plain", "kept")
+    assert (lift.components, lift.positions, lift.reach) == (0, False, 0.0)
+    # Refused where it cannot be had, which `auto` is not.
+    assert lift.encoder == "facebook/dinov2-base"
+
+
+def test_commands_start_from_the_preset_and_change_what_is_said() -> None:
+    assert parse_reconstruct(["mug", "--preset", "paper"]).pipeline == PRESETS["paper"]
+    words = ["mug", "--lift.encoder", "descriptors", "--preset", "paper", "--fit.steps", "7"]
+    mixed = parse_reconstruct(words).pipeline
+    assert (mixed.fit.steps, mixed.fit.clusters) == (7, 256)
+    assert (mixed.scene.lift.encoder, mixed.scene.lift.onto) == ("descriptors", "gaussians")
+    fitted = parse_fit(["mug", "--output", "mug.safetensors", "--preset", "paper"])
+    assert (fitted.config, fitted.method, fitted.gain_model) == (PRESETS["paper"].fit, "short-time", "network")
+
+
+def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_open() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "equations.md").read_text(encoding="utf-8")
+    table = page.partition("## The paper's form of each stage")[2].partition("\n\n`evaluate`")[0]
+    words = [word for options in re.findall(r"`(--[^`]*)`", table.partition("|---|")[2]) for word in options.split()]
+    found, paper = parse_reconstruct(["mug", *words]).pipeline, PRESETS["paper"]
+    silent = {name: getattr(paper.fit, name) for name in ("width", "hidden", "layers", "warmup_rate")}
+    assert replace(found, fit=replace(found.fit, **silent)) == paper
+
+
+def test_a_preset_that_there_is_not_is_refused() -> None:
+    with pytest.raises(SystemExit):
+        parse_reconstruct(["mug", "--preset", "quick"])
