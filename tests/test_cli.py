@@ -390,4 +390,7 @@ def test_show_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
         assert (output / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     # Without a capture, and without pictures.
     assert main(["show", str(field)]) == 0
-    assert "field of plate" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "field of plate" in out
+    assert (told["pipeline"]["method"], told["pipeline"]["fit"]["seed"]) == ("high-resolution", 0)
+    assert "extraction high-resolution" in out

@@ -35,12 +35,7 @@ class FieldMethod:
 
     def fit(self, task: Task) -> SoundField:
         """Fit the field. Raises AvmsfError where modes, features or field cannot be made."""
-        features = task.features(self.look)
-        if self.finder is None:
-            modes = task.modes()
-        else:
-            modes = extract_sounds(task.train.sounds, sample_rate=task.train.sample_rate, method=self.finder)
-        return fit_field(task, task.train, features, modes, self.config)
+        return fit_field(task, task.train, task.features(self.look), modes_of(task, self.finder), self.config)
 
 
 @dataclass(frozen=True)
@@ -90,6 +85,13 @@ class UninformedField:
         steps = self.config.warmup_steps + self.config.steps
         config = replace(self.config, warmup_steps=0, steps=steps, correction_rate=self.correction_rate)
         return fit_field(task, task.train, task.features(self.look), start, config)
+
+
+def modes_of(task: Task, finder: ModeFinder | None) -> Extraction:
+    """Return the modes of a task's training blows: those that all methods share, or what another finder makes."""
+    if finder is None:
+        return task.modes()
+    return extract_sounds(task.train.sounds, sample_rate=task.train.sample_rate, method=finder)
 
 
 def fit_field(

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from avmsf.bench.fieldmethods import QUICK, fit_field
+from avmsf.bench.fieldmethods import QUICK, fit_field, modes_of
 from avmsf.bench.task import Look, Task
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.places import rows_by_place
@@ -13,6 +13,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import held_out
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.modal.spectra import envelope
 
 _FEWEST_TO_VALIDATE = 6
@@ -60,10 +61,12 @@ class GridField:
     """Settings that the grid does not name, and those to take where nothing can be validated."""
     look: Look = "visual"
     """What the network reads of the object's points."""
+    finder: ModeFinder | None = None
+    """How modes are found; None takes those that all methods share."""
 
     def fit(self, task: Task) -> SoundField:
         """Choose and fit the field, whose report has what was chosen. Raises as FieldMethod."""
-        features, modes = task.features(self.look), task.modes()
+        features, modes = task.features(self.look), modes_of(task, self.finder)
         held = held_out(task.train.contacts, self.base.validation)
         if len(rows_by_place(task.train.contacts)) < _FEWEST_TO_VALIDATE or not held:
             field = fit_field(task, task.train, features, modes, self.base)

@@ -135,10 +135,10 @@ FIELDS = (
     FieldMethod("paper", replace(PAPER, damping="shared"), "paper", ShortTime()),
     FieldMethod("paper-per-contact", replace(PAPER, damping="per-contact"), "paper", ShortTime()),
     GridField("field-grid", QUICK_GRID),
-    GridField("field-paper-grid", PAPER_GRID, PAPER),
+    GridField("paper-grid", PAPER_GRID, replace(PAPER, damping="shared"), "paper", ShortTime()),
 )
-"""Fields by the quick recipe unless told otherwise: the paper's form, other gains, ablations, the paper's settings and
-grids."""
+"""Fields by the quick recipe unless told otherwise: the paper's form, other gains, ablations, the paper's method
+whole, and choices from grids."""
 
 SIMULATIONS = (DiffSoundMethod("diffsound"), DiffSoundMethod("diffsound-weighted", weighted=True))
 """Other systems, built from their publications."""

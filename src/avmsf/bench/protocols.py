@@ -88,7 +88,7 @@ PROTOCOLS = {
         ),
         EvaluationProtocol(
             "grid",
-            "Choose the field's settings from a small grid on validation contacts (the paper's: `field-paper-grid`); "
+            "Choose the field's settings from a small grid on validation contacts (the paper's: `paper-grid`); "
             "test as `farthest` does.",
             Farthest(),
             (BASELINE, "field", "field-grid"),

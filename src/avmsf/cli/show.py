@@ -21,6 +21,7 @@ from avmsf.cli.modetable import levels, mode_rows
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.scores import quality_words, score_table, score_values
 from avmsf.field.attention import AttentionGains
+from avmsf.field.gains.estimator import NETWORK
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
@@ -201,7 +202,7 @@ def _words(values: dict[str, Any], quality: list[str]) -> str:
         f"  gains      {_gains_words(values['gain_field'])}",
         f"  fitted to  {len(values['trained_on'])} recordings",
     ]
-    lines += [f"  made by    {words}" for words in _pipeline_words(values["pipeline"])]
+    lines += _pipeline_lines(values["pipeline"])
     lines += [f"  quality    {words}" for words in quality]
     excluded = report.get("excluded", ())
     for name, words in report.get("outliers", {}).items():
@@ -215,23 +216,22 @@ def _words(values: dict[str, Any], quality: list[str]) -> str:
     return "\n".join(lines)
 
 
-def _pipeline_words(pipeline: dict[str, Any]) -> list[str]:
+def _pipeline_lines(pipeline: dict[str, Any]) -> list[str]:
     """Return lines on the stages that made the field, as far as its file names them."""
     fit, scene = pipeline["fit"], pipeline.get("scene")
     lines = []
     if "method" in pipeline:
-        model = pipeline["gain_model"]
-        lines.append(f"{pipeline['method']} extraction, at most {pipeline['modes']} modes; gain model {model}")
+        lines.append(f"  extraction {pipeline['method']}, {pipeline['modes']} modes at most")
+        lines.append(f"  gain model {pipeline['gain_model']}")
     if scene is not None:
-        lift, views = scene["lift"], scene["views"]
+        lift, count = scene["lift"], scene["views"]["count"]
         lines.append(
-            f"features of {pipeline['encoder']}, averaged {lift['weighting']}, {lift['components'] or 'all'} components"
-            f"; views {views['count'] or 'all'}, onto {lift['onto']}, splat steps {scene['splat']['steps']}"
+            f"  features   {pipeline['encoder']}, {lift['weighting']} mean over {count or 'all'} views, "
+            f"{lift['components'] or 'all'} components, onto {lift['onto']}"
         )
-    rates = f"rates {fit['warmup_rate']:g} and {fit['learning_rate']:g}"
-    lines.append(
-        f"{fit['warmup_steps']} + {fit['steps']} steps, {fit['clusters']} clusters, {rates}, seed {fit['seed']}"
-    )
+    learned = f"{fit['clusters']} clusters, {fit['warmup_steps']} steps of warm-up, "
+    network = pipeline.get("gain_model") == NETWORK
+    lines.append(f"  fit        {learned if network else ''}{fit['steps']} steps end to end, seed {fit['seed']}")
     return lines
 
 
