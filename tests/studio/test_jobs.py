@@ -57,6 +57,15 @@ def test_events_come_in_order_and_the_result_last() -> None:
     assert run(text) == [*counted, {"taken": {"n": 3}}]
 
 
+def test_what_a_worker_says_that_does_not_read_its_task_is_heard() -> None:
+    async def heard() -> list[Any]:
+        job = Job("test", {"long": "x" * 2_000_000}, same, script("os.close(0); time.sleep(0.2); say(result={})"))
+        await job.run()
+        return [event async for _, event in job.listen()]
+
+    assert run_async(heard()) == [{"taken": {}}]
+
+
 def test_what_libraries_print_is_no_event() -> None:
     assert run("print('Loading weights: 100%'); print('[1, 2]'); say(result={})") == [{"taken": {}}]
 

@@ -5,6 +5,7 @@ standard input stays open as long as the server lives, so that it ends where the
 """
 
 import asyncio
+import contextlib
 import json
 import os
 import secrets
@@ -112,8 +113,10 @@ class Job:
         said = asyncio.create_task(_last_words(process.stderr))
         result: Event | None = None
         try:
-            process.stdin.write(json.dumps(self.task).encode() + b"\n")
-            await process.stdin.drain()
+            # A process that ended without reading its task may have said why.
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                process.stdin.write(json.dumps(self.task).encode() + b"\n")
+                await process.stdin.drain()
             async for line in process.stdout:
                 event = _understand(line)
                 if event is None:
@@ -122,8 +125,6 @@ class Job:
                     result = event
                 else:
                     await self._tell(event)
-            status = await process.wait()
-        except (BrokenPipeError, ConnectionResetError):
             status = await process.wait()
         except BaseException:
             self._end_process(signal.SIGKILL)
