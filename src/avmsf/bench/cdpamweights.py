@@ -53,7 +53,7 @@ def find_weights() -> Path:
     if found is None or not found.submodule_search_locations:
         raise EvaluationError(
             "CDPAM is computed by the trained weights that come with the package cdpam, which is not installed: "
-            "pip install 'avmsf[eval]'"
+            "pip install 'avmsf[eval]', or leave CDPAM out with --no-cdpam"
         )
     return Path(found.submodule_search_locations[0]) / _FILE
 

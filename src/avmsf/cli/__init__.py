@@ -68,6 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not words or words[0] not in VERBS:
         _explain(words)
         return 2
+    # Threads that wait actively for each other make many small sums several times slower where other programs run.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     heart = nullcontext() if words[0] in _WAITING else beating(f"avmsf {words[0]}")
     with warnings.catch_warnings(), _interrupting() as received, heart:
         try:

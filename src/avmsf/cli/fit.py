@@ -231,7 +231,10 @@ def _beside(output: Path, ending: str) -> Path:
 def features_of(capture: Capture, config: FitConfig) -> FeatureField:
     """Return the object's points: of its surface where there is one, else those that fill the contacts' box."""
     if capture.surface is None:
-        say("the capture has no surface: points that fill the box of its contacts stand for the object")
+        say(
+            "the capture has no surface: points that fill the box of its contacts stand for the object. Photographs, a "
+            "video or Gaussians are used by avmsf reconstruct"
+        )
         return FeatureField.from_contacts(capture.impacts.contacts)
     return FeatureField.from_mesh(capture.surface, generator=torch.Generator().manual_seed(config.seed))
 

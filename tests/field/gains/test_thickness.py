@@ -31,7 +31,7 @@ def test_the_posterior_of_a_normal_evidence_is_normal_with_the_variance_of_shape
     found, thickness = search_thickness([walled(each) for each in (None, *GRID)], normal, walled)
     assert thickness is not None
     assert thickness.median == pytest.approx(true, rel=0.03)
-    both = math.hypot(deviation, 0.15)
+    both = math.hypot(deviation, 0.2)
     assert math.log(thickness.high / thickness.low) == pytest.approx(2 * 1.645 * both, rel=0.15)
     assert all(body.wall is not None for body in found)
     assert min(abs(math.log(body.wall / true)) for body in found if body.wall) < 0.04
