@@ -181,6 +181,8 @@ def test_a_dropped_recording_is_located_and_painted(visit: Open) -> None:
     text = page.inner_text("#sheet-find")
     for words in ("12.0 mm", "3.1 % of the surface", "97 %", "20 %: mirrored", "Quiet: the answer is less sure."):
         assert words in text
+    # Labels are put in their places when the next picture is drawn.
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     box = page.locator(".mark .label", has_text="or here").bounding_box()
     x, y = on_screen(page, table.points[300])
     assert box is not None
