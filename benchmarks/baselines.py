@@ -110,7 +110,7 @@ class _Objects:
         features = self.folder / "features"
         evaluation = Evaluation(
             dataset, "sim-20", PROTOCOLS[protocol], tuple(map(method_named, METHODS)), ObjectLooks(dataset, features),
-            ObjectBodies(dataset, features), judging=Judging(cdpam=False), families=self.family,
+            ObjectBodies(dataset, features), judging=Judging(cdpam=False),
         )  # fmt: skip
         results = ResultsFolder(self.folder / protocol)
         evaluation.begin(results)

@@ -8,6 +8,7 @@ import torch
 from avmsf.bench.task import Look
 from avmsf.capture import Capture, Surface, write_capture
 from avmsf.errors import SceneError, SimulationError
+from avmsf.fem.family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
@@ -67,5 +68,9 @@ class NoBodies:
     """Knows no object's shape."""
 
     def __call__(self, identifier: str) -> CandidateBodies:
+        """Raise SimulationError."""
+        raise SimulationError(f"{identifier} has no shape here")
+
+    def family(self, identifier: str) -> BodyFamily:
         """Raise SimulationError."""
         raise SimulationError(f"{identifier} has no shape here")

@@ -142,7 +142,7 @@ def test_the_papers_network_takes_part_and_a_known_wall_is_handed_on(
         asked.append(evaluation)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("avmsf.cli.efficiency.run_objects", stop)
+    monkeypatch.setattr("avmsf.cli.evaluate.run_objects", stop)
     capture = fill_plate(tmp_path / "plate")
     words = [str(capture), "--counts", "2", "--output", str(tmp_path / "results"), "--body.wall", "0.004"]
     assert run(parse(words)) == 130

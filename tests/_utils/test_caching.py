@@ -113,3 +113,15 @@ def test_what_is_made_once_gives_its_result_or_its_failure_again() -> None:
         with pytest.raises(FitError, match="call 2"):
             failed()
     assert len(calls) == 2
+
+
+def test_what_is_made_once_is_made_once_for_each_set_of_arguments() -> None:
+    calls = []
+
+    def make(number: int, *, sign: int = 1) -> int:
+        calls.append((number, sign))
+        return sign * number
+
+    made = caching.once(make)
+    assert [made(1), made(2), made(1), made(1, sign=-1), made(2)] == [1, 2, 1, -1, 2]
+    assert calls == [(1, 1), (2, 1), (1, -1)]

@@ -4,12 +4,13 @@ import hashlib
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
+from functools import cache, wraps
 from pathlib import Path
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 from avmsf.errors import AvmsfError, AvmsfWarning
 
+Given = ParamSpec("Given")
 Result = TypeVar("Result")
 
 
@@ -51,21 +52,25 @@ def digest_of_sources(root: Path) -> str:
     return digest.hexdigest()
 
 
-def once(make: Callable[[], Result]) -> Callable[[], Result]:
-    """Return `make`, which is called once: later calls return its result, or raise its AvmsfError, again."""
-    found: list[Result] = []
-    failures: list[AvmsfError] = []
+def once(make: Callable[Given, Result]) -> Callable[Given, Result]:
+    """Return `make`, which is called once for the same arguments: later calls return its result, or raise its error.
 
-    def kept() -> Result:
-        if failures:
-            raise failures[0]
-        if not found:
-            try:
-                found.append(make())
-            except AvmsfError as error:
-                failures.append(error)
-                raise
-        return found[0]
+    Only an AvmsfError counts as an answer.
+    """
+
+    @cache
+    def answer(*given: Given.args, **named: Given.kwargs) -> Result | AvmsfError:
+        try:
+            return make(*given, **named)
+        except AvmsfError as error:
+            return error
+
+    @wraps(make)
+    def kept(*given: Given.args, **named: Given.kwargs) -> Result:
+        found = answer(*given, **named)  # type: ignore[arg-type]  # No ParamSpec can say that they are hashable.
+        if isinstance(found, AvmsfError):
+            raise found
+        return found
 
     return kept
 

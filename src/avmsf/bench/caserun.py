@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.caching import Given, Result
 from avmsf.bench.cases import Case
 from avmsf.bench.judging import spread
 from avmsf.bench.knowntruth import truth_at
@@ -46,8 +47,8 @@ class CaseRun:
         folder: Path,
         place: str,
         look: Callable[[Look], FeatureField],
-        bodies: Callable[[], CandidateBodies | AvmsfError],
-        family: Callable[[], BodyFamily | AvmsfError],
+        bodies: Callable[[], CandidateBodies],
+        family: Callable[[], BodyFamily],
         material: str | None,
         stranger: Callable[[], Float[Tensor, " samples"]],
         listened: bool,
@@ -105,10 +106,10 @@ class CaseRun:
             names=self.impacts.names,
             seed=self.evaluation.seed,
             modes=self._modes,
-            features=self._features,
-            bodies=self._bodies,
-            stranger=self._stranger,
-            family=self._family,
+            features=self._shared(self.look),
+            bodies=self._shared(self.bodies),
+            stranger=self._shared(self.stranger),
+            family=self._shared(self.family),
             material=self.material,
         )
 
@@ -130,27 +131,12 @@ class CaseRun:
         else:
             self.train, self.test = modes.aligned(self.train), modes.aligned(self.test)
 
-    def _features(self, look: Look) -> FeatureField:
-        with self._sharing():
-            return self.look(look)
+    def _shared(self, make: Callable[Given, Result]) -> Callable[Given, Result]:
+        def made(*given: Given.args, **named: Given.kwargs) -> Result:
+            with self._sharing():
+                return make(*given, **named)
 
-    def _bodies(self) -> CandidateBodies:
-        with self._sharing():
-            found = self.bodies()
-        if isinstance(found, AvmsfError):
-            raise found
-        return found
-
-    def _family(self) -> BodyFamily:
-        with self._sharing():
-            found = self.family()
-        if isinstance(found, AvmsfError):
-            raise found
-        return found
-
-    def _stranger(self) -> Float[Tensor, " samples"]:
-        with self._sharing():
-            return self.stranger()
+        return made
 
     @contextmanager
     def _sharing(self) -> Iterator[None]:

@@ -28,19 +28,14 @@ class FeatureMaker(Protocol):
 
 @runtime_checkable
 class BodyMaker(Protocol):
-    """Makes what fields know of an object's shape."""
+    """Makes what fields and simulations know of an object's shape."""
 
     def __call__(self, identifier: str) -> CandidateBodies:
         """Return an object's bodies. Raises AvmsfError where its shape is unknown or unfit."""
         ...
 
-
-@runtime_checkable
-class FamilyMaker(Protocol):
-    """Makes what simulations know of an object's shape."""
-
-    def __call__(self, identifier: str) -> BodyFamily:
-        """Return an object's bodies of any material. Raises AvmsfError where its shape is unknown or unfit."""
+    def family(self, identifier: str) -> BodyFamily:
+        """Return its bodies of any material and thickness, for simulations. Raises AvmsfError likewise."""
         ...
 
 
@@ -62,8 +57,6 @@ class Evaluation:
     """How modes are found, once a case."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Plain values that decide the features."""
-    families: FamilyMaker | None = None
-    """None where no method simulates the object."""
 
     def begin(self, results: ResultsFolder) -> None:
         """Take a folder for this evaluation's results.

@@ -1,28 +1,24 @@
 """Running an evaluation: object by object, case by case, method by method, keeping each figure as it comes."""
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
+from functools import partial
 
 import numba
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
+from avmsf._utils.caching import once
 from avmsf.bench.caserun import CaseRun
 from avmsf.bench.cases import Case, Places
 from avmsf.bench.knowntruth import truth_at, truth_from_first_sample, truth_of
 from avmsf.bench.otherobjects import draw_stranger
 from avmsf.bench.plan import Evaluation
 from avmsf.bench.results import CaseRecord, ObjectRecord, ResultsFolder, one_line
-from avmsf.bench.task import Look
+from avmsf.capture.datasets.dataset import ObjectFacts
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, EvaluationError
-from avmsf.fem.family import BodyFamily
-from avmsf.field.gains.bodies import CandidateBodies
-from avmsf.scene.features import FeatureField
 from avmsf.simulate.truth import Truth
 
 
@@ -38,62 +34,24 @@ def run_object(
         record = results.read(identifier) or ObjectRecord(identifier)
         try:
             impacts = evaluation.dataset.capture(identifier).impacts
-            facts = evaluation.dataset.facts(identifier)
             truth = truth_of(evaluation.dataset, identifier)
-            cases = evaluation.protocol.choosing.cases(impacts)
             digest = digest_of(impacts, truth)
             if truth is not None:
                 truth = truth_from_first_sample(truth_at(truth, impacts.names), impacts)
+            facts, cases = evaluation.dataset.facts(identifier), evaluation.protocol.choosing.cases(impacts)
         except AvmsfError as error:
             results.write(replace(record, failure=one_line(error)))
             return
         except (OSError, ValueError) as error:  # A damaged object must not cost the others their hours.
             results.write(replace(record, failure=f"{type(error).__name__}: {one_line(error)}"))
             return
-        if record.digest != digest and all(each.failure is not None for each in record.outcomes):
-            # Nothing is mixed where there are no figures yet.
-            record = ObjectRecord(identifier)
-        if record.digest not in ("", digest):
-            raise EvaluationError(
-                f"{results.path}: holds figures of other recordings of {identifier} than {evaluation.title} "
-                "holds now; results are not mixed, choose another --output"
-            )
-        known = {case.key: case for case in record.cases}
-        record = replace(
-            record,
-            name=facts.name,
-            material=facts.material,
-            inferred=facts.inferred,
-            digest=digest,
-            contacts=len(Places.of(impacts).rows),
-            sample_rate=impacts.sample_rate,
-            duration=impacts.duration,
-            cases=tuple(known.get(case.key) or _named(case, impacts) for case in cases),
-            failure=None,
-        )
+        record = _described(_of_same_recordings(record, digest, evaluation, results), impacts, facts, cases)
         results.write(record)
-        looks = _Looks(evaluation, identifier)
-
-        @cache
-        def stranger() -> Float[Tensor, " samples"]:
-            return draw_stranger(evaluation.dataset, identifier, impacts, seed=evaluation.seed)
-
-        @cache
-        def bodies() -> CandidateBodies | AvmsfError:
-            try:
-                return evaluation.bodies(identifier)
-            except AvmsfError as error:
-                return error
-
-        @cache
-        def family() -> BodyFamily | AvmsfError:
-            if evaluation.families is None:
-                return EvaluationError(f"{identifier}: its shape is not known: expected a mesh, or views of it")
-            try:
-                return evaluation.families(identifier)
-            except AvmsfError as error:
-                return error
-
+        # Each made once for all cases; so is the error of what cannot be made.
+        features = once(evaluation.features)
+        bodies = once(partial(evaluation.bodies, identifier))
+        family = once(partial(evaluation.bodies.family, identifier))
+        stranger = once(partial(draw_stranger, evaluation.dataset, identifier, impacts, seed=evaluation.seed))
         firsts = {case.label: case.key for case in reversed(cases)}
         for number, case in enumerate(cases, 1):
             record = _run_case(
@@ -105,7 +63,7 @@ def run_object(
                     truth,
                     folder=results.path,
                     place=f"{identifier}/{number:02d}",
-                    look=looks.of(case.views),
+                    look=partial(features, identifier, views=case.views),
                     bodies=bodies,
                     family=family,
                     material=facts.material,
@@ -116,6 +74,36 @@ def run_object(
                 results,
                 tell,
             )
+
+
+def _of_same_recordings(
+    record: ObjectRecord, digest: str, evaluation: Evaluation, results: ResultsFolder
+) -> ObjectRecord:
+    """Return an object's record, an empty one where it has no figures; raise EvaluationError if they are of others."""
+    if record.digest != digest and all(each.failure is not None for each in record.outcomes):
+        record = ObjectRecord(record.identifier)
+    if record.digest not in ("", digest):
+        raise EvaluationError(
+            f"{results.path}: holds figures of other recordings of {record.identifier} than {evaluation.title} "
+            "holds now; results are not mixed, choose another --output"
+        )
+    return replace(record, digest=digest)
+
+
+def _described(record: ObjectRecord, impacts: Impacts, facts: ObjectFacts, cases: Sequence[Case]) -> ObjectRecord:
+    """Return an object's record with what is known of it now, and with its cases."""
+    known = {case.key: case for case in record.cases}
+    return replace(
+        record,
+        name=facts.name,
+        material=facts.material,
+        inferred=facts.inferred,
+        contacts=len(Places.of(impacts).rows),
+        sample_rate=impacts.sample_rate,
+        duration=impacts.duration,
+        cases=tuple(known.get(case.key) or _named(case, impacts) for case in cases),
+        failure=None,
+    )
 
 
 @contextmanager
@@ -154,30 +142,6 @@ def _run_case(
         record = replace(record, cases=cases).adding(outcome)
         results.write(record)
     return record
-
-
-class _Looks:
-    """An object's features, each made once; so is the error of an object that nothing shows."""
-
-    def __init__(self, evaluation: Evaluation, identifier: str) -> None:
-        self.evaluation, self.identifier = evaluation, identifier
-        self.made: dict[tuple[Look, int | None], FeatureField | AvmsfError] = {}
-
-    def of(self, views: int | None) -> Callable[[Look], FeatureField]:
-        """Return what makes features from at most so many views."""
-
-        def make(look: Look) -> FeatureField:
-            if (look, views) not in self.made:
-                try:
-                    self.made[look, views] = self.evaluation.features(self.identifier, look, views)
-                except AvmsfError as error:
-                    self.made[look, views] = error
-            found = self.made[look, views]
-            if isinstance(found, AvmsfError):
-                raise found
-            return found
-
-        return make
 
 
 def _named(case: Case, impacts: Impacts) -> CaseRecord:

@@ -1,30 +1,24 @@
 """`avmsf efficiency`: how many places each method needs, as a picture and as figures."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
 from avmsf.bench.efficiency import METHODS, curves, draw_efficiency, efficiency_protocol
 from avmsf.bench.judging import Judging
 from avmsf.bench.methods import method_named
-from avmsf.bench.parallel import RunProgress, Workers, run_objects
+from avmsf.bench.parallel import Workers
 from avmsf.bench.pictures import save_picture
-from avmsf.bench.plan import Evaluation
-from avmsf.bench.results import ResultsFolder, write_json
+from avmsf.bench.results import ObjectRecord, ResultsFolder, write_json
 from avmsf.capture.datasets import open_dataset
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.evaluate import settled_lifts, title_of
-from avmsf.cli.objectbar import ObjectBar
+from avmsf.cli.evaluate import evaluation_of, run_shown, title_of
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.errors import EvaluationError
-from avmsf.modal.extraction.finders import HighResolution
 from avmsf.pipeline.bodies import BodyConfig
-from avmsf.pipeline.features import LiftConfig
-from avmsf.pipeline.objectbodies import ObjectBodies
-from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.wording import counted
 
@@ -82,44 +76,43 @@ def run(options: Options) -> int:
     chosen = objects[0] if options.object is None else dataset.facts(options.object).identifier
     title = title_of(dataset, options.data)
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
-    lift, paper = settled_lifts(LiftConfig(), methods)
-    scene = SceneConfig(lift=lift)
-    bodies = ObjectBodies(dataset, folder / "features", config=options.body, scene=scene)
-    evaluation = Evaluation(
+    evaluation = evaluation_of(
         dataset,
         title,
         protocol,
         methods,
-        ObjectLooks(dataset, folder / "features", scene, paper),
-        bodies,
-        options.seed,
-        Judging(cdpam=False),
-        HighResolution(modes=options.modes),
-        {"scene": asdict(scene), "paper": asdict(paper), "body": asdict(options.body)},
-        bodies.family,
+        folder / "features",
+        scene=SceneConfig(),
+        body=options.body,
+        judging=Judging(cdpam=False),
+        modes=options.modes,
+        seed=options.seed,
     )
     results = ResultsFolder(folder)
     say(f"{protocol.name} of {len(methods)} methods on {chosen}, results in {folder}")
     try:
-        with ObjectBar() as bar:
-
-            def show(progress: RunProgress) -> None:
-                bar.show(progress.words, done=progress.done, total=progress.total)
-
-            run_objects(evaluation, [chosen], results, workers=Workers(), progress=show)
+        run_shown(evaluation, [chosen], results, Workers())
     except KeyboardInterrupt:
         say(f"avmsf efficiency: interrupted; the same command goes on from what {folder} holds")
         return INTERRUPTED
     record = results.read(chosen)
     assert record is not None
+    values = _report(record, options, folder / chosen)
+    if options.json:
+        print_json({**values, "results": str(folder)})
+    return 0
+
+
+def _report(record: ObjectRecord, options: Options, folder: Path) -> dict[str, Any]:
+    """Write and print an object's curves; return their figures."""
     found = curves(record, metric=options.metric)
-    picture, figures = (folder / chosen / name for name in (PICTURE, FIGURES))
+    picture, figures = (folder / name for name in (PICTURE, FIGURES))
     starts = "one choice" if options.starts == 1 else f"{options.starts} choices"
     contacts = f"{counted(record.contacts, 'place')}, {starts} of those learnt from"
-    save_picture(draw_efficiency(found, metric=options.metric, title=f"{chosen}: {contacts}"), picture)
+    save_picture(draw_efficiency(found, metric=options.metric, title=f"{record.identifier}: {contacts}"), picture)
     failures = {f"{each.method}, {each.case}": each.failure for each in record.outcomes if each.failure is not None}
     values = {
-        "object": chosen,
+        "object": record.identifier,
         "metric": options.metric,
         "methods": {curve.method: curve.values() for curve in found},
         "failures": failures,
@@ -131,11 +124,9 @@ def run(options: Options) -> int:
     for curve in found:
         by_count = dict(zip(curve.counts, curve.mean, strict=True))
         rows.append([curve.method, *(decimals(by_count.get(count), 3) for count in counts)])
-    heading = f"{options.metric} of {chosen} by the number of places learnt from; {contacts}"
+    heading = f"{options.metric} of {record.identifier} by the number of places learnt from; {contacts}"
     screen.print(table(heading, ("method", *map(str, counts)), rows))
     for where, why in failures.items():
         screen.print(f"failed: {where}: {why}", soft_wrap=True)
     screen.print(f"wrote {picture} and {figures}", soft_wrap=True)
-    if options.json:
-        print_json({**values, "results": str(folder)})
-    return 0
+    return values

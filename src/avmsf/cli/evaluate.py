@@ -1,7 +1,8 @@
 """`avmsf evaluate`: how good methods are on a dataset, as tables and as a page."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +13,7 @@ from avmsf.bench.judging import Judging
 from avmsf.bench.methods import method_named
 from avmsf.bench.parallel import RunProgress, Workers, run_objects
 from avmsf.bench.plan import Evaluation
-from avmsf.bench.protocols import protocol_named
+from avmsf.bench.protocols import EvaluationProtocol, protocol_named
 from avmsf.bench.report import PAGE, SUMMARY, TABLES, write_page, write_summary
 from avmsf.bench.reporttables import Section
 from avmsf.bench.results import ResultsFolder
@@ -109,39 +110,23 @@ def run(options: Options) -> int:
     title = title_of(dataset, options.data)
     objects = choose_objects(dataset, protocol, _words(options.objects))
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
-    lift, paper = settled_lifts(options.lift, methods)
-    scene = SceneConfig(ViewsConfig(source=options.look), options.splat, lift)
-    kept = (options.features or folder / "features").resolve()
-    bodies = ObjectBodies(dataset, kept, options.geometry, options.body, scene)
-    evaluation = Evaluation(
+    evaluation = evaluation_of(
         dataset,
         title,
         protocol,
         methods,
-        ObjectLooks(dataset, kept, scene, paper),
-        bodies,
-        options.seed,
-        Judging(level=options.level, cdpam=options.cdpam, cdpam_contacts=options.cdpam_contacts),
-        HighResolution(modes=options.modes),
-        {
-            "scene": asdict(scene),
-            "paper": asdict(paper),
-            "geometry": options.geometry,
-            "body": asdict(options.body),
-        },
-        bodies.family,
+        (options.features or folder / "features").resolve(),
+        scene=SceneConfig(ViewsConfig(source=options.look), options.splat, options.lift),
+        geometry=options.geometry,
+        body=options.body,
+        judging=Judging(level=options.level, cdpam=options.cdpam, cdpam_contacts=options.cdpam_contacts),
+        modes=options.modes,
+        seed=options.seed,
     )
     results, groups = ResultsFolder(folder), members(dataset)
     say(f"{protocol.name} on {title}: {len(objects)} objects, {len(methods)} methods, results in {folder}")
     try:
-        with ObjectBar() as bar:
-
-            def show(progress: RunProgress) -> None:
-                if progress.done > bar.done:
-                    write_summary(results, subsets=groups)
-                bar.show(progress.words, done=progress.done, total=progress.total)
-
-            run_objects(evaluation, objects, results, workers=workers, progress=show)
+        run_shown(evaluation, objects, results, workers, after_each=partial(write_summary, results, subsets=groups))
         summary = write_summary(results, subsets=groups)
         parts = write_page(results, subsets=groups)
     except KeyboardInterrupt:
@@ -162,6 +147,48 @@ def run(options: Options) -> int:
     if options.json:
         print_json({**summary, "results": str(folder)})
     return 0
+
+
+def evaluation_of(
+    dataset: Dataset,
+    title: str,
+    protocol: EvaluationProtocol,
+    methods: tuple[Method, ...],
+    kept: Path,
+    *,
+    scene: SceneConfig,
+    judging: Judging,
+    modes: int,
+    seed: int,
+    body: BodyConfig,
+    geometry: Geometry = "mesh",
+) -> Evaluation:
+    """Return the plan of an evaluation that keeps features and surfaces in the folder `kept`."""
+    lift, paper = settled_lifts(scene.lift, methods)
+    scene = replace(scene, lift=lift)
+    settings = {"scene": asdict(scene), "paper": asdict(paper), "geometry": geometry, "body": asdict(body)}
+    looks, bodies = ObjectLooks(dataset, kept, scene, paper), ObjectBodies(dataset, kept, geometry, body, scene)
+    finder = HighResolution(modes=modes)
+    return Evaluation(dataset, title, protocol, methods, looks, bodies, seed, judging, finder, settings)
+
+
+def run_shown(
+    evaluation: Evaluation,
+    objects: Sequence[str],
+    results: ResultsFolder,
+    workers: Workers,
+    *,
+    after_each: Callable[[], object] = lambda: None,
+) -> None:
+    """Run an evaluation under a progress bar, and call `after_each` after each object."""
+    with ObjectBar() as bar:
+
+        def show(progress: RunProgress) -> None:
+            if progress.done > bar.done:
+                after_each()
+            bar.show(progress.words, done=progress.done, total=progress.total)
+
+        run_objects(evaluation, objects, results, workers=workers, progress=show)
 
 
 def settled_lifts(lift: LiftConfig, methods: Sequence[Method]) -> tuple[LiftConfig, LiftConfig]:
