@@ -45,8 +45,8 @@ class Targets:
         early = spectral_target(impacts.sounds, fft_sizes=sizes, hops=hops, samples=length)
         if config.spectral_norm == "common":
             mean = sum(float(each.sum()) for each in whole.norms) / len(sizes)
-            parts = ([torch.full_like(each, mean / len(each)) for each in target.norms] for target in (whole, early))
-            whole, early = replace(whole, norms=tuple(next(parts))), replace(early, norms=tuple(next(parts)))
+            norms = [tuple(torch.full_like(each, mean / len(each)) for each in of.norms) for of in (whole, early)]
+            whole, early = replace(whole, norms=norms[0]), replace(early, norms=norms[1])
         return cls(rows, gains, whole, early)
 
 

@@ -152,7 +152,11 @@ class SceneStages:
         Where fewer than 3 views have masks, pictures of the Gaussians stand for them.
         """
         views, cloud = read_views(self.views.path), read_splats(self.cloud.path)
-        source = f"{len(views)} views" if masks_suffice(views) else "pictures of the Gaussians, as views have no masks,"
+        source = (
+            f"{len(views)} views"
+            if masks_suffice(views)
+            else "pictures of the Gaussians, as fewer than 3 views have masks,"
+        )
         self.listener.tell(f"shape: of {source} and {len(cloud)} Gaussians")
         shape = shape_of_cloud(cloud, views)
         self.listener.tell(f"shape: {shape.describe()}")

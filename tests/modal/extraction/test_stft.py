@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from avmsf.modal.extraction.finders import ShortTime
-from avmsf.modal.extraction.stft import consensus_modes, narrow_band
+from avmsf.modal.extraction.stft import Lines, narrow_band
 
 RATE = 16000.0
 
@@ -18,15 +18,10 @@ def tone(frequency: float, damping: float, *, gain: float = 1.0, seconds: float 
 
 
 def find(sounds: Tensor, *, latest_peak: float = 0.1, least_damping: float = 0.5, count: int = 20):
-    return consensus_modes(
-        sounds,
-        sample_rate=RATE,
-        fft_size=512,
-        hop=32,
-        latest_peak=latest_peak,
-        least_damping=least_damping,
-        count=count,
+    lines = Lines.of(
+        sounds, sample_rate=RATE, fft_size=512, hop=32, latest_peak=latest_peak, least_damping=least_damping
     )
+    return lines.modes(count)
 
 
 @pytest.mark.parametrize("chosen", [1, 9, 31])

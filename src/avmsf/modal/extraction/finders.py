@@ -13,7 +13,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.esprit import SHORTEST, candidates
 from avmsf.modal.extraction.least_squares import refine
 from avmsf.modal.extraction.selection import Candidates, chance_ratio, merge, prune, select
-from avmsf.modal.extraction.stft import consensus_modes, regressed_gains
+from avmsf.modal.extraction.stft import Lines
 from avmsf.modal.residual import noise_power
 
 _EMPTY = ModalBank(torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
@@ -151,36 +151,24 @@ class ShortTime:
 
     def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:
         """Return the modes of `sounds`, at most `modes` of them."""
-        fft_size, hop = self._transform(sample_rate)
-        return consensus_modes(
-            sounds,
-            sample_rate=sample_rate,
-            fft_size=fft_size,
-            hop=hop,
-            latest_peak=self.latest_peak,
-            least_damping=self.least_damping,
-            count=self.modes,
-        )
+        return self._lines(sounds, sample_rate).modes(self.modes)
 
     def gains(
         self, sounds: Float[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float
     ) -> Float64[Tensor, "contacts modes"]:
-        """Return the gains that the regression itself gives for a bank's modes, as `regressed_gains` does."""
-        fft_size, hop = self._transform(sample_rate)
-        return regressed_gains(
+        """Return the gains that the regression itself gives for a bank's modes, as `Lines.gains` does."""
+        return self._lines(sounds, sample_rate).gains(bank)
+
+    def _lines(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> Lines:
+        fft_size = _power_of_two(self.fft_seconds * sample_rate, least=32)
+        return Lines.of(
             sounds,
-            bank,
             sample_rate=sample_rate,
             fft_size=fft_size,
-            hop=hop,
+            hop=min(_power_of_two(self.hop_seconds * sample_rate, least=1), fft_size // 4),
             latest_peak=self.latest_peak,
             least_damping=self.least_damping,
         )
-
-    def _transform(self, sample_rate: float) -> tuple[int, int]:
-        """Return the transform's length and hop, samples."""
-        fft_size = _power_of_two(self.fft_seconds * sample_rate, least=32)
-        return fft_size, min(_power_of_two(self.hop_seconds * sample_rate, least=1), fft_size // 4)
 
 
 def finder_named(method: ExtractionMethod, modes: int) -> ModeFinder:

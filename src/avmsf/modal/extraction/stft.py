@@ -6,6 +6,7 @@ straight from the bin's frames; it is evaluated once a hop, where nothing of so 
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Complex, Float, Float64
@@ -50,89 +51,88 @@ def narrow_band(
     return moved * (2 / fft_size / overlap)
 
 
-def consensus_modes(
-    sounds: Float[Tensor, "contacts samples"],
-    *,
-    sample_rate: float,
-    fft_size: int,
-    hop: int,
-    latest_peak: float,
-    least_damping: float,
-    count: int,
-) -> ModalBank:
-    """Return up to `count` modes, the strongest of those that the recordings agree on.
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Straight lines fitted to the logarithms of the envelopes of all bins of all recordings (paper, eq. 5)."""
 
-    In each recording a bin is a candidate when its envelope is a local maximum over bins, peaks within
-    `latest_peak` seconds of the onset and falls by at least `least_damping` 1/s on a straight line fitted to its
-    logarithm (paper, eq. 5). A mode's damping is the mean over the recordings that show it, its frequency likewise,
-    from the slope of each narrow-band signal's phase. Strength is the mean fitted gain.
-    """
-    gain, damping, advance = _lines(
-        sounds,
-        sample_rate=sample_rate,
-        fft_size=fft_size,
-        hop=hop,
-        latest_peak=latest_peak,
-        least_damping=least_damping,
-    )
-    beside = torch.nn.functional.pad(gain, (1, 1))
-    candidate = (gain >= beside[:, :-2]) & (gain > beside[:, 2:])
-    candidate &= gain > gain.amax(1, keepdim=True) * 10 ** (-_PEAK_DB / 20)
-    # The lowest bin holds the recorder's offset and the room's rumble.
-    candidate[:, 0] = False
-    # The phase advances by whole turns besides from one hop to the next: those that bring it nearest to the centre.
-    centre = torch.arange(gain.shape[1], dtype=torch.float64) * (sample_rate / fft_size)
-    frequency = (
-        centre + torch.remainder(advance - centre + sample_rate / hop / 2, sample_rate / hop) - sample_rate / hop / 2
-    )
-    return _agree(candidate, gain, damping, frequency, sample_rate=sample_rate, count=count)
+    gain: Float64[Tensor, "contacts bins"]
+    """The line's value at the onset; 0 where no mode can be in the bin."""
+    damping: Float64[Tensor, "contacts bins"]
+    """1/s."""
+    frequency: Float64[Tensor, "contacts bins"]
+    """From the slope of the narrow-band signal's phase, Hz."""
+    sample_rate: float
 
+    @classmethod
+    def of(
+        cls,
+        sounds: Float[Tensor, "contacts samples"],
+        *,
+        sample_rate: float,
+        fft_size: int,
+        hop: int,
+        latest_peak: float,
+        least_damping: float,
+    ) -> "Lines":
+        """Fit the lines.
 
-def regressed_gains(
-    sounds: Float[Tensor, "contacts samples"],
-    bank: ModalBank,
-    *,
-    sample_rate: float,
-    fft_size: int,
-    hop: int,
-    latest_peak: float,
-    least_damping: float,
-) -> Float64[Tensor, "contacts modes"]:
-    """Return the gain g of eq. 5 in each recording at the bins nearest to the modes: not negative, without a sign.
+        No mode can be in a bin whose envelope peaks later than `latest_peak` seconds after the onset, or falls by less
+        than `least_damping` 1/s, or as fast as the window.
+        """
+        lines = [
+            _regress(narrow_band(sound[None], fft_size=fft_size, hop=hop)[0], hop / sample_rate, fft_size // hop)
+            for sound in sounds
+        ]
+        gain, damping, advance, peak = (torch.stack(part) for part in zip(*lines, strict=True))
+        # The line of a bin of noise, extended to the onset from its late peak, may start anywhere: reject before
+        # ranking. An envelope that falls as fast as the window itself is the window's, not a mode's.
+        ringing = (damping >= least_damping) & (damping < _WINDOW_FALL * sample_rate / fft_size)
+        # The phase is known up to whole turns from one hop to the next: those that bring it nearest to the center.
+        center = torch.arange(gain.shape[1], dtype=torch.float64) * (sample_rate / fft_size)
+        turns = sample_rate / hop
+        frequency = center + torch.remainder(advance - center + turns / 2, turns) - turns / 2
+        return cls(torch.where((peak <= latest_peak) & ringing, gain, 0.0), damping, frequency, sample_rate)
 
-    It is that of the bin's narrow-band signal, two thirds of a steady sine's amplitude at most. It is 0 where the line
-    is no mode's by the rules of `consensus_modes`: it peaks late, or falls too slowly or as fast as the window.
-    """
-    gain, _, _ = _lines(
-        sounds,
-        sample_rate=sample_rate,
-        fft_size=fft_size,
-        hop=hop,
-        latest_peak=latest_peak,
-        least_damping=least_damping,
-    )
-    return gain[:, torch.round(bank.frequency * (fft_size / sample_rate)).long()]
+    def modes(self, count: int) -> ModalBank:
+        """Return up to `count` modes, the strongest of those that the recordings agree on.
 
+        In each recording a bin is a candidate when its gain is a local maximum over bins. A mode's damping is the mean
+        over the recordings that show it, its frequency likewise. Strength is the mean fitted gain.
+        """
+        gain = self.gain
+        adjacent = torch.nn.functional.pad(gain, (1, 1))
+        candidate = (gain >= adjacent[:, :-2]) & (gain > adjacent[:, 2:])
+        candidate &= gain > gain.amax(1, keepdim=True) * 10 ** (-_PEAK_DB / 20)
+        # The lowest bin holds the recorder's offset and the room's rumble.
+        candidate[:, 0] = False
+        return self._agreed(candidate, count)
 
-def _lines(
-    sounds: Float[Tensor, "contacts samples"],
-    *,
-    sample_rate: float,
-    fft_size: int,
-    hop: int,
-    latest_peak: float,
-    least_damping: float,
-) -> tuple[Float64[Tensor, "contacts bins"], Float64[Tensor, "contacts bins"], Float64[Tensor, "contacts bins"]]:
-    """Return gain, damping (1/s) and frequency (Hz, up to whole turns a frame) of each bin; gain 0 for no mode's."""
-    lines = [
-        _regress(narrow_band(sound[None], fft_size=fft_size, hop=hop)[0], hop / sample_rate, fft_size // hop)
-        for sound in sounds
-    ]
-    gain, damping, advance, peak = (torch.stack(part) for part in zip(*lines, strict=True))
-    # The line of a bin of noise, extended to the onset from its late peak, may start anywhere: reject before ranking.
-    # An envelope that falls as fast as the window itself is the window's, not a mode's.
-    ringing = (damping >= least_damping) & (damping < _WINDOW_FALL * sample_rate / fft_size)
-    return torch.where((peak <= latest_peak) & ringing, gain, 0.0), damping, advance
+    def gains(self, bank: ModalBank) -> Float64[Tensor, "contacts modes"]:
+        """Return the gain g of eq. 5 in each recording at the bins nearest to the modes: not negative, without a sign.
+
+        It is that of the bin's narrow-band signal, two thirds of a steady sine's amplitude at most.
+        """
+        width = self.sample_rate / (2 * (self.gain.shape[1] - 1))
+        return self.gain[:, torch.round(bank.frequency / width).long()]
+
+    def _agreed(self, candidate: Bool[Tensor, "contacts bins"], count: int) -> ModalBank:
+        once = candidate.to(torch.float64)
+        near = once + _neighbors(once)
+        shown, votes = near.clamp_max(1.0).sum(0), near.sum(0)
+        before, after = (torch.nn.functional.pad(votes, sides) for sides in ((1, 0), (0, 1)))
+        best = (votes >= before[:-1]) & (votes > after[1:])
+        bins = torch.nonzero(best & (shown >= max(1.0, _CONSENSUS * len(candidate)))).flatten()
+
+        def mean(values: Float64[Tensor, "contacts bins"], weight: Float64[Tensor, "contacts bins"]) -> Tensor:
+            total, share = ((part + _neighbors(part)).sum(0)[bins] for part in (weight * values, weight))
+            return total / share
+
+        pitch, decay = mean(self.frequency, once * self.gain), mean(self.damping, once)
+        strength = mean(self.gain, once) * shown[bins]
+        audible = torch.nonzero((pitch > 0) & (pitch < self.sample_rate / 2)).flatten()
+        strongest = audible[torch.argsort(strength[audible], descending=True)[:count]]
+        order = strongest[torch.argsort(pitch[strongest])]
+        return ModalBank(pitch[order], decay[order])
 
 
 def _regress(
@@ -171,33 +171,6 @@ def _regress(
     return gain, -slope, torch.angle(turn).to(torch.float64) / (2 * math.pi * step), peak.to(torch.float64) * step
 
 
-def _agree(
-    candidate: Bool[Tensor, "contacts bins"],
-    gain: Float64[Tensor, "contacts bins"],
-    damping: Float64[Tensor, "contacts bins"],
-    frequency: Float64[Tensor, "contacts bins"],
-    *,
-    sample_rate: float,
-    count: int,
-) -> ModalBank:
-    near = candidate + _neighbours(candidate.to(torch.float64))
-    shown = near.clamp_max(1.0).sum(0)
-    votes = near.sum(0)
-    best = (votes >= torch.nn.functional.pad(votes, (1, 0))[:-1]) & (votes > torch.nn.functional.pad(votes, (0, 1))[1:])
-    bins = torch.nonzero(best & (shown >= max(1.0, _CONSENSUS * len(candidate)))).flatten()
-
-    def mean(values: Float64[Tensor, "contacts bins"], weight: Float64[Tensor, "contacts bins"]) -> Tensor:
-        total, share = ((part + _neighbours(part)).sum(0)[bins] for part in (weight * values, weight))
-        return total / share
-
-    once = candidate.to(torch.float64)
-    pitch, decay, strength = mean(frequency, once * gain), mean(damping, once), mean(gain, once) * shown[bins]
-    audible = torch.nonzero((pitch > 0) & (pitch < sample_rate / 2)).flatten()
-    strongest = audible[torch.argsort(strength[audible], descending=True)[:count]]
-    order = strongest[torch.argsort(pitch[strongest])]
-    return ModalBank(pitch[order], decay[order])
-
-
-def _neighbours(values: Float64[Tensor, "contacts bins"]) -> Float64[Tensor, "contacts bins"]:
+def _neighbors(values: Float64[Tensor, "contacts bins"]) -> Float64[Tensor, "contacts bins"]:
     padded = torch.nn.functional.pad(values, (1, 1))
     return padded[:, :-2] + padded[:, 2:]
