@@ -1,0 +1,237 @@
+"""Parts of the gain model: what each contributes, whether supports are found, and labels that are called wrong."""
+
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from avmsf.bench.evaluation import split
+from avmsf.capture import Impacts
+from avmsf.fem.supports import supports_of
+from avmsf.field.config import FitConfig
+from avmsf.field.gains.elastic import Elastic
+from avmsf.field.gains.estimator import FAMILIES, POSITIONAL, MixtureEstimator
+from avmsf.field.gains.symmetry import Symmetric
+from avmsf.field.recipes import GainCase
+from avmsf.field.soundfield import SoundField
+from avmsf.field.uncertainty import parts_of, std_of
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.residual import Residual
+from avmsf.modal.synthesis import synthesise_phased
+from avmsf.pipeline.bodies import BodyConfig, candidate_bodies, roughened
+from avmsf.scene.features import FeatureField
+from avmsf.simulate.block import block
+from avmsf.simulate.elastic import ElasticModes, elastic_modes
+from avmsf.simulate.elements import SecondOrder
+from avmsf.simulate.material import CERAMIC, STEEL
+from avmsf.simulate.shapes import make_shape
+from avmsf.simulate.sim20 import ABLATED
+from benchmarks.report import Options, Report, Table, tell
+from benchmarks.splitcases import COUNTS, ROUGH, SplitCase, bodies_of, measured, simulated, split_case, splits_of
+
+DEFAULT = "default"
+_ALONE = tuple(f"{kind} alone" for kind in FAMILIES)
+_LESS_KNOWN = ("positions alone", "positions and symmetry", "noisy mesh")
+"""Variants that know less of the object: not settings among which one would choose."""
+
+
+def ablation(options: Options) -> Report:
+    """Errors without each part of the default model, or with what was dropped; one split of each object."""
+    rows: list[list[str | float]] = []
+    found: dict[str, dict[str, float]] = defaultdict(dict)
+    cases = []
+    for name, case in _ablated(options):
+        cases.append(name)
+        for variant, error in _variants(case, options):
+            found[variant][name] = error
+            tell(f"{name}, {variant}: {error:.4f}")
+    logs = {
+        variant: {name: float(np.log(error / found[DEFAULT][name])) for name, error in errors.items()}
+        for variant, errors in found.items()
+    }
+    ratios = {variant: float(np.exp(np.mean(list(each.values())))) for variant, each in logs.items()}
+    for variant, errors in found.items():
+        rows.append([variant, *(errors.get(name, "-") for name in cases), ratios[variant]])
+    columns = ("model", *cases, "over the default, geometric mean")
+    tables = (Table("held-out error without each part", columns, rows), _halves(logs, cases))
+    figures = {f"gains.ablation.{variant.replace(' ', '_')}": ratio for variant, ratio in ratios.items()}
+    return Report(tables=tables, figures=figures)
+
+
+def _halves(logs: Mapping[str, Mapping[str, float]], cases: list[str]) -> Table:
+    """Return the settings that are best on one half of the cases, and how they do on the other half.
+
+    A case where a variant is no different, such as updating without a body, counts as the default.
+    """
+    rows: list[list[str | float]] = []
+    settings = [each for each in logs if each not in (*_ALONE, *_LESS_KNOWN)]
+    for number in range(2):
+        chosen_on, judged_on = cases[number::2], cases[1 - number :: 2]
+
+        def ratio(variant: str, names: list[str]) -> float:
+            return float(np.exp(np.mean([logs[variant].get(name, 0.0) for name in names]))) if names else float("nan")
+
+        best = min(settings, key=lambda variant: ratio(variant, chosen_on))
+        rows.append([", ".join(chosen_on), best, ratio(best, chosen_on), ratio(best, judged_on)])
+    columns = ("chosen on", "best setting", "over the default there", "on the other half")
+    return Table("settings chosen on one half and judged on the other", columns, rows)
+
+
+def _ablated(options: Options) -> Iterator[tuple[str, SplitCase]]:
+    for name, count, start in (("aircraft_response", 15, 18), ("ruler10", 7, 0), ("tree43", 20, 18)):
+        capture = measured(name)
+        bodies = None if capture.surface is None else bodies_of(capture.surface, options)
+        yield f"{name} {count}", split_case(*split(capture.impacts, count=count, start=start), capture, bodies)
+    with tempfile.TemporaryDirectory() as cache:
+        for name in options.objects or ABLATED[: 1 if options.quick_look else 3]:
+            capture, _ = simulated(name, options, Path(cache))
+            assert capture.surface is not None
+            bodies = bodies_of(capture.surface, options)
+            yield name, split_case(*split(capture.impacts, fraction=0.2), capture, bodies)
+
+
+def _variants(case: SplitCase, options: Options) -> Iterator[tuple[str, float]]:
+    """Yield names of variants of the default model and their errors."""
+    field = case.fit(MixtureEstimator(bodies=case.bodies), quick=False)
+    yield DEFAULT, case.error(field)
+    yield "not refined", case.error(case.fit(MixtureEstimator(bodies=case.bodies), quick=True))
+    yield "stationary noise alone", case.error(replace(field, residual=Residual(field.residual.magnitude)))
+    origin = replace(field.origin, config=replace(field.origin.config, residual_noise="gaussian"))
+    yield "Gaussian noise", case.error(replace(field, origin=origin))
+    yield "magnitudes lifted half way", case.error(_Lifted(field))  # type: ignore[arg-type]
+    if case.bodies is not None:
+        yield "no updating", case.error(case.fit(MixtureEstimator(bodies=case.bodies, update=False), quick=False))
+    for kind, label in zip(FAMILIES, _ALONE, strict=True):
+        if (kind != Symmetric.kind or case.symmetries) and (kind != Elastic.kind or case.bodies):
+            alone = MixtureEstimator((kind,), bodies=case.bodies, symmetries=case.symmetries)
+            yield label, case.error(case.fit(alone, quick=True))
+    yield "positions alone", case.error(case.fit(MixtureEstimator(tuple(POSITIONAL)), quick=False))
+    yield "positions and symmetry", case.error(case.fit(MixtureEstimator(symmetries=case.symmetries), quick=False))
+    if case.surface is not None:
+        rough = bodies_of(roughened(case.surface, ROUGH, seed=0), options)
+        yield "noisy mesh", case.error(case.fit(MixtureEstimator(bodies=rough), quick=False))
+
+
+def outliers(options: Options) -> Report:
+    """Exchanged labels that are named, and right ones that are, on the aircraft; right labels named on all captures."""
+    captures = {name: measured(name) for name in COUNTS}
+    bodies = {
+        name: None if each.surface is None else bodies_of(each.surface, options) for name, each in captures.items()
+    }
+    draws = {"found": 0, "false": 0, "exchanged": 0, "clean_false": 0, "clean_fits": 0}
+    for case in splits_of(captures["aircraft_response"], 15, bodies["aircraft_response"], options):
+        for seed in range(1 if options.quick_look else 9):
+            # Three contacts get the labels of one another, in a circle.
+            drawn = np.random.default_rng(seed).choice(len(case.train), 3, replace=False)
+            order = torch.arange(len(case.train))
+            order[torch.from_numpy(drawn)] = torch.from_numpy(np.roll(drawn, 1))
+            directions = None if case.train.directions is None else case.train.directions[order]
+            train = replace(case.train, contacts=case.train.contacts[order], directions=directions)
+            named, wrong = _named(replace(case, train=train)), {case.train.names[row] for row in drawn.tolist()}
+            draws["found"] += len(named & wrong)
+            draws["false"] += len(named - wrong)
+            draws["exchanged"] += 3
+            tell(f"exchanged {sorted(wrong)}, named {sorted(named)}")
+    for name, counts in COUNTS.items():
+        for count in counts[:1] if options.quick_look else counts:
+            for case in splits_of(captures[name], count, bodies[name], options):
+                draws["clean_false"] += len(_named(case))
+                draws["clean_fits"] += 1
+    rows: list[list[str | float]] = [["labels", *map(float, draws.values())]]
+    figures = {f"outliers.{key}": float(value) for key, value in draws.items()}
+    return Report(tables=(Table("labels called wrong", ("aircraft, 15 places", *draws), rows),), figures=figures)
+
+
+def _named(case: SplitCase) -> set[str]:
+    """Return the names of the training contacts that the fit reports as outliers."""
+    return set(case.fit(MixtureEstimator(bodies=case.bodies), quick=True).origin.report["outliers"])
+
+
+def supports(options: Options) -> Report:
+    """Errors of the gains of objects that are free or held, by whether supports are tried, and what is found."""
+    rows: list[list[str | float]] = []
+    figures = {}
+    mug = make_shape("mug", size=0.1, wall=0.003)
+    objects = (
+        ("plate", block((0.24, 0.16, 0.003), (16, 10, 1)), STEEL, "held along lower edge 3"),
+        ("mug", mug.solid, CERAMIC, "held at its lowest face"),
+    )
+    for kind, solid, material, place in objects[: 1 if options.quick_look else None]:
+        mesh = SecondOrder.of(solid)
+        [held] = [each for each in supports_of(mesh) if each.name == place]
+        along = solid.points[solid.cells].mean(1)[:, 0] / solid.size
+        uneven = 1 + 0.1 * torch.sin(2 * torch.pi * along).double()
+        for support in (None, held):
+            fixed = None if support is None else support.nodes(mesh)
+            true = elastic_modes(solid, material, count=30, stiffness_factor=uneven, fixed=fixed)
+            case, points, ways = _gains_of(true)
+            exact = true.gains(points, ways)
+            row: list[str | float] = [f"{kind}, {'free' if support is None else support.name}"]
+            for tried in ("free", "auto", "try", None):
+                config = BodyConfig() if tried is None else BodyConfig(supports=tried)
+                bodies = None if tried is None else candidate_bodies(solid.surface, config, tell=tell)
+                model, _ = MixtureEstimator(bodies=bodies).fit(case)
+                error = float((model.at(points, ways).mean.real - exact).norm() / exact.norm())
+                row += [error] if tried != "try" else [error, model.report["bodies"][0]["support"]]
+                figures[f"gains.supports.{kind}.{'free' if support is None else 'held'}.{tried}"] = error
+            rows.append(row)
+            tell(f"{row}")
+    columns = ("object", "taken for free", "default", "supports tried", "found", "no body")
+    return Report(tables=(Table("relative error of gains at 200 contacts, 12 known", columns, rows),), figures=figures)
+
+
+def _gains_of(true: ElasticModes) -> tuple[GainCase, Float64[Tensor, "others 3"], Float64[Tensor, "others 3"]]:
+    """Return gains at 12 contacts with errors of place, direction and force, and 200 other contacts with directions."""
+    generator = torch.Generator().manual_seed(0)
+
+    def drawn(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    points = true.nodes[torch.randperm(len(true.nodes), generator=generator)[:212]]
+    ways = -true.normals(points)
+    known, others = points[:12], points[12:]
+    struck = ways[:12] + 0.05 * drawn(12, 3)
+    gains = true.gains(known + 0.0015 * drawn(12, 3) / 3**0.5, struck / struck.norm(dim=1, keepdim=True))
+    gains = gains * (1 + 0.02 * drawn(12, 1))
+    impacts = Impacts(
+        contacts=known.float(), sounds=torch.zeros(12, 4410), sample_rate=44100.0,
+        names=tuple(f"{row:03d}" for row in range(12)), directions=ways[:12].float(),
+    )  # fmt: skip
+    bank = ModalBank(true.frequency, torch.full_like(true.frequency, 20.0))
+    found = Extraction(bank, gains, Residual(torch.zeros(1025)), torch.zeros_like(gains))
+    phase = torch.zeros(len(true), dtype=torch.float64)
+    features = FeatureField.from_points(true.nodes.float())
+    return GainCase(impacts, features, found, phase, gains, FitConfig()), others, ways[12:]
+
+
+@dataclass(frozen=True, eq=False)
+class _Lifted:
+    """A field whose gains have magnitudes half way, in decibels, to the posterior median of the magnitude."""
+
+    field: SoundField
+
+    @property
+    def sample_rate(self) -> float:
+        return self.field.sample_rate
+
+    def render(self, contacts: Tensor, *, directions: Tensor | None = None, samples: int | None = None) -> Tensor:
+        """Return the sounds."""
+        mean, deviation = parts_of(self.field, contacts, directions), std_of(self.field, contacts, directions)
+        drawn = torch.randn(200, *mean.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        median = (mean + deviation * drawn).norm(dim=3).median(dim=0).values
+        lifted = mean * (median / mean.norm(dim=2).clamp_min(1e-30)).sqrt()[..., None]
+        bank, length = self.field.bank, samples or self.field.samples
+        made = synthesise_phased(
+            lifted[..., 0].float(), bank.frequency, bank.damping, self.field.phase, samples=length,
+            sample_rate=self.sample_rate, quadrature=lifted[..., 1].float(),
+        )  # fmt: skip
+        silent = replace(self.field, residual=Residual(torch.zeros_like(self.field.residual.magnitude)))
+        noise = self.field.render(contacts, directions=directions, samples=length)
+        return made + noise - silent.render(contacts, directions=directions, samples=length)
