@@ -381,7 +381,7 @@ def test_show_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
     assert told["sample_rate"] == RATE
     assert told["mode_count"] == len(told["modes"]) == len(fitted.bank)
     assert told["modes"][0]["frequency_hertz"] == float(fitted.bank.frequency[0])
-    assert told["compared_with"]["which"] == "not trained on"
+    assert told["compared_with"]["which"] == "the field was not fitted to these"
     assert set(told["compared_with"]["recordings"]).isdisjoint(fitted.origin.trained_on)
     assert len(told["compared_with"]["recordings"]) == 3
     assert (len(told["trained_on"]), told["trained_on"][0]) == (5, "002.wav")

@@ -15,7 +15,7 @@ from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.capture.views.write import write_views
 from avmsf.cli import main
 from avmsf.errors import CaptureError
-from avmsf.pipeline.silhouettes import compare_outlines, judge_outlines
+from avmsf.pipeline.silhouettes import compare_outlines, expect_contacts_in_outlines, judge_outlines
 from plate_capture import fill_plate
 from small_scene import slab, slab_views
 
@@ -71,6 +71,16 @@ def test_cameras_in_another_unit_are_refused_with_it(unit: str) -> None:
     with pytest.raises(CaptureError) as caught:
         judge_outlines(scaled(1 / METRES[unit]), VIEWS, CaptureSettings())
     assert f'unit = "{unit}" and surface_unit = "{unit}"' in str(caught.value)
+
+
+@pytest.mark.parametrize("unit", ["mm", "cm", "in"])
+def test_contacts_in_another_unit_than_the_cameras_are_refused_with_it(unit: str) -> None:
+    contacts, settings = slab().vertices, CaptureSettings()
+    expect_contacts_in_outlines(contacts, VIEWS, settings)
+    expect_contacts_in_outlines(contacts / METRES[unit], [replace(view, mask=None) for view in VIEWS], settings)
+    with pytest.raises(CaptureError) as caught:
+        expect_contacts_in_outlines(contacts / METRES[unit], VIEWS, settings)
+    assert f'unit = "{unit}"' in str(caught.value)
 
 
 def test_reconstruct_refuses_them_before_it_fits_gaussians(tmp_path: Path, capsys: Streams) -> None:

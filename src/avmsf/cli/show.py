@@ -177,8 +177,10 @@ def _unheard(impacts: Impacts, field: SoundField) -> tuple[Impacts, str]:
     known = set(field.origin.trained_on)
     rows = [row for row, name in enumerate(impacts.names) if name not in known]
     if not rows:
-        return impacts, "all of them trained on"
-    return impacts.take(rows), "not trained on" if len(rows) < len(impacts) else "none of them trained on"
+        return impacts, "the field was fitted to all of them"
+    return impacts.take(rows), "the field was not fitted to these" if len(rows) < len(
+        impacts
+    ) else "the field was fitted to none of them"
 
 
 def _gains_words(gains: dict[str, Any]) -> str:

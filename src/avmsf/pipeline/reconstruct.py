@@ -33,7 +33,7 @@ from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import PipelineConfig, with_record
 from avmsf.pipeline.scene import Listener, SceneStages
-from avmsf.pipeline.silhouettes import judge_outlines
+from avmsf.pipeline.silhouettes import expect_contacts_in_outlines, judge_outlines
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
@@ -232,11 +232,13 @@ def _shape(
         surface, digest = object_shape(capture.surface, None)
         made = _surface_stage(stages, config, surface, digest, listener)
         return _Shape({"positions": features}, made, {}, surface, digest)
-    if capture.surface is not None and scene.source is not None and scene.source.kind == "cameras":
+    if scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
-        words = judge_outlines(capture.surface, read_views(scene.views.path), settings)
+        views = read_views(scene.views.path)
+        words = None if capture.surface is None else judge_outlines(capture.surface, views, settings)
         if words is not None:
             warnings.warn(words, CaptureWarning, stacklevel=2)
+        expect_contacts_in_outlines(capture.impacts.contacts, views, settings)
     features = load_features(scene.features.path)
     surface, digest = object_shape(capture.surface, scene)
     made = scene.made() | _surface_stage(stages, config, surface, digest, listener)

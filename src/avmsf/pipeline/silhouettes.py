@@ -6,10 +6,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from avmsf.capture.cameras import Camera, View
 from avmsf.capture.meshviews import MeshTracer
-from avmsf.capture.placement import FACTORS
+from avmsf.capture.placement import FACTORS, WRONG_ROWS
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.capture.surface import Surface
 from avmsf.capture.texturedmesh import TexturedMesh
@@ -67,11 +69,9 @@ def judge_outlines(surface: Surface, views: Sequence[View], settings: CaptureSet
     CaptureError where cameras and mesh count different units, with the one that fits: nothing that is made of the
     photographs would lie on the mesh.
     """
-    masked = [view for view in views if view.mask is not None and bool((view.mask > 127).any())]
-    if not masked or not len(surface.faces):
+    chosen = _masked(views)
+    if not chosen or not len(surface.faces):
         return None
-    positions = torch.stack([view.camera.position for view in masked])
-    chosen = [masked[row] for row in farthest_points(positions, min(MAX_VIEWS, len(masked))).tolist()]
     tracer = MeshTracer(TexturedMesh.plain(surface))
     found = compare_outlines(tracer, chosen)
     if found.beyond <= BEYOND:
@@ -92,6 +92,53 @@ def judge_outlines(surface: Surface, views: Sequence[View], settings: CaptureSet
         f"{words}, {_percent(found.beyond)} beyond {MASK_PIXELS:g} pixels of the masks' edges, and the mesh is {size}: "
         "are both of one object, in one unit and frame? The mesh is taken for the object's shape"
     )
+
+
+def expect_contacts_in_outlines(
+    contacts: Float[Tensor, "contacts 3"], views: Sequence[View], settings: CaptureSettings
+) -> None:
+    """Raise CaptureError where contacts in another unit would lie inside the outlines of views, and as they are do not.
+
+    Contacts (m) on an object lie inside its mask in every view. A factor is the mistake where at most half of them do
+    in the median view, but nearly all once it is undone; of several the largest, for contacts that are shrunk enough
+    lie inside whatever they were.
+    """
+    chosen = _masked(views)
+    if not chosen or 2 * _share_inside(contacts, chosen) > 1:
+        return
+    fitting = [each for each in FACTORS if _share_inside(each * contacts, chosen) >= 1 - WRONG_ROWS]
+    if not fitting:
+        return
+    factor = max(fitting)
+    name = next((unit for unit, size in METRES.items() if abs(size / (factor * settings.metres) - 1) < 1e-6), None)
+    mended = f'write unit = "{name}" in capture.toml' if name else "scale the contacts or the cameras"
+    raise CaptureError(
+        f"expected contacts on the object that the photographs show; most lie outside of its outlines, and inside when "
+        f"multiplied by {factor:.4g}: {mended}"
+    )
+
+
+def _masked(views: Sequence[View]) -> list[View]:
+    """Return views with masks that show something, `MAX_VIEWS` at most, as far apart as they stand."""
+    masked = [view for view in views if view.mask is not None and bool((view.mask > 127).any())]
+    if not masked:
+        return []
+    positions = torch.stack([view.camera.position for view in masked])
+    return [masked[row] for row in farthest_points(positions, min(MAX_VIEWS, len(masked))).tolist()]
+
+
+def _share_inside(contacts: Float[Tensor, "contacts 3"], views: Sequence[View]) -> float:
+    """Return the part of the contacts that lies inside the mask, or within `MASK_PIXELS`; the median over views."""
+    found = []
+    reach = round(MASK_PIXELS)
+    for view in views:
+        assert view.mask is not None
+        mask = cv2.dilate(view.mask.numpy(), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 127
+        pixels, depth = view.camera.project(contacts)
+        column, row = pixels.floor().long().unbind(1)
+        seen = (depth > 0) & (column >= 0) & (column < mask.shape[1]) & (row >= 0) & (row < mask.shape[0])
+        found.append(float(torch.from_numpy(mask)[row[seen], column[seen]].sum()) / len(contacts))
+    return float(np.median(found))
 
 
 def _mending(factor: float, settings: CaptureSettings) -> str:
