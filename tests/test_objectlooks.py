@@ -17,6 +17,7 @@ from avmsf.pipeline.features import LiftConfig
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig, find_source
+from avmsf.scene.features import FeatureField
 from avmsf.scene.ply import read_splats
 from avmsf.scene.splatconfig import SplatConfig
 from small_scene import slab_views, write_surface_file
@@ -88,6 +89,12 @@ def test_the_papers_features_are_of_gaussians_even_where_a_mesh_is_there(seen: P
     assert features.features.shape[1] > 4 + 3
     assert "components" not in features.encoder
     assert len(looks("slab", "visual").points) == 400
+    # The paper's ablations differ from it in nothing else.
+    bare, unaligned = looks("slab", "paper-positions"), looks("slab", "paper-unaligned")
+    assert torch.equal(bare.points, features.points)
+    assert torch.equal(bare.features, FeatureField.from_points(features.points).features)
+    assert unaligned.features.shape == features.features.shape
+    assert not torch.allclose(unaligned.features, features.features)
 
 
 @pytest.mark.slow

@@ -33,7 +33,7 @@ IDENTITY = {
     "seed": 0,
     "metrics": "m",
     "modes": "n",
-    "methods": {"knn3": "", "field": "", "nearest": ""},
+    "methods": {"knn3": "", "paper": "", "nearest": ""},
 }
 
 
@@ -47,36 +47,36 @@ def record(name: str, figures: dict[str, tuple[float | None, ...] | str], *, lab
 
 
 THREE = (
-    record("1", {"knn3": (1.0, 3.0), "field": (1.0, 1.0)}),
-    record("2", {"knn3": (4.0, 4.0), "field": (16.0, None)}),
-    record("10", {"knn3": (6.0, 6.0), "field": "no modes"}),
+    record("1", {"knn3": (1.0, 3.0), "paper": (1.0, 1.0)}),
+    record("2", {"knn3": (4.0, 4.0), "paper": (16.0, None)}),
+    record("10", {"knn3": (6.0, 6.0), "paper": "no modes"}),
 )
 
 
 def test_means_are_over_contacts_then_over_objects() -> None:
     summary = summarise(THREE, IDENTITY)
-    assert summary["methods"] == {"knn3": {"l1": 4.0}, "field": {"l1": 8.5}}
+    assert summary["methods"] == {"knn3": {"l1": 4.0}, "paper": {"l1": 8.5}}
     # Of 2, 4 and 6 the standard deviation is 2; of 1 and 16, 7.5 sqrt 2.
     assert summary["standard_errors"]["knn3"]["l1"] == pytest.approx(2 / math.sqrt(3))
-    assert summary["standard_errors"]["field"]["l1"] == pytest.approx(7.5)
-    assert summary["counts"] == {"knn3": 3, "field": 2}
-    assert summary["failures"] == [{"object": "10", "case": "farthest", "method": "field", "failure": "no modes"}]
+    assert summary["standard_errors"]["paper"]["l1"] == pytest.approx(7.5)
+    assert summary["counts"] == {"knn3": 3, "paper": 2}
+    assert summary["failures"] == [{"object": "10", "case": "farthest", "method": "paper", "failure": "no modes"}]
 
 
 def test_differences_and_ratios_are_paired() -> None:
     summary = summarise(THREE, IDENTITY)
     # Objects 1 and 2: 1 - 2 and 16 - 4; 1 / 2 and 16 / 4, whose geometric mean is sqrt 2; means 8.5 and 3.
-    assert summary["difference_to_knn3"]["field"]["l1"] == pytest.approx({"mean": 5.5, "standard_error": 6.5})
-    assert summary["ratio_to_knn3"]["field"]["l1"] == pytest.approx(math.sqrt(2))
-    assert summary["ratio_of_means_to_knn3"]["field"]["l1"] == pytest.approx(8.5 / 3)
+    assert summary["difference_to_knn3"]["paper"]["l1"] == pytest.approx({"mean": 5.5, "standard_error": 6.5})
+    assert summary["ratio_to_knn3"]["paper"]["l1"] == pytest.approx(math.sqrt(2))
+    assert summary["ratio_of_means_to_knn3"]["paper"]["l1"] == pytest.approx(8.5 / 3)
     assert summary["ratio_to_knn3"]["knn3"]["l1"] == 1.0
 
 
 def test_a_perfect_method_has_ratio_zero_and_a_perfect_baseline_no_ratio() -> None:
-    summary = summarise((record("1", {"knn3": (2.0, 2.0), "field": (0.0, 0.0)}),), IDENTITY)
-    assert summary["ratio_to_knn3"]["field"] == {"l1": 0.0}
-    assert summary["standard_errors"]["field"] == {"l1": None}
-    summary = summarise((record("1", {"knn3": (0.0, 0.0), "field": (1.0, 1.0)}),), IDENTITY)
+    summary = summarise((record("1", {"knn3": (2.0, 2.0), "paper": (0.0, 0.0)}),), IDENTITY)
+    assert summary["ratio_to_knn3"]["paper"] == {"l1": 0.0}
+    assert summary["standard_errors"]["paper"] == {"l1": None}
+    summary = summarise((record("1", {"knn3": (0.0, 0.0), "paper": (1.0, 1.0)}),), IDENTITY)
     assert summary["ratio_to_knn3"] == {}
 
 
@@ -93,15 +93,15 @@ def test_parts_of_one_experiment_are_pooled_and_one_that_failed_spoils_all() -> 
 
 def test_figures_of_which_more_is_better_have_no_ratio() -> None:
     cases = (CaseRecord("a", "a", ("t",), ("u",)),)
-    outcomes = tuple(Outcome("a", method, {}, {"mac": 0.5}) for method in ("knn3", "field"))
+    outcomes = tuple(Outcome("a", method, {}, {"mac": 0.5}) for method in ("knn3", "paper"))
     summary = summarise((ObjectRecord("1", cases=cases, outcomes=outcomes),), IDENTITY)
-    assert summary["methods"]["field"] == {"mac": 0.5}
-    assert summary["ratio_to_knn3"] == {"knn3": {}, "field": {}}
+    assert summary["methods"]["paper"] == {"mac": 0.5}
+    assert summary["ratio_to_knn3"] == {"knn3": {}, "paper": {}}
 
 
 def test_groups_of_objects_have_their_own_means() -> None:
     summary = summarise(THREE, IDENTITY, subsets={"odd": frozenset({"1"}), "none": frozenset({"7"})})
-    assert summary["subsets"] == {"odd": {"objects": 1, "methods": {"knn3": {"l1": 2.0}, "field": {"l1": 1.0}}}}
+    assert summary["subsets"] == {"odd": {"objects": 1, "methods": {"knn3": {"l1": 2.0}, "paper": {"l1": 1.0}}}}
 
 
 def test_the_mean_of_one_has_no_standard_error() -> None:
@@ -112,22 +112,22 @@ def test_tables_have_the_papers_rows_for_its_datasets_alone() -> None:
     words = markdown(sections(THREE, IDENTITY, subsets={}))
     assert "| paper: AV-MSF | 0.0130 |" in words
     assert "| knn3 | **4.00 ± 1.2** | 3 |" in words
-    assert "| 10 | farthest | field | no modes |" in words
+    assert "| 10 | farthest | paper | no modes |" in words
     assert WARNING in words
     other = markdown(sections(THREE, {**IDENTITY, "dataset": "sim-20"}, subsets={}))
     assert "paper: AV-MSF" not in other
     # The ratios that its tables allow stand beside ours everywhere.
-    assert "| paper, ObjectFolder Real: field | 0.929 |" in other
+    assert "| paper, ObjectFolder Real: paper | 0.929 |" in other
     assert WARNING in other
 
 
 def test_the_papers_ratio_is_of_its_own_rows() -> None:
     ratios = published_ratios("farthest")
-    assert ratios["ObjectFolder Real"]["field"]["cdpam"] == pytest.approx(1.35 / 1.53)
+    assert ratios["ObjectFolder Real"]["paper"]["cdpam"] == pytest.approx(1.35 / 1.53)
     assert ratios["ObjectFolder Real"]["white-noise"]["l1"] == pytest.approx(3.774 / 0.014)
     assert set(published_ratios("non-symmetric")) == {"ObjectFolder Real"}
-    assert published_ratios("closest")["RealImpact"]["field"]["l1"] == pytest.approx(21 / 26)
-    assert sum(len(table.rows) for table in PUBLISHED) == 37
+    assert published_ratios("closest")["RealImpact"]["paper"]["l1"] == pytest.approx(21 / 26)
+    assert sum(len(table.rows) for table in PUBLISHED) == 39
 
 
 @pytest.mark.parametrize(
@@ -208,7 +208,7 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("evaluated")
     plates = fill_plates(place / "plates", ("a", "b <i>"))
     results = ResultsFolder(place / "results")
-    run_objects(planned(plates, "knn3", "nearest", "field"), ("a", "b <i>"), results)
+    run_objects(planned(plates, "knn3", "nearest", "paper"), ("a", "b <i>"), results)
     write_summary(results, subsets={"round": frozenset("a")})
     write_page(results, subsets={"round": frozenset("a")})
     return place / "results"
@@ -257,7 +257,7 @@ def test_the_page_stays_small(evaluated: Path, tmp_path: Path, monkeypatch: pyte
 
 def test_times_and_failures_are_told(evaluated: Path) -> None:
     times = json.loads((evaluated / "times.json").read_text())
-    assert set(times["a"]["methods"]) == {"knn3", "nearest", "field"}
+    assert set(times["a"]["methods"]) == {"knn3", "nearest", "paper"}
     assert times["a"]["methods"]["knn3"]["render"] > 0
     words = (evaluated / "report.md").read_text()
     assert "| a | farthest | field | a: nothing shows its look |" in words

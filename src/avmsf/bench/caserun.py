@@ -12,11 +12,13 @@ from torch import Tensor
 
 from avmsf._utils.caching import Given, Result
 from avmsf.bench.cases import Case
-from avmsf.bench.judging import spread
+from avmsf.bench.judging import Judgement, spread
 from avmsf.bench.knowntruth import truth_at
 from avmsf.bench.listening import keep_sound, listening_gain
+from avmsf.bench.locating import located
 from avmsf.bench.methods import report_of
 from avmsf.bench.plan import Evaluation
+from avmsf.bench.renderer import Renderer
 from avmsf.bench.results import CaseRecord, Outcome, one_line
 from avmsf.bench.task import Look, Method, Task
 from avmsf.capture.impacts import Impacts
@@ -74,9 +76,7 @@ class CaseRun:
             with torch.no_grad():
                 sounds = renderer.render(self.test.contacts, directions=self.test.directions)
             render_seconds = time.perf_counter() - begun
-            judgement = self.evaluation.judging.judge(
-                renderer, sounds, self.test, self.truth, loudest=float(self.impacts.sounds.abs().max())
-            )
+            judgement = self._judgement(renderer, sounds)
         except AvmsfError as error:
             return Outcome(self.case.key, method.name, failure=one_line(error))
         except Exception as error:  # A fault in one method must not cost the others their hours.
@@ -97,6 +97,14 @@ class CaseRun:
         sounds = known.sounds or self._keep_sounds(_RECORDED, self.test.sounds)
         seconds, self.shared = known.shared_seconds + self.shared, 0.0
         return replace(known, sounds=sounds, shared_seconds=round(seconds, 4))
+
+    def _judgement(self, renderer: Renderer, sounds: Float[Tensor, "contacts samples"]) -> Judgement:
+        if self.evaluation.protocol.locating:
+            points = self._shared(self.look)("positions").points
+            return Judgement(dict(located(renderer, self.train, self.test, points)), {})
+        return self.evaluation.judging.judge(
+            renderer, sounds, self.test, self.truth, loudest=float(self.impacts.sounds.abs().max())
+        )
 
     def _task(self) -> Task:
         return Task(

@@ -72,10 +72,12 @@ class UninformedField:
     """Adam's step for frequencies (in widths of their modes) and for the logarithms of dampings."""
     look: Look = "visual"
     """What the network reads of the object's points."""
+    finder: ModeFinder | None = None
+    """How modes are counted; None takes those that all methods share."""
 
     def fit(self, task: Task) -> SoundField:
         """Fit the field. Raises AvmsfError where features or field cannot be made, or no mode can be counted."""
-        counted = task.modes()
+        counted = modes_of(task, self.finder)
         start = random_modes(
             task.train,
             modes=len(counted.bank),

@@ -16,7 +16,7 @@ A recording that the locator refuses counts as a random point, and its row says 
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -25,15 +25,22 @@ from typing import Any
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from avmsf.bench.baselines import NearestStrike
 from avmsf.bench.locatingbaselines import NearestSpectrum, random_distance
 from avmsf.bench.locatingimages import Images
+from avmsf.bench.renderer import Renderer
 from avmsf.bench.results import write_json
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError
+from avmsf.evaluation.diffsound import DiffSound
 from avmsf.evaluation.diffsound_locator import DiffSoundLocator
+from avmsf.field.soundfield import SoundField
+from avmsf.scene.points import farthest_points
 from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locator import Locator
 
+CANDIDATES = 2000
+"""Points among which `located` looks, spread out: 2 % of the diagonal apart, which is less than the best errors."""
 METHODS = ("random", "nearest", "cosine", "posterior")
 DIFFSOUND = "diffsound"
 LEVEL = 0.9
@@ -156,6 +163,51 @@ def judge_locating(
             locator, alike, ground, sound, place, name=test.names[row], methods=methods, diffsound=diffsound
         )
     return LocatingScores(name, tuple(rows), ground.diagonal, size, level, dict(settings or {}))
+
+
+def located(
+    renderer: Renderer, train: Impacts, test: Impacts, points: Float[Tensor, "points 3"]
+) -> dict[str, tuple[float, ...]]:
+    """Return how far off a method locates each recording of `test`, over the diagonal of the object's points.
+
+    `rmed`: at the point of least cosine distance between gains (the paper), of fields and DiffSound; at the contact of
+    the training recording with the most similar spectrum, of the nearest recording. `rmed_posterior`, of fields: at the
+    most probable point. What a method cannot locate counts as a random point, as do all recordings of a method that
+    locates nothing.
+    """
+    points = points[farthest_points(points, min(CANDIDATES, len(points)))].double()
+    ground, find = _Ground(points, Images.none(), LEVEL), _finder(renderer, train, points)
+    names = ("rmed", "rmed_posterior") if isinstance(renderer, SoundField) else ("rmed",)
+    rows = []
+    for sound, truth in zip(test.sounds, test.contacts.double(), strict=True):
+        try:
+            places = find(sound)
+        except (LocationError, EvaluationError):
+            places = {}
+        chance = ground.random_errors(truth)[0]
+        rows.append([ground.errors(places[name], truth)[0] if name in places else chance for name in names])
+    return {name: tuple(row[number] for row in rows) for number, name in enumerate(names)}
+
+
+def _finder(
+    renderer: Renderer, train: Impacts, points: Float64[Tensor, "points 3"]
+) -> Callable[[Float[Tensor, " samples"]], dict[str, Float64[Tensor, " 3"]]]:
+    """Return what locates a sound by a method, once for each of `located`'s errors; nothing for other methods."""
+    if isinstance(renderer, SoundField):
+        locator = Locator.of(renderer, points=points)
+
+        def by_field(sound: Float[Tensor, " samples"]) -> dict[str, Float64[Tensor, " 3"]]:
+            found = locator.locate(sound)
+            return {"rmed": points[int(found.distance.argmin())], "rmed_posterior": found.place.double()}
+
+        return by_field
+    if isinstance(renderer, DiffSound):
+        simulated = DiffSoundLocator.of(renderer, points)
+        return lambda sound: {"rmed": simulated.place(sound)}
+    if isinstance(renderer, NearestStrike):
+        similar = NearestSpectrum(train)
+        return lambda sound: {"rmed": similar.place(sound)}
+    return lambda sound: {}
 
 
 @dataclass(frozen=True, eq=False)

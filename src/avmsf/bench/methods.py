@@ -118,6 +118,7 @@ BASELINES = (
 """The paper's baselines that need nothing but data, then the strong ones that it leaves out. Those that share modes
 have noise beside them, as the field has: without it all is silent between modes, and L1-log is lost."""
 
+_PAPER = replace(PAPER, damping="shared")
 FIELDS = (
     FieldMethod("field"),
     MixtureField("field-auto"),
@@ -132,10 +133,14 @@ FIELDS = (
     FieldMethod("field-no-residual", replace(QUICK, residual=False)),
     # The warm-up moves no damping, so there is nothing to choose between.
     FieldMethod("field-warmup", replace(QUICK, steps=0, damping="shared")),
-    FieldMethod("paper", replace(PAPER, damping="shared"), "paper", ShortTime()),
+    FieldMethod("paper", _PAPER, "paper", ShortTime()),
+    FieldMethod("paper-positions", _PAPER, "paper-positions", ShortTime()),
+    UninformedField("paper-no-initialisation", _PAPER, look="paper", finder=ShortTime()),
+    FieldMethod("paper-unaligned", _PAPER, "paper-unaligned", ShortTime()),
+    FieldMethod("paper-no-residual", replace(_PAPER, residual=False), "paper", ShortTime()),
     FieldMethod("paper-per-contact", replace(PAPER, damping="per-contact"), "paper", ShortTime()),
     GridField("field-grid", QUICK_GRID),
-    GridField("paper-grid", PAPER_GRID, replace(PAPER, damping="shared"), "paper", ShortTime()),
+    GridField("paper-grid", PAPER_GRID, _PAPER, "paper", ShortTime()),
 )
 """Fields by the quick recipe unless told otherwise: the paper's form, other gains, ablations, the paper's method
 whole, and choices from grids."""

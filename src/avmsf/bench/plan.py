@@ -63,7 +63,8 @@ class Evaluation:
 
         Raises EvaluationError where the folder holds other ones, and where a metric's package is not installed.
         """
-        self.judging.prepare()
+        if not self.protocol.locating:
+            self.judging.prepare()
         identity = {
             "version": version("avmsf"),
             "source": source_digest(),

@@ -47,6 +47,8 @@ class EvaluationProtocol:
     all of theirs."""
     metrics: tuple[str, ...] = (*PAPER_METRICS, *OWN_METRICS)
     """Columns of the tables, by the metrics' names."""
+    locating: bool = False
+    """Whether methods are judged by where they locate the test recordings, not by their sounds."""
 
 
 PROTOCOLS = {
@@ -85,6 +87,16 @@ PROTOCOLS = {
             Farthest(),
             subset="non-symmetric",
             required=True,
+        ),
+        EvaluationProtocol(
+            "localize",
+            "Train as `farthest` does; locate the test recordings, on objects that no turn carries onto themselves.",
+            Farthest(),
+            ("white-noise", "nearest", "diffsound", "field", "field-no-residual", "field-auto"),
+            subset="non-symmetric",
+            required=True,
+            metrics=("rmed", "rmed_posterior"),
+            locating=True,
         ),
         EvaluationProtocol(
             "grid",

@@ -29,6 +29,8 @@ HEADINGS = {
     "relative_stft": "relative STFT",
     "mac": "MAC",
     "gain_error": "gain error",
+    "rmed": "RMED",
+    "rmed_posterior": "RMED, posterior",
 }
 """Metrics as columns call them; others go by their own names."""
 WARNING = (
@@ -109,7 +111,9 @@ def _opening(records: Sequence[ObjectRecord], identity: Mapping[str, Any], label
             f"test recordings in all: {tested}"
             f"{f' ({labels[0]})' if len(labels) > 1 else ''}; avmsf {identity['version']}, seed {identity['seed']}.",
             "Figures are means over an object's test recordings (CDPAM's over a few of them, `cdpam_contacts` below, 0 "
-            "for all), then over objects, ± the standard error over objects. "
+            "for all), then over objects, ± the standard error over objects. RMED is the distance of the located "
+            "contact from the true one over the diagonal of the object, by cosine distance; methods that cannot locate "
+            "count as a random point. "
             "Lower is better; of MAC, and of modes found, more is. L1, L1-log and ENV are in the convention `paper` of "
             "docs/conventions.md; relative STFT is free of unit and level. With level='full-scale' an "
             "object's sounds are multiplied by one factor that brings its loudest recording to a peak of one.",

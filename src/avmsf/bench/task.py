@@ -15,9 +15,10 @@ from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.scene.features import FeatureField
 
-Look = Literal["positions", "visual", "unaligned", "paper"]
+Look = Literal["positions", "visual", "unaligned", "paper", "paper-positions", "paper-unaligned"]
 """What a field reads of an object's points: positions alone; positions with what the places look like, made to obey the
-object's symmetries; the same without that; features of Gaussians as the paper has them."""
+object's symmetries; the same without that; features of Gaussians as the paper has them, their positions alone, and the
+features without symmetry pooling."""
 
 
 def _no_family() -> BodyFamily:

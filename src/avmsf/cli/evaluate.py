@@ -200,7 +200,7 @@ def settled_lifts(lift: LiftConfig, methods: Sequence[Method]) -> tuple[LiftConf
     paper = PRESETS["paper"].scene.lift
     if lift.encoder != AUTO:
         return lift, replace(paper, encoder=lift.encoder)
-    if any(getattr(method, "look", None) == "paper" for method in methods):
+    if any(getattr(method, "look", "").startswith("paper") for method in methods):
         choose_encoder(paper, tell=say)
     return settled(lift, tell=say), paper
 

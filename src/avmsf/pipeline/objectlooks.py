@@ -15,7 +15,12 @@ from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features
 
-NAMES: Mapping[Look, str] = {"unaligned": "unaligned.safetensors", "paper": "paper.safetensors"}
+NAMES: Mapping[Look, str] = {
+    "unaligned": "unaligned.safetensors",
+    "paper": "paper.safetensors",
+    "paper-positions": "paper.safetensors",
+    "paper-unaligned": "paper-unaligned.safetensors",
+}
 """What the files of features are called, where they are not those of the fields without ablation."""
 
 
@@ -37,11 +42,13 @@ class ObjectLooks:
         looks of such an object, and DatasetError for an unknown one.
         """
         seen = self.dataset.look(identifier)
-        if seen is None and look == "positions":
+        bare = look.endswith("positions")
+        if seen is None and bare:
             return self._bare(identifier)
         if seen is None:
             raise SceneError(f"{identifier}: the dataset holds neither a mesh nor pictures of it, so it has no looks")
-        lift = self.paper if look == "paper" else replace(self.config.lift, symmetry=look != "unaligned")
+        lift = self.paper if look.startswith("paper") else self.config.lift
+        lift = replace(lift, symmetry=not look.endswith("unaligned"))
         config = replace(self.config, lift=lift, views=replace(self.config.views, count=views or 0))
         place = self.cache / identifier / ("all views" if views is None else f"{views} views")
         stages = SceneStages(
@@ -53,7 +60,7 @@ class ObjectLooks:
         )
         with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
             features = load_features(stages.features.path)
-        return FeatureField.from_points(features.points) if look == "positions" else features
+        return FeatureField.from_points(features.points) if bare else features
 
     def _bare(self, identifier: str) -> FeatureField:
         capture = self.dataset.capture(identifier)
