@@ -260,5 +260,5 @@ def test_times_and_failures_are_told(evaluated: Path) -> None:
     assert set(times["a"]["methods"]) == {"knn3", "nearest", "paper"}
     assert times["a"]["methods"]["knn3"]["render"] > 0
     words = (evaluated / "report.md").read_text()
-    assert "| a | farthest | field | a: nothing shows its look |" in words
+    assert "| a | farthest | paper | a: nothing shows its look |" in words
     assert "## Objects: round" in words
