@@ -16,12 +16,14 @@ from PIL import Image
 
 from avmsf.bench.listening import Heard, draw_spectrogram, keep_sound, listening_gain
 from avmsf.bench.markdown import markdown
+from avmsf.bench.methods import METHODS
 from avmsf.bench.parallel import run_objects
 from avmsf.bench.published import PUBLISHED, published_ratios
 from avmsf.bench.report import write_page, write_summary
 from avmsf.bench.reporttables import WARNING, Grid, Section, figure, sections
 from avmsf.bench.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, natural
 from avmsf.bench.summary import Mean, object_figures, summarise
+from avmsf.bench.titles import TITLES
 from avmsf.errors import EvaluationError
 from plate_set import fill_plates
 from test_evaluation_run import planned
@@ -119,6 +121,11 @@ def test_tables_have_the_papers_rows_for_its_datasets_alone() -> None:
     # The ratios that its tables allow stand beside ours everywhere.
     assert "| paper, ObjectFolder Real: paper | 0.929 |" in other
     assert WARNING in other
+
+
+def test_every_method_has_a_title_and_tables_give_it() -> None:
+    assert set(METHODS) <= set(TITLES)
+    assert f"paper: {TITLES['paper']}" in markdown(sections(THREE, IDENTITY, subsets={}))
 
 
 def test_the_papers_ratio_is_of_its_own_rows() -> None:

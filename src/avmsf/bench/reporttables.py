@@ -20,6 +20,7 @@ from avmsf.bench.summary import (
     ratios,
     times_of,
 )
+from avmsf.bench.titles import TITLES
 
 HEADINGS = {
     "l1": "L1",
@@ -149,7 +150,9 @@ def _main_table(main: Table, shown: Sequence[str], protocol: str, dataset: str, 
         else f"The paper has no figures of this experiment on {dataset}."
     )
     grid = Grid(("method", *_headings(shown), "objects"), tuple(rows), best)
-    return Section("All methods" + (f": {labels[0]}" if len(labels) > 1 else ""), (), grid, (remark,))
+    titles = "; ".join(f"{method}: {TITLES[method]}" for method in found if method in TITLES)
+    remarks = (remark, f"{titles}.") if titles else (remark,)
+    return Section("All methods" + (f": {labels[0]}" if len(labels) > 1 else ""), (), grid, remarks)
 
 
 def _ratio_table(main: Table, shown: Sequence[str], protocol: str, dataset: str) -> Section:

@@ -1,0 +1,39 @@
+"""What reports say of each method, so that no row is taken for what it is not."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+TITLES: Mapping[str, str] = MappingProxyType(
+    {
+        "white-noise": "Gaussian noise as loud as the training recordings",
+        "random-impact": "a recording of another object",
+        "nearest": "the nearest training recording",
+        "knn3": "mean waveform of the three nearest recordings (the paper's KNN)",
+        "knn3-directions": "the same, with the directions of impacts as part of the distance",
+        "knn-gains": "modal gains averaged over the three nearest recordings",
+        "knn-spectra": "spectra averaged over the three nearest recordings",
+        "spline-gains": "modal gains by thin-plate splines",
+        "diffsound": "DiffSound, rebuilt, as the paper compares with it",
+        "diffsound-weighted": "DiffSound with a fitted weight for each mode",
+        "sonicgauss-small": "SonicGauss's objective at a small size, trained from scratch on simulated objects",
+        "field": "attention network, quick settings, visual features",
+        "field-auto": "Gaussian process over kernel families (the default of this package)",
+        "field-elastic": "Gaussian process on elastic mode shapes alone",
+        "field-smooth": "Gaussian process on distances alone",
+        "field-thin-plate": "Gaussian process of thin-plate splines alone",
+        "field-positions": "attention network, quick settings, positions only",
+        "field-unaligned": "attention network, quick settings, without symmetry pooling",
+        "field-no-initialisation": "attention network, quick settings, without extracted modes",
+        "field-no-residual": "attention network, quick settings, without residual noise",
+        "field-warmup": "attention network, quick settings, warm-up alone",
+        "field-grid": "attention network, settings chosen from a small grid",
+        "paper": "the paper's method with the preset `paper`, shared damping",
+        "paper-per-contact": "the paper's method with damping per contact",
+        "paper-positions": "the paper's method without visual features",
+        "paper-no-initialisation": "the paper's method without extracted modes",
+        "paper-unaligned": "the paper's method without symmetry pooling",
+        "paper-no-residual": "the paper's method without residual noise",
+        "paper-grid": "the paper's method with settings chosen from its lists",
+    }
+)
+"""By the names of `avmsf.bench.methods.METHODS`."""
