@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from avmsf.capture import CaptureSettings
 from avmsf.cli.fit import parse as parse_fit
 from avmsf.cli.reconstruct import parse as parse_reconstruct
 from avmsf.field.config import LATER, FitConfig
@@ -46,6 +47,15 @@ def test_commands_start_from_the_preset_and_change_what_is_said() -> None:
     assert (mixed.scene.lift.encoder, mixed.scene.lift.onto) == ("descriptors", "gaussians")
     fitted = parse_fit(["mug", "--output", "mug.safetensors", "--preset", "paper"])
     assert (fitted.config, fitted.method, fitted.gain_model) == (PRESETS["paper"].fit, "short-time", "network")
+
+
+def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:
+    own = CaptureSettings(seconds=1.0, time_zero="peak")
+    assert PipelineConfig().capture_settings(own) == own
+    assert PRESETS["paper"].capture_settings(replace(own, time_zero="onset")) == own
+    assert parse_fit(["mug", "--output", "f", "--time-zero", "onset"]).pipeline.capture_settings(own) == replace(
+        own, time_zero="onset"
+    )
 
 
 def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_open() -> None:
