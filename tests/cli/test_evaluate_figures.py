@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from avmsf.bench import report
 from avmsf.bench.results import ResultsFolder
-from avmsf.cli import evaluate
 from avmsf.cli.evaluate import parse, run
 from plate_set import RATE, fill_plates
 
@@ -43,8 +43,16 @@ def test_stored_results_are_drawn_without_evaluating(tmp_path: Path, monkeypatch
         assert all(len(axes.collections) == 1 for axes in panels)
 
 
-def test_cases_have_a_figure_each(tmp_path: Path) -> None:
+def test_cases_have_a_figure_each_of_their_own_sounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: dict[str, Figure] = {}
+    monkeypatch.setattr(report, "save_picture", lambda figure, path: drawn.update({path.name: figure}))
     plates, results = fill_plates(tmp_path / "plates", ("a",)), tmp_path / "results"
-    evaluate.run(parse(["shots", str(plates), *CHEAP, "--output", str(results), "--figures"]))
-    names = sorted(path.name for path in (results / "figures").iterdir())
-    assert names == ["a 1-shot.png", "a 2-shots.png", "a 4-shots.png", "a 8-shots.png"]
+    assert run(parse(["shots", str(plates), *CHEAP, "--output", str(results), "--figures"])) == 0
+    assert sorted(drawn) == ["a 1-shot.png", "a 2-shots.png", "a 4-shots.png", "a 8-shots.png"]
+    one, eight = (
+        [axes.collections[0].get_array() for axes in drawn[name].axes[:3]] for name in ("a 1-shot.png", "a 8-shots.png")
+    )
+    assert np.array_equal(one[0], eight[0])
+    # With one training place, the mean of three neighbors is the nearest one.
+    assert np.array_equal(one[1], one[2])
+    assert not np.array_equal(eight[1], eight[2])
