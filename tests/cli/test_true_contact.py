@@ -68,7 +68,7 @@ def test_the_true_contact_is_red_at_its_place_and_the_found_one_blue(
         scatter = axes.collections[0]
         colors = scatter.get_facecolors()[:, :3]
         hue = colors / colors.max(axis=1, keepdims=True)
-        for row, mark in ((OTHER, (1.0, 0.05, 0.05)), (STRUCK, (0.1, 0.25, 1.0))):
+        for row, mark in ((OTHER, (1.0, 0.05, 0.05)), (STRUCK, (0.2, 0.45, 1.0))):
             marked = np.abs(hue - mark).max(axis=1) < 0.01
             place = (points[row] - middle).numpy() @ view_from(side).T
             # Points are sparse here: the nearest one alone has the mark's color.

@@ -22,7 +22,7 @@ _DECADES = 3.0
 """Powers of ten below the likeliest that colours tell apart."""
 _HEAT = "viridis"
 """Its purple, green and yellow leave red and blue, the paper's colors of the true and the found contact, for marks."""
-_FOUND, _OTHER, _TRUTH = (0.10, 0.25, 1.00), (0.95, 0.95, 0.95), (1.00, 0.05, 0.05)
+_FOUND, _OTHER, _TRUTH = (0.20, 0.45, 1.00), (0.95, 0.95, 0.95), (1.00, 0.05, 0.05)
 _MARK = 0.018
 """Radius of a mark over the object's diagonal."""
 _DRAWN = 6000
