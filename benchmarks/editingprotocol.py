@@ -23,11 +23,16 @@ from avmsf.capture.datasets.recognise import open_dataset
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
+from avmsf.tasks.steer import SteerConfig
 from benchmarks.editing import labelled_objects, referred_task, spaces_of, strange_shapes, stranger
+from benchmarks.editingfigures import write_figures
 from benchmarks.report import Options, Report, Table, show, tell
 
 LEAST = 8
 """Objects that an embedding of materials needs to mean anything."""
+
+PREVIEWS = 20
+"""Sounds of each edit of which the CLAP score is taken, about, for its curve over the steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +62,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=None, help="of each descent; by itself what `avmsf edit` takes")
     parser.add_argument("--seed", type=int, default=0, help="of all chance")
     parser.add_argument("--record", type=Path, help="JSON file for all scores and the embeddings they rest on")
+    parser.add_argument("--figures", type=Path, help="folder for UMAP and CLAP figures, as editingfigures draws them")
     chosen = parser.parse_args(arguments)
     if (chosen.dataset is not None) == chosen.simulated:
         parser.error("expected the folder of a dataset or --simulated, one of the two")
     if chosen.model is None and (chosen.clap, chosen.model_seconds, chosen.generated) != (None, None, GENERATED):
         parser.error("--clap, --model-seconds and --generated go with --model, which is not given")
+    if chosen.figures is not None and chosen.record is None:
+        parser.error("--figures goes with --record, which is not given")
     try:
         # The models first: where one cannot be loaded nothing else is worth its time.
         model = None if chosen.model is None else StableAudio.load(chosen.model, seconds=chosen.model_seconds)
@@ -81,6 +89,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             seed=chosen.seed,
             record=chosen.record,
         )
+        if chosen.figures is not None:
+            write_figures(chosen.record, chosen.figures)
     except AvmsfError as error:
         print(f"benchmarks.editingprotocol: {error}", file=sys.stderr)
         return 2
@@ -144,6 +154,8 @@ def measure(
     """
     spaces = spaces_of(cast.labelled, seed=seed)
     settings = {} if steps is None else {"steps": steps}
+    if clap is not None:
+        settings["preview_every"] = max(1, (steps or SteerConfig().steps) // PREVIEWS)
     methods: tuple[EditMethod, ...]
     if model is not None:
         methods = towards_words(model, settings, generated=generated)

@@ -211,7 +211,7 @@ def leave_out_umap(monkeypatch: pytest.MonkeyPatch) -> None:
         return replace(space, stored=np.zeros((len(space.vectors), 2), dtype=np.float32))
 
     monkeypatch.setattr(MaterialSpace, "of", flat)
-    monkeypatch.setattr(MaterialSpace, "distance", MaterialSpace.plain_distance)
+    monkeypatch.setattr(MaterialSpace, "place", lambda self, bank: self.features.vector(bank)[:2])
 
 
 def test_the_protocol_of_recorded_objects_runs_without_words(tmp_path, monkeypatch):

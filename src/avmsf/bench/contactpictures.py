@@ -20,8 +20,9 @@ from avmsf.tasks.contactmap import ContactMap
 
 _DECADES = 3.0
 """Powers of ten below the likeliest that colours tell apart."""
-_HEAT = "inferno"
-_FOUND, _OTHER, _TRUTH = (0.10, 0.88, 0.78), (0.95, 0.95, 0.95), (0.20, 0.45, 1.00)
+_HEAT = "viridis"
+"""Its purple, green and yellow leave red and blue, the paper's colors of the true and the found contact, for marks."""
+_FOUND, _OTHER, _TRUTH = (0.20, 0.45, 1.00), (0.95, 0.95, 0.95), (1.00, 0.05, 0.05)
 _MARK = 0.018
 """Radius of a mark over the object's diagonal."""
 _DRAWN = 6000
@@ -38,7 +39,7 @@ def draw_contact(
 ) -> Figure:
     """Draw the probability of a contact over the object, and beneath it the paper's cosine distance, from all sides.
 
-    The likeliest place is marked turquoise, `others` that sound alike white, and the `truth` blue where it is known.
+    The likeliest place is marked blue, `others` that sound alike white, and the `truth` red where it is known.
     """
     points = contact.points
     # The likeliest point and its neighbourhood must not fall between those that are drawn.
@@ -67,7 +68,7 @@ def draw_contact(
 
 
 def contact_colours(contact: ContactMap) -> Float[Tensor, "points 3"]:
-    """Return colours, 0 to 1, from black for a thousandth of the greatest probability and less, to bright yellow."""
+    """Return colours, 0 to 1, dark purple for a thousandth of the greatest probability and less, up to yellow."""
     likely = contact.probability.double()
     share = likely / likely.max().clamp_min(torch.finfo(torch.float64).tiny)
     level = 1.0 + torch.log10(share.clamp_min(10.0**-_DECADES)) / _DECADES
@@ -131,5 +132,5 @@ def _marked(
 
 def _title(title: str, marks: Sequence[tuple[Tensor, tuple[float, float, float]]]) -> str:
     used = {colour for _, colour in marks}
-    named = ((_FOUND, "turquoise: likeliest"), (_OTHER, "white: sounds alike"), (_TRUTH, "blue: true contact"))
+    named = ((_FOUND, "blue: likeliest"), (_OTHER, "white: sounds alike"), (_TRUTH, "red: true contact"))
     return "\n".join([title, ", ".join(words for colour, words in named if colour in used)])

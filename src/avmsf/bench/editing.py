@@ -46,6 +46,10 @@ class EditScore:
     """Mean cosine of the sounds and the prompt."""
     seconds: float
     """That the edit took."""
+    places: Mapping[str, tuple[float, float]]
+    """Where the modes lie, by the names of the spaces; in UMAP's units."""
+    clap_curve: tuple[tuple[int, float], ...] = ()
+    """Steps of the edit and the CLAP score after each, at one place; step 0 is the object as it was."""
 
 
 def judge(
@@ -76,9 +80,12 @@ def judge(
                 )
                 continue
             seconds = time.perf_counter() - begun
-            said = None
+            said: float | None = None
+            curve: tuple[tuple[int, float], ...] = ()
             if clap is not None and task.prompt is not None:
                 said = float(clap.score(made.sounds, [task.prompt], sample_rate=made.sample_rate).mean())
+                curve = clap_curve(made, task.prompt, clap)
+            places = {name: space.place(made.bank) for name, space in spaces.items()}
             scores.append(
                 EditScore(
                     method.name,
@@ -87,16 +94,27 @@ def judge(
                     task.target,
                     task.prompt,
                     task.seed,
-                    {name: space.distance(made.bank, task.target) for name, space in spaces.items()},
+                    {name: space.distance(places[name], task.target) for name, space in spaces.items()},
                     {name: space.plain_distance(made.bank, task.target) for name, space in spaces.items()},
                     None if task.reference is None else spectral_distance(made, task.reference),
                     said,
                     seconds,
+                    {name: (float(place[0]), float(place[1])) for name, place in places.items()},
+                    curve,
                 )
             )
             if progress is not None:
                 progress(scores[-1])
     return tuple(scores)
+
+
+def clap_curve(made: Edited, prompt: str, clap: Clap) -> tuple[tuple[int, float], ...]:
+    """Return the steps of an edit's previews and their CLAP scores; silent previews have none."""
+    heard = [(step, sound) for step, sound in made.previews if bool(sound.any())]
+    if not heard:
+        return ()
+    scores = clap.score(torch.stack([sound for _, sound in heard]), [prompt], sample_rate=made.sample_rate)
+    return tuple((step, float(score)) for (step, _), score in zip(heard, scores, strict=True))
 
 
 def write_scores(scores: Sequence[EditScore], spaces: Mapping[str, MaterialSpace], path: Path) -> None:

@@ -1,7 +1,7 @@
 """Ways to come by an object's sound in another material: the paper's, its baselines, and the laws of elasticity."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -23,7 +23,7 @@ from avmsf.simulate.material import MATERIALS
 from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, DistillationConfig
 from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, SEARCHED, Parameterisation
 from avmsf.tasks.recast import recast
-from avmsf.tasks.steer import Guide, SteerConfig, steer
+from avmsf.tasks.steer import Guide, SteerConfig, SteerProgress, steer
 
 GENERATED = 3.0
 """Seconds of a sound that is made from words alone."""
@@ -38,6 +38,8 @@ class Edited:
     sounds: Float[Tensor, "contacts samples"]
     sample_rate: float
     """Hz."""
+    previews: tuple[tuple[int, Float[Tensor, " samples"]], ...] = ()
+    """Steps of the edit and the sound after each, all at one place; step 0 is the object as it was."""
 
 
 @runtime_checkable
@@ -93,7 +95,16 @@ class Steered:
     def edit(self, task: EditTask) -> Edited:
         """Return the steered object."""
         config = SteerConfig(**{"preview_every": 0, **self.config, "seed": task.seed})
-        return heard(steer(task.object.sound_field, self.guide(task), config=config, parameters=self.parameters), task)
+        field, previews = task.object.sound_field, list[tuple[int, Tensor]]()
+
+        def keep(progress: SteerProgress) -> None:
+            if progress.preview is not None and progress.place is not None:
+                if not previews:
+                    previews.append((0, field.render(progress.place[None])[0]))
+                previews.append((progress.step, progress.preview))
+
+        edited = steer(field, self.guide(task), config=config, parameters=self.parameters, progress=keep)
+        return replace(heard(edited, task), previews=tuple(previews))
 
 
 @runtime_checkable

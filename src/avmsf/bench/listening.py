@@ -3,7 +3,6 @@
 import base64
 import io
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +16,13 @@ from torch import Tensor
 
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
-from avmsf.modal.spectra import magnitude_stft, scaled_fft_size
+from avmsf.plotting.spectrograms import RANGE_DB, log_spectrogram
 
 _PEAK = 0.25
 """What recordings peak at, of full scale: louder sounds of a method have room above."""
 _LEAST_RATE = 8000.0
 """Hz below which browsers do not play."""
 _FULL = 1 - 2**-15
-_RANGE_DB = 80.0
 _LOWEST = 60.0
 """Hz at the lower edge of pictures, which are logarithmic in frequency above it."""
 
@@ -86,7 +84,7 @@ def draw_spectrogram(heard: Heard, *, loudest: float | None, width: int = 240, h
     """
     levels = _levels(heard, width, height)
     top = float(levels.max()) if loudest is None else loudest
-    shown = ((levels - top) / _RANGE_DB + 1).clamp(0, 1).flip(0)
+    shown = ((levels - top) / RANGE_DB + 1).clamp(0, 1).flip(0)
     return _png((shown * 255).round().to(torch.uint8).numpy())
 
 
@@ -102,17 +100,10 @@ def picture_span(heard: Heard) -> tuple[float, float, float]:
 
 
 def _levels(heard: Heard, width: int, height: int) -> Float64[Tensor, "height width"]:
-    """Return magnitudes in dB: the largest bin within each pixel, so that no line falls between two."""
-    fft_size = scaled_fft_size(2048, sample_rate=heard.sample_rate)
-    hop = max(1, len(heard.samples) // width)
-    spectrum = magnitude_stft(heard.samples[None], fft_size=fft_size, hop=hop)[0, :, :width]
     _, lowest, highest = picture_span(heard)
-    edges = np.geomspace(lowest, highest, height + 1) * fft_size / heard.sample_rate
-    rows = []
-    for low, high in pairwise(edges.tolist()):
-        first = min(round(low), spectrum.shape[0] - 1)
-        rows.append(spectrum[first : max(first + 1, round(high))].amax(0))
-    return 20 * torch.log10(torch.stack(rows).clamp(min=1e-9))
+    return log_spectrogram(
+        heard.samples, sample_rate=heard.sample_rate, lowest=lowest, highest=highest, width=width, height=height
+    )
 
 
 def _png(shades: UInt8[np.ndarray, "height width"]) -> str:

@@ -123,9 +123,9 @@ class MaterialSpace:
         """Return the mean of the points of a material. Raises EvaluationError with the materials there are."""
         return self.embedding[self._rows(material)].mean(axis=0)
 
-    def distance(self, bank: ModalBank, material: str) -> float:
-        """Return how far from a material's centre UMAP puts a set of modes, in its own units."""
-        return float(np.linalg.norm(self.place(bank) - self.centre(material)))
+    def distance(self, place: Float[np.ndarray, " 2"], material: str) -> float:
+        """Return how far a place is from a material's centre, in UMAP's units."""
+        return float(np.linalg.norm(place - self.centre(material)))
 
     def plain_distance(self, bank: ModalBank, material: str) -> float:
         """Return how far a set of modes is from the mean of a material's vectors, octaves, without any UMAP."""
@@ -173,7 +173,7 @@ class MaterialSpace:
         """Read a file that `save` wrote. Raises EvaluationError for any other.
 
         Points are placed by the embedding made again, which has to come out as stored: with other versions of its
-        packages it may not, and then `place` and `distance` raise EvaluationError with the versions that are needed.
+        packages it may not, and then `place` raises EvaluationError with the versions that are needed.
         """
         path = Path(path)
         try:

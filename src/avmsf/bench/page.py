@@ -104,7 +104,7 @@ def _cell(words: str, *, best: bool) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class _Contact:
+class HeardContact:
     """One test contact that can be listened to, with what every method made of it."""
 
     record: ObjectRecord
@@ -115,15 +115,16 @@ class _Contact:
     made: tuple[tuple[CaseRecord, Outcome], ...]
 
 
-def _contacts(records: Sequence[ObjectRecord]) -> Iterator[_Contact]:
+def _contacts(records: Sequence[ObjectRecord]) -> Iterator[HeardContact]:
     """Yield contacts to listen to: one of each object first, then a second one, and so on."""
     heard = [record for record in records if any(case.sounds for case in record.cases)]
-    chosen = [list(_of_object(heard[row])) for row in spread(len(heard), OBJECTS)]
+    chosen = [list(heard_contacts(heard[row])) for row in spread(len(heard), OBJECTS)]
     for place in range(max(map(len, chosen), default=0)):
         yield from (contacts[place] for contacts in chosen if place < len(contacts))
 
 
-def _of_object(record: ObjectRecord) -> Iterator[_Contact]:
+def heard_contacts(record: ObjectRecord) -> Iterator[HeardContact]:
+    """Yield an object's contacts that can be listened to."""
     files = {name: file for case in reversed(record.cases) for name, file in case.sounds.items()}
     for name, file in files.items():
         made = tuple(
@@ -132,7 +133,7 @@ def _of_object(record: ObjectRecord) -> Iterator[_Contact]:
             for each in record.outcomes
             if each.case == case.key and name in each.sounds
         )
-        yield _Contact(record, name, file, made)
+        yield HeardContact(record, name, file, made)
 
 
 def _listening(records: Sequence[ObjectRecord], folder: Path) -> str:
@@ -159,7 +160,7 @@ def _listening(records: Sequence[ObjectRecord], folder: Path) -> str:
     return f'<section id="listen"><h2>Look and listen</h2><p>{escape(words)}</p>{blocks}</section>'
 
 
-def _contact_block(contact: _Contact, folder: Path) -> str:
+def _contact_block(contact: HeardContact, folder: Path) -> str:
     recorded = Heard.read(folder / contact.recorded)
     loudest = loudest_of(recorded)
     seconds, lowest, highest = picture_span(recorded)

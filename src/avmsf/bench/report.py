@@ -4,16 +4,25 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
+from avmsf.bench.listening import Heard
 from avmsf.bench.markdown import markdown
-from avmsf.bench.page import page
+from avmsf.bench.page import heard_contacts, page
+from avmsf.bench.pictures import save_picture
 from avmsf.bench.reporttables import Section, sections
-from avmsf.bench.results import ResultsFolder, write_json
+from avmsf.bench.results import ObjectRecord, ResultsFolder, write_json
 from avmsf.bench.summary import summarise, times_of
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
+from avmsf.plotting.spectrograms import draw_method_spectrograms
 
 SUMMARY, TIMES, TABLES, PAGE = "summary.json", "times.json", "report.md", "report.html"
 """The files, beside `protocol.json` and the folder `objects`."""
+FIGURES = "figures"
+"""Folder of the spectrograms, one file for each object, or for each object and case."""
+_RECORDED = "recorded"
+"""Title of the first column."""
 
 
 def write_summary(results: ResultsFolder, *, subsets: Mapping[str, frozenset[str]]) -> dict[str, Any]:
@@ -32,6 +41,39 @@ def write_page(results: ResultsFolder, *, subsets: Mapping[str, frozenset[str]])
     parts = sections(records, results.identity(), subsets=subsets)
     _write_text(results.path / PAGE, page(parts, records, results.path))
     return parts
+
+
+def write_figures(results: ResultsFolder) -> list[Path]:
+    """Draw the kept sounds as spectrograms, the recording and all methods side by side, and return the files.
+
+    One PNG for each object and each label of its cases. Raises EvaluationError where a kept sound is gone.
+    """
+    return [path for record in results.records() for path in _write_spectrograms(record, results.path)]
+
+
+def _write_spectrograms(record: ObjectRecord, folder: Path) -> list[Path]:
+    labels = list(dict.fromkeys(case.label for case in record.cases if case.sounds))
+    paths = []
+    for label in labels:
+        rows: dict[str, dict[str, Tensor]] = {}
+        for contact in heard_contacts(record):
+            files = {outcome.method: outcome.sounds for case, outcome in contact.made if case.label == label}
+            if files:
+                heard = Heard.read(folder / contact.recorded)
+                made = {method: Heard.read(folder / sounds[contact.name]).samples for method, sounds in files.items()}
+                rows[contact.name] = {_RECORDED: heard.samples, **made}
+        if not rows:
+            continue
+        methods = list(dict.fromkeys(method for row in rows.values() for method in row))
+        title = f"{record.identifier}: {label}"
+        figure = draw_method_spectrograms(
+            rows, methods, sample_rate=heard.sample_rate, highest=0.5 * record.sample_rate, title=title
+        )
+        word = "".join(mark if mark.isalnum() or mark in "-_" else "-" for mark in label)
+        name = record.identifier if len(labels) == 1 else f"{record.identifier} {word}"
+        paths.append(folder / FIGURES / f"{name}.png")
+        save_picture(figure, paths[-1])
+    return paths
 
 
 def _write_text(path: Path, text: str) -> None:

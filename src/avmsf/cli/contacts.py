@@ -80,7 +80,7 @@ def refuse_far(contacts: Contacts, field: SoundField) -> None:
     size = float((high - low).norm())
     outside = torch.clamp(torch.maximum(low - contacts.places, contacts.places - high), min=0).norm(dim=1)
     worst = int(outside.argmax())
-    if float(outside[worst]) > size:
+    if not float(outside[worst]) <= size:
         place = ", ".join(f"{value:.4g}" for value in contacts.places[worst].tolist())
         raise OutputError(
             f"{contacts.names[worst]}: the contact ({place}) m lies {float(outside[worst]):.3g} m outside an object "

@@ -16,6 +16,7 @@ from torch import Tensor
 from avmsf.bench.editpictures import HeardModes, draw_edit, draw_sound_change
 from avmsf.bench.pictures import save_picture
 from avmsf.cli import INTERRUPTED
+from avmsf.cli.clapcurve import CLAP
 from avmsf.cli.contacts import contacts_at, refuse_far
 from avmsf.cli.editmaterial import MaterialChange
 from avmsf.cli.printing import console, decimals, figure, print_json, say, table
@@ -24,10 +25,12 @@ from avmsf.cli.writing import Level, OutputError, expect_writable, write_sound
 from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
+from avmsf.plotting.edits import draw_clap_curves
 from avmsf.tasks.edits import EDITS, remarks, silenced
 from avmsf.tasks.retune import retune
 
 MODES, SPECTROGRAMS, BEFORE, AFTER = "modes.png", "spectrograms.png", "before.wav", "after.wav"
+CURVE = "clap.png"
 """What the folder of pictures holds."""
 _LISTED = 20
 """Modes in the table, the loudest."""
@@ -106,7 +109,8 @@ class Options:
     sliders: tyro.conf.OmitArgPrefixes[Sliders] = dataclasses.field(default_factory=Sliders)
     steering: tyro.conf.OmitArgPrefixes[Steering] = dataclasses.field(default_factory=Steering)
     pictures: Path | None = None
-    """Folder for modes.png and spectrograms.png, and to listen, before.wav and after.wav; none without it."""
+    """Folder for modes.png and spectrograms.png, and to listen, before.wav and after.wav; with --clap also clap.png,
+    the score over the steps; none without it."""
     at: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
     """Contact of these sounds, metres, on the object as it was; where it is loudest without it."""
     json: bool = False
@@ -132,7 +136,7 @@ def run(options: Options) -> int:
         return INTERRUPTED
     save(new, options.output)
     if options.steering.asked:
-        for ending in ("checkpoint", "preview.wav"):
+        for ending in ("checkpoint", "preview.wav", "clap.json"):
             beside(options.output, ending).unlink(missing_ok=True)
     edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
     before, after = HeardModes.of(old), HeardModes.of(new)
@@ -142,6 +146,8 @@ def run(options: Options) -> int:
         screen.print(f"note: {words}", soft_wrap=True)
     if options.pictures is not None:
         _show(options.pictures, (old, contact), (new, options.change.size * contact))
+        if CLAP in edits[-1]:
+            _show_scores(options.pictures / CURVE, edits[-1])
     screen.print(f"wrote {options.output}", soft_wrap=True)
     if options.json:
         print_json(
@@ -192,7 +198,7 @@ def _expect(options: Options) -> None:
     if options.output.exists() and options.field.exists() and options.output.samefile(options.field):
         raise OutputError(f"{options.output}: is the field itself, which would be lost: name another file")
     if options.pictures is not None:
-        for name in (MODES, SPECTROGRAMS, BEFORE, AFTER):
+        for name in (MODES, SPECTROGRAMS, BEFORE, AFTER, CURVE):
             expect_writable(options.pictures / name)
 
 
@@ -229,6 +235,13 @@ def _show(
         write_sound(folder / each, factor * sound, sample_rate=old.sample_rate, coding="float32")
     for each in (*pictures, BEFORE, AFTER):
         say(f"wrote {folder / each}")
+
+
+def _show_scores(path: Path, edit: dict[str, Any]) -> None:
+    """Draw the CLAP scores of an edit over its steps."""
+    curve = list(zip(edit[CLAP]["steps"], edit[CLAP]["scores"], strict=True))
+    save_picture(draw_clap_curves({edit["parameters"]: [curve]}, title=f"CLAP score: {edit['prompt']}"), path)
+    say(f"wrote {path}")
 
 
 def _rows(before: HeardModes, after: HeardModes) -> list[dict[str, Any]]:

@@ -14,7 +14,7 @@ from avmsf.bench.methods import method_named
 from avmsf.bench.parallel import RunProgress, Workers, run_objects
 from avmsf.bench.plan import Evaluation
 from avmsf.bench.protocols import EvaluationProtocol, protocol_named
-from avmsf.bench.report import PAGE, SUMMARY, TABLES, write_page, write_summary
+from avmsf.bench.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.bench.reporttables import Section
 from avmsf.bench.results import ResultsFolder
 from avmsf.bench.subsets import choose_objects, members
@@ -90,6 +90,8 @@ class Options:
     """Where ObjectFolder Real's contacts are, for its raw form."""
     table: Path | None = None
     """The published table of ObjectFolder Real's names and materials."""
+    figures: bool = False
+    """Also draw figures/OBJECT.png: spectrograms of the recording and of all methods, 20 Hz to 20 kHz, first second."""
     json: bool = False
     """Print the summary as one JSON object on the standard output, all else on the standard error."""
 
@@ -129,6 +131,7 @@ def run(options: Options) -> int:
         run_shown(evaluation, objects, results, workers, after_each=partial(write_summary, results, subsets=groups))
         summary = write_summary(results, subsets=groups)
         parts = write_page(results, subsets=groups)
+        figures = write_figures(results) if options.figures else []
     except KeyboardInterrupt:
         say(f"avmsf evaluate: interrupted; the same command goes on from what {folder} holds")
         return INTERRUPTED
@@ -144,6 +147,8 @@ def run(options: Options) -> int:
             screen.print(f"failed: {each['object']}, {each['method'] or 'all'}: {each['failure']}", soft_wrap=True)
         screen.print(f"failures: {failures}, listed in {TABLES}; asked for again, they are tried again", soft_wrap=True)
     screen.print(f"wrote {SUMMARY}, {TABLES} and {PAGE} in {folder}", soft_wrap=True)
+    for path in figures:
+        screen.print(f"wrote {path}", soft_wrap=True)
     if options.json:
         print_json({**summary, "results": str(folder)})
     return 0

@@ -5,16 +5,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 import tyro
+from jaxtyping import Float64
+from torch import Tensor
 
 from avmsf.bench.contactpictures import draw_contact, write_contact_cloud
 from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.folder import settings_of
+from avmsf.cli.contacts import Contacts, refuse_far
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, figure, print_json, say
 from avmsf.cli.writing import OutputError, expect_writable
@@ -55,6 +58,9 @@ class Options:
     recordings that were not divided by their forces, over the mean blow among them."""
     level: float = 0.9
     """Probability of the region that is said to hold the contact."""
+    true_contact: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    """Where every impact really was, metres: its distance is printed, and the heat maps mark it red, the found one
+    blue."""
     output: Path | None = None
     """Folder for a heat map and a coloured point cloud of every blow, NAME.png and NAME.ply; none without it."""
     json: bool = False
@@ -77,6 +83,7 @@ def run(options: Options) -> int:
     settings = _settings(options)
     force = None if options.force is None else Force(options.force)
     known = _Known(load(options.field))
+    truth = _true_contact(options, known.field)
     say("avmsf locate: preparing gains over the surface and their reliability, once a run (seconds to minutes)")
     screen = console(errors=options.json)
     quality = known.field.quality
@@ -95,9 +102,11 @@ def run(options: Options) -> int:
             say(f"avmsf locate: {failures[-1]['error']}")
             continue
         for values, contact in answers:
+            if truth is not None and contact is not None:
+                values |= _error(contact, truth)
             screen.print(_words(values), soft_wrap=True)
             if contact is not None and options.output is not None:
-                values |= _draw(contact, options.output, _name(path, taken), values)
+                values |= _draw(contact, options.output, _name(path, taken), values, truth)
             found.append(values)
     if options.json:
         verdict = None if quality is None else quality.verdict
@@ -160,6 +169,22 @@ def _settings(options: Options) -> CaptureSettings | None:
     return settings_of(options.capture)
 
 
+def _true_contact(options: Options, field: SoundField) -> Float64[Tensor, " 3"] | None:
+    """Return the true contact. Raises OutputError where it is far from the object, as in another unit."""
+    if options.true_contact is None:
+        return None
+    place = torch.tensor(options.true_contact, dtype=torch.float64)
+    refuse_far(Contacts(place[None], ("--true-contact",)), field)
+    return place
+
+
+def _error(contact: ContactMap, truth: Float64[Tensor, " 3"]) -> dict[str, Any]:
+    """Return how far the found contact is from the true one, also relative to the object's diagonal (RMED)."""
+    distance = float((contact.place.double() - truth).norm())
+    diagonal = float((contact.points.amax(0) - contact.points.amin(0)).norm())
+    return {"true_contact": truth.tolist(), "error_metres": distance, "rmed": distance / diagonal}
+
+
 def _describe(name: str, seconds: float | None, contact: ContactMap, known: _Known, level: float) -> dict[str, Any]:
     """Return all that is found out about a blow, as plain values."""
     symmetries = known.symmetries if len(contact.peaks(level)) > 1 else None
@@ -178,6 +203,9 @@ def _words(values: dict[str, Any]) -> str:
         f"{figure(1000 * region['radius_metres'], 2)} mm, {figure(100 * region['share'], 2)} % of the surface; the "
         f"field explains {100 * values['explained']:.0f} % of the sound"
     ]
+    if "rmed" in values:
+        error, share = 1000 * values["error_metres"], 100 * values["rmed"]
+        lines.append(f"  {error:.1f} mm from the true contact ({share:.1f} % of the diagonal)")
     if values["ambiguous"]:
         lines.append("  ambiguous: several places sound about the same")
     lines += [f"  {other['words']}" for other in values["counterparts"]]
@@ -192,12 +220,14 @@ def _name(path: Path, taken: set[str]) -> str:
     return name
 
 
-def _draw(contact: ContactMap, folder: Path, name: str, values: dict[str, Any]) -> dict[str, str]:
+def _draw(
+    contact: ContactMap, folder: Path, name: str, values: dict[str, Any], truth: Float64[Tensor, " 3"] | None
+) -> dict[str, str]:
     picture, cloud = folder / f"{name}.png", folder / f"{name}.ply"
     others = [other["place"] for other in values["counterparts"]]
     marks = torch.tensor(others) if others else None
     title = f"{values['recording']}: where it was struck"
-    save_picture(draw_contact(contact, title=title, others=marks), picture)
+    save_picture(draw_contact(contact, title=title, others=marks, truth=truth), picture)
     write_contact_cloud(contact, cloud)
     for path in (picture, cloud):
         say(f"wrote {path}")

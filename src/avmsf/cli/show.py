@@ -252,6 +252,8 @@ def _edit_words(edit: dict[str, Any]) -> str:
     ):
         if edit.get(name):
             told.append(f"modes {what}: {len(edit[name])}")
+    if scores := edit.get("clap", {}).get("scores"):
+        told.append(f"CLAP score {scores[0]:.3f} to {scores[-1]:.3f}")
     return ", ".join(told)
 
 

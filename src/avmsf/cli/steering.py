@@ -11,6 +11,8 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from avmsf.bench.clap import Clap
+from avmsf.cli.clapcurve import CLAP, ClapCurve
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, figure, say
 from avmsf.cli.writing import Level, write_sound
@@ -18,6 +20,7 @@ from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.simulate.material import Material, material_named
 from avmsf.tasks.distillation import DecoderDistillation, DistillationConfig, expect_prompt
+from avmsf.tasks.edits import EDITS
 from avmsf.tasks.materialstatistics import MaterialStatistics
 from avmsf.tasks.parameters import PARAMETERISATIONS
 from avmsf.tasks.reference import Reference
@@ -28,7 +31,7 @@ from avmsf.tasks.steer import Guide, SteerConfig, SteerProgress, steer
 _PREVIEW = Level("peak", -1.0)
 _GENERATED_SECONDS = 3.0
 """Length of a sound that is made of a prompt alone."""
-_OF_THE_MODEL = ("--model", "--negative", "--model-seconds", "--device", "--generated")
+_OF_THE_MODEL = ("--model", "--negative", "--model-seconds", "--device", "--generated", "--clap")
 """Options that nothing but words needs."""
 
 
@@ -58,6 +61,9 @@ class Steering:
     """Where the model computes: cuda, cpu; the GPU where there is one."""
     generated: Annotated[Path | None, tyro.conf.arg(metavar="WAV")] = None
     """Also write the sound that the model makes of the prompt alone, without the field: the paper's baseline."""
+    clap: Annotated[str | None, tyro.conf.arg(metavar="FOLDER|NAME")] = None
+    """Also take the CLAP score of the unedited field and of every preview by this network, a folder or a name on the
+    hub; needs the extra `eval`."""
     parameters: Literal["hierarchical", "published", "independent", "searched"] = "hierarchical"
     """What is free to move. hierarchical: factors on all frequencies and all dampings, then single modes, with a
     penalty. published: the paper's form, a factor on all frequencies and single modes without a penalty, gains times
@@ -91,6 +97,8 @@ class Steering:
             _expect_unchanged([*own, *_changed(self.distillation)], "--prompt, which is not given")
             return
         expect_prompt(self.prompt)
+        if self.clap is not None and self.config.preview_every == 0:
+            raise EditError("--clap takes scores of the previews, and --preview-every 0 makes none: give 50, say")
         if self.model_seconds is not None and not 0 < self.model_seconds < math.inf:
             raise EditError(f"--model-seconds {self.model_seconds:g}: expected more than 0, such as 3")
 
@@ -100,12 +108,23 @@ class Steering:
         `old` is what the field is of, needed for `like_material` alone.
         """
         guide = self._guide(field, old)
-        preview = beside(output, "preview.wav")
+        preview, checkpoint = beside(output, "preview.wav"), beside(output, "checkpoint")
+        curve: ClapCurve | None = None
+        if self.clap is not None and self.prompt is not None:
+            clap, kept = Clap.load(self.clap), beside(output, "clap.json")
+            curve = ClapCurve(clap, self.prompt, field, kept, resumed=checkpoint.exists())
         with SteerBar(preview, sample_rate=field.sample_rate) as bar:
-            return steer(
-                field, guide, config=self.config, parameters=PARAMETERISATIONS[self.parameters], progress=bar.show,
-                checkpoint=beside(output, "checkpoint"),
+
+            def progress(reached: SteerProgress) -> None:
+                if curve is not None:
+                    curve.add(reached)
+                bar.show(reached)
+
+            edited = steer(
+                field, guide, config=self.config, parameters=PARAMETERISATIONS[self.parameters], progress=progress,
+                checkpoint=checkpoint,
             )  # fmt: skip
+        return edited if curve is None else _with_scores(edited, curve)
 
     @property
     def _guides(self) -> list[str]:
@@ -133,6 +152,13 @@ class Steering:
             negative=self.negative,
             config=self.distillation,
         )
+
+
+def _with_scores(field: SoundField, curve: ClapCurve) -> SoundField:
+    """Return the field with the CLAP scores in the last entry of its edits."""
+    *others, last = field.origin.report[EDITS]
+    report = {**field.origin.report, EDITS: [*others, {**last, CLAP: curve.record()}]}
+    return dataclasses.replace(field, origin=dataclasses.replace(field.origin, report=report))
 
 
 def _changed(options: Any) -> list[str]:

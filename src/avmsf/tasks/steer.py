@@ -115,6 +115,8 @@ class SteerProgress:
     """Factor on the times in which modes die away so far."""
     preview: Float[Tensor, " samples"] | None
     """The edited field's sound at one place, at the field's rate, every so many steps and at the end."""
+    place: Float[Tensor, " 3"] | None = None
+    """The place of the preview, object frame, metres."""
 
 
 def steer(
@@ -196,9 +198,8 @@ class _Steering:
                     edit, every = self.variables.edit(), self.config.preview_every
                     due = every > 0 and (self.step % every == 0 or self.step == self.config.steps)
                     preview = self._preview() if due else None
-                    progress(
-                        SteerProgress(self.step, self.config.steps, loss, edit.pitch_factor, edit.decay_factor, preview)
-                    )
+                    factors, place = (edit.pitch_factor, edit.decay_factor), self.loudest_place if due else None
+                    progress(SteerProgress(self.step, self.config.steps, loss, *factors, preview, place))
                 if time.monotonic() - self.saved_at > _CHECKPOINT_SECONDS:
                     self._save()
         except KeyboardInterrupt:

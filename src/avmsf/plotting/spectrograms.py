@@ -1,0 +1,121 @@
+"""Spectrograms with a logarithmic frequency axis, of many methods next to each other."""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
+from torch import Tensor
+
+from avmsf.modal.spectra import magnitude_stft, scaled_fft_size
+
+LOWEST_HZ, HIGHEST_HZ, SECONDS = 20.0, 20000.0, 1.0
+"""Band and time of the paper's spectrograms (its figure of qualitative comparisons)."""
+RANGE_DB = 80.0
+"""Levels further below the loudest one have the darkest color."""
+_WIDTH, _HEIGHT = 240, 160
+"""Cells of a spectrogram: about one for each printed pixel."""
+
+
+def log_spectrogram(
+    sound: Float[Tensor, " samples"],
+    *,
+    sample_rate: float,
+    lowest: float,
+    highest: float,
+    width: int = _WIDTH,
+    height: int = _HEIGHT,
+) -> Float64[Tensor, "height frames"]:
+    """Return levels in dB, at most `width` frames, in `height` bands of equal ratio from `lowest` to `highest` (Hz).
+
+    Each cell holds the largest bin within its band, or the nearest one, so that no narrow line falls between cells.
+    """
+    fft_size = scaled_fft_size(2048, sample_rate=sample_rate)
+    spectrum = magnitude_stft(sound.double()[None], fft_size=fft_size, hop=_hop(len(sound), width))[0, :, :width]
+    edges = np.geomspace(lowest, highest, height + 1) * fft_size / sample_rate
+    rows = []
+    for low, high in pairwise(edges.tolist()):
+        first = min(round(low), spectrum.shape[0] - 1)
+        rows.append(spectrum[first : max(first + 1, round(high))].amax(0))
+    return 20 * torch.log10(torch.stack(rows).clamp(min=1e-9))
+
+
+def draw_method_spectrograms(
+    contacts: Mapping[str, Mapping[str, Float[Tensor, " _samples"]]],
+    methods: Sequence[str],
+    *,
+    sample_rate: float,
+    highest: float = HIGHEST_HZ,
+    title: str,
+) -> Figure:
+    """Draw a row for each contact and a column for each of `methods`, the recording first, in the paper's settings.
+
+    20 Hz to 20 kHz (or `highest`, or half of `sample_rate`, if these are lower), the first second, and every sound
+    scaled so that its samples span (-1, 1). The colors of a row span 80 dB below the loudest level of its first column.
+    A method without a sound at a contact has an empty panel.
+    """
+    top = min(HIGHEST_HZ, highest, 0.5 * sample_rate)
+    bottom = min(LOWEST_HZ, top / 50)
+    figure = Figure(figsize=(2.3 * len(methods) + 1.2, 2.2 * len(contacts) + 0.8), layout="constrained")
+    grid = figure.subplots(len(contacts), len(methods), sharex=True, sharey=True, squeeze=False)
+    mesh: QuadMesh | None = None
+    longest = 0.0
+    for row, (contact, sounds) in zip(grid, contacts.items(), strict=True):
+        loudest: float | None = None
+        for axes, method in zip(row, methods, strict=True):
+            if method in sounds:
+                heard = _first_second(sounds[method], sample_rate=sample_rate)
+                levels = log_spectrogram(heard, sample_rate=sample_rate, lowest=bottom, highest=top)
+                loudest = float(levels.max()) if loudest is None else loudest
+                mesh = _draw(axes, levels - loudest, _hop(len(heard), _WIDTH) / sample_rate, (bottom, top))
+                longest = max(longest, len(heard) / sample_rate)
+        row[0].set_ylabel(f"{contact}\nfrequency (Hz)", fontsize=9)
+    for axes in grid.flat:
+        _set_axes(axes, longest or SECONDS, (bottom, top))
+    for axes, method in zip(grid[0], methods, strict=True):
+        axes.set_title(method, fontsize=9, wrap=True)
+    for axes in grid[-1]:
+        axes.set_xlabel("time (s)")
+    if mesh is not None:
+        figure.colorbar(mesh, ax=grid, label="level (dB, 0 = loudest of the first column)", shrink=0.8)
+    figure.suptitle(title)
+    return figure
+
+
+def _first_second(sound: Float[Tensor, " samples"], *, sample_rate: float) -> Float64[Tensor, " kept"]:
+    heard = sound[: max(1, round(SECONDS * sample_rate))].double()
+    return heard / heard.abs().max().clamp_min(torch.finfo(torch.float64).tiny)
+
+
+def _hop(samples: int, width: int) -> int:
+    return max(1, -(-samples // width))
+
+
+def _draw(axes: Axes, levels: Float64[Tensor, "height frames"], step: float, band: tuple[float, float]) -> QuadMesh:
+    """Draw levels whose frames are centered on 0, `step`, 2 `step`, ... seconds."""
+    height, frames = levels.shape
+    return axes.pcolormesh(
+        (np.arange(frames + 1) - 0.5) * step,
+        np.geomspace(*band, height + 1),
+        levels.numpy(),
+        cmap="magma",
+        vmin=-RANGE_DB,
+        vmax=0.0,
+        rasterized=True,
+    )
+
+
+def _set_axes(axes: Axes, seconds: float, band: tuple[float, float]) -> None:
+    axes.set_yscale("log")
+    axes.set_ylim(*band)
+    axes.set_xlim(0.0, seconds)
+    marks = [mark for mark in (20.0, 100.0, 1000.0, 10000.0, 20000.0) if band[0] <= mark <= band[1]]
+    axes.yaxis.set_major_locator(FixedLocator(marks))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())

@@ -1,0 +1,111 @@
+"""`avmsf edit --prompt --clap`: scores over the steps, with a tiny CLAP network of random weights."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from avmsf.bench.clap import Clap
+from avmsf.cli import edit, main, steering
+from avmsf.cli.edit import parse, run
+from avmsf.errors import AvmsfError
+from avmsf.field.store import load, save
+from avmsf.tasks.edits import EDITS
+from avmsf.tasks.retune import retune
+from made_clap import save_clap
+from test_cli_edit import PLACES, RATE, Echo, ceramic
+
+PROMPT = "a bell"
+QUICK = ("--prompt", PROMPT, "--model", "here", "--steps", "5", "--contacts", "2", "--preview-every", "2")
+
+
+@pytest.fixture
+def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return a command without its output: a field, a model that always answers the same sound, a tiny network."""
+    pytest.importorskip("transformers", reason="needs pip install 'avmsf[eval]'")
+    save_clap(tmp_path / "clap")
+    save(ceramic(), tmp_path / "plate.safetensors")
+    model = Echo(retune(ceramic(), pitch=1.02).render(PLACES[:1])[0])
+    monkeypatch.setattr(steering.StableAudio, "load", lambda *_, **__: model)
+    return [str(tmp_path / "plate.safetensors"), *QUICK, "--clap", str(tmp_path / "clap")]
+
+
+def test_the_curve_is_stored_drawn_and_shown(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn: dict[str, Figure] = {}
+    monkeypatch.setattr(edit, "save_picture", lambda figure, path: drawn.update({path.name: figure}))
+    output, folder = tmp_path / "new.safetensors", tmp_path / "look"
+    assert run(parse([*words, "--output", str(output), "--pictures", str(folder)])) == 0
+    new, clap = load(output), Clap.load(tmp_path / "clap")
+    curve = new.origin.report[EDITS][-1]["clap"]
+    assert curve["steps"] == [0, 2, 4, 5]
+    # The first score is of the field as it was, the last one of the edited field, at one of its points.
+    for field, score in ((ceramic(), curve["scores"][0]), (new, curve["scores"][-1])):
+        points = ceramic().gain_field.points
+        alone = clap.score(field.render(points), [PROMPT], sample_rate=RATE).numpy()
+        assert np.abs(alone - score).min() < 1e-6
+    (axes,) = drawn["clap.png"].axes
+    assert np.asarray(axes.lines[0].get_xydata()) == pytest.approx(np.array([curve["steps"], curve["scores"]]).T)
+    assert not list(tmp_path.glob("new.safetensors.*"))
+    capsys.readouterr()
+    assert main(["show", str(output)]) == 0
+    assert f"CLAP score {curve['scores'][0]:.3f} to {curve['scores'][-1]:.3f}" in capsys.readouterr().out
+
+
+def test_an_interrupted_edit_has_the_whole_curve(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def report(name: str) -> dict:
+        found: dict = load(tmp_path / name).origin.report[EDITS][-1]["clap"]
+        return found
+
+    assert run(parse([*words, "--output", str(tmp_path / "whole.safetensors")])) == 0
+    shown = steering.SteerBar.show
+
+    def impatient(bar: steering.SteerBar, progress: steering.SteerProgress) -> None:
+        shown(bar, progress)
+        if progress.step == 3:
+            raise KeyboardInterrupt
+
+    part = [*words, "--output", str(tmp_path / "part.safetensors")]
+    with monkeypatch.context() as patched:
+        patched.setattr(steering.SteerBar, "show", impatient)
+        assert run(parse(part)) == 130
+    kept = tmp_path / "part.safetensors.clap.json"
+    save_clap(tmp_path / "other", seed=1)
+    with pytest.raises(AvmsfError, match=r"part\.safetensors\.clap\.json"):
+        run(parse([*part[:-3], str(tmp_path / "other"), *part[-2:]]))
+    text = kept.read_text(encoding="utf-8")
+    kept.write_text("{}", encoding="utf-8")
+    with pytest.raises(AvmsfError, match=r"part\.safetensors\.clap\.json"):
+        run(parse(part))
+    kept.write_text(text, encoding="utf-8")
+    assert run(parse(part)) == 0
+    assert report("part.safetensors") == report("whole.safetensors")
+    assert not kept.exists()
+    # Without a state to go on from, old scores are of another edit.
+    kept.write_text(text, encoding="utf-8")
+    assert run(parse([*part, "--preview-every", "3"])) == 0
+    assert report("part.safetensors")["steps"] == [0, 3, 5]
+
+
+@pytest.mark.parametrize(
+    "given", [("--like", "a.wav", "--clap", "x"), ("--prompt", "a", "--clap", "x", "--preview-every", "0")]
+)
+def test_scores_need_a_prompt_and_previews(given: tuple[str, ...], tmp_path: Path) -> None:
+    save(ceramic(), tmp_path / "plate.safetensors")
+    with pytest.raises(AvmsfError, match="--clap"):
+        run(
+            parse(
+                [
+                    str(tmp_path / "plate.safetensors"),
+                    "--output",
+                    str(tmp_path / "new.safetensors"),
+                    "--clap",
+                    "x",
+                    *given,
+                ]
+            )
+        )

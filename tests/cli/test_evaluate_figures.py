@@ -1,0 +1,58 @@
+"""`avmsf evaluate --figures`: one picture for each object, drawn from stored results."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from avmsf.bench import report
+from avmsf.bench.results import ResultsFolder
+from avmsf.cli.evaluate import parse, run
+from plate_set import RATE, fill_plates
+
+CHEAP = ("--methods", "knn3,nearest", "--no-cdpam")
+
+
+def test_stored_results_are_drawn_without_evaluating(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plates, results = fill_plates(tmp_path / "plates", ("a", "b")), tmp_path / "results"
+    words = ["farthest", str(plates), *CHEAP, "--output", str(results)]
+    assert run(parse(words)) == 0
+    assert not (results / "figures").exists()
+    drawn: dict[str, Figure] = {}
+    save = report.save_picture
+
+    def keep(figure: Figure, path: Path) -> None:
+        drawn[path.name] = figure
+        save(figure, path)
+
+    monkeypatch.setattr(report, "save_picture", keep)
+    monkeypatch.setattr("avmsf.bench.caserun.CaseRun.outcome", lambda *_, **__: pytest.fail("a method was run again"))
+    assert run(parse([*words, "--figures"])) == 0
+    assert list(drawn) == ["a.png", "b.png"]
+    for name, figure in drawn.items():
+        assert (results / "figures" / name).read_bytes().startswith(b"\x89PNG")
+        record = ResultsFolder(results).read(name.removesuffix(".png"))
+        assert record is not None
+        kept = list(record.cases[0].sounds)
+        panels = [axes for axes in figure.axes if axes.get_yscale() == "log"]
+        assert len(panels) == 3 * len(kept)
+        assert [axes.get_title() for axes in panels[:3]] == ["recorded", "knn3", "nearest"]
+        assert [axes.get_ylabel().splitlines()[0] for axes in panels[::3]] == kept
+        assert panels[0].get_ylim() == pytest.approx((20.0, 0.5 * RATE))
+        assert all(len(axes.collections) == 1 for axes in panels)
+
+
+def test_cases_have_a_figure_each_of_their_own_sounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: dict[str, Figure] = {}
+    monkeypatch.setattr(report, "save_picture", lambda figure, path: drawn.update({path.name: figure}))
+    plates, results = fill_plates(tmp_path / "plates", ("a",)), tmp_path / "results"
+    assert run(parse(["shots", str(plates), *CHEAP, "--output", str(results), "--figures"])) == 0
+    assert sorted(drawn) == ["a 1-shot.png", "a 2-shots.png", "a 4-shots.png", "a 8-shots.png"]
+    one, eight = (
+        [axes.collections[0].get_array() for axes in drawn[name].axes[:3]] for name in ("a 1-shot.png", "a 8-shots.png")
+    )
+    assert np.array_equal(one[0], eight[0])
+    # With one training place, the mean of three neighbors is the nearest one.
+    assert np.array_equal(one[1], one[2])
+    assert not np.array_equal(eight[1], eight[2])

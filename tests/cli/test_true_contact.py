@@ -1,0 +1,92 @@
+"""`avmsf locate --true-contact`: the true contact's place in the heat maps, its distance, and wrong units."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+from matplotlib.figure import Figure
+
+from avmsf.bench.sides import ALL_SIDES, view_from
+from avmsf.cli import locate as verb
+from avmsf.cli.locate import parse, run
+from avmsf.cli.writing import OutputError
+from avmsf.field.soundfield import Origin, SoundField
+from avmsf.field.store import save
+from avmsf.modal.residual import Residual
+from avmsf.modal.synthesis import synthesise
+from avmsf.tasks.locator import Locator
+from made_fields import BANK, positional
+
+RATE, SAMPLES, STRUCK, OTHER = 8000, 4000, 68, 102
+
+
+@pytest.fixture(scope="module")
+def hit(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str, torch.Tensor]:
+    """Return a field, a recording of an impact at its point STRUCK, and its points."""
+    folder = tmp_path_factory.mktemp("hit")
+    zero = torch.zeros(len(BANK), dtype=torch.float64)
+    origin = Origin("plate")
+    field = SoundField(BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), float(RATE), SAMPLES, origin)
+    save(field, folder / "plate.safetensors")
+    locator = Locator.of(field)
+    gains = locator.gains[STRUCK][None].to(torch.complex128)
+    sound = synthesise(
+        gains.real, BANK.frequency, BANK.damping, samples=SAMPLES, sample_rate=float(RATE), quadrature=gains.imag
+    )[0]
+    noise = torch.randn(len(sound) + 800, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    whole = torch.nn.functional.pad(sound, (800, 0)) / sound.abs().max() + 1e-4 * noise
+    soundfile.write(folder / "hit.wav", (0.5 * whole).numpy(), RATE, subtype="FLOAT")
+    return str(folder / "plate.safetensors"), str(folder / "hit.wav"), locator.points.double()
+
+
+def test_the_true_contact_is_red_at_its_place_and_the_found_one_blue(
+    hit: tuple[str, str, torch.Tensor],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    field, recording, points = hit
+    figures: list[Figure] = []
+    monkeypatch.setattr(verb, "save_picture", lambda figure, path: figures.append(figure))
+    true = [f"{value:.9g}" for value in points[OTHER].tolist()]
+    assert run(parse([field, recording, "--output", str(tmp_path), "--true-contact", *true, "--json"])) == 0
+    (blow,) = json.loads(capsys.readouterr().out)["blows"]
+    distance = float((points[STRUCK] - points[OTHER]).norm())
+    diagonal = float((points.amax(0) - points.amin(0)).norm())
+    assert blow["true_contact"] == pytest.approx(points[OTHER].tolist(), abs=1e-6)
+    assert blow["error_metres"] == pytest.approx(distance, abs=1e-6)
+    assert blow["rmed"] == pytest.approx(distance / diagonal, abs=1e-6)
+    (figure,) = figures
+    middle = 0.5 * (points.amax(0) + points.amin(0))
+    panels = [axes for axes in figure.axes if axes.get_title()]
+    assert len(panels) == 2 * len(ALL_SIDES)
+    for axes, side in zip(panels, ALL_SIDES * 2, strict=True):
+        scatter = axes.collections[0]
+        colors = scatter.get_facecolors()[:, :3]
+        hue = colors / colors.max(axis=1, keepdims=True)
+        for row, mark in ((OTHER, (1.0, 0.05, 0.05)), (STRUCK, (0.2, 0.45, 1.0))):
+            marked = np.abs(hue - mark).max(axis=1) < 0.01
+            place = (points[row] - middle).numpy() @ view_from(side).T
+            # Points are sparse here: the nearest one alone has the mark's color.
+            assert np.asarray(scatter.get_offsets())[marked] == pytest.approx(place[None, :2], abs=1e-6)
+
+
+def test_the_distance_is_printed_without_pictures(
+    hit: tuple[str, str, torch.Tensor], capsys: pytest.CaptureFixture[str]
+) -> None:
+    field, recording, points = hit
+    true = [f"{value:.9g}" for value in points[OTHER].tolist()]
+    assert run(parse([field, recording, "--true-contact", *true])) == 0
+    distance = 1000 * float((points[STRUCK] - points[OTHER]).norm())
+    assert f"{distance:.1f} mm from the true contact" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("wrong", [("120", "40", "0"), (str(math.nan), "0", "0")])
+def test_a_contact_in_another_unit_is_refused(hit: tuple[str, str, torch.Tensor], wrong: tuple[str, ...]) -> None:
+    field, recording, _ = hit
+    with pytest.raises(OutputError, match="--true-contact"):
+        run(parse([field, recording, "--true-contact", *wrong]))

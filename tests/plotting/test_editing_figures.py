@@ -1,0 +1,126 @@
+"""From edits to the record of the protocol and its figures, with a tiny CLAP network of random weights."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from avmsf.bench.clap import Clap
+from avmsf.bench.editing import EditScore, judge, write_scores
+from avmsf.bench.editmethods import towards_words
+from avmsf.bench.edittasks import EditTask
+from avmsf.bench.modefeatures import Pitches
+from avmsf.bench.modespace import MaterialSpace
+from avmsf.tasks.distillation import DistillationConfig
+from made_clap import save_clap
+from test_editing import QUICK, Speaker, flat_space, struck
+
+# The benchmarks are no part of the package.
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from benchmarks import editingfigures, editingprotocol
+
+PROMPT = "a glass is struck"
+METHODS = ("audio-sds", "hierarchical")
+
+
+class Answering(Speaker):
+    """A model that wants every sound half as loud towards its end."""
+
+    def denoised(self, latents, level, conditioning, *, guidance):
+        made = latents.clone()
+        made[..., made.shape[-1] // 2 :] *= 0.5
+        return made
+
+
+def space_of_vectors(monkeypatch: pytest.MonkeyPatch) -> MaterialSpace:
+    """Return a space whose embedding is two components of the vectors: UMAP would have to be compiled."""
+    monkeypatch.setattr(MaterialSpace, "place", lambda self, bank: self.features.vector(bank)[[0, 31]])
+    space = flat_space(Pitches())
+    return replace(space, stored=space.vectors[:, [0, 31]])
+
+
+@pytest.fixture
+def judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[MaterialSpace, Clap, tuple[EditScore, ...]]:
+    pytest.importorskip("transformers", reason="needs pip install 'avmsf[eval]'")
+    save_clap(tmp_path / "clap")
+    clap, space = Clap.load(tmp_path / "clap"), space_of_vectors(monkeypatch)
+    settings = {**QUICK, "preview_every": 2}
+    methods = towards_words(Answering(), settings, distillation=DistillationConfig(denoising=1))
+    task = EditTask(struck("ceramic"), "glass", prompt=PROMPT)
+    return space, clap, judge([task], methods, {"pitches": space}, clap=clap)
+
+
+def test_scores_hold_the_places_and_the_clap_score_of_every_preview(
+    judged: tuple[MaterialSpace, Clap, tuple[EditScore, ...]],
+) -> None:
+    space, clap, scores = judged
+    before, *others = scores
+    assert [each.method for each in others] == list(METHODS)
+    assert before.clap_curve == ()
+    assert before.places["pitches"] == pytest.approx(space.place(struck("ceramic").bank), abs=1e-6)
+    for each in scores:
+        apart = np.asarray(each.places["pitches"]) - space.centre("glass")
+        assert each.umap["pitches"] == pytest.approx(float(np.linalg.norm(apart)))
+    # Of the object as it was, wherever it is loudest.
+    known = struck("ceramic").sound_field
+    rendered = known.render(known.gain_field.points)
+    alone = clap.score(rendered, [PROMPT], sample_rate=known.sample_rate).tolist()
+    for each in others:
+        # Every second of three steps, and the last one.
+        assert [step for step, _ in each.clap_curve] == [0, 2, 3]
+        assert min(abs(each.clap_curve[0][1] - score) for score in alone) < 1e-6
+        assert len({score for _, score in each.clap_curve}) == 3
+
+
+def test_a_record_is_drawn_without_editing(
+    judged: tuple[MaterialSpace, Clap, tuple[EditScore, ...]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    space, _, scores = judged
+    write_scores(scores, {"pitches": space}, tmp_path / "record.json")
+    drawn: dict[str, Figure] = {}
+    save = editingfigures.save_picture
+
+    def keep(figure: Figure, path: Path) -> None:
+        drawn[path.name] = figure
+        save(figure, path)
+
+    monkeypatch.setattr(editingfigures, "save_picture", keep)
+    assert editingfigures.main([str(tmp_path / "record.json"), str(tmp_path / "figures")]) == 0
+    assert list(drawn) == ["umap-pitches-ceramic-to-glass.png", "clap.png"]
+    assert all((tmp_path / "figures" / name).read_bytes().startswith(b"\x89PNG") for name in drawn)
+    panels = drawn["umap-pitches-ceramic-to-glass.png"].axes
+    assert [axes.get_title() for axes in panels] == list(METHODS)
+    for axes, score in zip(panels, scores[1:], strict=True):
+        points = np.concatenate([np.asarray(each.get_offsets()) for each in axes.collections])
+        assert sorted(points.tolist()) == pytest.approx(np.array(sorted(space.embedding.tolist())))
+        ends = {str(line.get_label()): np.asarray(line.get_xydata()) for line in axes.lines}
+        assert ends["before the edit"] == pytest.approx(np.array([scores[0].places["pitches"]]))
+        assert ends["after the edit"] == pytest.approx(np.array([score.places["pitches"]]))
+    (axes,) = drawn["clap.png"].axes
+    lines = [np.asarray(line.get_xydata()) for line in axes.lines if str(line.get_label()).startswith("_")]
+    for line, score in zip(lines, scores[1:], strict=True):
+        assert line == pytest.approx(np.array(score.clap_curve))
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"scores": [{}], "spaces": {}}'])
+def test_another_file_is_no_record(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "other.json").write_text(text, encoding="utf-8")
+    assert editingfigures.main([str(tmp_path / "other.json"), str(tmp_path / "figures")]) == 2
+    assert "other.json" in capsys.readouterr().err
+
+
+def test_the_protocol_draws_what_it_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[object] = []
+    cast = editingprotocol.Cast("none", (), (), "", known=False)
+    monkeypatch.setattr(editingprotocol, "recorded_cast", lambda *_, **__: cast)
+    monkeypatch.setattr(editingprotocol, "measure", lambda *_, **__: asked.append("measured"))
+    monkeypatch.setattr(editingprotocol, "write_figures", lambda *given: asked.append(given))
+    monkeypatch.setattr(editingprotocol, "show", lambda *_, **__: None)
+    record, folder = tmp_path / "record.json", tmp_path / "figures"
+    assert editingprotocol.main([str(tmp_path), "--record", str(record), "--figures", str(folder)]) == 0
+    assert asked == ["measured", (record, folder)]
+    with pytest.raises(SystemExit):
+        editingprotocol.main([str(tmp_path), "--figures", str(folder)])
