@@ -63,9 +63,7 @@ class PatchCodec:
         return rows.reshape(len(rows), PATCHES * BINS, FRAMES)
 
 
-def spectra(
-    sounds: Float[Tensor, "contacts samples"], sample_rate: float
-) -> Complex[Tensor, "contacts bins frames"]:
+def spectra(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> Complex[Tensor, "contacts bins frames"]:
     """Return spectra of the first 2 s at 32 kHz; shorter sounds are continued by silence. Hann windows, centered."""
     heard = lasting(resampled(sounds.float(), sample_rate=sample_rate, wanted=RATE), SAMPLES)
     found = torch.stft(

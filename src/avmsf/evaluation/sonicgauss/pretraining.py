@@ -26,7 +26,9 @@ class PretrainingConfig:
     """Sizes and schedule; the defaults take a quarter of an hour on one core."""
 
     network: SmallConfig = field(default_factory=SmallConfig)
-    training: TrainingConfig = field(default_factory=lambda: TrainingConfig(steps=1000, batch=24, rate=1e-3))
+    training: TrainingConfig = field(
+        default_factory=lambda: TrainingConfig(steps=1000, batch=24, rate=1e-3, warmup=100)
+    )
 
 
 def pretrain(

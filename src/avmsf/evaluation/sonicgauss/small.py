@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
@@ -28,6 +28,7 @@ from avmsf.evaluation.sonicgauss.patches import PATCHES, VALUES, PatchCodec
 from avmsf.evaluation.sonicgauss.tensors import expect_tensors
 from avmsf.files import write_whole
 from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.points import farthest_points
 
 COMMAND = "python -m benchmarks baselines --parts sonicgauss-training --weights FILE"
 """What makes the weights."""
@@ -176,20 +177,11 @@ def visible(cloud: GaussianCloud) -> Normalized:
 def object_tokens(found: Normalized, *, count: int) -> Float[Tensor, "tokens 23"]:
     """Return an object's features, mean over the cells around `count` far-apart Gaussians.
 
-    A cell holds the Gaussians nearest to its own.
+    A cell holds the Gaussians nearest to its own. Raises EvaluationError for fewer Gaussians than tokens.
     """
-    distances = torch.cdist(found.centers, found.centers[_far_apart(found.centers, count)])
+    centers = found.centers
+    start = int((centers - centers.mean(0)).norm(dim=1).argmax())
+    distances = torch.cdist(centers, centers[farthest_points(centers, count, start=start)])
     cells = torch.nn.functional.one_hot(distances.argmin(1), count).to(found.features)
     tokens: Tensor = (cells.T @ found.features) / cells.sum(0)[:, None].clamp(min=1.0)
     return tokens
-
-
-def _far_apart(points: Float[Tensor, "points 3"], count: int) -> Int[Tensor, " count"]:
-    """Return rows of points each of which is farthest from those before, the first from the middle of all."""
-    distance = (points - points.mean(0)).norm(dim=1)
-    rows = []
-    for _ in range(count):
-        rows.append(int(distance.argmax()))
-        nearest = (points - points[rows[-1]]).norm(dim=1)
-        distance = nearest if len(rows) == 1 else torch.minimum(distance, nearest)
-    return torch.tensor(rows)

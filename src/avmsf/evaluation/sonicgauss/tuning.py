@@ -19,7 +19,7 @@ class TrainingConfig:
     batch: int
     rate: float = 1e-4
     warmup: int = 200
-    """Steps; at most a tenth of all."""
+    """Steps; at most half of all."""
     betas: tuple[float, float] = (0.9, 0.95)
     decay: float = 1e-2
 
@@ -39,7 +39,7 @@ def train(
     """
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.AdamW(parameters, lr=config.rate, betas=config.betas, weight_decay=config.decay)
-    warmup = max(1, min(config.warmup, config.steps // 10))
+    warmup = max(1, min(config.warmup, config.steps // 2))
 
     def factor(step: int) -> float:
         return min((step + 1) / warmup, (config.steps - step) / max(1, config.steps - warmup))
