@@ -14,10 +14,14 @@ from avmsf.bench.gridfield import PAPER_GRID, QUICK_GRID, GridField
 from avmsf.bench.interpolation import SplineGains
 from avmsf.bench.recorded import Recorded
 from avmsf.bench.renderer import Renderer
+from avmsf.bench.sonicgaussmethod import PUBLISHED, SMALL, SmallSonicGaussMethod, SonicGaussMethod
 from avmsf.bench.spectralmean import MeanSpectra
 from avmsf.bench.task import Method, Task
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.diffsound import DiffSound
+from avmsf.evaluation.sonicgauss.published_renderer import PublishedRenderer
+from avmsf.evaluation.sonicgauss.small import COMMAND
+from avmsf.evaluation.sonicgauss.small_renderer import SmallRenderer
 from avmsf.field.config import PAPER
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.finders import ShortTime
@@ -144,30 +148,42 @@ SIMULATIONS = (DiffSoundMethod("diffsound"), DiffSoundMethod("diffsound-weighted
 """Other systems, built from their publications."""
 
 METHODS: dict[str, Method] = {method.name: method for method in (*BASELINES, *SIMULATIONS, *FIELDS)}
-"""All methods but `recorded:FOLDER`, in the order of tables."""
+"""All methods but those that take a path, in the order of tables."""
 
 
 def method_named(name: str) -> Method:
     """Return the method of this name. Raises EvaluationError that lists the known ones."""
     if name in METHODS:
         return METHODS[name]
+    if name.partition(":")[0] == PUBLISHED[:-1]:
+        return SonicGaussMethod(_given(name, PUBLISHED, "the folder of the published weights", Path.is_dir))
+    if name.partition(":")[0] == SMALL[:-1]:
+        return SmallSonicGaussMethod(_given(name, SMALL, f"the file that this makes: {COMMAND}", Path.is_file))
     if name.startswith(_RECORDED):
-        folder = Path(name.removeprefix(_RECORDED)).expanduser()
-        if name == _RECORDED or not folder.is_dir():
-            raise EvaluationError(
-                f"{name}: expected a folder after `{_RECORDED}`, with a folder of wav files for every object, found "
-                "none of this name"
-            )
-        return RecordedMethod(folder)
+        wanted = "a folder with a folder of wav files for every object"
+        return RecordedMethod(_given(name, _RECORDED, wanted, Path.is_dir))
     near = difflib.get_close_matches(name, METHODS, n=1)
     guess = f"; did you mean {near[0]}?" if near else ""
-    raise EvaluationError(f"no method is called {name!r}: there are {', '.join(METHODS)} and recorded:FOLDER{guess}")
+    raise EvaluationError(
+        f"no method is called {name!r}: there are {', '.join(METHODS)}, {PUBLISHED}FOLDER, {SMALL}FILE and "
+        f"{_RECORDED}FOLDER{guess}"
+    )
+
+
+def _given(name: str, prefix: str, wanted: str, is_there: Callable[[Path], bool]) -> Path:
+    """Return the path in a method's name. Raises EvaluationError where nothing is there."""
+    path = Path(name.removeprefix(prefix)).expanduser()
+    if name in (prefix, prefix[:-1]) or not is_there(path):
+        raise EvaluationError(f"{name}: expected after `{prefix}` {wanted}; found none of this name")
+    return path
 
 
 def report_of(renderer: Renderer) -> dict[str, Any]:
     """Return what a method chose on its way to a renderer, as plain values; empty where it had no choice."""
     if isinstance(renderer, SoundField):
         return renderer.origin.report
+    if isinstance(renderer, SmallRenderer | PublishedRenderer):
+        return dict(renderer.report)
     if isinstance(renderer, SplineGains | DiffSound):
         return renderer.report
     if isinstance(renderer, MeanGains | MeanSpectra | MeanWaveform):

@@ -15,6 +15,7 @@ from avmsf.fem.family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
 from avmsf.scene.features import FeatureField
+from avmsf.scene.gaussians import GaussianCloud
 
 
 @runtime_checkable
@@ -44,6 +45,15 @@ class FamilyMaker(Protocol):
         ...
 
 
+@runtime_checkable
+class CloudMaker(Protocol):
+    """Makes an object's Gaussians."""
+
+    def __call__(self, identifier: str, views: int | None = None) -> GaussianCloud:
+        """Return an object's Gaussians, from at most `views` views. Raises SceneError where nothing shows its look."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """What is evaluated, on what, and how."""
@@ -64,6 +74,8 @@ class Evaluation:
     """Plain values that decide the features."""
     families: FamilyMaker | None = None
     """None where no method simulates the object."""
+    clouds: CloudMaker | None = None
+    """None where no method reads Gaussians."""
 
     def begin(self, results: ResultsFolder) -> None:
         """Take a folder for this evaluation's results.

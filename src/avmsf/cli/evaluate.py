@@ -112,13 +112,14 @@ def run(options: Options) -> int:
     lift, paper = settled_lifts(options.lift, methods)
     scene = SceneConfig(ViewsConfig(source=options.look), options.splat, lift)
     kept = (options.features or folder / "features").resolve()
+    looks = ObjectLooks(dataset, kept, scene, paper)
     bodies = ObjectBodies(dataset, kept, options.geometry, options.body, scene)
     evaluation = Evaluation(
         dataset,
         title,
         protocol,
         methods,
-        ObjectLooks(dataset, kept, scene, paper),
+        looks,
         bodies,
         options.seed,
         Judging(level=options.level, cdpam=options.cdpam, cdpam_contacts=options.cdpam_contacts),
@@ -130,6 +131,7 @@ def run(options: Options) -> int:
             "body": asdict(options.body),
         },
         bodies.family,
+        looks.cloud,
     )
     results, groups = ResultsFolder(folder), members(dataset)
     say(f"{protocol.name} on {title}: {len(objects)} objects, {len(methods)} methods, results in {folder}")
