@@ -33,7 +33,7 @@ from avmsf.evaluation.sonicgauss.patches import (
     spectra,
 )
 from avmsf.evaluation.sonicgauss.pretraining import PretrainingConfig, pretrain
-from avmsf.evaluation.sonicgauss.small import SmallConfig, SmallWeights
+from avmsf.evaluation.sonicgauss.small import SmallConfig, SmallSonicGauss, SmallWeights
 from avmsf.evaluation.sonicgauss.small_renderer import SmallRenderer, fit_small
 from avmsf.evaluation.sonicgauss.tuning import TrainingConfig, train
 from avmsf.simulate.sim20 import SIM20
@@ -258,10 +258,16 @@ def test_a_file_of_other_weights_is_refused_by_the_tensors_name(tmp_path, change
         SmallWeights.read(path)
 
 
-def test_the_contact_and_the_object_change_the_velocity():
+def lively_network() -> SmallSonicGauss:
+    """Return a network whose gates, zero at the start of training, are open."""
     network = weights.__wrapped__().network.requires_grad_(False)
     for layer in (network.output, network.modulation, *(block.modulation for block in network.blocks)):
         torch.nn.init.normal_(layer.weight, generator=torch.Generator().manual_seed(0))
+    return network
+
+
+def test_the_contact_and_the_object_change_the_velocity():
+    network = lively_network()
     latents, times = torch.randn(1, PATCHES, CHANNELS), torch.tensor([0.5])
     features, place = torch.randn(1, 4, 23), torch.rand(1, 3)
     base = network(latents, times, network.condition(features, place))
@@ -270,13 +276,13 @@ def test_the_contact_and_the_object_change_the_velocity():
 
 
 def test_the_order_of_gaussian_tokens_changes_nothing():
-    network = weights().network
+    network = lively_network()
     latents, times = torch.randn(1, PATCHES, CHANNELS), torch.tensor([0.5])
     features, place = torch.randn(1, 4, 23), torch.rand(1, 3)
     one, other = (
         network(latents, times, network.condition(each, place)) for each in (features, features[:, [2, 0, 3, 1]])
     )
-    torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
+    torch.testing.assert_close(one, other, rtol=0, atol=1e-4 * float(one.abs().max()))
 
 
 @pytest.fixture

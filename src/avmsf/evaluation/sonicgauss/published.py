@@ -190,8 +190,6 @@ def folder_digest(folder: Path) -> str:
 
 
 def _load(part: nn.Module, path: Path) -> None:
-    if not path.is_file():
-        raise EvaluationError(f"{path}: expected published weights of SonicGauss, found no such file: {_DOWNLOAD}")
     state = part.state_dict()
     try:
         with safe_open(path, framework="pt") as file:
