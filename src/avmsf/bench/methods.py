@@ -5,7 +5,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, RandomImpact, WhiteNoise
 from avmsf.bench.diffsoundmethod import DiffSoundMethod
@@ -156,12 +156,11 @@ def method_named(name: str) -> Method:
     if name in METHODS:
         return METHODS[name]
     if name.partition(":")[0] == PUBLISHED[:-1]:
-        return SonicGaussMethod(_given(name, PUBLISHED, "the folder of the published weights", Path.is_dir))
+        return SonicGaussMethod(_given(name, PUBLISHED, "a folder", "with the published weights"))
     if name.partition(":")[0] == SMALL[:-1]:
-        return SmallSonicGaussMethod(_given(name, SMALL, f"the file that this makes: {COMMAND}", Path.is_file))
+        return SmallSonicGaussMethod(_given(name, SMALL, "a file", f"which this makes: {COMMAND}"))
     if name.startswith(_RECORDED):
-        wanted = "a folder with a folder of wav files for every object"
-        return RecordedMethod(_given(name, _RECORDED, wanted, Path.is_dir))
+        return RecordedMethod(_given(name, _RECORDED, "a folder", "with a folder of wav files for every object"))
     near = difflib.get_close_matches(name, METHODS, n=1)
     guess = f"; did you mean {near[0]}?" if near else ""
     raise EvaluationError(
@@ -170,11 +169,11 @@ def method_named(name: str) -> Method:
     )
 
 
-def _given(name: str, prefix: str, wanted: str, is_there: Callable[[Path], bool]) -> Path:
+def _given(name: str, prefix: str, kind: Literal["a folder", "a file"], use: str) -> Path:
     """Return the path in a method's name. Raises EvaluationError where nothing is there."""
     path = Path(name.removeprefix(prefix)).expanduser()
-    if name in (prefix, prefix[:-1]) or not is_there(path):
-        raise EvaluationError(f"{name}: expected after `{prefix}` {wanted}; found none of this name")
+    if name in (prefix, prefix[:-1]) or not (path.is_dir() if kind == "a folder" else path.is_file()):
+        raise EvaluationError(f"{name}: expected {kind} after `{prefix}`, {use}; found none of this name")
     return path
 
 
