@@ -111,10 +111,10 @@ class _Objects:
     def _family(self, name: str) -> BodyFamily:
         return body_family(self.surface(name), count=MODES, tell=tell)
 
-    def cloud(self, name: str, views: int | None = None) -> GaussianCloud:
+    def cloud(self, identifier: str, views: int | None = None) -> GaussianCloud:
         clouds = self.folder / "clouds" if self._clouds is None else self._clouds
         clouds.mkdir(parents=True, exist_ok=True)
-        return views_and_gaussians(self.root([name]) / name, clouds, quick=self.quick)[1]
+        return views_and_gaussians(self.root([identifier]) / identifier, clouds, quick=self.quick)[1]
 
     def training(self) -> Report:
         cache = None if self._clouds is None else self._clouds / "sonicgauss"

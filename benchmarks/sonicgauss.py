@@ -24,7 +24,7 @@ def train_small(weights: Path, *, cache: Path | None, quick: bool) -> Report:
     found = pretrain(objects, config, tell=tell)
     found.write(weights)
     losses = [float(value) for value in found.report["losses"]]
-    rows = [[f"{(place + 1) / len(losses):.0%}", value] for place, value in enumerate(losses)]
+    rows: list[list[str | float]] = [[f"{(place + 1) / len(losses):.0%}", value] for place, value in enumerate(losses)]
     figures = {
         "sonicgauss_small.objects_seconds": made,
         "sonicgauss_small.training_seconds": float(found.report["seconds"]),
