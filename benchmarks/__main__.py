@@ -75,13 +75,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "photographs of gains need it, the others simulate them again without it",
     )
     parser.add_argument(
-        "--objects", nargs="+", default=(), choices=tuple(SIM20), metavar="NAME", help="gains: some of these objects"
+        "--objects",
+        nargs="+",
+        default=(),
+        choices=tuple(SIM20),
+        metavar="NAME",
+        help="baselines, gains: some of these objects",
     )
     parser.add_argument(
         "--clouds",
         type=Path,
         metavar="FOLDER",
-        help="gains, surface: keep the Gaussians fitted to the objects here; without it they are fitted again",
+        help="baselines, gains, surface: keep the Gaussians fitted to the objects here; without it they are made again",
+    )
+    parser.add_argument(
+        "--weights",
+        type=Path,
+        metavar="FILE",
+        help="baselines: weights of sonicgauss-small, which the part sonicgauss-training makes",
     )
     chosen = parser.parse_args(arguments)
     benchmark = BENCHMARKS[chosen.name]
@@ -92,7 +103,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not chosen.paper_minutes > 0:
         parser.error(f"--paper-minutes is {chosen.paper_minutes:g}; expected a number above 0")
     options = Options(
-        parts, chosen.quick_look, chosen.paper_minutes, chosen.sim_20, tuple(chosen.objects), chosen.clouds
+        parts,
+        chosen.quick_look,
+        chosen.paper_minutes,
+        chosen.sim_20,
+        tuple(chosen.objects),
+        chosen.clouds,
+        chosen.weights,
     )
     # Remarks on a capture are `avmsf check`'s business.
     warnings.simplefilter("ignore", CaptureWarning)

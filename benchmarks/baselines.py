@@ -1,4 +1,4 @@
-"""DiffSound: what it recovers of bodies that sound as it assumes, its errors on simulated objects, where it locates."""
+"""DiffSound and SonicGauss: errors on simulated objects; what DiffSound recovers, how the small SonicGauss learns."""
 
 import math
 import tempfile
@@ -35,6 +35,7 @@ from avmsf.modal.extraction.extract import extract
 from avmsf.modal.synthesis import synthesise
 from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
+from avmsf.scene.gaussians import GaussianCloud
 from avmsf.simulate.material import Material, material_named
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import simulate_object
@@ -42,6 +43,8 @@ from avmsf.simulate.simulationfolder import write_simulation
 from avmsf.tasks.locator import Locator
 from benchmarks.material import surface_features
 from benchmarks.report import Options, Report, Table, tell
+from benchmarks.sonicgauss import small_method, train_small
+from benchmarks.surface import views_and_gaussians
 
 OWN = (("blob-polycarbonate", 1.0), ("dish-ceramic", 1.13))
 """Objects, and their walls' thickness over one of those that are computed beforehand."""
@@ -56,6 +59,8 @@ RATE, SECONDS = 48_000.0, 0.5
 CONVENTIONS = (
     "diffsound: two clips of the body, 16 modes of equal amplitude, Rayleigh damping; stiffness E / rho 37 % above "
     "the table's, which the fit does not know, nor the thickness. Seconds of CPU: bodies, then fit.",
+    "sonicgauss-training: makes the weights of sonicgauss-small in the file --weights; sim20 and shots take the method "
+    "where that file is there. Seconds of CPU: making the objects, then training.",
     "sim20, shots: `avmsf evaluate`, farthest (8 of 40 impacts) and shots, exact meshes; means over objects of L1 at "
     "full scale and of the relative STFT error. Stiffness errors are relative to the material's table.",
     "locating: 8 of 40 impacts, held-out impacts, candidates of diffsound are the mesh's vertices; cosine is of a "
@@ -80,8 +85,10 @@ class _Objects:
     """Simulated objects, read or made, and their bodies, each computed once."""
 
     def __init__(self, options: Options, folder: Path) -> None:
-        self.folder, self._given = folder, options.sim20
-        self.most = 1 if options.quick_look else None
+        self.folder, self._given, self._clouds = folder, options.sim20, options.clouds
+        self.quick, self.most = options.quick_look, 1 if options.quick_look else None
+        self.weights = folder / "sonicgauss-small.safetensors" if options.weights is None else options.weights
+        self.few, self.more = options.objects or FEW, options.objects or MORE
         self.family = cache(self._family)
 
     def root(self, names: Sequence[str]) -> Path:
@@ -104,13 +111,23 @@ class _Objects:
     def _family(self, name: str) -> BodyFamily:
         return body_family(self.surface(name), count=MODES, tell=tell)
 
+    def cloud(self, identifier: str, views: int | None = None) -> GaussianCloud:
+        clouds = self.folder / "clouds" if self._clouds is None else self._clouds
+        clouds.mkdir(parents=True, exist_ok=True)
+        return views_and_gaussians(self.root([identifier]) / identifier, clouds, quick=self.quick)[1]
+
+    def training(self) -> Report:
+        cache = None if self._clouds is None else self._clouds / "sonicgauss"
+        return train_small(self.weights, cache=cache, quick=self.quick)
+
     def records(self, protocol: str, names: Sequence[str]) -> _Records:
         """Return what `avmsf evaluate` finds of objects."""
         dataset = CaptureCollection(self.root(names))
         features = self.folder / "features"
         evaluation = Evaluation(
-            dataset, "sim-20", PROTOCOLS[protocol], tuple(map(method_named, METHODS)), ObjectLooks(dataset, features),
-            ObjectBodies(dataset, features), judging=Judging(cdpam=False),
+            dataset, "sim-20", PROTOCOLS[protocol], (*map(method_named, METHODS), *small_method(self.weights)),
+            ObjectLooks(dataset, features), ObjectBodies(dataset, features), judging=Judging(cdpam=False),
+            clouds=self.cloud,
         )  # fmt: skip
         results = ResultsFolder(self.folder / protocol)
         evaluation.begin(results)
@@ -180,16 +197,17 @@ def _clips(family: BodyFamily, thickness: float | None, material: Material) -> t
 
 
 def _sim20(objects: _Objects) -> Report:
-    names = MORE[: objects.most]
+    names = objects.more[: objects.most]
     records = objects.records("farthest", names)
+    methods = _methods(records)
     rows: list[list[str | float]] = []
     for record in records:
         chosen = next((each for each in record.outcomes if each.method == "diffsound"), None)
         table = material_named(sim20_recipe(record.identifier).material)
         stiffness = math.nan if chosen is None or chosen.failure else chosen.report["stiffness"]
-        errors: list[str | float] = [_error(record, method) for method in METHODS]
+        errors: list[str | float] = [_error(record, method) for method in methods]
         rows.append([record.identifier, stiffness / (table.young / table.density) - 1.0, *errors])
-    columns = ("object", "stiffness error", *METHODS)
+    columns = ("object", "stiffness error", *map(_short, methods))
     tables = (Table("sim20: relative STFT error of each object, 8 impacts", columns, rows), *_errors("sim20", records))
     off = [abs(float(row[1])) for row in rows if math.isfinite(float(row[1]))]
     figures = {"sim20.diffsound.stiffness_error": sum(off) / len(off) if off else math.nan}
@@ -197,8 +215,18 @@ def _sim20(objects: _Objects) -> Report:
 
 
 def _shots(objects: _Objects) -> Report:
-    records = objects.records("shots", FEW[: objects.most])
+    records = objects.records("shots", objects.few[: objects.most])
     return Report(tables=_errors("shots", records), figures=_figures("shots", records))
+
+
+def _methods(records: _Records) -> tuple[str, ...]:
+    """Return the methods of records in their order."""
+    return tuple(dict.fromkeys(each.method for record in records for each in record.outcomes))
+
+
+def _short(method: str) -> str:
+    """Return a method's name without the path of its weights."""
+    return method.partition(":")[0]
 
 
 def _error(record: ObjectRecord, method: str) -> float:
@@ -212,10 +240,10 @@ def _figures(part: str, records: _Records) -> dict[str, float]:
     for label in labels_of(records):
         found = means(figures_of(records, label))
         key = f"{part}.{label.split()[0]}" if part == "shots" else part
-        for method in METHODS:
+        for method in _methods(records):
             if method in found:
-                figures[f"{key}.{method}"] = found[method]["l1"].mean
-                figures[f"{key}.{method}.relative_stft"] = found[method]["relative_stft"].mean
+                figures[f"{key}.{_short(method)}"] = found[method]["l1"].mean
+                figures[f"{key}.{_short(method)}.relative_stft"] = found[method]["relative_stft"].mean
     return figures
 
 
@@ -251,6 +279,7 @@ def _locating(objects: _Objects) -> Report:
 
 
 PARTS: dict[str, Callable[[_Objects], Report]] = {
+    "sonicgauss-training": _Objects.training,
     "diffsound": _diffsound,
     "sim20": _sim20,
     "shots": _shots,

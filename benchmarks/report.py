@@ -26,6 +26,8 @@ class Options:
     """Some of these objects; none for all."""
     clouds: Path | None = None
     """Folder that keeps Gaussians fitted to these objects; None to fit them again."""
+    weights: Path | None = None
+    """File of the weights of sonicgauss-small; None to keep none."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -370,8 +370,8 @@ def test_unknown_names_are_refused_with_the_known_ones(tmp_path):
         EvaluationError, match=r"'spline-gain': there are white-noise, .*recorded:FOLDER; did you mean "
     ):
         method_named("spline-gain")
-    with pytest.raises(EvaluationError, match=r"no method is called 'sonicgauss': there are .*field-grid"):
-        method_named("sonicgauss")
+    with pytest.raises(EvaluationError, match=r"no method is called 'audio': there are .*field-grid"):
+        method_named("audio")
     for name in ("recorded:", f"recorded:{tmp_path}/none"):
         with pytest.raises(EvaluationError, match="expected a folder after `recorded:`"):
             method_named(name)

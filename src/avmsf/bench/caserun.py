@@ -22,11 +22,12 @@ from avmsf.bench.renderer import Renderer
 from avmsf.bench.results import CaseRecord, Outcome, one_line
 from avmsf.bench.task import Look, Method, Task
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import AvmsfError, ExtractionError
+from avmsf.errors import AvmsfError, EvaluationError, ExtractionError
 from avmsf.fem.family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.scene.features import FeatureField
+from avmsf.scene.gaussians import GaussianCloud
 from avmsf.simulate.truth import Truth
 
 LISTENED = 3
@@ -119,6 +120,7 @@ class CaseRun:
             stranger=self._shared(self.stranger),
             family=self._shared(self.family),
             material=self.material,
+            gaussians=self._gaussians,
         )
 
     def _modes(self) -> Extraction:
@@ -145,6 +147,12 @@ class CaseRun:
                 return make(*given, **named)
 
         return made
+
+    def _gaussians(self) -> GaussianCloud:
+        if self.evaluation.clouds is None:
+            raise EvaluationError(f"{self.identifier}: it has no Gaussians: expected views of it, or its mesh")
+        with self._sharing():
+            return self.evaluation.clouds(self.identifier, self.case.views)
 
     @contextmanager
     def _sharing(self) -> Iterator[None]:

@@ -5,7 +5,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, RandomImpact, WhiteNoise
 from avmsf.bench.diffsoundmethod import DiffSoundMethod
@@ -14,10 +14,14 @@ from avmsf.bench.gridfield import PAPER_GRID, QUICK_GRID, GridField
 from avmsf.bench.interpolation import SplineGains
 from avmsf.bench.recorded import Recorded
 from avmsf.bench.renderer import Renderer
+from avmsf.bench.sonicgaussmethod import PUBLISHED, SMALL, SmallSonicGaussMethod, SonicGaussMethod
 from avmsf.bench.spectralmean import MeanSpectra
 from avmsf.bench.task import Method, Task
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.diffsound import DiffSound
+from avmsf.evaluation.sonicgauss.published_renderer import PublishedRenderer
+from avmsf.evaluation.sonicgauss.small import COMMAND
+from avmsf.evaluation.sonicgauss.small_renderer import SmallRenderer
 from avmsf.field.config import PAPER
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.finders import ShortTime
@@ -149,30 +153,41 @@ SIMULATIONS = (DiffSoundMethod("diffsound"), DiffSoundMethod("diffsound-weighted
 """Other systems, built from their publications."""
 
 METHODS: dict[str, Method] = {method.name: method for method in (*BASELINES, *SIMULATIONS, *FIELDS)}
-"""All methods but `recorded:FOLDER`, in the order of tables."""
+"""All methods but those that take a path, in the order of tables."""
 
 
 def method_named(name: str) -> Method:
     """Return the method of this name. Raises EvaluationError that lists the known ones."""
     if name in METHODS:
         return METHODS[name]
+    if name.partition(":")[0] == PUBLISHED[:-1]:
+        return SonicGaussMethod(_given(name, PUBLISHED, "a folder", "with the published weights"))
+    if name.partition(":")[0] == SMALL[:-1]:
+        return SmallSonicGaussMethod(_given(name, SMALL, "a file", f"which this makes: {COMMAND}"))
     if name.startswith(_RECORDED):
-        folder = Path(name.removeprefix(_RECORDED)).expanduser()
-        if name == _RECORDED or not folder.is_dir():
-            raise EvaluationError(
-                f"{name}: expected a folder after `{_RECORDED}`, with a folder of wav files for every object, found "
-                "none of this name"
-            )
-        return RecordedMethod(folder)
+        return RecordedMethod(_given(name, _RECORDED, "a folder", "with a folder of wav files for every object"))
     near = difflib.get_close_matches(name, METHODS, n=1)
     guess = f"; did you mean {near[0]}?" if near else ""
-    raise EvaluationError(f"no method is called {name!r}: there are {', '.join(METHODS)} and recorded:FOLDER{guess}")
+    raise EvaluationError(
+        f"no method is called {name!r}: there are {', '.join(METHODS)}, {PUBLISHED}FOLDER, {SMALL}FILE and "
+        f"{_RECORDED}FOLDER{guess}"
+    )
+
+
+def _given(name: str, prefix: str, kind: Literal["a folder", "a file"], use: str) -> Path:
+    """Return the path in a method's name. Raises EvaluationError where nothing is there."""
+    path = Path(name.removeprefix(prefix)).expanduser()
+    if name in (prefix, prefix[:-1]) or not (path.is_dir() if kind == "a folder" else path.is_file()):
+        raise EvaluationError(f"{name}: expected {kind} after `{prefix}`, {use}; found none of this name")
+    return path
 
 
 def report_of(renderer: Renderer) -> dict[str, Any]:
     """Return what a method chose on its way to a renderer, as plain values; empty where it had no choice."""
     if isinstance(renderer, SoundField):
         return renderer.origin.report
+    if isinstance(renderer, SmallRenderer | PublishedRenderer):
+        return dict(renderer.report)
     if isinstance(renderer, SplineGains | DiffSound):
         return renderer.report
     if isinstance(renderer, MeanGains | MeanSpectra | MeanWaveform):

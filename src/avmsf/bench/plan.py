@@ -15,6 +15,7 @@ from avmsf.fem.family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
 from avmsf.scene.features import FeatureField
+from avmsf.scene.gaussians import GaussianCloud
 
 
 @runtime_checkable
@@ -39,6 +40,15 @@ class BodyMaker(Protocol):
         ...
 
 
+@runtime_checkable
+class CloudMaker(Protocol):
+    """Makes an object's Gaussians."""
+
+    def __call__(self, identifier: str, views: int | None = None) -> GaussianCloud:
+        """Return an object's Gaussians, from at most `views` views. Raises SceneError where nothing shows its look."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """What is evaluated, on what, and how."""
@@ -57,6 +67,8 @@ class Evaluation:
     """How modes are found, once a case."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Plain values that decide the features."""
+    clouds: CloudMaker | None = None
+    """None where no method reads Gaussians."""
 
     def begin(self, results: ResultsFolder) -> None:
         """Take a folder for this evaluation's results.

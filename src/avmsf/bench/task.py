@@ -14,6 +14,7 @@ from avmsf.fem.family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.scene.features import FeatureField
+from avmsf.scene.gaussians import GaussianCloud
 
 Look = Literal["positions", "visual", "unaligned", "paper", "paper-positions", "paper-unaligned"]
 """What a field reads of an object's points: positions alone; positions with what the places look like, made to obey the
@@ -23,6 +24,12 @@ features without symmetry pooling."""
 
 def _no_family() -> BodyFamily:
     raise EvaluationError("the object's shape is not known: expected a mesh, or views of it")
+
+
+def _no_gaussians() -> GaussianCloud:
+    raise EvaluationError(
+        "the object has no Gaussians: expected views of it, its mesh, or a .ply of Gaussians in its folder"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +62,8 @@ class Task:
     """Computes the bodies that the object's surface may enclose, of any material. Raises AvmsfError likewise."""
     material: str | None = None
     """What the dataset says that the object is made of, in lower case; None where it does not."""
+    gaussians: Callable[[], GaussianCloud] = _no_gaussians
+    """Fits Gaussians to the object's views. Raises AvmsfError where nothing shows its look."""
 
 
 @runtime_checkable

@@ -174,7 +174,7 @@ def evaluation_of(
     settings = {"scene": asdict(scene), "paper": asdict(paper), "geometry": geometry, "body": asdict(body)}
     looks, bodies = ObjectLooks(dataset, kept, scene, paper), ObjectBodies(dataset, kept, geometry, body, scene)
     finder = HighResolution(modes=modes)
-    return Evaluation(dataset, title, protocol, methods, looks, bodies, seed, judging, finder, settings)
+    return Evaluation(dataset, title, protocol, methods, looks, bodies, seed, judging, finder, settings, looks.cloud)
 
 
 def run_shown(

@@ -11,9 +11,12 @@ from avmsf.errors import SceneError
 from avmsf.pipeline.config import PRESETS
 from avmsf.pipeline.features import LiftConfig
 from avmsf.pipeline.scene import FEATURES, SceneConfig, SceneStages
+from avmsf.pipeline.sources import ViewsConfig
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.ply import read_splats
 
 NAMES: Mapping[Look, str] = {
     "unaligned": "unaligned.safetensors",
@@ -41,26 +44,35 @@ class ObjectLooks:
         object that nothing shows, they are its surface's, or fill the box of its contacts. Raises SceneError for the
         looks of such an object, and DatasetError for an unknown one.
         """
-        seen = self.dataset.look(identifier)
         bare = look.endswith("positions")
-        if seen is None and bare:
+        if bare and self.dataset.look(identifier) is None:
             return self._bare(identifier)
-        if seen is None:
-            raise SceneError(f"{identifier}: the dataset holds neither a mesh nor pictures of it, so it has no looks")
         lift = self.paper if look.startswith("paper") else self.config.lift
         lift = replace(lift, symmetry=not look.endswith("unaligned"))
-        config = replace(self.config, lift=lift, views=replace(self.config.views, count=views or 0))
-        place = self.cache / identifier / ("all views" if views is None else f"{views} views")
-        stages = SceneStages(
-            seen.folder,
-            StageFolder(place),
-            config,
-            settings=seen.settings,
-            name=NAMES.get(look, FEATURES),
-        )
+        stages = self._stages(identifier, replace(self.config, lift=lift), views, name=NAMES.get(look, FEATURES))
         with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
             features = load_features(stages.features.path)
         return FeatureField.from_points(features.points) if bare else features
+
+    def cloud(self, identifier: str, views: int | None = None) -> GaussianCloud:
+        """Return an object's Gaussians: those in its folder, or fitted to its views, or to pictures of its mesh.
+
+        Raises SceneError where nothing shows the object.
+        """
+        # Other methods may look at the mesh alone; those that ask for Gaussians have the best that shows the object.
+        config = replace(self.config, views=replace(self.config.views, source=ViewsConfig().source))
+        stages = self._stages(identifier, config, views)
+        with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
+            return read_splats(stages.cloud.path)
+
+    def _stages(self, identifier: str, config: SceneConfig, views: int | None, name: str = FEATURES) -> SceneStages:
+        """Return the stages from what shows an object. Raises SceneError where nothing does."""
+        seen = self.dataset.look(identifier)
+        if seen is None:
+            raise SceneError(f"{identifier}: the dataset holds neither a mesh nor pictures of it, so it has no looks")
+        config = replace(config, views=replace(config.views, count=views or 0))
+        place = self.cache / identifier / ("all views" if views is None else f"{views} views")
+        return SceneStages(seen.folder, StageFolder(place), config, settings=seen.settings, name=name)
 
     def _bare(self, identifier: str) -> FeatureField:
         capture = self.dataset.capture(identifier)

@@ -1,0 +1,40 @@
+"""The small SonicGauss: its training from scratch, by one command, and the method beside the others."""
+
+import time
+from pathlib import Path
+
+from avmsf.bench.sonicgaussmethod import SmallSonicGaussMethod
+from avmsf.evaluation.sonicgauss.objects import training_objects, training_recipes
+from avmsf.evaluation.sonicgauss.pretraining import PretrainingConfig, pretrain
+from avmsf.evaluation.sonicgauss.small import SmallConfig
+from avmsf.evaluation.sonicgauss.tuning import TrainingConfig
+from benchmarks.report import Report, Table, tell
+
+OBJECTS = 40
+"""Simulated objects, 32 recordings each."""
+_QUICK = PretrainingConfig(SmallConfig(blocks=1, encoder_blocks=1), TrainingConfig(steps=4, batch=8, rate=1e-3))
+
+
+def train_small(weights: Path, *, cache: Path | None, quick: bool) -> Report:
+    """Make training objects, train on them, write the weights, and return the curve of the loss."""
+    config = _QUICK if quick else PretrainingConfig()
+    begun = time.process_time()
+    objects = list(training_objects(training_recipes(2 if quick else OBJECTS), cache=cache, tell=tell))
+    made = time.process_time() - begun
+    found = pretrain(objects, config, tell=tell)
+    found.write(weights)
+    losses = [float(value) for value in found.report["losses"]]
+    rows: list[list[str | float]] = [[f"{(place + 1) / len(losses):.0%}", value] for place, value in enumerate(losses)]
+    figures = {
+        "sonicgauss_small.objects_seconds": made,
+        "sonicgauss_small.training_seconds": float(found.report["seconds"]),
+        "sonicgauss_small.first_loss": losses[0],
+        "sonicgauss_small.last_loss": losses[-1],
+    }
+    title = f"sonicgauss-small: loss by part of {found.report['steps']} steps, {found.report['clips']} recordings"
+    return Report(tables=(Table(title, ("steps", "loss"), rows),), figures=figures)
+
+
+def small_method(weights: Path) -> tuple[SmallSonicGaussMethod, ...]:
+    """Return the method of weights that have been made."""
+    return (SmallSonicGaussMethod(weights),) if weights.is_file() else ()

@@ -1,0 +1,68 @@
+"""An object's Gaussians in an evaluation: those of its folder, or an error where nothing shows it."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from avmsf.bench.baselines import NearestStrike
+from avmsf.bench.judging import Judging
+from avmsf.bench.plan import Evaluation
+from avmsf.bench.protocols import PROTOCOLS
+from avmsf.bench.results import ResultsFolder
+from avmsf.bench.run import run_object
+from avmsf.bench.task import Task
+from avmsf.capture.datasets import CaptureCollection
+from avmsf.errors import SceneError
+from avmsf.pipeline.objectlooks import ObjectLooks
+from avmsf.scene.gaussians import GaussianCloud
+from avmsf.scene.ply import write_splats
+from plate_capture import fill_plate
+from plate_set import NoBodies, PlateLooks, fill_plates
+from sonicgauss_cases import cloud
+
+
+def test_given_gaussians_are_read_and_an_object_that_nothing_shows_is_refused(tmp_path: Path) -> None:
+    for name in ("shown", "hidden"):
+        fill_plate(tmp_path / "set" / name, surface=False)
+    given = cloud(200)
+    write_splats(given, tmp_path / "set" / "shown" / "splats.ply")
+    looks = ObjectLooks(CaptureCollection(tmp_path / "set"), tmp_path / "cache")
+    assert torch.equal(looks.cloud("shown").centers, given.centers)
+    assert torch.equal(looks.cloud("shown", views=12).centers, given.centers)
+    with pytest.raises(SceneError):
+        looks.cloud("hidden")
+
+
+def test_methods_get_the_gaussians_of_their_object_and_views(tmp_path: Path) -> None:
+    folder = fill_plates(tmp_path / "plates")
+    asked = []
+
+    def clouds(identifier: str, views: int | None = None) -> GaussianCloud:
+        asked.append((identifier, views))
+        return cloud(7)
+
+    class Asking:
+        name = "asking"
+
+        def fit(self, task: Task) -> NearestStrike:
+            assert len(task.gaussians()) == 7
+            return NearestStrike(task.train)
+
+    for number, given in enumerate((clouds, None)):
+        results = ResultsFolder(tmp_path / f"results {number}")
+        evaluation = Evaluation(
+            CaptureCollection(folder),
+            "plates",
+            PROTOCOLS["farthest"],
+            (Asking(),),
+            PlateLooks(),
+            NoBodies(),
+            judging=Judging(cdpam=False),
+            clouds=given,
+        )
+        run_object(evaluation, "a", results)
+        record = results.read("a")
+        assert record is not None
+        assert (record.outcomes[0].failure is None) == (given is not None)
+    assert asked == [("a", None)]
