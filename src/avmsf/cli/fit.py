@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
@@ -23,6 +23,7 @@ from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import GainModel, estimator_for
 from avmsf.field.recipes import GainRecipe
 from avmsf.field.soundfield import SoundField
@@ -31,6 +32,7 @@ from avmsf.modal.extraction.extract import extract_once
 from avmsf.modal.extraction.finders import ExtractionMethod, finder_named
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero, with_record
+from avmsf.pipeline.guess import guess_field, known_surface
 from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.scene.features import FeatureField
@@ -49,15 +51,19 @@ _SHOWN = 8
 class Options:
     """Fit a sound field to a capture and write it to one file.
 
-    An interrupted fit leaves its state beside the output; the same command goes on from it to the same result.
+    Without recordings, a mesh and --material give a guess. An interrupted fit leaves its state beside the output; the
+    same command goes on from it to the same result.
     """
 
     capture: tyro.conf.Positional[Path]
-    """Folder with impacts.csv and the wav files it names."""
+    """Folder with impacts.csv and the wav files it names; with --material, a folder with a mesh, or a mesh file."""
     output: Annotated[Path, tyro.conf.arg(metavar="FIELD.safetensors")]
     """File to write the field to."""
     settings: Path | None = None
     """A capture.toml to use in place of the folder's own."""
+    material: str | None = None
+    """Guess the field of an object without recordings from its mesh and its material: ceramic, glass, wood, plastic,
+    iron, polycarbonate or steel."""
     train_fraction: float | None = None
     """Fit to all recordings at this part of the places, spread as far apart as they go, and score the field on the
     others. Contacts nearer than 1 % of the extent of all are one place."""
@@ -128,6 +134,8 @@ def run(options: Options) -> int:
     """Fit, write, and say what came of it; return 130 where Ctrl-C stopped it."""
     expect_writable(options.output)
     known = settings_of(options.capture) if options.settings is None else CaptureSettings.read(options.settings)
+    if options.material is not None:
+        return _run_guess(options, options.material, known)
     capture = read_capture(options.capture, options.pipeline.capture_settings(known))
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
@@ -202,6 +210,51 @@ def run(options: Options) -> int:
             }
         )
     return 0
+
+
+def _run_guess(options: Options, material: str, settings: CaptureSettings) -> int:
+    """Guess, write, and say what it is."""
+    refuse_with_material(options)
+    guessed = guess_field(
+        known_surface(options.capture, settings),
+        material,
+        body=options.body,
+        modes=options.modes,
+        config=options.config,
+        settings=settings,
+        name=settings.name or options.capture.resolve().stem,
+        cache=_beside(options.output, "bodies"),
+        tell=say,
+    )
+    guessed = with_record(guessed, options.pipeline, {})
+    save(guessed, options.output)
+    show_guess(guessed, options.output, json=options.json)
+    return 0
+
+
+def refuse_with_material(options: Any) -> None:
+    """Raise FitError for options of `fit` or `reconstruct` that need recordings, given with --material."""
+    names = ("train_fraction", "train_count", "features")
+    given = [name for name in names if getattr(options, name, None) is not None]
+    if options.gain_model not in ("auto", Elastic.kind):
+        given.append("gain_model")
+    if given:
+        raise FitError(
+            f"--material guesses a field without recordings, which --{given[0].replace('_', '-')} needs: leave one of "
+            "them out"
+        )
+
+
+def show_guess(guessed: SoundField, output: Path, *, json: bool) -> None:
+    """Say what a guessed field in the file `output` is."""
+    screen = console(errors=json)
+    for words in quality_words(guessed, output):
+        screen.print(words, soft_wrap=True)
+    screen.print(f"wrote {output}", soft_wrap=True)
+    if json:
+        report = guessed.origin.report
+        values = {"field": str(output), "capture": guessed.origin.capture, "modes": len(guessed.bank)}
+        print_json(values | {"sample_rate": guessed.sample_rate, "trained_on": [], "report": report})
 
 
 def _estimator(options: Options, capture: Capture, train: Impacts) -> GainRecipe:

@@ -7,10 +7,17 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.capture import read_capture
+from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
-from avmsf.cli.fit import describe_outliers, part_contacts, preset_of, summary
+from avmsf.cli.fit import (
+    describe_outliers,
+    part_contacts,
+    preset_of,
+    refuse_with_material,
+    show_guess,
+    summary,
+)
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
@@ -27,7 +34,7 @@ from avmsf.modal.extraction.finders import ExtractionMethod
 from avmsf.pipeline.bodies import BodyConfig
 from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
 from avmsf.pipeline.features import LiftConfig
-from avmsf.pipeline.reconstruct import reconstruct
+from avmsf.pipeline.reconstruct import reconstruct, reconstruct_guess
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig
 from avmsf.pipeline.stages import StageFolder
@@ -44,6 +51,8 @@ class Options(SceneOptions):
 
     output: Annotated[Path | None, tyro.conf.arg(metavar="FIELD.safetensors")] = None
     """File to copy the field to."""
+    material: str | None = None
+    """Guess the field of an object without recordings from its shape and its material; see `avmsf fit --help`."""
     train_fraction: float | None = None
     """Fit to all recordings at this part of the places, spread as far apart as they go, and score the field on the
     others. Contacts nearer than 1 % of the extent of all are one place."""
@@ -105,6 +114,8 @@ def run(options: Options) -> int:
     if options.output is not None:
         expect_writable(options.output)
     settings = options.pipeline.capture_settings(options.read_settings())
+    if options.material is not None:
+        return _run_guess(options, options.material, settings)
     capture = read_capture(options.folder, settings)
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
@@ -165,6 +176,28 @@ def run(options: Options) -> int:
                 "scores": score_values(scores),
             }
         )
+    return 0
+
+
+def _run_guess(options: Options, material: str, settings: CaptureSettings) -> int:
+    """Guess, write, and say what it is."""
+    refuse_with_material(options)
+    try:
+        with SceneBar() as bar, StageFolder(options.kept).lock("avmsf reconstruct"):
+            made = reconstruct_guess(
+                options.folder,
+                material,
+                options.pipeline,
+                cache=options.kept,
+                settings=settings,
+                listener=bar.listener,
+            )
+            if options.output is not None:
+                copy_whole(made, options.output)
+    except KeyboardInterrupt:
+        say("avmsf reconstruct: interrupted; the same command goes on from where it was")
+        return INTERRUPTED
+    show_guess(load(made), options.output or made, json=options.json)
     return 0
 
 

@@ -1,36 +1,48 @@
-"""How loud a vibrating body is without a listener's place: the pressure of each mode, averaged over directions.
+"""How loud a vibrating body is where the listener's place is not known: mean square pressures over all directions.
 
-A body of surface area S whose mode vibrates with the normal velocity v_n radiates the power
-
-    W = rho c sigma(k a) integral of <v_n^2> over S,   sigma(k a) = (k a)^2 / (1 + (k a)^2),   a = sqrt(S / (4 pi)),
-
-with the radiation efficiency sigma of a pulsating sphere of the same area, k the wavenumber in air (Fahy and Gardonio,
-*Sound and Structural Vibration*, 2007, sections 3.2 and 3.3). At the distance r the mean square pressure over all
-directions is rho c W / (4 pi r^2). The efficiency holds for parts of the surface that move alike. Parts that move
-against each other cancel in part at low frequencies, so the lowest modes are quieter than that.
+The pressure in one direction is that of `avmsf.simulate.radiation`: Kirchhoff's and Helmholtz's integral, with the
+pressure on the surface that a plane wave would have. A pulsating sphere of the same area, which is often taken (Fahy
+and Gardonio, *Sound and Structural Vibration*, 2007, chapter 3), makes the lowest modes of vessels and pans 10 to 20 dB
+too loud: their parts move against each other, and cancel.
 """
 
 import math
 
+import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.simulate.elastic import ElasticModes
-from avmsf.simulate.radiation import AIR_DENSITY, SOUND_SPEED, surface_patches
+from avmsf.simulate.radiation import radiated
+from avmsf.simulate.vibration import Vibration
 
 DISTANCE = 1.0
-"""Meters at which pressures are stated."""
+"""Meters that pressures are stated for."""
+DIRECTIONS = 64
+"""Directions that are averaged: twice as many change the level of a mode by less than .3 dB on average."""
+_FAR = 100.0
+"""Distance of the microphones over the body's size. Pressures go with 1/distance from there on."""
 
 
-def radiated_pressure(modes: ElasticModes) -> Float64[Tensor, " modes"]:
-    """Return the pressure amplitude of each mode at `DISTANCE`, root mean square over directions, for unit momentum.
+def radiated_pressure(
+    modes: ElasticModes, vibration: Vibration, *, directions: int = DIRECTIONS
+) -> Float64[Tensor, " modes"]:
+    """Return the pressure of each damped mode for a push of one newton second on it alone, pascals.
 
-    In pascals per (kg^.5 m/s) of modal momentum: times the component of the mode shape along an impact of one newton
-    second (`ElasticModes.gains`) it is the amplitude in pascals.
+    The root mean square over directions of its amplitude in the far field, stated for a distance of `DISTANCE`.
     """
-    _, outward, motion = surface_patches(modes)
-    area = outward.norm(dim=1)
-    squares = area @ motion.square()
-    wave = 2.0 * math.pi * modes.frequency / SOUND_SPEED * math.sqrt(float(area.sum()) / (4.0 * math.pi))
-    efficiency = wave.square() / (1.0 + wave.square())
-    return AIR_DENSITY * SOUND_SPEED / DISTANCE * (efficiency * squares / (4.0 * math.pi)).sqrt()
+    middle = 0.5 * (modes.nodes.amax(0) + modes.nodes.amin(0))
+    reach = _FAR * float((modes.nodes.amax(0) - modes.nodes.amin(0)).norm())
+    power = torch.zeros(len(vibration.poles), dtype=torch.float64)
+    for way in _evenly(directions):
+        power += radiated(modes, vibration, middle + reach * way).abs().square()
+    return reach / DISTANCE * (power / directions).sqrt()
+
+
+def _evenly(count: int) -> Float64[Tensor, "count 3"]:
+    """Return unit vectors on a spherical Fibonacci lattice (Gonzalez, Mathematical Geosciences 42, 2010)."""
+    row = torch.arange(count, dtype=torch.float64)
+    height = 1.0 - (2.0 * row + 1.0) / count
+    turn = row * math.pi * (3.0 - math.sqrt(5.0))
+    flat = (1.0 - height.square()).sqrt()
+    return torch.stack([flat * torch.cos(turn), flat * torch.sin(turn), height], dim=1)

@@ -44,7 +44,7 @@ def radiated(
     `microphone` is a place in the object frame, metres. `retardation` scales the differences of the patches' delays:
     0 hears the whole body at once. Raises SimulationError for a microphone closer than `CLOSEST` to the surface.
     """
-    places, outward, motion = surface_patches(modes)
+    places, outward, motion = _patches(modes)
     towards = microphone - places
     distance = towards.norm(dim=1)
     nearest = float(distance.min())
@@ -74,7 +74,7 @@ def travel_time(modes: ElasticModes, microphone: Float64[Tensor, " 3"]) -> float
     return float((microphone - middles).norm(dim=1).min()) / SOUND_SPEED
 
 
-def surface_patches(
+def _patches(
     modes: ElasticModes,
 ) -> tuple[Float64[Tensor, "patches 3"], Float64[Tensor, "patches 3"], Float64[Tensor, "patches modes"]]:
     """Return places, outward normals times area, and normal displacement of each mode, three patches a triangle.
