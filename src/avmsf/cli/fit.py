@@ -9,6 +9,7 @@ import torch
 import tyro
 
 from avmsf._utils.caching import discard
+from avmsf._utils.device import usable_device
 from avmsf.bench.evaluation import split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.folder import settings_of
@@ -84,6 +85,9 @@ class Options:
     """Most modes to keep."""
     time_zero: TimeZero | None = None
     """Where sounds start: onset, or peak (paper); capture.toml decides where this does not."""
+    device: str | None = None
+    """What computes: cpu, or cuda; the GPU where there is one. On it run training end to end, its spectral loss
+    and the network; the modes, clusters, finite elements and the Gaussian process run on the CPU."""
     json: bool = False
     """Print one JSON object on the standard output, all else on the standard error."""
     preset: Preset = "default"
@@ -97,7 +101,8 @@ class Options:
     def pipeline(self) -> PipelineConfig:
         """All settings as one; those of views and features are the features' file's own."""
         scene = SceneConfig()
-        return PipelineConfig(self.gain_model, self.body, scene, self.config, self.method, self.modes, self.time_zero)
+        start, place = self.time_zero, self.device
+        return PipelineConfig(self.gain_model, self.body, scene, self.config, self.method, self.modes, start, place)
 
 
 @dataclass(frozen=True)
@@ -133,6 +138,7 @@ def preset_of(words: Sequence[str]) -> Preset:
 def run(options: Options) -> int:
     """Fit, write, and say what came of it; return 130 where Ctrl-C stopped it."""
     expect_writable(options.output)
+    usable_device(options.device, raising=FitError)
     known = settings_of(options.capture) if options.settings is None else CaptureSettings.read(options.settings)
     if options.material is not None:
         return _run_guess(options, options.material, known)
@@ -167,6 +173,7 @@ def run(options: Options) -> int:
                 settings=capture.settings,
                 checkpoint=checkpoint,
                 progress=bar.show,
+                device=options.device,
             )
     except KeyboardInterrupt:
         where = f"from {checkpoint}, or delete it" if checkpoint.exists() else "from the start of training"

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from avmsf._utils.device import usable_device
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
@@ -25,6 +26,7 @@ from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import SceneOptions, features_words
 from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
 from avmsf.cli.writing import expect_writable
+from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import Progress
 from avmsf.field.gains.estimator import GainModel
@@ -66,6 +68,10 @@ class Options(SceneOptions):
     """Most modes to keep."""
     time_zero: TimeZero | None = None
     """Where sounds start: onset, or peak (paper); capture.toml decides where this does not."""
+    device: str | None = None
+    """What computes: cpu, or cuda; the GPU where there is one. On it run the Gaussians
+    (with gsplat), DINOv2, training end to end, its spectral loss
+    and the network; the modes, clusters, finite elements and the Gaussian process run on the CPU."""
     json: bool = False
     """Print one JSON object on the standard output, all else on the standard error."""
     gain_model: GainModel = "auto"
@@ -83,7 +89,8 @@ class Options(SceneOptions):
     def pipeline(self) -> PipelineConfig:
         """All settings as one."""
         scene = SceneConfig(self.views, self.splat, self.lift)
-        return PipelineConfig(self.gain_model, self.body, scene, self.fit, self.method, self.modes, self.time_zero)
+        start, place = self.time_zero, self.device
+        return PipelineConfig(self.gain_model, self.body, scene, self.fit, self.method, self.modes, start, place)
 
 
 @dataclass(frozen=True)
@@ -113,6 +120,7 @@ def run(options: Options) -> int:
     """Reconstruct, and say what came of it; return 130 where Ctrl-C stopped it."""
     if options.output is not None:
         expect_writable(options.output)
+    usable_device(options.device, raising=FitError)
     settings = options.pipeline.capture_settings(options.read_settings())
     if options.material is not None:
         return _run_guess(options, options.material, settings)

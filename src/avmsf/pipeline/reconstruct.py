@@ -150,6 +150,7 @@ def _reconstruct(
             settings=capture.settings,
             checkpoint=stages.checkpoint(FIELD),
             progress=fitting,
+            device=config.device,
         )
         save(with_record(fitted, config, shape.report), path)
 
@@ -192,7 +193,9 @@ def reconstruct_guess(
         mesh = find_surface(folder, settings)
         scene = None
         if mesh is None or not len(mesh.faces):
-            scene = SceneStages(folder, stages, config.scene, settings=settings, listener=listener)
+            scene = SceneStages(
+                folder, stages, config.scene, settings=settings, listener=listener, device=config.device
+            )
             scene.expect_any()
             if scene.source is not None and scene.source.kind in ("photographs", "video"):
                 raise SceneError(
@@ -268,7 +271,7 @@ def _shape(
     settings: CaptureSettings,
     listener: Listener,
 ) -> _Shape:
-    scene = SceneStages(folder, stages, config.scene, settings=settings, listener=listener)
+    scene = SceneStages(folder, stages, config.scene, settings=settings, listener=listener, device=config.device)
     bare = capture.surface is not None and not len(capture.surface.faces)
     if not scene or (bare and scene.source is not None and scene.source.kind == "mesh"):
         if capture.surface is None:
