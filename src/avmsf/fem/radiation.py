@@ -2,7 +2,7 @@
 
 The pressure in one direction is that of `avmsf.simulate.radiation`: Kirchhoff's and Helmholtz's integral, with the
 pressure on the surface that a plane wave would have. A pulsating sphere of the same area, which is often taken (Fahy
-and Gardonio, *Sound and Structural Vibration*, 2007, chapter 3), makes the lowest modes of vessels and pans 10 to 20 dB
+and Gardonio, *Sound and Structural Vibration*, 2007, chapter 3), makes the lowest modes of vessels and pans 8 to 26 dB
 too loud: their parts move against each other, and cancel.
 """
 

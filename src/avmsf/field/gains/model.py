@@ -238,8 +238,8 @@ class MixtureGains:
             named["features"] = family.features
         for row, group in enumerate(group for family in self._of(Symmetric) for group in family.groups):
             named |= {f"groups.{row}.{name}": getattr(group, name) for name in ("motions", "characters")}
-        for row, family in enumerate(self._of(Elastic)):
-            named |= {f"bodies.{row}.{name}": each for name, each in mode_tensors(family.modes).items()}
+        for row, modes in enumerate(family.modes for family in self._of(Elastic)):
+            named |= {f"bodies.{row}.{name}": each for name, each in mode_tensors(modes).items()}
         return named
 
     @classmethod
