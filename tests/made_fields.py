@@ -1,12 +1,14 @@
 """One gain field of every kind, for a plate whose mode shapes are known in closed form, made in a moment."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import torch
 
 from avmsf.field.attention import AttentionGains, AttentionShape
 from avmsf.field.gainfield import GainField
+from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import KernelFamily, Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
@@ -104,6 +106,13 @@ def elastic() -> MixtureGains:
     return mixture(impacts, 1.1 * values, body, directional=True).judged_by(values)
 
 
+def body() -> BodyGains:
+    """Return what the plate's own modes alone say."""
+    known, count = plate(), len(BANK)
+    modes = replace(known, frequency=known.frequency[:count], shapes=known.shapes[:, :count].float().double())
+    return BodyGains(places(150, seed=0).float(), modes)
+
+
 FIELDS: dict[str, Callable[[], GainField]] = {
     "attention": cache(attention),
     "attention with dampings": cache(lambda: attention(spatial_damping=True)),
@@ -112,5 +121,6 @@ FIELDS: dict[str, Callable[[], GainField]] = {
     "positional, few contacts": cache(lambda: positional(4)),
     "directional": cache(directional),
     "elastic": cache(elastic),
+    "body": cache(body),
 }
 """All there are, by what tests call them; the same object at every call."""

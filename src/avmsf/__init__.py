@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from avmsf.modal.pulse import ForcePulse
     from avmsf.modal.residual import Residual
     from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
+    from avmsf.pipeline.guess import guess_field
     from avmsf.scene.descriptors import ImageDescriptors
     from avmsf.scene.dino import DinoEncoder
     from avmsf.scene.features import FeatureField
@@ -105,6 +106,7 @@ __all__ = [
     "find_foreground",
     "find_symmetries",
     "fit",
+    "guess_field",
     "lift",
     "load",
     "load_features",
@@ -199,6 +201,7 @@ _HOMES = {
     "avmsf.modal.extraction.finders": ("HighResolution", "ShortTime"),
     "avmsf.modal.residual": ("Residual",),
     "avmsf.pipeline.bodies": ("BodyConfig", "candidate_bodies"),
+    "avmsf.pipeline.guess": ("guess_field",),
     "avmsf.tasks.locate": ("locate",),
     "avmsf.tasks.locator": ("Locator",),
     "avmsf.tasks.severalblows": ("locate_blows",),

@@ -24,7 +24,7 @@ FARTHEST = 100.0
 """Metres from the origin beyond which a contact cannot be meant."""
 HOW_TO_WRITE = (
     f"{TABLE} has the header line file,x,y,z (and if known nx,ny,nz,force_newtons) and one row a recording, "
-    "for example: 001.wav,0.12,0.05,0.30"
+    "for example: 001.wav,0.12,0.05,0.30. Without recordings, avmsf fit --material NAME guesses a field from the shape"
 )
 
 

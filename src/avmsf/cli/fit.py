@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
 
 from avmsf._utils.caching import discard
+from avmsf._utils.device import usable_device
 from avmsf.bench.evaluation import split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.folder import settings_of
@@ -23,6 +24,7 @@ from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import GainModel, estimator_for
 from avmsf.field.recipes import GainRecipe
 from avmsf.field.soundfield import SoundField
@@ -31,6 +33,7 @@ from avmsf.modal.extraction.extract import extract_once
 from avmsf.modal.extraction.finders import ExtractionMethod, finder_named
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero, with_record
+from avmsf.pipeline.guess import guess_field, known_surface
 from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.scene.features import FeatureField
@@ -49,15 +52,19 @@ _SHOWN = 8
 class Options:
     """Fit a sound field to a capture and write it to one file.
 
-    An interrupted fit leaves its state beside the output; the same command goes on from it to the same result.
+    Without recordings, a mesh and --material give a guess. An interrupted fit leaves its state beside the output; the
+    same command goes on from it to the same result.
     """
 
     capture: tyro.conf.Positional[Path]
-    """Folder with impacts.csv and the wav files it names."""
+    """Folder with impacts.csv and the wav files it names; with --material, a folder with a mesh, or a mesh file."""
     output: Annotated[Path, tyro.conf.arg(metavar="FIELD.safetensors")]
     """File to write the field to."""
     settings: Path | None = None
     """A capture.toml to use in place of the folder's own."""
+    material: str | None = None
+    """Guess the field of an object without recordings from its mesh and its material: ceramic, glass, wood, plastic,
+    iron, polycarbonate or steel."""
     train_fraction: float | None = None
     """Fit to all recordings at this part of the places, spread as far apart as they go, and score the field on the
     others. Contacts nearer than 1 % of the extent of all are one place."""
@@ -78,6 +85,9 @@ class Options:
     """Most modes to keep."""
     time_zero: TimeZero | None = None
     """Where sounds start: onset, or peak (paper); capture.toml decides where this does not."""
+    device: str | None = None
+    """What computes: cpu, or cuda; the GPU where there is one. On it run training end to end, its spectral loss
+    and the network; the modes, clusters, finite elements and the Gaussian process run on the CPU."""
     json: bool = False
     """Print one JSON object on the standard output, all else on the standard error."""
     preset: Preset = "default"
@@ -91,7 +101,8 @@ class Options:
     def pipeline(self) -> PipelineConfig:
         """All settings as one; those of views and features are the features' file's own."""
         scene = SceneConfig()
-        return PipelineConfig(self.gain_model, self.body, scene, self.config, self.method, self.modes, self.time_zero)
+        start, place = self.time_zero, self.device
+        return PipelineConfig(self.gain_model, self.body, scene, self.config, self.method, self.modes, start, place)
 
 
 @dataclass(frozen=True)
@@ -127,7 +138,10 @@ def preset_of(words: Sequence[str]) -> Preset:
 def run(options: Options) -> int:
     """Fit, write, and say what came of it; return 130 where Ctrl-C stopped it."""
     expect_writable(options.output)
+    usable_device(options.device, raising=FitError)
     known = settings_of(options.capture) if options.settings is None else CaptureSettings.read(options.settings)
+    if options.material is not None:
+        return _run_guess(options, options.material, known)
     capture = read_capture(options.capture, options.pipeline.capture_settings(known))
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
@@ -159,6 +173,7 @@ def run(options: Options) -> int:
                 settings=capture.settings,
                 checkpoint=checkpoint,
                 progress=bar.show,
+                device=options.device,
             )
     except KeyboardInterrupt:
         where = f"from {checkpoint}, or delete it" if checkpoint.exists() else "from the start of training"
@@ -202,6 +217,51 @@ def run(options: Options) -> int:
             }
         )
     return 0
+
+
+def _run_guess(options: Options, material: str, settings: CaptureSettings) -> int:
+    """Guess, write, and say what it is."""
+    refuse_with_material(options)
+    guessed = guess_field(
+        known_surface(options.capture, settings),
+        material,
+        body=options.body,
+        modes=options.modes,
+        config=options.config,
+        settings=settings,
+        name=settings.name or options.capture.resolve().stem,
+        cache=_beside(options.output, "bodies"),
+        tell=say,
+    )
+    guessed = with_record(guessed, options.pipeline, {})
+    save(guessed, options.output)
+    show_guess(guessed, options.output, json=options.json)
+    return 0
+
+
+def refuse_with_material(options: Any) -> None:
+    """Raise FitError for options of `fit` or `reconstruct` that need recordings, given with --material."""
+    names = ("train_fraction", "train_count", "features")
+    given = [name for name in names if getattr(options, name, None) is not None]
+    if options.gain_model not in ("auto", Elastic.kind):
+        given.append("gain_model")
+    if given:
+        raise FitError(
+            f"--material guesses a field without recordings, which --{given[0].replace('_', '-')} needs: leave one of "
+            "them out"
+        )
+
+
+def show_guess(guessed: SoundField, output: Path, *, json: bool) -> None:
+    """Say what a guessed field in the file `output` is."""
+    screen = console(errors=json)
+    for words in quality_words(guessed, output):
+        screen.print(words, soft_wrap=True)
+    screen.print(f"wrote {output}", soft_wrap=True)
+    if json:
+        report = guessed.origin.report
+        values = {"field": str(output), "capture": guessed.origin.capture, "modes": len(guessed.bank)}
+        print_json(values | {"sample_rate": guessed.sample_rate, "trained_on": [], "report": report})
 
 
 def _estimator(options: Options, capture: Capture, train: Impacts) -> GainRecipe:

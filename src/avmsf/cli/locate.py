@@ -87,8 +87,9 @@ def run(options: Options) -> int:
     say("avmsf locate: preparing gains over the surface and their reliability, once a run (seconds to minutes)")
     screen = console(errors=options.json)
     quality = known.field.quality
-    if quality is not None:
-        screen.print(quality.verdict, soft_wrap=True)
+    verdict = known.field.origin.report.get("guess") if quality is None else quality.verdict
+    if verdict is not None:
+        screen.print(verdict, soft_wrap=True)
     taken, found, failures = set[str](), list[dict[str, Any]](), list[dict[str, str]]()
     for path in options.recordings:
         if found:
@@ -109,7 +110,6 @@ def run(options: Options) -> int:
                 values |= _draw(contact, options.output, _name(path, taken), values, truth)
             found.append(values)
     if options.json:
-        verdict = None if quality is None else quality.verdict
         print_json({"field": str(options.field), "quality": verdict, "blows": found, "failures": failures})
     return UNLOCATED if failures or any(each["place"] is None for each in found) else 0
 

@@ -7,10 +7,18 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.capture import read_capture
+from avmsf._utils.device import usable_device
+from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
-from avmsf.cli.fit import describe_outliers, part_contacts, preset_of, summary
+from avmsf.cli.fit import (
+    describe_outliers,
+    part_contacts,
+    preset_of,
+    refuse_with_material,
+    show_guess,
+    summary,
+)
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
@@ -18,6 +26,7 @@ from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import SceneOptions, features_words
 from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
 from avmsf.cli.writing import expect_writable
+from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import Progress
 from avmsf.field.gains.estimator import GainModel
@@ -27,7 +36,7 @@ from avmsf.modal.extraction.finders import ExtractionMethod
 from avmsf.pipeline.bodies import BodyConfig
 from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
 from avmsf.pipeline.features import LiftConfig
-from avmsf.pipeline.reconstruct import reconstruct
+from avmsf.pipeline.reconstruct import reconstruct, reconstruct_guess
 from avmsf.pipeline.scene import SceneConfig
 from avmsf.pipeline.sources import ViewsConfig
 from avmsf.pipeline.stages import StageFolder
@@ -44,6 +53,8 @@ class Options(SceneOptions):
 
     output: Annotated[Path | None, tyro.conf.arg(metavar="FIELD.safetensors")] = None
     """File to copy the field to."""
+    material: str | None = None
+    """Guess the field of an object without recordings from its shape and its material; see `avmsf fit --help`."""
     train_fraction: float | None = None
     """Fit to all recordings at this part of the places, spread as far apart as they go, and score the field on the
     others. Contacts nearer than 1 % of the extent of all are one place."""
@@ -57,6 +68,10 @@ class Options(SceneOptions):
     """Most modes to keep."""
     time_zero: TimeZero | None = None
     """Where sounds start: onset, or peak (paper); capture.toml decides where this does not."""
+    device: str | None = None
+    """What computes: cpu, or cuda; the GPU where there is one. On it run the Gaussians
+    (with gsplat), DINOv2, training end to end, its spectral loss
+    and the network; the modes, clusters, finite elements and the Gaussian process run on the CPU."""
     json: bool = False
     """Print one JSON object on the standard output, all else on the standard error."""
     gain_model: GainModel = "auto"
@@ -74,7 +89,8 @@ class Options(SceneOptions):
     def pipeline(self) -> PipelineConfig:
         """All settings as one."""
         scene = SceneConfig(self.views, self.splat, self.lift)
-        return PipelineConfig(self.gain_model, self.body, scene, self.fit, self.method, self.modes, self.time_zero)
+        start, place = self.time_zero, self.device
+        return PipelineConfig(self.gain_model, self.body, scene, self.fit, self.method, self.modes, start, place)
 
 
 @dataclass(frozen=True)
@@ -104,7 +120,10 @@ def run(options: Options) -> int:
     """Reconstruct, and say what came of it; return 130 where Ctrl-C stopped it."""
     if options.output is not None:
         expect_writable(options.output)
+    usable_device(options.device, raising=FitError)
     settings = options.pipeline.capture_settings(options.read_settings())
+    if options.material is not None:
+        return _run_guess(options, options.material, settings)
     capture = read_capture(options.folder, settings)
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
@@ -165,6 +184,28 @@ def run(options: Options) -> int:
                 "scores": score_values(scores),
             }
         )
+    return 0
+
+
+def _run_guess(options: Options, material: str, settings: CaptureSettings) -> int:
+    """Guess, write, and say what it is."""
+    refuse_with_material(options)
+    try:
+        with SceneBar() as bar, StageFolder(options.kept).lock("avmsf reconstruct"):
+            made = reconstruct_guess(
+                options.folder,
+                material,
+                options.pipeline,
+                cache=options.kept,
+                settings=settings,
+                listener=bar.listener,
+            )
+            if options.output is not None:
+                copy_whole(made, options.output)
+    except KeyboardInterrupt:
+        say("avmsf reconstruct: interrupted; the same command goes on from where it was")
+        return INTERRUPTED
+    show_guess(load(made), options.output or made, json=options.json)
     return 0
 
 

@@ -54,6 +54,8 @@ def parts_words(train: Impacts, test: Impacts) -> str:
 
 def quality_words(field: SoundField, path: Path) -> list[str]:
     """Return how good a field in the file `path` is, and which command says where to record more; empty if unknown."""
+    if isinstance(guess := field.origin.report.get("guess"), str):
+        return [f"{guess} Record a few impacts and fit again: avmsf fit"]
     if field.quality is None:
         return []
     more = f" More contacts: avmsf suggest {shlex.quote(str(path))}" if field.quality.advice else ""

@@ -21,6 +21,7 @@ from avmsf.cli.modetable import levels, mode_rows
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.scores import quality_words, score_table, score_values
 from avmsf.field.attention import AttentionGains
+from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.estimator import NETWORK
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.soundfield import SoundField
@@ -157,7 +158,7 @@ def draw_field(
         title = f"doubt of {name}"
         pictures["doubt"] = draw_doubt(points, doubt, title=title, struck=training_contacts(field))
         pictures["spectrum"] = draw_band(spectrum_band(field, points[0]), title=f"{name}: one blow, and its doubt")
-    body = field.gain_field.body if isinstance(field.gain_field, MixtureGains) else None
+    body = field.gain_field.body if isinstance(field.gain_field, MixtureGains | BodyGains) else None
     if body is not None:
         surface = Surface(body.nodes.float(), body.triangles[:, :3])
         pictures["surface"] = draw_surface(surface, title=f"the body of {name}")
@@ -186,6 +187,8 @@ def _unheard(impacts: Impacts, field: SoundField) -> tuple[Impacts, str]:
 def _gains_words(gains: dict[str, Any]) -> str:
     if gains.get("inner", gains["kind"]) == AttentionGains.kind:
         return f"the network's on features: {gains['encoder']}"
+    if gains.get("inner", gains["kind"]) == BodyGains.kind:
+        return "guessed: mode shapes of a body, each times its loudness"
     return (
         f"Gaussian process over {', '.join(dict.fromkeys(gains['families']))} kernels, by {gains['contacts']} contacts"
     )
@@ -204,7 +207,7 @@ def _words(values: dict[str, Any], quality: list[str]) -> str:
         f"  gains      {_gains_words(values['gain_field'])}",
         f"  fitted to  {len(values['trained_on'])} recordings",
     ]
-    lines += _pipeline_lines(values["pipeline"])
+    lines += [] if "guess" in report else _pipeline_lines(values["pipeline"])
     lines += [f"  quality    {words}" for words in quality]
     excluded = report.get("excluded", ())
     for name, words in report.get("outliers", {}).items():

@@ -11,6 +11,7 @@ from torch import Tensor
 from avmsf.errors import ExportError
 from avmsf.export.normals import outward_normals
 from avmsf.field.gainfield import GainField
+from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import SoundField
@@ -203,4 +204,4 @@ def _expect_places(
 def _known_normals(gain_field: GainField, places: Float[Tensor, "points 3"]) -> Float64[Tensor, "points 3"] | None:
     if isinstance(gain_field, ScaledGains):
         return _known_normals(gain_field.field, places.double() / gain_field.length)
-    return gain_field.normals(places) if isinstance(gain_field, MixtureGains) else None
+    return gain_field.normals(places) if isinstance(gain_field, MixtureGains | BodyGains) else None

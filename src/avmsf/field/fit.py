@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.device import usable_device
 from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.places import rows_by_place
@@ -67,6 +68,7 @@ def fit(
     settings: CaptureSettings | None = None,
     checkpoint: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
+    device: torch.device | str | None = None,
 ) -> SoundField:
     """Fit a sound field to recordings (paper, section 3.5).
 
@@ -76,7 +78,9 @@ def fit(
     are read by them. What the config leaves open is chosen on a part of the training contacts held out for the purpose,
     then the field is fitted to all. With `checkpoint`, the state is kept there while the fit runs, on interruption and
     at the end, and a fit of the same arguments goes on from it to the same result; delete the file once the field is
-    saved. Raises `FitError` for arguments that do not fit together and for a fit that diverges, `FieldFileError` for a
+    saved. The network and the spectral loss are trained on `device`, by default a CUDA GPU where there is one, with the
+    same result up to rounding; clusters, the Gaussian process and the field are on the CPU. Raises `FitError` for
+    arguments that do not fit together, a fit that diverges and a device that is not there, `FieldFileError` for a
     checkpoint of another fit.
     """
     config = FitConfig() if config is None else config
@@ -87,7 +91,8 @@ def fit(
     case = gain_case(train, features, modes, config)
     train = case.train
     recipe = MixtureEstimator() if gains is None else gains
-    job = _Job(case, recipe, None if checkpoint is None else Path(checkpoint), progress)
+    place = usable_device(device, raising=FitError)
+    job = _Job(case, recipe, None if checkpoint is None else Path(checkpoint), progress, place)
     chosen, report = job.choose()
     run = job.run("fit", list(range(len(train))), chosen)
     # Close modes may have passed one another on the way.
@@ -140,7 +145,9 @@ class _Job:
         recipe: GainRecipe,
         checkpoint: Path | None,
         progress: Callable[[Progress], None] | None,
+        device: torch.device,
     ) -> None:
+        self.device = device
         self.case, self.recipe, self.checkpoint, self.progress = case, recipe, checkpoint, progress
         self.train = case.train
         # Where nothing has to be learned first, the run starts end to end.
@@ -222,6 +229,7 @@ class _Job:
         else:
             # The work is done but the field is not saved yet: should that fail, it need not be done again.
             self._save(name, run, None)
+        run.end()
         return run
 
     def _start(self, learned: list[int], plan: _Plan) -> TrainingRun:
@@ -231,7 +239,7 @@ class _Job:
         return TrainingRun(
             self.recipe.start(case, plan.damping),
             case.modes,
-            gains=case.gains,
+            gains=case.gains.to(self.device),
             phase=case.phase,
             sample_rate=self.train.sample_rate,
             samples=self.train.sounds.shape[1],
@@ -239,7 +247,7 @@ class _Job:
         )
 
     def _targets(self, rows: list[int]) -> Targets:
-        return Targets.of(self.train.take(rows), self.case.gains[rows], self.rows[rows], self.config)
+        return Targets.of(self.train.take(rows), self.case.gains[rows].to(self.device), self.rows[rows], self.config)
 
     def _save(self, name: str, run: TrainingRun, validation: "_Validation | None") -> None:
         if self.checkpoint is None:
@@ -271,7 +279,7 @@ class _Validation:
         with torch.no_grad():
             sounds = run.sounds(self.targets.rows)
             spectral = float(spectral_loss(sounds, self.targets.whole)) / len(self.targets.whole.hops)
-            distance = float((envelope(sounds) - self.envelope).square().mean(1).sqrt().mean())
+            distance = float((envelope(sounds.cpu()) - self.envelope).square().mean(1).sqrt().mean())
         run.generator.set_state(state)
         if not self.config.patience or spectral < self.best["spectral"]:
             self.best = {"spectral": spectral, "envelope": distance, "steps": run.step}

@@ -12,10 +12,11 @@ from torch import Tensor
 from avmsf._utils.records import count_of, like
 from avmsf.field.attention import AttentionGains
 from avmsf.field.gainfield import GainField, Gains
+from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.model import MixtureGains
 
-FITTED: dict[str, type[GainField]] = {each.kind: each for each in (AttentionGains, MixtureGains)}
-"""The gain fields that are fitted to recordings, by what a file calls them."""
+FITTED: dict[str, type[GainField]] = {each.kind: each for each in (AttentionGains, MixtureGains, BodyGains)}
+"""The gain fields beneath all edits, fitted to recordings or guessed, by what a file calls them."""
 _INNER = "field."
 
 

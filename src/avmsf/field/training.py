@@ -39,15 +39,16 @@ class Targets:
         rows: Int[Tensor, " contacts"],
         config: FitConfig,
     ) -> "Targets":
-        """Prepare recordings with the config's resolutions."""
+        """Prepare recordings with the config's resolutions, on the device of `gains`."""
         sizes, hops, length = config.resolutions(impacts.sample_rate)
-        whole = spectral_target(impacts.sounds, fft_sizes=sizes, hops=hops)
-        early = spectral_target(impacts.sounds, fft_sizes=sizes, hops=hops, samples=length)
+        sounds = impacts.sounds.to(gains.device)
+        whole = spectral_target(sounds, fft_sizes=sizes, hops=hops)
+        early = spectral_target(sounds, fft_sizes=sizes, hops=hops, samples=length)
         if config.spectral_norm == "common":
             mean = sum(float(each.sum()) for each in whole.norms) / len(sizes)
             norms = [tuple(torch.full_like(each, mean / len(each)) for each in of.norms) for of in (whole, early)]
             whole, early = replace(whole, norms=norms[0]), replace(early, norms=norms[1])
-        return cls(rows, gains, whole, early)
+        return cls(rows.to(gains.device), gains, whole, early)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,14 +97,18 @@ class AdamW:
 
     def resume(self, moments: list[list[list[Tensor]]]) -> None:
         """Go back to `moments` of before."""
-        self.moments = [[[tensor.clone() for tensor in each] for each in group] for group in moments]
+        self.moments = [
+            [[to.to(at.device, copy=True) for to, at in zip(*each, strict=True)] for each in zip(*group, strict=True)]
+            for group in zip(moments, self.moments, strict=True)
+        ]
 
 
 class TrainingRun:
     """Parameters on their way: a gain field, small corrections to the bank and residual, and their optimisers.
 
     The corrections are measured in what the recordings resolve: frequencies in their modes' widths, dampings and noise
-    magnitudes as logarithms. So one learning rate serves all, and dampings and magnitudes stay positive.
+    magnitudes as logarithms. So one learning rate serves all, and dampings and magnitudes stay positive. All tensors
+    are on one device, that of `gains`; chance is drawn on the CPU.
     """
 
     def __init__(
@@ -117,15 +122,15 @@ class TrainingRun:
         samples: int,
         config: FitConfig,
     ) -> None:
-        self.network, self.config, self.phase = network, config, phase
+        device = gains.device
+        self.network, self.config, self.phase = network.to(device), config, phase.to(device)
         self.sample_rate, self.samples = sample_rate, samples
-        self.start = modes
-        self.weight = _mode_weight(modes.bank, gains, config)
-        self.width = torch.clamp(modes.bank.damping / (2 * math.pi), min=sample_rate / samples)
+        self.start = _on(modes, device)
+        self.weight = _mode_weight(self.start.bank, gains, config)
         count, bins = len(modes.bank), len(modes.residual.magnitude)
-        self.shift = nn.Parameter(torch.zeros(count, dtype=torch.float64))
-        self.decay = nn.Parameter(torch.zeros(count, dtype=torch.float64))
-        self.noise = nn.Parameter(torch.zeros(bins))
+        self.shift = nn.Parameter(torch.zeros(count, dtype=torch.float64, device=device))
+        self.decay = nn.Parameter(torch.zeros(count, dtype=torch.float64, device=device))
+        self.noise = nn.Parameter(torch.zeros(bins, device=device))
         self.generator = torch.Generator().manual_seed(config.seed)
         matrices = [parameter for parameter in network.parameters() if parameter.ndim == 2]
         vectors = [parameter for parameter in network.parameters() if parameter.ndim != 2]
@@ -148,7 +153,8 @@ class TrainingRun:
         """The modes as they stand."""
         bank = self.start.bank
         # A correction beyond half the mode's own frequency would mean that another mode is sought.
-        moved = torch.clamp(bank.frequency + self.width * self.shift, bank.frequency / 2, bank.frequency * 1.5)
+        width = torch.clamp(bank.damping / (2 * math.pi), min=self.sample_rate / self.samples)
+        moved = torch.clamp(bank.frequency + width * self.shift, bank.frequency / 2, bank.frequency * 1.5)
         return ModalBank(torch.clamp(moved, max=0.499 * self.sample_rate), bank.damping * torch.exp(self.decay))
 
     @property
@@ -213,6 +219,12 @@ class TrainingRun:
         gains = self.network.read(targets.rows).mean
         return ((gains - targets.gains).square() * self.weight).sum(1).mean()
 
+    def end(self) -> None:
+        """Bring what was trained to the CPU; no step can follow."""
+        self.network, self.start = self.network.cpu(), _on(self.start, torch.device("cpu"))
+        for each in (self.shift, self.decay, self.noise):
+            each.data = each.data.cpu()
+
     def state(self) -> dict[str, Any]:
         """Return all that decides how the run goes on after its last whole step: tensors, numbers, containers of these.
 
@@ -238,6 +250,12 @@ class TrainingRun:
         self._chance = state["generator"]
         self.generator.set_state(self._chance)
         self.step = state["step"]
+
+
+def _on(modes: Extraction, device: torch.device) -> Extraction:
+    """Return modes whose bank and residual are on a device."""
+    bank = ModalBank(modes.bank.frequency.to(device), modes.bank.damping.to(device))
+    return replace(modes, bank=bank, residual=replace(modes.residual, magnitude=modes.residual.magnitude.to(device)))
 
 
 def _mode_weight(bank: ModalBank, gains: Float[Tensor, "contacts modes"], config: FitConfig) -> Float[Tensor, " modes"]:

@@ -37,6 +37,9 @@ class PipelineConfig:
     """Most modes to keep."""
     time_zero: TimeZero | None = None
     """Where sounds start; None leaves that to the capture's settings."""
+    device: str | None = None
+    """What computes: cpu or cuda; None takes the GPU where there is one. Results are the same up to rounding, so no
+    stage is made anew for it."""
 
     @property
     def finder(self) -> ModeFinder:

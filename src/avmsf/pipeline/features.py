@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import torch
 
+from avmsf._utils.device import usable_device
 from avmsf.capture.cameras import View
 from avmsf.capture.surface import Surface
 from avmsf.errors import SceneError
@@ -91,14 +92,18 @@ class MadeFeatures:
     symmetries, spread over orbits."""
 
 
-def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None]) -> Encoder:
-    """Return the encoder that the settings name. Raises SceneError where it is not to be had."""
+def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None], device: str | None = None) -> Encoder:
+    """Return the encoder that the settings name, on a device as for `usable_device`.
+
+    Raises SceneError where either is not to be had.
+    """
     if config.encoder == DESCRIPTORS:
         return ImageDescriptors()
+    place = usable_device(device, raising=SceneError)
     if config.encoder != AUTO:
-        return DinoEncoder.load(config.encoder, longest=config.longest, device=_device())
+        return DinoEncoder.load(config.encoder, longest=config.longest, device=place)
     try:
-        return DinoEncoder.load(DINO, longest=config.longest, device=_device())
+        return DinoEncoder.load(DINO, longest=config.longest, device=place)
     except SceneError as error:
         reason = str(error).split(":")[0]
         tell(f"encoder: the built-in descriptors, for {DINO} is not to be had: {reason}")
@@ -189,7 +194,3 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
     if config.positions:
         features = with_positions(features)
     return MadeFeatures(features, symmetries, report)
-
-
-def _device() -> str:
-    return "cuda" if torch.cuda.is_available() else "cpu"

@@ -16,7 +16,7 @@ from avmsf._utils.caching import once
 from avmsf.capture import Capture, Impacts, Surface
 from avmsf.capture.placement import judge_placement
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.surface import read_surface, write_surface
+from avmsf.capture.surface import find_surface, read_surface, write_surface
 from avmsf.capture.views import read_views
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import AvmsfError, CaptureError, SceneError
@@ -32,6 +32,7 @@ from avmsf.geometry.closest import ClosestPoints
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import PipelineConfig, with_record
+from avmsf.pipeline.guess import expect_no_recordings, guess_field
 from avmsf.pipeline.scene import Listener, SceneStages
 from avmsf.pipeline.silhouettes import expect_contacts_in_outlines, judge_outlines
 from avmsf.pipeline.stages import Kept, StageFolder
@@ -149,6 +150,7 @@ def _reconstruct(
             settings=capture.settings,
             checkpoint=stages.checkpoint(FIELD),
             progress=fitting,
+            device=config.device,
         )
         save(with_record(fitted, config, shape.report), path)
 
@@ -169,6 +171,56 @@ def _reconstruct(
     times = tuple(StageTime(name, each.seconds, each.fresh) for name, each in made.items())
     path = shape.made["surface"].path if "surface" in shape.made else None
     return Reconstruction(kept.path, times, shape.report, modes, path)
+
+
+def reconstruct_guess(
+    folder: Path,
+    material: str,
+    config: PipelineConfig,
+    *,
+    cache: Path,
+    settings: CaptureSettings,
+    listener: Listener,
+) -> Path:
+    """Return the file of a field that is guessed for an object without recordings, made anew where something changed.
+
+    The object's shape is its mesh, or what its photographs show where their cameras are known in meters. Raises as the
+    stages and `guess_field` do, FitError for a folder with recordings, and SceneError where the size is not known.
+    """
+    expect_no_recordings(folder)
+    stages = StageFolder(cache)
+    with stages.lock("reconstruct"):
+        mesh = find_surface(folder, settings)
+        scene = None
+        if mesh is None or not len(mesh.faces):
+            scene = SceneStages(
+                folder, stages, config.scene, settings=settings, listener=listener, device=config.device
+            )
+            scene.expect_any()
+            if scene.source is not None and scene.source.kind in ("photographs", "video"):
+                raise SceneError(
+                    f"{folder}: expected a mesh, or photographs with cameras in meters (transforms.json, COLMAP), got "
+                    f"{scene.source.kind} alone, from which the object's size and so its pitch are not known"
+                )
+        shape, digest = object_shape(mesh, scene)
+
+        def make(path: Path) -> None:
+            guessed = guess_field(
+                shape(),
+                material,
+                body=config.body,
+                modes=config.modes,
+                config=config.fit,
+                settings=settings,
+                name=settings.name or folder.resolve().name,
+                cache=stages.folder / BODIES,
+                tell=listener.tell,
+            )
+            save(with_record(guessed, config, {}), path)
+
+        recipe = {"guess": material, "surface": digest, "modes": config.modes, "body": asdict(config.body)}
+        recipe |= {"fit": asdict(config.fit), "settings": asdict(settings), "name": folder.resolve().name}
+        return stages.keep(FIELD, recipe, make).path
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +271,7 @@ def _shape(
     settings: CaptureSettings,
     listener: Listener,
 ) -> _Shape:
-    scene = SceneStages(folder, stages, config.scene, settings=settings, listener=listener)
+    scene = SceneStages(folder, stages, config.scene, settings=settings, listener=listener, device=config.device)
     bare = capture.surface is not None and not len(capture.surface.faces)
     if not scene or (bare and scene.source is not None and scene.source.kind == "mesh"):
         if capture.surface is None:

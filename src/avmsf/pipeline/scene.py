@@ -76,8 +76,13 @@ class SceneStages:
         settings: CaptureSettings,
         listener: Listener | None = None,
         name: str = FEATURES,
+        device: str | None = None,
     ) -> None:
-        """Prepare the stages; `name` is what the features' file is called, for several may share their Gaussians."""
+        """Prepare the stages; `name` is what the features' file is called, for several may share their Gaussians.
+
+        Gaussians and DINOv2 are computed on `device`, by default on a GPU where there is one.
+        """
+        self.device = device
         self.folder, self.stages, self.config, self.settings, self.name = folder, stages, config, settings, name
         self.listener = Listener() if listener is None else listener
         found = find_source(folder, settings, prefer=config.views.source)
@@ -119,6 +124,7 @@ class SceneStages:
                 start=start,
                 progress=self.listener.splatting,
                 checkpoint=self.stages.checkpoint(CLOUD),
+                device=self.device,
             )
             write_splats(cloud, path)
 
@@ -129,7 +135,7 @@ class SceneStages:
     @cached_property
     def features(self) -> Kept:
         """The file of features, on the Gaussians or on points of the mesh."""
-        encoder = choose_encoder(self.config.lift, tell=self.listener.tell)
+        encoder = choose_encoder(self.config.lift, tell=self.listener.tell, device=self.device)
         on_mesh = self.splats is None and self._source().kind == "mesh" and self.config.lift.onto == "mesh"
         recipe = {
             "views": self.views.digest,

@@ -110,10 +110,11 @@ def nominal_bodies(
     walls: Sequence[float | None] | None = None,
     count: int = 80,
     freedoms: int = 40_000,
+    material: Material = NOMINAL,
     cache: Path | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> NominalBodies:
-    """Return the bodies that may lie behind a surface, with the lowest `count` modes of each.
+    """Return the bodies that may lie behind a surface, with the lowest `count` modes of each, made of `material`.
 
     `walls` states what to try: thicknesses in metres, None for what the surface encloses. By itself it tries that,
     and walls of `WALLS` times the surface's size where the surface is a sheet or holds much more than the wall would;
@@ -127,7 +128,7 @@ def nominal_bodies(
     with the reason for each.
     """
     told = tell or (lambda words: None)
-    maker = _Maker(surface, count, cache, told)
+    maker = _Maker(surface, count, cache, told, material)
     _expect_settings(count, freedoms, walls)
     guessed = walls is None
     wanted: list[float | None] = maker.guesses() if walls is None else list(dict.fromkeys(walls))
@@ -196,7 +197,7 @@ def refined(
     told = tell or (lambda words: None)
     _expect_settings(len(body.elastic), freedoms, [body.wall])
     try:
-        maker = _Maker(surface, len(body.elastic), cache, told)
+        maker = _Maker(surface, len(body.elastic), cache, told, body.elastic.material)
         if body.support is None:
             return maker.body(body.wall, freedoms, fine=True)
         modes = maker.held(body.wall, freedoms, maker.solid(body.wall, freedoms), body.support, perturbed=True)
@@ -223,7 +224,7 @@ def supported(
     told = tell or (lambda words: None)
     trial = TRIAL if isinstance(surface, Surface) else WALL_TRIAL
     few = min(freedoms, trial)
-    maker, bodies = _Maker(surface, len(body.elastic), cache, told), []
+    maker, bodies = _Maker(surface, len(body.elastic), cache, told, body.elastic.material), []
     try:
         solid = maker.solid(body.wall, few)
         for support in (None, *supports_of(SecondOrder.of(solid))):
@@ -242,10 +243,17 @@ def supported(
 class _Maker:
     """Makes the bodies of one surface or shape, and does once what all of them need."""
 
-    def __init__(self, surface: Surface | Shape, count: int, cache: Path | None, tell: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        surface: Surface | Shape,
+        count: int,
+        cache: Path | None,
+        tell: Callable[[str], None],
+        material: Material = NOMINAL,
+    ) -> None:
         self._given = surface
         self._shape = None if isinstance(surface, Surface) else surface
-        self._count, self._cache, self._tell = count, cache, tell
+        self._count, self._cache, self._tell, self._material = count, cache, tell, material
         self._walls: dict[int, Callable[[float], Solid]] = {}
 
     @cached_property
@@ -335,7 +343,7 @@ class _Maker:
         size = freedoms_of(solid)
         self._tell(f"{self._count} elastic modes of {size} degrees of freedom")
         try:
-            return elastic_modes(solid, NOMINAL, count=self._count, fixed=fixed, perturbed=perturbed)
+            return elastic_modes(solid, self._material, count=self._count, fixed=fixed, perturbed=perturbed)
         except MemoryError as error:
             raise SimulationError(
                 f"the modes of {size} degrees of freedom do not fit into the memory: ask for fewer, as "
@@ -372,6 +380,7 @@ class _Maker:
             "count": self._count,
             "freedoms": freedoms,
             "perturbed": perturbed,
+            "material": asdict(self._material),
             "support": None if support is None else asdict(support),
         }
         return self._cache / f"nominal-{key_of(values)}.safetensors"

@@ -25,13 +25,17 @@ class MadeOf:
 
 
 def made_of(field: SoundField, *, option: str) -> MadeOf:
-    """Return what a field is made of: what it was recast to, or the material whose damping fits its modes best.
+    """Return what a field is made of: what it was recast to or guessed for, or what damps as its modes do.
 
     `option` is what a user says the material by, for the words. Raises `EditError` where no material fits.
     """
     known = _recast_to(field.origin.report.get(EDITS, []))
     if known is not None:
         return MadeOf(known, f"the object is of {known.name}, which it was recast to before")
+    report = field.origin.report
+    if "guess" in report and not report.get(EDITS):
+        guessed = Material(**report["material"])
+        return MadeOf(guessed, f"the object is of {guessed.name}, which the field was guessed for")
     best, second, *_ = guess_materials(field.bank)
     if not best.fits:
         raise EditError(

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from avmsf._utils.device import usable_device
 from avmsf.errors import EditError
 from avmsf.tasks.clips import lasting
 from avmsf.tasks.distillation import expect_prompt
@@ -68,7 +69,7 @@ class StableAudio:
         first), for a folder that holds another model or a part of one, and for a device that is not there or whose
         memory does not hold the model.
         """
-        place = _device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        place = usable_device(device, raising=EditError)
         precision = dtype or (torch.bfloat16 if place.type == "cuda" else torch.float32)
         pipeline, name = load_pipeline(source, precision)
         try:
@@ -252,20 +253,6 @@ class StableAudio:
             silence = torch.zeros(1, self.channels, (2 * self._reach + 1) * self._hop)
             self._silence = self._encoded(silence)[:, :, self._reach : self._reach + 1]
         return self._silence
-
-
-def _device(name: str | torch.device) -> torch.device:
-    """Return a device on which tensors can be made. Raises `EditError`."""
-    try:
-        place = torch.device(name)
-        torch.empty(1, device=place)
-    except (RuntimeError, AssertionError) as error:  # AssertionError: PyTorch was built without it
-        raise EditError(
-            f"device = {name}: expected one that PyTorch can use here, such as cpu, or cuda with an NVIDIA GPU, its "
-            f"driver and free memory; found {str(error).splitlines()[0] if str(error) else type(error).__name__}: "
-            "choose cpu"
-        ) from error
-    return place
 
 
 def _reach(strides: list[int]) -> int:

@@ -15,6 +15,7 @@ from torch import Tensor
 from avmsf.capture.placement import expect_placed
 from avmsf.errors import AvmsfError, FitError
 from avmsf.fem.supports import FREE, FREE_PRIOR
+from avmsf.fem.thickness import search_thickness
 from avmsf.fem.updating import update
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import FACTORS, Elastic
@@ -26,7 +27,6 @@ from avmsf.field.gains.outliers import Fit, Judgment, judge_contacts, predicts_b
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.symmetry import Symmetric
-from avmsf.field.gains.thickness import search_thickness
 from avmsf.field.recipes import Attention, GainCase, GainRecipe
 from avmsf.scene.features import GEOMETRY, FeatureField
 from avmsf.scene.points import farthest_points

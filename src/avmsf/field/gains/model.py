@@ -12,6 +12,7 @@ from torch import Tensor
 
 from avmsf._utils.records import count_of, like
 from avmsf.capture.places import places_of
+from avmsf.fem.modestate import mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gainfield import Gains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Family, KernelFamily, Sites, nearest_sites, sites_along
@@ -20,7 +21,6 @@ from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.scene.symmetrycharacters import Group
 from avmsf.simulate.elastic import ElasticModes
-from avmsf.simulate.nominal import NOMINAL
 
 NEIGHBORS = 3
 """Nearest recordings that are averaged, as in the paper's baseline."""
@@ -216,10 +216,7 @@ class MixtureGains:
             "directional": self.directional,
             "families": [family.kind for family in self.families],
             "kept": [len(each) for each in self.kept],
-            "bodies": [
-                {"nodes": len(each.nodes), "triangles": len(each.triangles), "shapes": len(each)}
-                for each in (family.modes for family in self._of(Elastic))
-            ],
+            "bodies": [mode_sizes(family.modes) for family in self._of(Elastic)],
             "symmetries": [[list(group.characters.shape) for group in family.groups] for family in self._of(Symmetric)],
             "features": [family.features.shape[1] for family in self._of(Visual)],
         }
@@ -241,9 +238,8 @@ class MixtureGains:
             named["features"] = family.features
         for row, group in enumerate(group for family in self._of(Symmetric) for group in family.groups):
             named |= {f"groups.{row}.{name}": getattr(group, name) for name in ("motions", "characters")}
-        for row, body in enumerate(family.modes for family in self._of(Elastic)):
-            named |= {f"bodies.{row}.{name}": getattr(body, name) for name in ("frequency", "nodes", "triangles")}
-            named[f"bodies.{row}.shapes"] = body.shapes.float()
+        for row, modes in enumerate(family.modes for family in self._of(Elastic)):
+            named |= {f"bodies.{row}.{name}": each for name, each in mode_tensors(modes).items()}
         return named
 
     @classmethod
@@ -277,26 +273,17 @@ class MixtureGains:
         for row, (characters, order) in enumerate(group for family in record["symmetries"] for group in family):
             sizes[f"groups.{row}.motions"] = (double, count_of(order, "motions"), 3, 4)
             sizes[f"groups.{row}.characters"] = (double, count_of(characters, "characters"), order)
+        found = {name: torch.empty(*size, dtype=dtype, device="meta") for name, (dtype, *size) in sizes.items()}
         for row, body in enumerate(bodies):
-            nodes, triangles, shapes = (count_of(body[name], name) for name in ("nodes", "triangles", "shapes"))
-            sizes[f"bodies.{row}.frequency"] = (double, shapes)
-            sizes[f"bodies.{row}.nodes"] = (double, nodes, 3)
-            sizes[f"bodies.{row}.triangles"] = (integer, triangles, 6)
-            sizes[f"bodies.{row}.shapes"] = (single, nodes, shapes, 3)
-        return {name: torch.empty(*size, dtype=dtype, device="meta") for name, (dtype, *size) in sizes.items()}
+            found |= {f"bodies.{row}.{name}": each for name, each in mode_skeleton(body).items()}
+        return found
 
     @classmethod
     def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "MixtureGains":
         """Return the model."""
         training = Sites(tensors["contacts"], tensors["directions"])
-        _expect_sound(tensors, len(record["bodies"]))
-        bodies = iter(
-            ElasticModes(
-                tensors[f"{body}.frequency"], tensors[f"{body}.nodes"], tensors[f"{body}.triangles"],
-                tensors[f"{body}.shapes"].double(), NOMINAL, mass=0.0,
-            )
-            for body in (f"bodies.{row}" for row in range(len(record["bodies"])))
-        )  # fmt: skip
+        _expect_sound(tensors)
+        bodies = iter([restored_modes(tensors, f"bodies.{row}.") for row in range(len(record["bodies"]))])
 
         def family_of(kind: str, size: float) -> KernelFamily:
             if kind == Elastic.kind:
@@ -357,17 +344,13 @@ class MixtureGains:
         raise AssertionError(row)
 
 
-def _expect_sound(tensors: Mapping[str, Tensor], bodies: int) -> None:
+def _expect_sound(tensors: Mapping[str, Tensor]) -> None:
     """Raise ValueError for values that no fit leaves: they would fail only when gains are asked for."""
-    positive = ["scale", *(f"bodies.{row}.frequency" for row in range(bodies))]
-    for name in positive:
-        if not bool((tensors[name] > 0).all()):
-            raise ValueError(f"expected {name} above 0, got {float(tensors[name].min()):g}")
+    if not bool((tensors["scale"] > 0).all()):
+        raise ValueError(f"expected scale above 0, got {float(tensors['scale'].min()):g}")
     for name in ("weights", "floor"):
         if not bool((tensors[name] >= 0).all()):
             raise ValueError(f"expected {name} of 0 or more, got {float(tensors[name].min()):g}")
-    for row in range(bodies):
-        _expect_rows(tensors[f"bodies.{row}.triangles"], len(tensors[f"bodies.{row}.nodes"]), "corners of triangles")
 
 
 def _expect_rows(rows: Int[Tensor, "*rows"], count: int, name: str) -> None:

@@ -292,13 +292,14 @@ def predicts_better(
 ) -> bool:
     """Return whether gains are surely predicted better, from leave-one-place-out predictions at the same contacts.
 
-    The errors over the gains, each mode by its energy, have to fall by more than two standard errors of the paired
-    differences.
+    The errors over measured and predicted gains, each mode by its energy, have to fall by more than two standard errors
+    of the paired differences. Over the measured ones alone, a contact near a support would outweigh all others.
     """
     power = (measured.values.abs().square() / measured.damping).sum(1)
     less, more = (
-        ((predicted - measured.values).abs().square() / measured.damping).sum(1).div(power).sqrt()
+        (((predicted - measured.values).abs().square() / measured.damping).sum(1) / (power + energy)).sqrt()
         for predicted in (new, old)
+        for energy in [(predicted.abs().square() / measured.damping).sum(1)]
     )
     fall = (more - less)[power > 0]
     return float(fall.mean()) > _SURE * float(fall.std()) / len(fall) ** 0.5

@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 
-from avmsf.field.gains.thickness import search_thickness
+from avmsf.fem.thickness import search_thickness
 from avmsf.simulate.nominal import NominalBody
 from made_dome import bodies
 

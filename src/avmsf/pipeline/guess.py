@@ -1,0 +1,166 @@
+"""A field without any recording: what a body of a known shape and material would sound like."""
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Complex128, Float64
+from torch import Tensor
+
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.surface import SURFACE_FILES, Surface, find_surface, read_surface
+from avmsf.capture.table import TABLE, read_cells
+from avmsf.capture.together import NARROWEST, WIDEST
+from avmsf.errors import FitError, SimulationError
+from avmsf.fem.radiation import radiated_pressure
+from avmsf.field.config import FitConfig
+from avmsf.field.gains.body import BodyGains
+from avmsf.field.soundfield import Origin, SoundField
+from avmsf.modal.bank import ModalBank
+from avmsf.modal.residual import Residual
+from avmsf.pipeline.bodies import BodyConfig
+from avmsf.scene.features import FeatureField
+from avmsf.simulate.elastic import ElasticModes
+from avmsf.simulate.hammer import Hammer, contact_times, pulse_spectrum
+from avmsf.simulate.material import Material, material_named
+from avmsf.simulate.nominal import NominalBody, Shape, nominal_bodies
+from avmsf.simulate.vibration import damped, rayleigh
+
+SAMPLE_RATE = 44_100.0
+"""Hz: that of most recordings."""
+_HIGHEST = 0.499
+"""Highest frequency of a mode over the sample rate."""
+_BINS = 1025
+"""Of the residual, which is zero: as many as that of a fit has."""
+
+
+def guess_field(
+    surface: Surface | Shape,
+    material: Material | str,
+    *,
+    body: BodyConfig | None = None,
+    modes: int = 128,
+    sample_rate: float = SAMPLE_RATE,
+    config: FitConfig | None = None,
+    settings: CaptureSettings | None = None,
+    name: str = "",
+    cache: Path | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> SoundField:
+    """Return the field of a free body of a material, by finite elements, without any recording.
+
+    `surface` is in meters. It is filled, unless `body.wall` states the thickness of a wall. At most `modes` modes are
+    kept, those that sound below half of `sample_rate`, Hz. Sounds are in pascals per newton of peak force of a small
+    steel hammer (`Hammer`), at a distance of 1 m (`radiated_pressure`). There is no residual noise. Elastic modes are
+    kept in the folder `cache`, and `tell` hears what is done.
+
+    Raises SimulationError for an unknown material, a surface without a body and a body that makes no sound, and
+    FitError for a surface in another unit and a wall whose thickness has to be stated.
+    """
+    material = material_named(material) if isinstance(material, str) else material
+    body, settings = body or BodyConfig(), settings or CaptureSettings()
+    seen = surface if isinstance(surface, Surface) else surface.as_seen()
+    _expect_meters(seen)
+    found = _body(surface, material, body, count=modes, cache=cache, tell=tell)
+    vibration = damped(
+        found.elastic.frequency,
+        torch.diag(rayleigh(found.elastic.frequency, material)),
+        highest=_HIGHEST * sample_rate,
+    )
+    # Rayleigh damping does not couple modes: each damped one has one shape.
+    rows = vibration.pushes.abs().argmax(dim=1)
+    elastic = replace(
+        found.elastic, frequency=found.elastic.frequency[rows], shapes=found.elastic.shapes[:, rows], perturbations=None
+    )
+    push = 2.0 * vibration.pushes.gather(1, rows[:, None])[:, 0].abs()
+    loudness = push * radiated_pressure(found.elastic, vibration) * _pulse(elastic, vibration.poles)
+    # As a file holds them, so that a field read back has the same sounds.
+    shapes = (elastic.shapes * loudness[:, None]).float().double()
+    points = FeatureField.from_mesh(seen, generator=torch.Generator().manual_seed(0)).points
+    described = f"{len(elastic)} modes of a {material.name} body ({found.name})"
+    report = {
+        "gains": "mode shapes of a guessed body",
+        "guess": f"No recordings: a guess of {described} from its shape and the material's constants alone.",
+        "material": asdict(material),
+        "body": found.name,
+        "mass": elastic.mass,
+    }
+    return SoundField(
+        ModalBank(vibration.frequency, vibration.damping),
+        BodyGains(points, replace(elastic, shapes=shapes)),
+        torch.zeros_like(vibration.frequency),
+        Residual(torch.zeros(_BINS)),
+        sample_rate,
+        round(settings.kept_seconds(sample_rate) * sample_rate),
+        Origin(name, (), True, config or FitConfig(), report, settings),
+    )
+
+
+def expect_no_recordings(folder: Path) -> None:
+    """Raise FitError for a folder whose table of contacts has rows: a fit to them says more than a guess."""
+    table = folder / TABLE
+    if table.is_file() and len(read_cells(table)[0]) > 1:
+        raise FitError(
+            f"--material guesses a field without recordings, but {table} lists some: leave --material out, or name the "
+            "mesh alone"
+        )
+
+
+def known_surface(place: Path, settings: CaptureSettings) -> Surface:
+    """Return the surface of a mesh file, or of a folder without recordings. Raises FitError where there is none."""
+    if not place.is_dir():
+        return read_surface(place, metres=settings.surface_metres)
+    expect_no_recordings(place)
+    surface = find_surface(place, settings)
+    if surface is None:
+        raise FitError(
+            f"{place}: expected a mesh ({', '.join(SURFACE_FILES)}), got none: name the mesh's file, or use avmsf "
+            "reconstruct for photographs"
+        )
+    return surface
+
+
+def _expect_meters(surface: Surface) -> None:
+    extent = float((surface.vertices.amax(0) - surface.vertices.amin(0)).max())
+    if not NARROWEST <= extent <= WIDEST:
+        raise FitError(
+            f"expected a surface of {NARROWEST:g} to {WIDEST:g} m, got one of {extent:.3g} m: state its unit as "
+            "surface_unit in capture.toml"
+        )
+
+
+def _body(
+    surface: Surface | Shape,
+    material: Material,
+    config: BodyConfig,
+    *,
+    count: int,
+    cache: Path | None,
+    tell: Callable[[str], None] | None,
+) -> NominalBody:
+    between = None if isinstance(surface, Surface) else surface.thickness_range
+    if between is not None and config.wall is None:
+        low, high = (1000 * each for each in between)
+        raise FitError(
+            f"expected the thickness of the object's wall, which is {low:.2g} to {high:.2g} mm by its views and sets "
+            "its frequencies: state it in meters by --body.wall (0: it is solid)"
+        )
+    try:
+        found = nominal_bodies(
+            surface, walls=[config.wall or None], count=count, freedoms=config.freedoms, material=material, cache=cache,
+            tell=tell,
+        )  # fmt: skip
+    except SimulationError as error:
+        if config.wall:
+            raise
+        raise SimulationError(f"{error}; a wall's thickness in meters is stated by --body.wall") from error
+    return found.bodies[0]
+
+
+def _pulse(elastic: ElasticModes, poles: Complex128[Tensor, " modes"]) -> Float64[Tensor, " modes"]:
+    """Return the size of the hammer's pulse at the modes' poles, newton seconds per newton of peak force."""
+    hammer = Hammer()
+    speed = torch.tensor([hammer.speed], dtype=torch.float64)
+    times = contact_times(hammer, elastic.material, mass=elastic.mass, speeds=speed)
+    return pulse_spectrum(hammer, poles, times)[0].abs()
