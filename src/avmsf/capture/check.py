@@ -12,7 +12,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import stay_uncut
 from avmsf.capture.surface import find_surface
 from avmsf.capture.table import TABLE, Row, Strike, read_rows, refuse_repeated_files, understand
-from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_levels, judge_surface, refuse_empty
+from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_levels, judge_surface
 from avmsf.errors import CaptureError
 from avmsf.wording import counted
 
@@ -143,7 +143,6 @@ def _check_contacts(
 
     refused = []
     judges: tuple[Callable[[], None], ...] = (
-        lambda: refuse_empty(len(rows)),
         lambda: refuse_repeated_files(strikes),
         judge_shape,
     )

@@ -29,7 +29,7 @@ from avmsf.capture.table import (
     refuse_repeated_files,
     understand,
 )
-from avmsf.capture.together import common_rate, judge_contacts, judge_levels, judge_surface, refuse_empty
+from avmsf.capture.together import common_rate, judge_contacts, judge_levels, judge_surface
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
 
@@ -61,7 +61,6 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
     settings = settings or settings_of(folder)
     rows, remarks = read_rows(folder)
     strikes = [understand(row, settings) for row in rows]
-    refuse_empty(len(strikes))
     refuse_repeated_files(strikes)
     _refuse_missing(folder, strikes)
     remarks += judge_contacts(strikes, settings)

@@ -32,12 +32,6 @@ MAX_RANGE_DB = 140.0
 loudest in float32 (144 dB), in which they are fitted."""
 
 
-def refuse_empty(count: int) -> None:
-    """Raise `CaptureError` for a table without recordings."""
-    if count < 1:
-        raise CaptureError(f"{TABLE}: expected one or more recordings, got none: add a row for each")
-
-
 def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:
     """Return the one sample rate of the files, Hz; `CaptureError` where they differ."""
     counts = Counter(rates)

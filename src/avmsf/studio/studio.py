@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from avmsf.capture.together import refuse_empty
-from avmsf.errors import CaptureError
 from avmsf.field.store import load, save
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.editing import MATERIAL_NAMES, Sliders
@@ -147,10 +145,8 @@ class Studio:
         """Begin to make a field of the capture, which is heard when it is done."""
         book = self.expect_book()
         strikes = await self.threads.read(book.strikes)
-        try:
-            refuse_empty(len(strikes))
-        except CaptureError as error:
-            raise RefusedError(409, f"{error}: strike more places first") from error
+        if not strikes:
+            raise RefusedError(409, "expected one or more recordings, got none: strike more places first")
         # One place is enough: the next job starts when this one's field is open.
         output = str(self.folder / "reconstructed")
         task = {"task": "make_field", "folder": str(book.folder), "modes": self.config.modes, "output": output}

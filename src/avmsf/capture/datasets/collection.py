@@ -11,7 +11,7 @@ from avmsf.capture.folder import Capture, read_capture, settings_of
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import find_surface_file
 from avmsf.capture.table import TABLE, read_rows, refuse_repeated_files, understand
-from avmsf.capture.together import common_rate, refuse_empty
+from avmsf.capture.together import common_rate
 from avmsf.capture.views.colmap import find_model
 from avmsf.capture.views.pictures import SUFFIXES
 from avmsf.errors import CaptureError, DatasetError
@@ -90,7 +90,6 @@ class CaptureCollection:
         try:
             settings = settings_of(folder)
             rows, _ = read_rows(folder)
-            refuse_empty(len(rows))
         except CaptureError as error:
             return ObjectReport(facts, 0, (str(error),))
         strikes = []
