@@ -19,7 +19,7 @@ from avmsf.simulate.vibration import Vibration
 DISTANCE = 1.0
 """Meters that pressures are stated for."""
 DIRECTIONS = 64
-"""Directions that are averaged: twice as many change the level of a mode by less than .3 dB on average."""
+"""Directions that are averaged: levels of modes are .15 to .31 dB from those of 512 on average (mug, bowl, skillet)."""
 _FAR = 100.0
 """Distance of the microphones over the body's size. Pressures go with 1/distance from there on."""
 
