@@ -23,6 +23,7 @@ from avmsf.field.gains.outliers import (
     set_aside,
 )
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
+from gain_cases import draw
 
 CONTACTS, MODES = 20, 12
 
@@ -207,3 +208,17 @@ def test_leaving_wrong_labels_out_predicts_the_others_better_and_right_ones_not(
 @pytest.mark.parametrize(("with_body", "without", "credible"), [(0.8, 0.4, True), (0.6, 0.1, False), (2.0, 1.9, False)])
 def test_body_has_to_predict_and_to_add(with_body: float, without: float, credible: bool) -> None:
     assert Credibility(with_body, without).credible == credible
+
+
+def test_a_contact_near_a_support_does_not_outweigh_the_others():
+    gains = draw(12, 5, seed=0).to(torch.complex128)
+    # A body that moves there is as wrong as can be, and no more.
+    gains[-1] *= 1e-6
+    measured = MeasuredGains(
+        gains, torch.full((5,), 1e-5).double(), torch.arange(1.0, 6.0).double() * 100, torch.full((5,), 10.0).double()
+    )
+    held = gains + 0.2 * draw(12, 5, seed=1)
+    free = gains + 0.8 * draw(12, 5, seed=2)
+    assert predicts_better(held, free, measured)
+    assert not predicts_better(free, held, measured)
+    assert not predicts_better(gains + 0.8 * draw(12, 5, seed=3), free, measured)

@@ -295,12 +295,12 @@ def predicts_better(
     The errors over measured and predicted gains, each mode by its energy, have to fall by more than two standard errors
     of the paired differences. Over the measured ones alone, a contact near a support would outweigh all others.
     """
-    power = (measured.values.abs().square() / measured.damping).sum(1)
-    less, more = (
-        (((predicted - measured.values).abs().square() / measured.damping).sum(1) / (power + energy)).sqrt()
-        for predicted in (new, old)
-        for energy in [(predicted.abs().square() / measured.damping).sum(1)]
-    )
+
+    def energy(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, " contacts"]:
+        return (values.abs().square() / measured.damping).sum(1)
+
+    power = energy(measured.values)
+    less, more = ((energy(each - measured.values) / (power + energy(each))).sqrt() for each in (new, old))
     fall = (more - less)[power > 0]
     return float(fall.mean()) > _SURE * float(fall.std()) / len(fall) ** 0.5
 
