@@ -222,3 +222,22 @@ def test_a_contact_near_a_support_does_not_outweigh_the_others():
     assert predicts_better(held, free, measured)
     assert not predicts_better(free, held, measured)
     assert not predicts_better(gains + 0.8 * draw(12, 5, seed=3), free, measured)
+
+
+def test_the_best_of_several_candidates_has_to_be_better_still():
+    # Of one mode at 12 contacts the errors fall by .1, give or take .15: by 2.2 standard errors.
+    falls = 0.1 + 0.15 * (-1.0) ** torch.arange(12.0, dtype=torch.float64)
+    ones = torch.ones(12, 1, dtype=torch.complex128)
+
+    def predicted(error: Float64[Tensor, " contacts"]) -> Tensor:
+        """Gains p with |p - 1| / sqrt(1 + |p|^2) = error."""
+        return ones + 1j * (error * (2 / (1 - error.square())).sqrt())[:, None]
+
+    one = torch.ones(1, dtype=torch.float64)
+    new, old, measured = (
+        predicted(torch.full_like(falls, 0.3)),
+        predicted(0.3 + falls),
+        MeasuredGains(ones, one, one, one),
+    )
+    assert predicts_better(new, old, measured)
+    assert not predicts_better(new, old, measured, candidates=5)

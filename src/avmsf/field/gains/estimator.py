@@ -347,7 +347,7 @@ def _more_probable(fit: _Fit, rows: Int[Tensor, " rows"], bodies: Sequence[Nomin
     if held[best] - free <= math.log(FREE_PRIOR / (1.0 - FREE_PRIOR) * len(held)):
         return None
     new, old = (fit(rows, fit.families(rows, [body])).leave_one_out() for body in (bodies[1 + best], bodies[0]))
-    return bodies[1 + best] if predicts_better(new, old, fit.at(rows)) else None
+    return bodies[1 + best] if predicts_better(new, old, fit.at(rows), candidates=len(held)) else None
 
 
 def _body_weights(model: MixtureGains, families: Sequence[KernelFamily], measured: MeasuredGains) -> list[float]:

@@ -31,6 +31,7 @@ say little of the gains nothing is an outlier.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from statistics import NormalDist
 
 import torch
 from jaxtyping import Complex128, Float, Float64, Int
@@ -62,8 +63,8 @@ _REFUTED = -1.5
 """Nats below which a contact's own label is refuted."""
 _EXPLAINED = 0.4
 """Part of the others' mean ratio that a contact has to reach at another place."""
-_SURE = 2.0
-"""Standard errors by which the others' errors have to fall."""
+_CHANCE = 0.0228
+"""Probability that errors fall as much by chance: two standard errors."""
 _TINY = torch.finfo(torch.float64).tiny
 
 Fit = Callable[[Int[Tensor, " rows"], tuple[float, ...]], MixtureGains]
@@ -288,12 +289,17 @@ def set_aside(ratios: PredictiveRatios, start: frozenset[int] = frozenset()) -> 
 
 
 def predicts_better(
-    new: Complex128[Tensor, "contacts modes"], old: Complex128[Tensor, "contacts modes"], measured: MeasuredGains
+    new: Complex128[Tensor, "contacts modes"],
+    old: Complex128[Tensor, "contacts modes"],
+    measured: MeasuredGains,
+    *,
+    candidates: int = 1,
 ) -> bool:
     """Return whether gains are surely predicted better, from leave-one-place-out predictions at the same contacts.
 
     The errors over measured and predicted gains, each mode by its energy, have to fall by more than two standard errors
-    of the paired differences. Over the measured ones alone, a contact near a support would outweigh all others.
+    of the paired differences, by more where `new` is the best of several candidates (Bonferroni). Over the measured
+    ones alone, a contact near a support would outweigh all others.
     """
 
     def energy(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, " contacts"]:
@@ -302,7 +308,8 @@ def predicts_better(
     power = energy(measured.values)
     less, more = ((energy(each - measured.values) / (power + energy(each))).sqrt() for each in (new, old))
     fall = (more - less)[power > 0]
-    return float(fall.mean()) > _SURE * float(fall.std()) / len(fall) ** 0.5
+    least = -NormalDist().inv_cdf(_CHANCE / candidates)
+    return float(fall.mean()) > least * float(fall.std()) / len(fall) ** 0.5
 
 
 def _search(fit: Fit, sites: Sites, measured: MeasuredGains) -> _Search:
