@@ -23,6 +23,7 @@ from avmsf.capture import Capture, Surface, read_capture
 from avmsf.capture.datasets import CaptureCollection
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.heartbeat import beating
+from avmsf.errors import EvaluationError
 from avmsf.evaluation.diffsound import fit_diffsound
 from avmsf.evaluation.diffsound_locator import DiffSoundLocator
 from avmsf.evaluation.material_fit import MODES, DampingCurve, DiffSoundConfig, clip_spectra, fit_material
@@ -72,6 +73,11 @@ _Records = list[ObjectRecord]
 def measure(options: Options) -> Report:
     """Return the chosen parts."""
     report = Report(CONVENTIONS)
+    making = "sonicgauss-training" in options.parts
+    if making and options.weights is None:
+        raise EvaluationError("sonicgauss-training: expected --weights FILE, where the weights are to be written")
+    if options.weights is not None and not making and not options.weights.is_file():
+        raise EvaluationError(f"{options.weights}: expected weights, found no file: add the part sonicgauss-training")
     with tempfile.TemporaryDirectory() as folder:
         objects = _Objects(options, Path(folder))
         for part in options.parts:

@@ -126,6 +126,11 @@ def test_tables_have_the_papers_rows_for_its_datasets_alone() -> None:
 def test_every_method_has_a_title_and_tables_give_it() -> None:
     assert set(METHODS) <= set(TITLES)
     assert f"paper: {TITLES['paper']}" in markdown(sections(THREE, IDENTITY, subsets={}))
+    # Also those that read a file or a folder.
+    method = "sonicgauss:/some/folder"
+    records = (record("1", {"knn3": (1.0, 1.0), method: (1.0, 1.0)}),)
+    words = markdown(sections(records, {**IDENTITY, "methods": {"knn3": "", method: ""}}, subsets={}))
+    assert TITLES["sonicgauss"] in words
 
 
 def test_the_papers_ratio_is_of_its_own_rows() -> None:

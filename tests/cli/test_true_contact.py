@@ -59,6 +59,7 @@ def test_the_true_contact_is_red_at_its_place_and_the_found_one_blue(
     diagonal = float((points.amax(0) - points.amin(0)).norm())
     assert blow["true_contact"] == pytest.approx(points[OTHER].tolist(), abs=1e-6)
     assert blow["error_metres"] == pytest.approx(distance, abs=1e-6)
+    assert blow["rmed_posterior"] == pytest.approx(distance / diagonal, abs=1e-6)
     assert blow["rmed"] == pytest.approx(distance / diagonal, abs=1e-6)
     (figure,) = figures
     middle = 0.5 * (points.amax(0) + points.amin(0))

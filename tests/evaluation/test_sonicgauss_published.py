@@ -249,7 +249,7 @@ def test_the_method_fits_and_renders_from_a_folder_by_its_seed(folder):
     assert sounds.shape == impacts(3).sounds.shape
     assert torch.equal(again.render(contacts), sounds)
     assert torch.equal(first.render(contacts[1:2])[0], sounds[1])
-    assert report_of(first)["steps"] == 3
+    assert report_of(first)["steps"] == 4
     known = repr(method)
     (folder / "model_3.safetensors").write_bytes(b"others")
     assert repr(method) != known

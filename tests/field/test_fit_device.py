@@ -87,7 +87,7 @@ def fitted(device: str | None, recipe: GainRecipe | None = None):
     return fit(impacts, plate_features(60), plate_extraction(impacts), config, gains=recipe, device=device)
 
 
-@pytest.mark.parametrize("device", ["nonesuch", *([] if CUDA else ["cuda"])])
+@pytest.mark.parametrize("device", ["nonesuch", "meta", *([] if CUDA else ["cuda"])])
 def test_a_device_that_is_not_there_is_refused(device: str, tmp_path, capsys) -> None:
     with pytest.raises(FitError, match=device):
         fitted(device)

@@ -138,6 +138,8 @@ def test_a_guess_is_kept_whole_and_says_what_it_is(tmp_path: Path):
     assert read.quality is None
     assert read.origin.report["guess"].startswith("No recordings")
     assert read.origin.trained_on == ()
+    with pytest.raises(FitError, match="guess"):
+        avmsf.suggest(read)
     assert made_of(read, option="--from").material == STEEL
     assert avmsf.SampledField.of(read, limit=20).sine.shape == (20, 12)
 

@@ -20,7 +20,7 @@ from avmsf.bench.summary import (
     ratios,
     times_of,
 )
-from avmsf.bench.titles import TITLES
+from avmsf.bench.titles import TITLES, kind_of
 
 HEADINGS = {
     "l1": "L1",
@@ -150,7 +150,7 @@ def _main_table(main: Table, shown: Sequence[str], protocol: str, dataset: str, 
         else f"The paper has no figures of this experiment on {dataset}."
     )
     grid = Grid(("method", *_headings(shown), "objects"), tuple(rows), best)
-    titles = "; ".join(f"{method}: {TITLES[method]}" for method in found if method in TITLES)
+    titles = "; ".join(f"{method}: {TITLES[kind_of(method)]}" for method in found if kind_of(method) in TITLES)
     remarks = (remark, f"{titles}.") if titles else (remark,)
     return Section("All methods" + (f": {labels[0]}" if len(labels) > 1 else ""), (), grid, remarks)
 
@@ -165,7 +165,7 @@ def _ratio_table(main: Table, shown: Sequence[str], protocol: str, dataset: str)
         rows += [
             (f"paper, {source}: {method}", *(figure(figures.get(metric)) for metric in falling))
             for method, figures in methods.items()
-            if method in found
+            if method in map(kind_of, found)
         ]
     return Section(
         f"Ratio to {BASELINE}",

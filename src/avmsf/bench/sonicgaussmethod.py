@@ -4,9 +4,9 @@ import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import torch
-
+from avmsf._utils.device import usable_device
 from avmsf.bench.task import Task
+from avmsf.errors import EvaluationError
 from avmsf.evaluation.sonicgauss.published import PublishedSizes, PublishedSonicGauss, folder_digest
 from avmsf.evaluation.sonicgauss.published_renderer import EPOCHS, PublishedRenderer, fit_published
 from avmsf.evaluation.sonicgauss.small import SmallWeights
@@ -38,7 +38,7 @@ class SonicGaussMethod:
     def fit(self, task: Task) -> PublishedRenderer:
         """Fine-tune. Raises AvmsfError for weights of another model, and for an object without Gaussians."""
         model = PublishedSonicGauss.load(self.folder, self.sizes)
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+        device = usable_device(None, raising=EvaluationError)
         return fit_published(model.to(device), task.gaussians(), task.train, epochs=self.epochs, seed=task.seed)
 
 

@@ -15,6 +15,8 @@ TITLES: Mapping[str, str] = MappingProxyType(
         "spline-gains": "modal gains by thin-plate splines",
         "diffsound": "DiffSound, rebuilt, as the paper compares with it",
         "diffsound-weighted": "DiffSound with a fitted weight for each mode",
+        "sonicgauss": "SonicGauss with its published weights, which have seen ObjectFolder Real, fine-tuned",
+        "recorded": "sounds of another system, from files",
         "sonicgauss-small": "SonicGauss's objective at a small size, trained from scratch on simulated objects",
         "field": "attention network, quick settings, visual features",
         "field-auto": "Gaussian process over kernel families (the default of this package)",
@@ -37,3 +39,8 @@ TITLES: Mapping[str, str] = MappingProxyType(
     }
 )
 """By the names of `avmsf.bench.methods.METHODS`."""
+
+
+def kind_of(method: str) -> str:
+    """Return a method's name without the file or folder that it reads."""
+    return method.partition(":")[0]

@@ -245,6 +245,10 @@ def refuse_with_material(options: Any) -> None:
     given = [name for name in names if getattr(options, name, None) is not None]
     if options.gain_model not in ("auto", Elastic.kind):
         given.append("gain_model")
+    if options.body.supports == "try":
+        given.append("body.supports")
+    if options.time_zero is not None:
+        given.append("time_zero")
     if given:
         raise FitError(
             f"--material guesses a field without recordings, which --{given[0].replace('_', '-')} needs: leave one of "

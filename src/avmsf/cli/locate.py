@@ -179,10 +179,15 @@ def _true_contact(options: Options, field: SoundField) -> Float64[Tensor, " 3"] 
 
 
 def _error(contact: ContactMap, truth: Float64[Tensor, " 3"]) -> dict[str, Any]:
-    """Return how far the found contact is from the true one, also relative to the object's diagonal (RMED)."""
-    distance = float((contact.place.double() - truth).norm())
+    """Return how far the most probable contact is from the true one, and both estimates relative to the diagonal.
+
+    `rmed` is of the point of least cosine distance, as in `avmsf evaluate localize`.
+    """
     diagonal = float((contact.points.amax(0) - contact.points.amin(0)).norm())
-    return {"true_contact": truth.tolist(), "error_metres": distance, "rmed": distance / diagonal}
+    places = (contact.points[int(contact.distance.argmin())], contact.place)
+    cosine, likely = (float((place.double() - truth).norm()) for place in places)
+    relative = {"rmed": cosine / diagonal, "rmed_posterior": likely / diagonal}
+    return {"true_contact": truth.tolist(), "error_metres": likely, **relative}
 
 
 def _describe(name: str, seconds: float | None, contact: ContactMap, known: _Known, level: float) -> dict[str, Any]:
@@ -204,7 +209,7 @@ def _words(values: dict[str, Any]) -> str:
         f"field explains {100 * values['explained']:.0f} % of the sound"
     ]
     if "rmed" in values:
-        error, share = 1000 * values["error_metres"], 100 * values["rmed"]
+        error, share = 1000 * values["error_metres"], 100 * values["rmed_posterior"]
         lines.append(f"  {error:.1f} mm from the true contact ({share:.1f} % of the diagonal)")
     if values["ambiguous"]:
         lines.append("  ambiguous: several places sound about the same")

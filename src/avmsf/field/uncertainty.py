@@ -12,6 +12,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.errors import FitError
+from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.scaledgains import ScaledGains, fitted_gains
 from avmsf.field.soundfield import SoundField
@@ -78,6 +79,10 @@ def fitted_mixture(field: SoundField) -> MixtureGains:
     Raises FitError where its uncertainty is not known: for the attention network, and for contacts in a single place.
     """
     gains = fitted_gains(field.gain_field)
+    if isinstance(gains, BodyGains):
+        raise FitError(
+            "expected a field that was fitted to recordings, got a guess without any: record impacts and fit"
+        )
     if not isinstance(gains, MixtureGains):
         raise FitError(
             f"expected gains of the kind {MixtureGains.kind!r}, got {gains.kind!r}: fit with --gain-model auto"

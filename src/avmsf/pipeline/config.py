@@ -38,8 +38,8 @@ class PipelineConfig:
     time_zero: TimeZero | None = None
     """Where sounds start; None leaves that to the capture's settings."""
     device: str | None = None
-    """What computes: cpu or cuda; None takes the GPU where there is one. Results are the same up to rounding, so no
-    stage is made anew for it."""
+    """What computes: cpu or cuda; None takes the GPU where there is one. Training gives the same up to rounding,
+    Gaussians do not; stages that are kept are used whichever device made them."""
 
     @property
     def finder(self) -> ModeFinder:

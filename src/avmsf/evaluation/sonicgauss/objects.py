@@ -8,9 +8,11 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.caching import source_digest
 from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.capture.meshviews import orbit_cameras, render_views
 from avmsf.errors import EvaluationError, SceneError, SimulationError
+from avmsf.evaluation.sonicgauss.small import SmallConfig, object_tokens, visible
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.splat import splat
 from avmsf.scene.splatconfig import SplatConfig
@@ -66,11 +68,13 @@ def training_objects(
     """
     for number, recipe in enumerate(recipes, 1):
         name = f"{number} of {len(recipes)}, {recipe.kind}-{recipe.material}"
-        path = None if cache is None else cache / f"{recipe.kind}-{recipe.seed}.pt"
+        path = None if cache is None else cache / f"{recipe.kind}-{recipe.seed}-{key_of(_identity(recipe))}.pt"
         try:
             found = None if path is None else _kept(path, recipe)
             made = found or _made(recipe)
-        except (SimulationError, SceneError) as error:
+            # What training reads of it.
+            object_tokens(visible(made.cloud), count=SmallConfig().tokens)
+        except (SimulationError, SceneError, EvaluationError) as error:
             if tell is not None:
                 tell(f"{name} is left out: {error}")
             continue
@@ -90,7 +94,7 @@ def _made(recipe: ObjectRecipe) -> TrainingObject:
 
 
 def _identity(recipe: ObjectRecipe) -> dict[str, str]:
-    return {"recipe": key_of(recipe.values()), "splatting": repr(SPLAT)}
+    return {"recipe": key_of(recipe.values()), "splatting": repr(SPLAT), "source": source_digest()}
 
 
 def _keep(path: Path, recipe: ObjectRecipe, made: TrainingObject) -> None:

@@ -180,12 +180,14 @@ class PublishedSonicGauss(nn.Module):
 
 
 def folder_digest(folder: Path) -> str:
-    """Return a digest of the names and sizes of a folder's weights and of the first mebibyte of each."""
+    """Return a digest of the names and sizes of a folder's weights and of the first and last mebibyte of each."""
     digest = hashlib.sha256()
     for path in sorted(folder.glob("*.safetensors")):
         digest.update(f"{path.name}\0{path.stat().st_size}\0".encode())
         with open(path, "rb") as file:
             digest.update(file.read(1 << 20))
+            file.seek(max(0, path.stat().st_size - (1 << 20)))
+            digest.update(file.read())
     return digest.hexdigest()[:16]
 
 

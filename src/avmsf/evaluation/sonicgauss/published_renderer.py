@@ -1,5 +1,6 @@
 """The published SonicGauss, fine-tuned to one object."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -86,7 +87,7 @@ def fit_published(
             lambda z, s: model.velocity(z, s, tokens, seconds=seconds, kept=kept), latents, generator=generator
         )
 
-    config = TrainingConfig(steps=max(1, epochs * len(train_impacts) // BATCH), batch=BATCH)
+    config = TrainingConfig(steps=epochs * math.ceil(len(train_impacts) / BATCH), batch=BATCH)
     model.train().autoencoder.eval()
     for part in model.gaussians.modules():
         if isinstance(part, torch.nn.BatchNorm1d):

@@ -1,4 +1,4 @@
-"""A small SonicGauss, trained from scratch: the published objective and conditioning, two million weights."""
+"""A small SonicGauss, trained from scratch: the published objective and conditioning, three million weights."""
 
 import json
 import math

@@ -31,10 +31,10 @@ say little of the gains nothing is an outlier.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from statistics import NormalDist
 
 import torch
 from jaxtyping import Complex128, Float, Float64, Int
+from scipy.special import stdtrit
 from torch import Tensor
 
 from avmsf.capture.places import places_of
@@ -64,7 +64,7 @@ _REFUTED = -1.5
 _EXPLAINED = 0.4
 """Part of the others' mean ratio that a contact has to reach at another place."""
 _CHANCE = 0.0228
-"""Probability that errors fall as much by chance: two standard errors."""
+"""Probability that errors fall as much by chance: that of two standard errors, if there are many contacts."""
 _TINY = torch.finfo(torch.float64).tiny
 
 Fit = Callable[[Int[Tensor, " rows"], tuple[float, ...]], MixtureGains]
@@ -297,9 +297,9 @@ def predicts_better(
 ) -> bool:
     """Return whether gains are surely predicted better, from leave-one-place-out predictions at the same contacts.
 
-    The errors over measured and predicted gains, each mode by its energy, have to fall by more than two standard errors
-    of the paired differences, by more where `new` is the best of several candidates (Bonferroni). Over the measured
-    ones alone, a contact near a support would outweigh all others.
+    The errors over measured and predicted gains, each mode by its energy, have to fall more than by chance: Student's
+    t of the paired differences, with Bonferroni's correction where `new` is the best of several candidates. Over the
+    measured ones alone, a contact near a support would outweigh all others.
     """
 
     def energy(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, " contacts"]:
@@ -308,7 +308,7 @@ def predicts_better(
     power = energy(measured.values)
     less, more = ((energy(each - measured.values) / (power + energy(each))).sqrt() for each in (new, old))
     fall = (more - less)[power > 0]
-    least = -NormalDist().inv_cdf(_CHANCE / candidates)
+    least = float(stdtrit(max(1, len(fall) - 1), 1 - _CHANCE / candidates))
     return float(fall.mean()) > least * float(fall.std()) / len(fall) ** 0.5
 
 
