@@ -225,7 +225,7 @@ def test_a_folder_without_any_look_is_refused_by_lift_and_fitted_in_a_box_by_rec
     assert "shows nothing of the object" in capsys.readouterr().err
 
 
-def test_contacts_on_another_scale_than_the_gaussians_are_refused_with_the_scale(
+def test_contacts_on_another_scale_than_the_photographs_are_refused_with_the_scale(
     capture: Path, kept: Path, tmp_path: Path, capsys: Streams
 ) -> None:
     folder = tmp_path / "slab"
@@ -236,5 +236,4 @@ def test_contacts_on_another_scale_than_the_gaussians_are_refused_with_the_scale
     (folder / "impacts.csv").write_text("\n".join([table[0], *scaled, ""]))
     assert main(["reconstruct", str(folder), "--cache", str(kept), *SMALL]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
-    assert "off the surface" in error
-    assert "divided by 10 they lie within" in error
+    assert "multiplied by 0.1" in error
