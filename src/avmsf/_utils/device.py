@@ -1,24 +1,32 @@
 """The device that tensors are computed on."""
 
+from collections.abc import Sequence
+
 import torch
 
 from avmsf.errors import AvmsfError
 
+TRAINABLE = ("cpu", "cuda")
+"""Kinds of devices that fields are trained on: others lack double precision or hold no values."""
 
-def usable_device(name: str | torch.device | None, *, raising: type[AvmsfError]) -> torch.device:
-    """Return the CPU or a CUDA GPU that can be used; without a name the GPU where there is one, else the CPU.
 
-    Raises `raising` for any other name, and a GPU that is not there or has no memory left.
+def usable_device(
+    name: str | torch.device | None, *, raising: type[AvmsfError], kinds: Sequence[str] = ()
+) -> torch.device:
+    """Return a device on which tensors can be made; without a name the CUDA GPU where there is one, else the CPU.
+
+    Raises `raising` for a name of none, for one that is not of `kinds` where these are given, and for a GPU that is not
+    there or has no memory left.
     """
     wanted = name or ("cuda" if torch.cuda.is_available() else "cpu")
     try:
         place = torch.device(wanted)
-        if place.type not in ("cpu", "cuda"):
-            raise RuntimeError(f"the kind {place.type}, which lacks what is computed here")
+        if kinds and place.type not in kinds:
+            raise RuntimeError(f"the kind {place.type}, where {' or '.join(kinds)} is needed")
         torch.empty(1, device=place)
     except (RuntimeError, AssertionError) as error:  # AssertionError: PyTorch was built without it
         raise raising(
-            f"device = {wanted}: expected cpu, or cuda where PyTorch can use an NVIDIA GPU, its "
+            f"device = {wanted}: expected one that PyTorch can use here, such as cpu, or cuda with an NVIDIA GPU, its "
             f"driver and free memory; found {str(error).splitlines()[0] if str(error) else type(error).__name__}: "
             "choose cpu"
         ) from error

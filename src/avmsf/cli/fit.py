@@ -9,7 +9,7 @@ import torch
 import tyro
 
 from avmsf._utils.caching import discard
-from avmsf._utils.device import usable_device
+from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.bench.evaluation import split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.folder import settings_of
@@ -138,7 +138,7 @@ def preset_of(words: Sequence[str]) -> Preset:
 def run(options: Options) -> int:
     """Fit, write, and say what came of it; return 130 where Ctrl-C stopped it."""
     expect_writable(options.output)
-    usable_device(options.device, raising=FitError)
+    usable_device(options.device, raising=FitError, kinds=TRAINABLE)
     known = settings_of(options.capture) if options.settings is None else CaptureSettings.read(options.settings)
     if options.material is not None:
         return _run_guess(options, options.material, known)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from avmsf._utils.device import usable_device
+from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
@@ -120,7 +120,7 @@ def run(options: Options) -> int:
     """Reconstruct, and say what came of it; return 130 where Ctrl-C stopped it."""
     if options.output is not None:
         expect_writable(options.output)
-    usable_device(options.device, raising=FitError)
+    usable_device(options.device, raising=FitError, kinds=TRAINABLE)
     settings = options.pipeline.capture_settings(options.read_settings())
     if options.material is not None:
         return _run_guess(options, options.material, settings)

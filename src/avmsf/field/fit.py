@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf._utils.device import usable_device
+from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.places import rows_by_place
@@ -91,7 +91,7 @@ def fit(
     case = gain_case(train, features, modes, config)
     train = case.train
     recipe = MixtureEstimator() if gains is None else gains
-    place = usable_device(device, raising=FitError)
+    place = usable_device(device, raising=FitError, kinds=TRAINABLE)
     job = _Job(case, recipe, None if checkpoint is None else Path(checkpoint), progress, place)
     chosen, report = job.choose()
     run = job.run("fit", list(range(len(train))), chosen)
