@@ -1,16 +1,17 @@
 """`avmsf fit`: a capture folder in, a field file out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 import tyro
+from rich.console import Console
 
 from avmsf._utils.caching import discard
 from avmsf._utils.device import TRAINABLE, usable_device
-from avmsf.bench.evaluation import split
+from avmsf.bench.evaluation import Scores, split
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.folder import settings_of
 from avmsf.cli import INTERRUPTED
@@ -190,16 +191,9 @@ def run(options: Options) -> int:
     scores = {} if test is None else compare(fitted, train, test, modes)
     screen = console(errors=options.json)
     if test is not None:
-        title = f"{parts_words(train, test)}; lower is better"
         shown = ", ".join(test.names[:_SHOWN]) + f" and {len(test) - _SHOWN} more" * (len(test) > _SHOWN)
         say(f"not trained on: {shown}")
-        screen.print(score_table(title, scores))
-    report = fitted.origin.report
-    for words in describe_outliers(fitted):
-        screen.print(words, soft_wrap=True)
-    screen.print(summary(fitted, len(train)), soft_wrap=True)
-    for words in quality_words(fitted, options.output):
-        screen.print(words, soft_wrap=True)
+    print_fitted(screen, fitted, train, test, scores, options.output)
     screen.print(f"wrote {options.output}", soft_wrap=True)
     if options.json:
         print_json(
@@ -212,11 +206,21 @@ def run(options: Options) -> int:
                 "sample_rate": fitted.sample_rate,
                 "trained_on": list(train.names),
                 "tested_on": [] if test is None else list(test.names),
-                "report": report,
+                "report": fitted.origin.report,
                 "scores": score_values(scores),
             }
         )
     return 0
+
+
+def print_fitted(
+    screen: Console, fitted: SoundField, train: Impacts, test: Impacts | None, scores: Mapping[str, Scores], path: Path
+) -> None:
+    """Print how a field in the file `path` does on the recordings left out, what is odd, and how good it is."""
+    if test is not None:
+        screen.print(score_table(f"{parts_words(train, test)}; lower is better", scores))
+    for words in (*describe_outliers(fitted), summary(fitted, len(train)), *quality_words(fitted, path)):
+        screen.print(words, soft_wrap=True)
 
 
 def _run_guess(options: Options, material: str, settings: CaptureSettings) -> int:

@@ -11,20 +11,13 @@ from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
-from avmsf.cli.fit import (
-    describe_outliers,
-    part_contacts,
-    preset_of,
-    refuse_with_material,
-    show_guess,
-    summary,
-)
+from avmsf.cli.fit import part_contacts, preset_of, print_fitted, refuse_with_material, show_guess
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import SceneOptions, features_words
-from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
+from avmsf.cli.scores import compare, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
@@ -155,14 +148,7 @@ def run(options: Options) -> int:
         screen.print(features_words(made.report), soft_wrap=True)
     rows = [[each.stage, figure(each.seconds), "now" if each.fresh else "before"] for each in made.stages]
     screen.print(table("stages", ["stage", "seconds", "made"], rows))
-    if test is not None:
-        title = f"{parts_words(train, test)}; lower is better"
-        screen.print(score_table(title, scores))
-    for words in describe_outliers(fitted):
-        screen.print(words, soft_wrap=True)
-    screen.print(summary(fitted, len(train)), soft_wrap=True)
-    for words in quality_words(fitted, options.output or made.field):
-        screen.print(words, soft_wrap=True)
+    print_fitted(screen, fitted, train, test, scores, options.output or made.field)
     if made.surface is not None:
         screen.print(f"the object's surface is {made.surface}", soft_wrap=True)
     screen.print(f"the field is {made.field}", soft_wrap=True)
