@@ -21,7 +21,7 @@ _LENGTH = 0.25
 """Correlation length L of a departure, over the body's size."""
 _SAMPLES = 600
 """Cells on which the eigenfunctions are solved for; the others follow by Nystroem's formula."""
-_CHUNK = 1024
+_CHUNK = 256
 """Cells at a time."""
 
 
@@ -82,11 +82,11 @@ def perturbations(
         flat = both.reshape(len(weight), -1, modes)
         moving = np.einsum("ab,cadm->cbdm", root, moved).reshape(len(weight), 30, modes)
         moving *= np.sqrt(density * elements.volumes[part])[:, None, None]
-        for row, values in enumerate(fields[:, part]):
-            stiff[row] += _products(flat, values)
-            heavy[row] += _products(moving, values)
-        turned += 2.0 * by_poisson[0] * _products(distortion.reshape(len(weight), -1, modes), np.ones(len(weight)))
-        turned += by_poisson[1] * _products(dilation, np.ones(len(weight)))
+        stiff += _products(flat, fields[:, part])
+        heavy += _products(moving, fields[:, part])
+        everywhere = np.ones((1, len(weight)))
+        turned += 2.0 * by_poisson[0] * _products(distortion.reshape(len(weight), -1, modes), everywhere)[0]
+        turned += by_poisson[1] * _products(dilation, everywhere)[0]
     return Perturbations(stiff, heavy, turned)
 
 
@@ -119,6 +119,8 @@ def _strains(slopes: np.ndarray, moved: np.ndarray, weight: np.ndarray) -> tuple
 
 
 def _products(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the sum over cells of values times rows' rows."""
-    flat = rows.reshape(-1, rows.shape[-1])
-    return flat.T @ (flat * np.repeat(values, rows.shape[1])[:, None])
+    """Return the sums over cells of values [fields, cells] times the products [modes, modes] of a cell's rows."""
+    cells, _, modes = rows.shape
+    # One product for each cell serves all fields.
+    products = rows.transpose(0, 2, 1) @ rows
+    return (values @ products.reshape(cells, -1)).reshape(len(values), modes, modes)

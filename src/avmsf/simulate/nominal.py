@@ -2,18 +2,22 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
+from threading import Lock
 from types import MappingProxyType
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int
+from threadpoolctl import threadpool_limits
 
 from avmsf._utils.caching import source_digest
 from avmsf.capture.surface import Surface
+from avmsf.compiled import lane_count
 from avmsf.errors import SceneError, SimulationError
 from avmsf.fem.supports import Support, supports_of
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
@@ -142,11 +146,18 @@ def nominal_bodies(
             refused[wall] = str(error)
     fine = len(likely) == 1
     bodies = []
-    for wall in likely:
+    # Most of the time goes to factorizations, which release the interpreter's lock and keep one processor busy each.
+    # The limit on BLAS is the whole process's: set by each thread for itself, it would not be taken back in order.
+    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(lane_count()) as pool:
+        pending = {wall: pool.submit(maker.body, wall, freedoms, fine=fine) for wall in likely}
         try:
-            bodies.append(maker.body(wall, freedoms, fine=fine))
-        except SimulationError as error:
-            refused[wall] = str(error)
+            for wall, body in pending.items():
+                try:
+                    bodies.append(body.result())
+                except SimulationError as error:
+                    refused[wall] = str(error)
+        finally:
+            pool.shutdown(cancel_futures=True)
     reasons = _grouped(refused)
     for reason in reasons:
         told(f"not tried: {reason}")
@@ -255,6 +266,7 @@ class _Maker:
         self._shape = None if isinstance(surface, Surface) else surface
         self._count, self._cache, self._tell, self._material = count, cache, tell, material
         self._walls: dict[int, Callable[[float], Solid]] = {}
+        self._lock = Lock()
 
     @cached_property
     def _seen(self) -> Surface:
@@ -362,8 +374,9 @@ class _Maker:
             except SceneError as error:
                 raise SimulationError(str(error)) from error
             return filled_solid(checked(surface, tell=self._tell), freedoms, wall=wall)
-        if freedoms not in self._walls:
-            self._walls[freedoms] = wall_solids(self.checked, freedoms)
+        with self._lock:
+            if freedoms not in self._walls:
+                self._walls[freedoms] = wall_solids(self.checked, freedoms)
         return self._walls[freedoms](wall)
 
     def _kept(
