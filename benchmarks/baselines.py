@@ -43,6 +43,7 @@ from avmsf.simulate.simulation import simulate_object
 from avmsf.simulate.simulationfolder import write_simulation
 from avmsf.tasks.locator import Locator
 from benchmarks.material import surface_features
+from benchmarks.paperrun import paper_runs
 from benchmarks.report import Options, Report, Table, tell
 from benchmarks.sonicgauss import small_method, train_small
 from benchmarks.surface import views_and_gaussians
@@ -91,7 +92,7 @@ class _Objects:
     """Simulated objects, read or made, and their bodies, each computed once."""
 
     def __init__(self, options: Options, folder: Path) -> None:
-        self.folder, self._given, self._clouds = folder, options.sim20, options.clouds
+        self.options, self.folder, self._given, self._clouds = options, folder, options.sim20, options.clouds
         self.quick, self.most = options.quick_look, 1 if options.quick_look else None
         self.weights = folder / "sonicgauss-small.safetensors" if options.weights is None else options.weights
         self.few, self.more = options.objects or FEW, options.objects or MORE
@@ -290,4 +291,5 @@ PARTS: dict[str, Callable[[_Objects], Report]] = {
     "sim20": _sim20,
     "shots": _shots,
     "locating": _locating,
+    "paper": lambda objects: paper_runs(objects.options, objects.folder),
 }
