@@ -40,9 +40,6 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
         page = name.lower()
         _generated[page] = (REPOSITORY / name).read_text()
         sections["Development"].append({title: page})
-    listed = sorted(path.name for path in (REPOSITORY / "docs" / "decisions").glob("*.md") if path.name != "README.md")
-    decisions = next(part["Decisions"] for part in sections["Development"] if "Decisions" in part)
-    decisions.extend(f"decisions/{name}" for name in listed)
     return config
 
 
