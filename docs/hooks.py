@@ -61,7 +61,9 @@ def on_page_content(html: str, **_: Any) -> str:
     """Write formulas as MathML, which browsers show without a script."""
 
     def mathml(found: re.Match[str]) -> str:
-        return convert(_unescaped(found[3]), display="inline" if found[1] == "span" else "block")
+        written = convert(_unescaped(found[3]), display="inline" if found[1] == "span" else "block")
+        # The converter leaves no space after functions without parentheses.
+        return re.sub(r"(<mi>(?:log|det)</mi>)(?!<mo[^>]*>&#x00028;)", r'\1<mspace width="0.17em"/>', written)
 
     return re.sub(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', mathml, html, flags=re.DOTALL)
 
