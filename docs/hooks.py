@@ -28,6 +28,7 @@ print(json.dumps(found))
 """
 """Prints each verb's summary and help. In a process of its own, so that what verbs import does not slow mkdocs down."""
 
+_RULE = re.compile(r" *[-─]{10,} *$")
 _generated: dict[str, str] = {}
 
 
@@ -94,12 +95,25 @@ def _command_pages() -> list[Any]:
 
 
 def _command_page(verb: str, text: str) -> str:
-    """Return a page: the usage, the description as text, and the options as the command prints them."""
-    first = re.search(r"^ *[a-z ]+\n *-{20,}", text, re.MULTILINE)
-    start = first.start() if first else len(text)
-    usage, _, description = text[:start].partition("\n\n")
-    options = "\n".join(line.rstrip() for line in text[start:].splitlines()).rstrip()
-    return f"# avmsf {verb}\n\n```text\n{usage}\n```\n\n{description.strip()}\n\n```text\n{options}\n```\n"
+    """Return a page of a verb's help: the usage as it is, the description as text, and the options as a list."""
+    usage, _, rest = text.partition("\n\n")
+    lines = rest.splitlines()
+    page, described = [f"# avmsf {verb}", "", "```text", usage.strip(), "```", ""], False
+    for line, following in zip(lines, [*lines[1:], ""], strict=True):
+        words = line.strip().replace("<", "&lt;").replace("*", "\\*")
+        indent = len(line) - len(line.lstrip())
+        if _RULE.match(line):
+            continue
+        if indent <= 1 and (_RULE.match(following) or words.endswith(":")) and words.islower():
+            page += ["", f"## {words.strip(':').capitalize()}", ""]
+            described = False
+        elif 0 < indent <= 4 and (words.startswith("-") or re.match(r"[A-Z{\[]\S+(  |$)", words)):
+            name, _, description = words.partition("  ")
+            page += ["", f"`{name}`", f":   {description.strip()}"]
+            described = True
+        else:
+            page.append(f"    {words}" if described and words else words)
+    return "\n".join(page) + "\n"
 
 
 def _package_pages() -> list[Any]:
