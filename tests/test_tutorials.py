@@ -17,9 +17,10 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
 PAGES = (REPOSITORY / "README.md", DOCS / "getting-started.md", *sorted((DOCS / "tutorials").glob("*.md")))
 FEW_STEPS = ("--splat.steps", "60", "--splat.start-points", "800")
+FEW_VIEWS = ("--views.rendered", "48", "--views.count", "18")
 SMALL = {
     "fit": ("--gain-model", "smooth", "--modes", "8", "--steps", "4"),
-    "reconstruct": (*FEW_STEPS, "--lift.encoder", "descriptors", "--gain-model", "smooth", "--modes", "8"),
+    "reconstruct": (*FEW_STEPS, *FEW_VIEWS, "--lift.encoder", "descriptors", "--gain-model", "smooth", "--modes", "8"),
     "splat": tuple(word.replace("splat.", "") for word in FEW_STEPS),
     "lift": (*FEW_STEPS, "--encoder", "descriptors"),
     "surface": FEW_STEPS,
@@ -80,10 +81,10 @@ def test_every_step_of_a_page_runs(
     shutil.copytree(request.getfixturevalue(folder), tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     for kind, text in steps(page):
-        step = f"{folder}: {text}"
-        if text.startswith(LONG) or step in done:
+        # README's Python fits with bodies of many thicknesses, for minutes: tests/test_docs.py checks its names.
+        if text.startswith(LONG) or text in done or (kind == "python" and page.stem == "README"):
             continue
-        done.add(step)
+        done.add(text)
         if kind == "command":
             run(text)
         else:
