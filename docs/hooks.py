@@ -119,28 +119,31 @@ def _command_page(verb: str, text: str) -> str:
 def _package_pages() -> list[Any]:
     """Write one page for each package that exports names, and return their part of the navigation."""
     exported = {path.parent: names for path in sorted(SOURCE.rglob("__init__.py")) if (names := _names(path))}
-    homes = {name: _module(folder) for folder, names in exported.items() for name in names}
     entries = []
     for folder, names in exported.items():
         module = _module(folder)
         lines = [f"# {module}", "", ast.get_docstring(ast.parse((folder / "__init__.py").read_text())) or "", ""]
-        # Each name is documented once, in the package nearest to it.
-        elsewhere = [f"[{name}][{homes[name]}.{name}]" for name in names if homes[name] != module]
+        # Each name is documented once, in the package below that exports it too.
+        below = {name: _module(other) for other in exported if other.is_relative_to(folder) for name in exported[other]}
+        elsewhere = [f"[{name}][{below[name]}.{name}]" for name in names if below[name] != module]
         lines += [f"Documented with the packages below: {', '.join(elsewhere)}.", ""] if elsewhere else []
-        lines += [f"::: {module}.{name}\n" for name in names if homes[name] == module]
+        lines += [f"::: {module}.{name}\n" for name in names if below[name] == module]
         _generated[f"api/{module}.md"] = "\n".join(lines)
         entries.append({module: f"api/{module}.md"})
     return entries
 
 
 def _names(package: Path) -> list[str]:
-    """Return the public names of a package: its literal `__all__`, in the stub file where there is one."""
+    """Return the names that a package exports: those that its stub imports from modules, or its literal `__all__`."""
     stub = package.with_suffix(".pyi")
-    for node in ast.parse((stub if stub.exists() else package).read_text()).body:
+    for node in ast.parse(package.read_text()).body:
         literal = isinstance(node, ast.Assign) and isinstance(node.value, ast.List)
         if literal and ast.unparse(node.targets[0]) == "__all__":
             return [name for name in ast.literal_eval(node.value) if not name.startswith("_")]
-    return []
+    imports = (
+        [node for node in ast.parse(stub.read_text()).body if isinstance(node, ast.ImportFrom)] if stub.exists() else []
+    )
+    return sorted(each.name for node in imports if node.module for each in node.names if not each.name.startswith("_"))
 
 
 def _module(folder: Path) -> str:
