@@ -15,7 +15,8 @@ from small_scene import slab_views
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
-PAGES = (REPOSITORY / "README.md", DOCS / "getting-started.md", *sorted((DOCS / "tutorials").glob("*.md")))
+PAGES = (*sorted((DOCS / "tutorials").glob("*.md")), REPOSITORY / "README.md", DOCS / "getting-started.md")
+"""Tutorials first: what they have run is not repeated for README and getting started."""
 FEW_STEPS = ("--splat.steps", "60", "--splat.start-points", "800")
 FEW_VIEWS = ("--views.rendered", "48", "--views.count", "18")
 SMALL = {
