@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo example test test-all lint install clean
+.PHONY: demo docs example test test-all lint install clean
 
 install: .venv/developed
 
@@ -41,5 +41,9 @@ lint: .venv/developed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# The documentation, into site/. A link or an anchor that leads nowhere is an error.
+docs: .venv/developed
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
 clean:
-	rm -rf .venv demo
+	rm -rf .venv demo site

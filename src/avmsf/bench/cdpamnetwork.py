@@ -19,7 +19,7 @@ _LEAK, _HEAD_LEAK = 0.1, 0.01
 _SILENCE = 1024
 """Samples of silence in whose middle, after all layers, the ends are not felt: they reach 27 of 64."""
 _TILES = {1: 48, 2: 32}
-"""Samples a tile, by stride. Longer ones need fewer products and more memory for weights; see docs/decisions.md."""
+"""Samples a tile, by stride. Longer ones need fewer products and more memory; see docs/decisions/cdpam.md."""
 
 
 @dataclass(frozen=True, eq=False)

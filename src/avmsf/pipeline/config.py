@@ -71,7 +71,7 @@ PRESETS: Mapping[Preset, PipelineConfig] = {
         time_zero="peak",
     ),
 }
-"""`paper` has every stage as published, and of each published list the middle value; docs/equations.md lists what the
+"""`paper` has every stage as published, and of each published list the middle value; docs/paper-map.md lists what the
 paper leaves open."""
 
 

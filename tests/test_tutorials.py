@@ -1,0 +1,92 @@
+"""README and tutorials: their commands and Python blocks run, page by page, on small simulated objects."""
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+
+from avmsf.capture.views.write import write_views
+from avmsf.cli import main
+from plate_capture import fill_plate
+from plate_set import fill_plates
+from small_scene import slab_views
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+DOCS = REPOSITORY / "docs"
+PAGES = (*sorted((DOCS / "tutorials").glob("*.md")), REPOSITORY / "README.md", DOCS / "getting-started.md")
+"""Tutorials first: what they have run is not repeated for README and getting started."""
+FEW_STEPS = ("--splat.steps", "60", "--splat.start-points", "800")
+FEW_VIEWS = ("--views.rendered", "48", "--views.count", "18")
+SMALL = {
+    "fit": ("--gain-model", "smooth", "--modes", "8", "--steps", "4"),
+    "reconstruct": (*FEW_STEPS, *FEW_VIEWS, "--lift.encoder", "descriptors", "--gain-model", "smooth", "--modes", "8"),
+    "splat": tuple(word.replace("splat.", "") for word in FEW_STEPS),
+    "lift": (*FEW_STEPS, "--encoder", "descriptors"),
+    "surface": FEW_STEPS,
+    "evaluate": ("--modes", "8"),
+    "efficiency": ("--methods", "knn3", "--counts", "3", "--starts", "1", "--modes", "8"),
+}
+"""For each verb, settings that take seconds; the pages' own take minutes."""
+LONG = ("avmsf simulate", "avmsf reconstruct scan")
+"""Commands that take minutes with any setting: what they make is there already, or is not used on the page."""
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with what the pages' reader has: a capture, its field, and simulated objects."""
+    folder = tmp_path_factory.mktemp("workshop")
+    fill_plate(folder / "bowl")
+    fill_plates(folder / "objects", ("mug-ceramic",))
+    (folder / "places.csv").write_text("x,y,z\n0.05,0.06,0\n")
+    assert main(["fit", str(folder / "bowl"), "--output", str(folder / "bowl.safetensors"), *SMALL["fit"]]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def photographed(workshop: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the same with photographs in place of the mesh."""
+    folder = tmp_path_factory.mktemp("photographed") / "workshop"
+    shutil.copytree(workshop, folder)
+    (folder / "bowl" / "surface.ply").unlink()
+    write_views(slab_views(), folder / "views")
+    for part in (folder / "views").iterdir():
+        part.rename(folder / "bowl" / part.name)
+    return folder
+
+
+def steps(page: Path) -> list[tuple[str, str]]:
+    """Return the page's commands and Python blocks in their order, each as its kind and its text."""
+    found = re.findall(r"^    (avmsf [^\n]+)$|^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+    return [("command", re.split(r"\s+#", command)[0]) if command else ("python", block) for command, block in found]
+
+
+def run(command: str) -> None:
+    _, verb, *words = shlex.split(command)
+    assert main([verb, *words, *SMALL.get(verb, ())]) == 0, command
+
+
+@pytest.fixture(scope="module")
+def done() -> set[str]:
+    """Return the commands that have run on an earlier page."""
+    return set()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_step_of_a_page_runs(
+    page: Path, done: set[str], request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = "photographed" if page.stem == "photographs" else "workshop"
+    shutil.copytree(request.getfixturevalue(folder), tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    for kind, text in steps(page):
+        # README's Python fits with bodies of many thicknesses, for minutes: tests/test_docs.py checks its names.
+        if text.startswith(LONG) or text in done or (kind == "python" and page.stem == "README"):
+            continue
+        done.add(text)
+        if kind == "command":
+            run(text)
+        else:
+            exec(compile(text, page.name, "exec"), {})
