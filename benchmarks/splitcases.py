@@ -18,7 +18,7 @@ from avmsf.field.recipes import along_phase
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uncertainty import coverage
 from avmsf.geometry import ObjectShape
-from avmsf.modal.extraction.extract import Extraction, extract
+from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.scene.features import FeatureField
@@ -82,7 +82,7 @@ def splits_of(capture: Capture, count: int, bodies: CandidateBodies | None, opti
 
 
 def split_case(train: Impacts, test: Impacts, capture: Capture, bodies: CandidateBodies | None) -> SplitCase:
-    modes = extract(train)
+    modes = extract_modes(train)
     contacts = capture.impacts.contacts
     features = FeatureField.from_contacts(contacts) if capture.surface is None else surface_features(capture)
     return SplitCase(modes.aligned(train), modes.aligned(test), modes, features, bodies, capture.surface)

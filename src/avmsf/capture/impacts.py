@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from avmsf.capture.places import rows_by_place
 from avmsf.compiled import compiled
 
 _SINC_HALF_WIDTH = 32
@@ -54,6 +55,12 @@ class Impacts:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def __repr__(self) -> str:
+        places = len(rows_by_place(self.contacts))
+        return (
+            f"Impacts({len(self)} recordings at {places} positions, {self.duration:.3g} s at {self.sample_rate:g} Hz)"
+        )
 
     def digest(self) -> str:
         """Return a digest of all that can be learnt from the recordings."""

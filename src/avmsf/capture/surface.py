@@ -28,6 +28,10 @@ class Surface:
     faces: Int[Tensor, "faces 3"]
     """Rows of `vertices` at the corners of each triangle; no rows for a point cloud."""
 
+    def __repr__(self) -> str:
+        size = " x ".join(f"{side:.3g}" for side in (self.vertices.amax(0) - self.vertices.amin(0)).tolist())
+        return f"Surface({len(self.vertices)} vertices, {len(self.faces)} triangles, {size} m)"
+
 
 def read_surface(path: str | Path, *, metres: float = 1.0) -> Surface:
     """Read a mesh or a point cloud whose coordinates count `metres` each; vertices keep the file's order.

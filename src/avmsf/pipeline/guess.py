@@ -80,7 +80,7 @@ def guess_field(
     points = FeatureField.from_mesh(seen, generator=torch.Generator().manual_seed(0)).points
     described = f"{len(elastic)} modes of a {material.name} body ({found.name})"
     report = {
-        "gains": "mode shapes of a guessed body",
+        "gain_model": "mode shapes of a guessed body",
         "guess": f"No recordings: a guess of {described} from its shape and the material's constants alone.",
         "material": asdict(material),
         "body": found.name,

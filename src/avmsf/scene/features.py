@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from avmsf._utils.summary import short_repr
 from avmsf.capture.surface import Surface
 from avmsf.errors import FitError
 from avmsf.scene.points import cluster, lattice, nearest_points, sample_surface
@@ -29,6 +30,8 @@ class Regions:
 @dataclass(frozen=True, eq=False)
 class FeatureField:
     """Points of an object, each with a feature vector."""
+
+    __repr__ = short_repr
 
     points: Float[Tensor, "points 3"]
     """Object frame, metres."""

@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from avmsf._utils.summary import short_repr
 from avmsf.errors import LocationError
 from avmsf.scene.symmetry import Symmetries
 from avmsf.tasks.counterparts import Counterpart, name_counterpart
@@ -30,6 +31,8 @@ _NEIGHBOUR_PART = 0.04
 class Peak:
     """A place, as large as it may be, where the blow may have fallen."""
 
+    __repr__ = short_repr
+
     row: int
     """Its likeliest point."""
     place: Float32[Tensor, " 3"]
@@ -43,6 +46,8 @@ class Peak:
 @dataclass(frozen=True, eq=False)
 class ContactMap:
     """Scores of all points of a surface for one blow (paper, section Contact Localization, and beyond it)."""
+
+    __repr__ = short_repr
 
     points: Float32[Tensor, "points 3"]
     """Object frame, metres."""

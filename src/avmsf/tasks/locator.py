@@ -10,6 +10,7 @@ from jaxtyping import Complex64, Complex128, Float, Float32, Float64
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from avmsf._utils.summary import short_repr
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
@@ -31,6 +32,8 @@ _KEPT_LENGTHS = 8
 @dataclass(frozen=True, eq=False)
 class Locator:
     """What blows at all points of a field's surface are foretold to sound like, ready for any number of sounds."""
+
+    __repr__ = short_repr
 
     field: SoundField
     points: Float32[Tensor, "points 3"]
