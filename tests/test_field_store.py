@@ -281,6 +281,25 @@ def test_a_newer_format_is_refused_by_name(tmp_path):
     assert "install a newer avmsf" in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("report", "command"),
+    [
+        ({}, "avmsf fit FOLDER --output"),
+        ({"pipeline": {"scene": {"views": {}}}}, "avmsf reconstruct FOLDER --output"),
+        ({"guess": "…", "material": {"name": "glass"}}, "avmsf fit FOLDER --material glass --output"),
+    ],
+)
+def test_an_older_format_is_refused_with_the_command_that_makes_the_field_again(tmp_path, report, command):
+    def change(_: dict, record: dict) -> None:
+        record.update(format=7, gain_field=record.pop("gains"))
+        record["origin"]["report"] = report
+
+    with pytest.raises(FieldFileError) as caught:
+        load(changed(tmp_path, change))
+    assert f"{command} {tmp_path}" in str(caught.value)
+    assert "'a plate'" in str(caught.value)
+
+
 def test_missing_and_unexpected_tensors_are_named(tmp_path):
     def change(tensors: dict[str, torch.Tensor], _: dict) -> None:
         tensors["gains.to_dampings.bias"] = tensors.pop("gains.to_gains.bias")
