@@ -271,7 +271,7 @@ def test_fit_says_why_elastic_mode_shapes_took_no_part(tmp_path: Path, capsys: S
     report = json.loads(out)["report"]
     assert report["bodies"] == []
     assert "no mesh" in report["unavailable"]["elastic"]
-    assert f"no elastic mode shapes: {report['missing']['elastic']}" in err
+    assert f"no elastic mode shapes: {report['unavailable']['elastic']}" in err
     # Told to do without them, it does not look for any.
     assert main(["fit", str(folder), "--output", str(fields / "one"), "--gain-model", "smooth", *TINY]) == 0
     assert "elastic" not in capsys.readouterr().err

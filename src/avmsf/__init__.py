@@ -14,5 +14,4 @@ import lazy_loader
 __version__ = "0.1.0"
 
 # Imported when first used: torch takes seconds. The stub `__init__.pyi` lists the names, also for editors.
-__getattr__, __dir__, _names = lazy_loader.attach_stub(__name__, __file__)
-__all__ = [*_names, "__version__"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -66,7 +66,7 @@ def test_an_impulse_into_the_surface_sounds_as_the_blow(tmp_path, force):
     model = modal(*read(tmp_path / "thing.glb"))
     for point in range(POINTS):
         heard = struck(model, point, -force * field.normals[point].double().numpy())
-        true = field.render(torch.tensor([point]), forces=force)[0]
+        true = field.render(torch.tensor([point]), force=force)[0]
         # Frequencies are float32 there: 3300 Hz to 1e-4 Hz, which is a phase of 1e-4 after .2 s.
         assert apart(heard, true) < 3e-4
     assert written.error < 1e-6

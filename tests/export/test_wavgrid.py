@@ -38,7 +38,7 @@ def test_every_row_is_its_blow(tmp_path):
         assert float((field.points[point] - place).abs().max()) < 1e-6
         assert [float(row[axis]) for axis in ("nx", "ny", "nz")] == pytest.approx(field.normals[point][0].tolist())
         pulse = ForcePulse(float(row["contact_time"]))
-        truths.append(field.render(point, forces=float(row["force"]), pulse=pulse)[0].numpy())
+        truths.append(field.render(point, force=float(row["force"]), pulse=pulse)[0].numpy())
         sounds.append(sound)
         assert (rate, len(sound), float(row["seconds"])) == (RATE, SAMPLES, SAMPLES / RATE)
         assert float(row["peak_db"]) == pytest.approx(20 * np.log10(np.abs(sound).max()), abs=0.01)

@@ -8,7 +8,6 @@ import shutil
 import uuid
 import warnings
 from dataclasses import dataclass, field, replace
-from numbers import Integral
 from pathlib import Path, PurePosixPath
 
 import soundfile
@@ -71,8 +70,10 @@ class Capture:
         from avmsf.bench.evaluation import split
 
         start = 0 if seed is None else random.Random(seed).randrange(len(self.impacts))
-        part = {"count": train_size} if isinstance(train_size, Integral) else {"fraction": train_size}
-        train, test = split(self.impacts, **part, start=start)
+        if isinstance(train_size, int):
+            train, test = split(self.impacts, count=train_size, start=start)
+        else:
+            train, test = split(self.impacts, fraction=train_size, start=start)
         return replace(self, impacts=train), replace(self, impacts=test)
 
 

@@ -66,7 +66,7 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
     rows = field.spread(grid.contacts)
     samples = field.samples if grid.seconds is None else max(1, round(grid.seconds * rate))
     sounds = [
-        field.render(rows, forces=layer.force, samples=samples, pulse=ForcePulse(layer.contact_time, layer.shape))
+        field.render(rows, force=layer.force, samples=samples, pulse=ForcePulse(layer.contact_time, layer.shape))
         for layer in grid.layers
     ]
     peak = max(float(each.abs().max()) for each in sounds)

@@ -373,7 +373,7 @@ def expect_near(positions: Float[Tensor, "contacts 3"], points: Float[Tensor, "p
     low, high = known.amin(0), known.amax(0)
     size = float((high - low).norm())
     outside = torch.clamp(torch.maximum(low - places, places - high), min=0).norm(dim=1)
-    far = torch.nonzero(outside > size).flatten()
+    far = torch.nonzero(~(outside <= size)).flatten()
     if len(far):
         row = int(far[outside[far].argmax()])
         where = ", ".join(f"{value:.4g}" for value in places[row].tolist())
