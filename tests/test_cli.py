@@ -102,7 +102,7 @@ def test_every_public_name_is_there_and_no_other() -> None:
     for name in avmsf.__all__:
         assert getattr(avmsf, name) is not None
     assert set(avmsf.__all__) <= set(dir(avmsf))
-    with pytest.raises(AttributeError, match="no attribute 'fitt'"):
+    with pytest.raises(AttributeError):
         avmsf.fitt  # noqa: B018
 
 

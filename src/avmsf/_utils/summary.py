@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_LONGEST = 40
+_LONGEST = 80
 """Characters of a single value."""
 
 
