@@ -374,7 +374,7 @@ def _stream(options: LocatingOptions) -> Report:
         near = [blow for blow in blows if abs(blow.seconds - begin / field.sample_rate) < 0.002]
         if near:
             truth = test.contacts[row % len(test)].double()
-            apart = (plate_images(STRUCK.plate).at(truth) - near[0].map.place.double()).norm(dim=1)
+            apart = (plate_images(STRUCK.plate).at(truth) - near[0].map.position.double()).norm(dim=1)
             errors.append(float(apart.min()) / float((features.points.amax(0) - features.points.amin(0)).norm()))
     waited, unloaded = [blow.latency for blow in blows] or [math.nan], unloaded or [math.nan]
     found = {

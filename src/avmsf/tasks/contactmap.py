@@ -35,7 +35,7 @@ class Peak:
 
     row: int
     """Its likeliest point."""
-    place: Float32[Tensor, " 3"]
+    position: Float32[Tensor, " 3"]
     """Where that is, object frame, metres."""
     probability: float
     """That the blow fell here: of all points that hang together with this one."""
@@ -88,7 +88,7 @@ class ContactMap:
         return int(torch.argmax(self.probability))
 
     @property
-    def place(self) -> Float32[Tensor, " 3"]:
+    def position(self) -> Float32[Tensor, " 3"]:
         """Where the most probable point is, object frame, metres. Raises LocationError after a `refusal`."""
         if self.refusal is not None:
             raise LocationError(self.refusal)
@@ -155,7 +155,7 @@ class ContactMap:
         first, *others = self.peaks(level)
         return tuple(
             name_counterpart(
-                first.place, other.place, symmetries, probability=other.probability, tolerance=2.0 * self.radius
+                first.position, other.position, symmetries, probability=other.probability, tolerance=2.0 * self.radius
             )
             for other in others
         )

@@ -56,7 +56,7 @@ def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: flo
     others = contact.counterparts(symmetries, level)
     return {
         "status": LOCATED,
-        "place": contact.place.tolist(),
+        "place": contact.position.tolist(),
         "region": {
             "level": level,
             "radius_metres": _radius(contact, level),
@@ -73,7 +73,8 @@ def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: flo
         },
         "ambiguous": bool(others),
         "counterparts": [
-            {"place": other.place.tolist(), "probability": other.probability, "words": str(other)} for other in others
+            {"place": other.position.tolist(), "probability": other.probability, "words": str(other)}
+            for other in others
         ],
         "notes": list(contact.notes),
     }
@@ -86,7 +87,7 @@ def not_located(reason: str) -> dict[str, Any]:
 
 def _radius(contact: ContactMap, level: float) -> float:
     """Return how far from the likeliest place the blow fell at most, with a probability of `level`, metres."""
-    apart = (contact.points.double() - contact.place.double()).norm(dim=1)
+    apart = (contact.points.double() - contact.position.double()).norm(dim=1)
     order = torch.argsort(apart, stable=True)
     reached = torch.cumsum(contact.probability[order], 0) >= level * contact.probability.sum()
     return float(apart[order][int(reached.double().argmax())])
