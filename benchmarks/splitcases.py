@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import torch
-
 from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture import Capture, CaptureSettings, CaptureWarning, Impacts, Surface, read_capture
 from avmsf.field.config import FitConfig
@@ -61,7 +59,7 @@ class SplitCase:
         """Of the mesh's points; None without a mesh, or where they have none."""
         if self.surface is None:
             return None
-        found = find_symmetries(self.features.points, generator=torch.Generator().manual_seed(0))
+        found = find_symmetries(self.features.points, seed=0)
         return found if groups_of(found) else None
 
     def coverage(self, field: SoundField) -> float:

@@ -225,6 +225,23 @@ def test_a_surface_is_printed_in_a_line():
     assert len(repr(surface)) < 120
 
 
+def test_impacts_and_surfaces_are_made_of_arrays(tmp_path):
+    given = capture().impacts
+    made = Impacts.of(given.contacts.tolist(), given.sounds.numpy(), RATE, forces=given.forces.tolist())
+    assert torch.equal(made.sounds, given.sounds)
+    assert made.names[0] == "001"
+    for wrong in ({"sounds": given.sounds[:3]}, {"contacts": given.contacts[0]}, {"names": ["a"]}):
+        with pytest.raises(ArrayError) as caught:
+            Impacts.of(**{"contacts": given.contacts, "sounds": given.sounds, "sample_rate": RATE} | wrong)
+        assert caught.value.name == next(iter(wrong))
+    surface = avmsf.Surface.of([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.array([[0, 1, 2]]))
+    surface.write(tmp_path / "a.ply")
+    assert torch.equal(avmsf.Surface.read(tmp_path / "a.ply").vertices, surface.vertices)
+    with pytest.raises(ArrayError) as caught:
+        avmsf.Surface.of(surface.vertices, [[0, 1, 2], [0, 1, 3]])
+    assert caught.value.row == 1
+
+
 def test_paths_may_be_strings(tmp_path):
     field().save(str(tmp_path / "a.safetensors"))
     assert Path(tmp_path / "a.safetensors").is_file()

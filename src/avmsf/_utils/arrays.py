@@ -35,6 +35,14 @@ def as_numbers(values: float | ArrayLike, name: str, *, count: int) -> Float[Ten
     return _finite(found.expand(count), name)
 
 
+def as_rows(values: ArrayLike, name: str, *, count: int) -> Float[Tensor, "rows columns"]:
+    """Return `count` rows of numbers. Raises as `as_vectors`."""
+    found = as_floats(values, name)
+    if found.ndim != 2 or len(found) != count:
+        raise ArrayError(f"{name}: expected an array of {count} rows, got shape {list(found.shape)}", name=name)
+    return _finite(found, name)
+
+
 def as_floats(values: float | ArrayLike, name: str) -> Float[Tensor, "*shape"]:
     """Return numbers of any shape as floats on the CPU. Raises ArrayError for what are no numbers."""
     try:
@@ -50,3 +58,12 @@ def _finite(found: Tensor, name: str) -> Tensor:
         row = int(wrong[0])
         raise ArrayError(f"{name}: expected finite numbers, got {found[row].tolist()} (row {row})", name=name, row=row)
     return found
+
+
+Seed = int | torch.Generator | None
+"""What decides chance: a number, a generator that goes on from where it is, or None for the number 0."""
+
+
+def generator_of(seed: Seed) -> torch.Generator:
+    """Return the generator of a seed."""
+    return seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(0 if seed is None else seed)

@@ -138,7 +138,7 @@ def _points_of(capture: Capture, config: PipelineConfig, log: Callable[[str], No
             "video or Gaussians are used by avmsf reconstruct"
         )
         return FeatureField.from_contacts(capture.impacts.contacts)
-    return FeatureField.from_mesh(capture.surface, generator=torch.Generator().manual_seed(config.fit.seed))
+    return FeatureField.from_mesh(capture.surface, seed=config.fit.seed)
 
 
 def _bodies(
@@ -153,5 +153,5 @@ def _symmetries(capture: Capture, config: PipelineConfig) -> Symmetries | None:
     if capture.surface is None:
         return None
     generator = torch.Generator().manual_seed(config.fit.seed)
-    points = FeatureField.from_mesh(capture.surface, generator=generator).points
-    return find_symmetries(points, generator=generator)
+    points = FeatureField.from_mesh(capture.surface, seed=generator).points
+    return find_symmetries(points, seed=generator)

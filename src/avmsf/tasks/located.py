@@ -22,9 +22,7 @@ _CLOSED = 0.02
 def symmetries_of(field: SoundField) -> Symmetries | None:
     """Return the symmetries of a field's points; None where these are too few to tell."""
     try:
-        return find_symmetries(
-            field.gain_field.points, generator=torch.Generator().manual_seed(0), missing=_CLOSED, limit=_JUDGED
-        )
+        return find_symmetries(field.gain_field.points, seed=0, missing=_CLOSED, limit=_JUDGED)
     except AvmsfError:
         return None
 
