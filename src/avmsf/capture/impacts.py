@@ -61,7 +61,7 @@ class Impacts:
         directions: ArrayLike | None = None,
         forces: ArrayLike | None = None,
     ) -> "Impacts":
-        """Return final impacts of contacts in meters, [contacts, 3], and sounds that start with them, [contacts, samples].
+        """Return final impacts of contacts in meters and of sounds that start with them, one row each.
 
         Recordings without `names` are numbered. `forces` are those that the sounds were divided by. Raises ArrayError
         for arrays of other shapes and values that are not finite.
