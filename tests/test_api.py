@@ -114,7 +114,7 @@ def test_lists_and_arrays_sound_like_tensors(kind):
     sounds = field().render(kind(contacts), forces=kind([2.0, 0.5]))
     expected = torch.tensor([[2.0], [0.5]]) * field().render(torch.tensor(contacts, dtype=torch.float64))
     torch.testing.assert_close(sounds, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
-    assert field().render(kind(contacts), kind([[0.0, 0.0, -1.0]] * 2), 2.0).shape == sounds.shape
+    assert field().render(kind(contacts), kind([[0.0, 0.0, -1.0]] * 2), 2).shape == sounds.shape
 
 
 @pytest.mark.parametrize(
@@ -211,8 +211,16 @@ def test_modes_are_extracted_from_a_capture_or_its_impacts():
 
 @pytest.mark.parametrize(
     "made",
-    [capture, lambda: capture().impacts, field, lambda: field().bank, lambda: avmsf.extract_modes(capture())],
-    ids=["capture", "impacts", "field", "bank", "modes"],
+    [
+        capture,
+        lambda: capture().impacts,
+        field,
+        lambda: field().bank,
+        lambda: avmsf.extract_modes(capture()),
+        lambda: field().locate(capture().impacts.sounds[0]),
+        lambda: field().posterior([CONTACT]),
+    ],
+    ids=["capture", "impacts", "field", "bank", "modes", "map", "posterior"],
 )
 def test_what_is_printed_is_a_line_or_two(made):
     text = repr(made())

@@ -27,7 +27,7 @@ def as_vectors(values: ArrayLike, name: str, *, count: int | None = None) -> Flo
     return _finite(found, name)
 
 
-def as_numbers(values: float | ArrayLike, name: str, *, count: int) -> Float[Tensor, " rows"]:
+def as_numbers(values: float | int | ArrayLike, name: str, *, count: int) -> Float[Tensor, " rows"]:
     """Return `count` numbers, or one that holds for all, as a tensor of `count`. Raises as `as_vectors`."""
     found = as_floats(values, name)
     if found.ndim > 1 or (found.ndim == 1 and len(found) != count):
@@ -43,7 +43,7 @@ def as_rows(values: ArrayLike, name: str, *, count: int) -> Float[Tensor, "rows 
     return _finite(found, name)
 
 
-def as_floats(values: float | ArrayLike, name: str) -> Float[Tensor, "*shape"]:
+def as_floats(values: float | int | ArrayLike, name: str) -> Float[Tensor, "*shape"]:
     """Return numbers of any shape as floats on the CPU. Raises ArrayError for what are no numbers."""
     try:
         found = torch.as_tensor(values if isinstance(values, Tensor) else np.asarray(values, dtype=np.float64))

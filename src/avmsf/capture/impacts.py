@@ -55,7 +55,7 @@ class Impacts:
         cls,
         contacts: ArrayLike,
         sounds: ArrayLike,
-        sample_rate: float,
+        sample_rate: float | int,
         *,
         names: Sequence[str] | None = None,
         directions: ArrayLike | None = None,

@@ -233,7 +233,7 @@ class SoundField:
 
         return suggest(self, count)
 
-    def locate(self, recording: "Sound", *, sample_rate: float | None = None) -> "ContactMap":
+    def locate(self, recording: "Sound", *, sample_rate: float | int | None = None) -> "ContactMap":
         """Return where on the object a recorded impact was: points with probabilities.
 
         `recording` is the path of a sound file, or the samples of one channel at `sample_rate` Hz (by default the
@@ -283,7 +283,7 @@ class SoundField:
         self,
         positions: ArrayLike,
         directions: ArrayLike | None = None,
-        forces: float | ArrayLike | None = None,
+        forces: float | int | ArrayLike | None = None,
         *,
         samples: int | None = None,
         pulse: ForcePulse | None = None,

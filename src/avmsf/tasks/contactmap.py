@@ -47,7 +47,13 @@ class Peak:
 class ContactMap:
     """Scores of all points of a surface for one blow (paper, section Contact Localization, and beyond it)."""
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        if self.refusal is not None:
+            return f"ContactMap({len(self.points)} points, no position: {self.refusal})"
+        first, *others = self.peaks()
+        where = ", ".join(f"{value + 0.0:.3f}" for value in self.position.tolist())
+        more = f", {len(others)} more positions as probable" if others else ""
+        return f"ContactMap({len(self.points)} points, most probable ({where}) m with {first.probability:.0%}{more})"
 
     points: Float32[Tensor, "points 3"]
     """Object frame, metres."""

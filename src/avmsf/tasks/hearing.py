@@ -47,7 +47,7 @@ def hear(
     recording: Sound,
     field: SoundField,
     *,
-    sample_rate: float | None = None,
+    sample_rate: float | int | None = None,
     settings: CaptureSettings | None = None,
 ) -> Heard:
     """Prepare a recorded blow for a field as the recordings were that it was fitted to.
@@ -93,7 +93,9 @@ def read_if_path(recording: Sound) -> Recording | ArrayLike:
     return read_recording(Path(recording)) if isinstance(recording, str | Path) else recording
 
 
-def as_recording(recording: Recording | ArrayLike, field: SoundField, *, sample_rate: float | None = None) -> Recording:
+def as_recording(
+    recording: Recording | ArrayLike, field: SoundField, *, sample_rate: float | int | None = None
+) -> Recording:
     """Return a recording that can be listened to.
 
     Raises LocationError for samples of more than one channel, rates that are none, silence and what is not finite.

@@ -39,7 +39,7 @@ def locate_blows(
     field: SoundField,
     recording: Sound,
     *,
-    sample_rate: float | None = None,
+    sample_rate: float | int | None = None,
     settings: CaptureSettings | None = None,
     force: Force | None = None,
     locator: Locator | None = None,
