@@ -24,7 +24,7 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.modal.extraction.alignment import Alignment, align, coherence, strongest_modes
-from avmsf.modal.extraction.extract import Extraction, extract
+from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.scene.features import FeatureField
@@ -99,11 +99,11 @@ def _captures(options: Options) -> Report:
         before, after = (
             _bowl(name) if name == "bowl_clips" else (by_threshold(shared_data() / name), _read(name).impacts)
         )
-        modes = extract(after)
+        modes = extract_modes(after)
         assert modes.alignment is not None
         delays = modes.alignment.delays
         values = {
-            "before": coherence_of(extract(before)),
+            "before": coherence_of(extract_modes(before)),
             "after": coherence_of(modes),
             "shortest": float(delays.min()),
             "longest": float(delays.max()),
@@ -184,7 +184,7 @@ def _jitter_with(options: Options, cache: Path) -> Report:
             for seed in range(draws):
                 moved, starts = jittered(files, jitter, seed=seed)
                 train, test = split(moved, count=12)
-                modes, found = extract(train), align(moved)
+                modes, found = extract_modes(train), align(moved)
                 assert found is not None
                 train, test = modes.aligned(train), modes.aligned(test)
                 for method, recipe in (("no_body", MixtureEstimator()), ("auto", estimator)):
@@ -225,7 +225,7 @@ def _modes(options: Options) -> Report:
         ("tree", "tree43", tree_frequencies(), 0.0),
     ):
         impacts = _read(name).impacts
-        modes = extract(impacts)
+        modes = extract_modes(impacts)
         counted = count_modes(impacts, modes, known, least_share=share)
         quality = measure_quality(modes.aligned(impacts).sounds, modes, sample_rate=impacts.sample_rate)
         called = float(quality.is_mode.sum())
@@ -406,7 +406,7 @@ def _error(
     impacts: Impacts, capture: Capture, count: int, start: int, make: Callable[[], GainRecipe], options: Options
 ) -> float:
     train, test = split(impacts, count=count, start=start)
-    modes = extract(train)
+    modes = extract_modes(train)
     train, test = modes.aligned(train), modes.aligned(test)
     features = FeatureField.from_contacts(impacts.contacts) if capture.surface is None else surface_features(capture)
     config = QUICK_LOOK if options.quick_look else FitConfig()

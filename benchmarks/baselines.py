@@ -32,7 +32,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import extract_modes
 from avmsf.modal.synthesis import synthesise
 from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
@@ -268,7 +268,7 @@ def _locating(objects: _Objects) -> Report:
         capture = objects.capture(name)
         assert capture.surface is not None
         train, test = split(capture.impacts, fraction=0.2)
-        modes = extract(train)
+        modes = extract_modes(train)
         config = DiffSoundConfig(sim20_recipe(name).material)
         renderer = fit_diffsound(train, objects.family(name), modes, config, weighted=False)
         field = fit(train, surface_features(capture), modes, FitConfig(steps=0), gains=MixtureEstimator())

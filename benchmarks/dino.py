@@ -104,7 +104,7 @@ def _fit(*, quick_look: bool) -> dict[str, Any]:
     cloud = splat(train, config, rasteriser=rasteriser, progress=look)
     seconds = time.perf_counter() - began - judging
     figures = judge(cloud, held, rasteriser=rasteriser)
-    symmetries = find_symmetries(cloud.centers, generator=torch.Generator().manual_seed(0), missing=0.1)
+    symmetries = find_symmetries(cloud.centers, seed=0, missing=0.1)
     figures |= {"seconds": masking + seconds, "gigabytes": peak_gigabytes(), "gaussians": float(len(cloud))}
     return {
         "figures": figures,

@@ -13,7 +13,7 @@ from avmsf.bench.metrics import default_fft_sizes, relative_stft_error
 from avmsf.capture import Impacts
 from avmsf.errors import ExtractionError
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.extract import extract, extract_sounds
+from avmsf.modal.extraction.extract import extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
 from avmsf.simulate.plate import PlateModes, plate_modes
 from benchmarks.material import IMPULSE, clips_in_place
@@ -96,7 +96,7 @@ def _plate(options: Options) -> Report:
         strikes = IMPULSE.strikes(count, seconds=seconds, noise_db=-noise)
         truth = plate_modes(IMPULSE.plate, strikes.contacts)
         for method, finder in METHODS.items():
-            found = extract(strikes, finder).bank
+            found = extract_modes(strikes, finder).bank
             tell(f"plate, noise {noise} dB down, {method}: {len(found)} modes for {len(truth.frequency)}")
             each = Match.of(found, truth).figures() | {"modes": float(len(found))}
             names = list(each)

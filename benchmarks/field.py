@@ -23,7 +23,7 @@ from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uncertainty import coverage
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import extract_modes
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.nominal import nominal_bodies
@@ -146,7 +146,7 @@ def _crossed(options: Options) -> Report:
     runs: list[Figures] = []
     for start in AIRCRAFT_STARTS[:1] if options.quick_look else AIRCRAFT_STARTS:
         train, test = split(capture.impacts, count=CROSSED, start=start)
-        modes = extract(train)
+        modes = extract_modes(train)
         train, test = modes.aligned(train), modes.aligned(test)
         errors = {
             name: evaluate(fit(train, features, modes, config, gains=estimator), test).mean()["relative_stft"]
@@ -211,7 +211,7 @@ def _visual(options: Options) -> Report:
             "visual_alone": finish(lifted, symmetry=False, positions=False).features,
             "visual_alone_symmetric": finish(lifted, symmetry=True, positions=False).features,
         }
-        modes, config = extract(train), QUICK_LOOK if options.quick_look else FitConfig()
+        modes, config = extract_modes(train), QUICK_LOOK if options.quick_look else FitConfig()
         train, test = modes.aligned(train), modes.aligned(test)
         figures: Figures = {}
         rows: list[list[str | float]] = []
@@ -259,7 +259,7 @@ def _judge(
     """Return METHOD and METHOD.METRIC for all methods, on one extraction that they share."""
     config = QUICK_LOOK if options.quick_look else FitConfig()
     begun = time.perf_counter()
-    modes = extract(train)
+    modes = extract_modes(train)
     train, test = modes.aligned(train), modes.aligned(test)
     extracted = time.perf_counter()
     fitted = fit(train, features, modes, config, gains=Attention())

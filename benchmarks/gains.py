@@ -186,7 +186,7 @@ def _located(field: SoundField, test: Impacts) -> float:
     points = field.gain_field.points
     size = float((points.amax(0) - points.amin(0)).norm())
     locator = Locator.of(field, points=points[farthest_points(points, min(_PLACES, len(points)))])
-    places = torch.stack([locator.locate(sound).place for sound in test.sounds])
+    places = torch.stack([locator.locate(sound).position for sound in test.sounds])
     return float((places - test.contacts).norm(dim=1).median()) / size
 
 

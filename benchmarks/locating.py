@@ -28,7 +28,7 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.soundfield import SoundField
-from avmsf.modal.extraction.extract import Extraction, extract
+from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.residual import Residual
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.scene.features import FeatureField
@@ -225,7 +225,7 @@ def _table(key: str, groups: dict[str, list[LocatingCase]], options: LocatingOpt
 
 def _judged(case: LocatingCase, options: LocatingOptions, seconds: list[float]) -> dict[str, LocatingScores]:
     """Return a case's scores: with bodies under the empty name, then without residual and by the network."""
-    modes = extract(case.train)
+    modes = extract_modes(case.train)
     silent = replace(modes, residual=Residual(torch.zeros_like(modes.residual.magnitude)))
     plain = FitConfig(steps=0)
     runs: dict[str, tuple[GainRecipe, Extraction, FitConfig]] = {
@@ -277,7 +277,7 @@ def _strangers(options: LocatingOptions) -> Report:
             surface = capture.surface
             recipe = MixtureEstimator() if surface is None else _estimator(surface, wall, name, options)
             features = bare if surface is None else surface_features(capture)
-            field = fit(train, features, extract(train), FitConfig(steps=0), gains=recipe)
+            field = fit(train, features, extract_modes(train), FitConfig(steps=0), gains=recipe)
             locator = Locator.of(
                 field, points=field.gain_field.points[:: max(1, len(features.points) // STRANGE_POINTS)]
             )
@@ -349,7 +349,11 @@ def _stream(options: LocatingOptions) -> Report:
     train, test = split(STRUCK.strikes(40, seconds=seconds), fraction=0.5)
     features = FeatureField.from_points(plate_surface_points(STRUCK.plate, STREAM_POINTS))
     field = fit(
-        train, features, extract(train), FitConfig(steps=0), gains=_estimator(slab(STRUCK.plate), 0.0, "plate", options)
+        train,
+        features,
+        extract_modes(train),
+        FitConfig(steps=0),
+        gains=_estimator(slab(STRUCK.plate), 0.0, "plate", options),
     )
     begun = time.process_time()
     listener = Listener(Locator.of(field))
@@ -370,7 +374,7 @@ def _stream(options: LocatingOptions) -> Report:
         near = [blow for blow in blows if abs(blow.seconds - begin / field.sample_rate) < 0.002]
         if near:
             truth = test.contacts[row % len(test)].double()
-            apart = (plate_images(STRUCK.plate).at(truth) - near[0].map.place.double()).norm(dim=1)
+            apart = (plate_images(STRUCK.plate).at(truth) - near[0].map.position.double()).norm(dim=1)
             errors.append(float(apart.min()) / float((features.points.amax(0) - features.points.amin(0)).norm()))
     waited, unloaded = [blow.latency for blow in blows] or [math.nan], unloaded or [math.nan]
     found = {

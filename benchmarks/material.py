@@ -103,7 +103,7 @@ def example_capture() -> Capture:
 def surface_features(capture: Capture) -> FeatureField:
     """Return points drawn with seed 0 from a capture's surface, with positions alone as features."""
     assert capture.surface is not None
-    return FeatureField.from_mesh(capture.surface, generator=torch.Generator().manual_seed(0), count=POINTS)
+    return FeatureField.from_mesh(capture.surface, seed=0, count=POINTS)
 
 
 def clips_in_place(name: str, *, highpass: float = 0.0) -> list[Clip]:

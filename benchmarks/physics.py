@@ -19,7 +19,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.uncertainty import coverage
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.simulate.bodies import make_body
 from avmsf.simulate.material import material_named
@@ -103,7 +103,7 @@ def _fitted(folder: Path, cache: Path, wall: str, freedoms: int) -> dict[str, fl
     config = BodyConfig(wall=None if wall == "unknown" else float(wall), freedoms=freedoms)
     bodies = candidate_bodies(capture.surface, config, impacts=capture.impacts, cache=cache)
     solved = time.perf_counter()
-    modes = extract(capture.impacts)
+    modes = extract_modes(capture.impacts)
     estimator = MixtureEstimator(bodies=bodies)
     field = fit(capture.impacts, surface_features(capture), modes, FitConfig(), gains=estimator)
     done = time.perf_counter()
@@ -132,7 +132,7 @@ def _coverage(options: Options) -> Report:
         with tempfile.TemporaryDirectory() as cache:
             estimator = MixtureEstimator(bodies=candidate_bodies(made.capture.surface, config, cache=Path(cache)))
             steps = FitConfig(steps=2) if options.quick_look else FitConfig()
-            modes = extract(train)
+            modes = extract_modes(train)
             field = fit(train, surface_features(made.capture), modes, steps, gains=estimator)
             test = modes.aligned(test)
         held = coverage(field, test.contacts, measured_parts(test, field), directions=test.directions, level=0.9)

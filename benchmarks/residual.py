@@ -13,7 +13,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.soundfield import SoundField
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.sim20 import SIM20, sim20_recipe
@@ -75,7 +75,7 @@ def measure(options: Options) -> Report:
 def _judged(case: _Case, options: Options) -> Iterator[tuple[str, tuple[float, float, float]]]:
     """Yield the name of each residual with the tail's level in dB, the relative STFT error and L1-log."""
     config = QUICK_LOOK if options.quick_look else FitConfig(damping="shared")
-    modes = extract(case.train)
+    modes = extract_modes(case.train)
     test = modes.aligned(case.test)
     for name, rate in RATES.items():
         rated = replace(config, noise_rate=rate, residual_noise="gaussian")

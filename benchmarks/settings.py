@@ -12,7 +12,7 @@ from avmsf.capture import Impacts
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.recipes import Attention
-from avmsf.modal.extraction.extract import Extraction, extract
+from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate
 from benchmarks.material import PlateCase, capture_in_place, surface_features
@@ -81,14 +81,14 @@ def _cases(options: Options) -> list[Case]:
     cases = []
     for plate in (GLASS, WOOD):
         train, test = split(plate.strikes(60, seconds=1.0, highest=6000.0), count=15)
-        cases.append((train, test, extract(train), plate.features()))
+        cases.append((train, test, extract_modes(train), plate.features()))
     if options.quick_look:
         return cases[:1]
     capture = capture_in_place("aircraft_response")
     features = surface_features(capture)
     for count, start, part in AIRCRAFT:
         train, test = split(split(capture.impacts, count=count, start=start)[0], count=part)
-        modes = extract(train)
+        modes = extract_modes(train)
         cases.append((modes.aligned(train), modes.aligned(test), modes, features))
     return cases
 

@@ -16,7 +16,7 @@ from avmsf.field.fit import Progress, fit
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.training import Targets, TrainingRun
-from avmsf.modal.extraction.extract import Extraction, extract
+from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.scene.features import FeatureField
 from benchmarks.material import IMPULSE, STRUCK
 from benchmarks.report import Options, Report, Table, tell
@@ -87,7 +87,7 @@ def _quick(options: Options) -> Report:
     count, seconds, config = (30, 0.5, QUICK_LOOK) if options.quick_look else (100, 3.0, FitConfig())
     train, test = split(STRUCK.strikes(count, seconds=seconds), fraction=0.2)
     features = STRUCK.features()
-    modes, extracting = _timed(lambda: extract(train))
+    modes, extracting = _timed(lambda: extract_modes(train))
     quick, fitting = _timed(lambda: fit(train, features, modes, config, gains=Attention()))
     quick_error = evaluate(quick, test).mean()["relative_stft"]
     tell(f"quick: {extracting:.1f} s to extract, {fitting:.1f} s to fit, error {quick_error:.4f}")
@@ -175,7 +175,7 @@ def _quick_of_eight(options: Options) -> float:
     seconds, config = (0.5, QUICK_LOOK) if options.quick_look else (3.0, FitConfig())
     train = IMPULSE.strikes(8, seconds=seconds, sample_rate=48000.0, highest=20000.0)
     features = IMPULSE.features()
-    _, taken = _timed(lambda: fit(train, features, extract(train), config, gains=Attention()))
+    _, taken = _timed(lambda: fit(train, features, extract_modes(train), config, gains=Attention()))
     return taken
 
 

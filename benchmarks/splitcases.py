@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import torch
-
 from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture import Capture, CaptureSettings, CaptureWarning, Impacts, Surface, read_capture
 from avmsf.field.config import FitConfig
@@ -18,7 +16,7 @@ from avmsf.field.recipes import along_phase
 from avmsf.field.soundfield import SoundField
 from avmsf.field.uncertainty import coverage
 from avmsf.geometry import ObjectShape
-from avmsf.modal.extraction.extract import Extraction, extract
+from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.scene.features import FeatureField
@@ -61,7 +59,7 @@ class SplitCase:
         """Of the mesh's points; None without a mesh, or where they have none."""
         if self.surface is None:
             return None
-        found = find_symmetries(self.features.points, generator=torch.Generator().manual_seed(0))
+        found = find_symmetries(self.features.points, seed=0)
         return found if groups_of(found) else None
 
     def coverage(self, field: SoundField) -> float:
@@ -82,7 +80,7 @@ def splits_of(capture: Capture, count: int, bodies: CandidateBodies | None, opti
 
 
 def split_case(train: Impacts, test: Impacts, capture: Capture, bodies: CandidateBodies | None) -> SplitCase:
-    modes = extract(train)
+    modes = extract_modes(train)
     contacts = capture.impacts.contacts
     features = FeatureField.from_contacts(contacts) if capture.surface is None else surface_features(capture)
     return SplitCase(modes.aligned(train), modes.aligned(test), modes, features, bodies, capture.surface)

@@ -14,7 +14,7 @@ from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.soundfield import SoundField
 from avmsf.field.suggest import suggest
 from avmsf.modal.extraction.alignment import align
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import farthest_points
@@ -116,7 +116,7 @@ def _paths(
 
 def _fitted(impacts: Impacts, rows: list[int], features: FeatureField, estimator: MixtureEstimator) -> SoundField:
     train = impacts.take(rows)
-    return fit(train, features, extract(train), FitConfig(steps=0), gains=estimator)
+    return fit(train, features, extract_modes(train), FitConfig(steps=0), gains=estimator)
 
 
 PARTS: dict[str, Callable[[Options], Report]] = {"aircraft": _aircraft, "sim20": _sim20}

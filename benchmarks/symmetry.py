@@ -268,7 +268,7 @@ def score_cloud(
     turn = Rotation.random(random_state=seed)
     size, shift = random.uniform(0.1, 3.0), random.normal(size=3)
     posed = torch.from_numpy(size * turn.apply(points) + shift)
-    found = find_symmetries(posed, generator=torch.Generator().manual_seed(seed))
+    found = find_symmetries(posed, seed=seed)
     true = [
         Element(
             tuple(turn.apply(each.direction)), tuple(size * turn.apply(each.point) + shift), each.order, each.mirror

@@ -47,4 +47,4 @@ def truth(wall: float) -> ElasticModes:
 
 @cache
 def points() -> torch.Tensor:
-    return FeatureField.from_mesh(dome(), generator=torch.Generator().manual_seed(0), count=1500).points
+    return FeatureField.from_mesh(dome(), seed=0, count=1500).points

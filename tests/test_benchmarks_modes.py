@@ -10,7 +10,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from avmsf.capture import CaptureSettings, read_capture
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import extract_modes
 from benchmarks.modes import AIRCRAFT, LEAST_SHARE, ModeCount, count_modes, match_modes, tree_frequencies
 
 
@@ -27,7 +27,7 @@ def test_modes_are_matched_one_to_one_and_others_counted_by_energy() -> None:
 @pytest.mark.slow
 def test_the_aircrafts_thirteen_modes_are_found_and_hardly_any_other(shared: Path) -> None:
     impacts = read_capture(shared / "aircraft_response").impacts
-    counted = count_modes(impacts, extract(impacts), AIRCRAFT, least_share=LEAST_SHARE)
+    counted = count_modes(impacts, extract_modes(impacts), AIRCRAFT, least_share=LEAST_SHARE)
     assert counted.found == 13
     assert counted.extra <= 4
 
@@ -36,4 +36,4 @@ def test_the_aircrafts_thirteen_modes_are_found_and_hardly_any_other(shared: Pat
 @pytest.mark.filterwarnings("ignore:.*at one and the same contact")
 def test_the_trees_modes_are_found_and_no_other(shared: Path) -> None:
     impacts = read_capture(shared / "tree43", CaptureSettings(align=False)).impacts
-    assert count_modes(impacts, extract(impacts), tree_frequencies()) == ModeCount(24, 0)
+    assert count_modes(impacts, extract_modes(impacts), tree_frequencies()) == ModeCount(24, 0)

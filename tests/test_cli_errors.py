@@ -50,7 +50,7 @@ WRONG = {
     f"render not-ours.safetensors {AT} --output s": "a file of another kind",
     "render field.safetensors --output s": "expected contacts either by --at",
     f"render field.safetensors {AT} --contacts no-z.csv --output s": "expected contacts either by --at",
-    "render field.safetensors --at 50 60 0 --output s": "say so with --unit",
+    "render field.safetensors --at 50 60 0 --output s": "--unit says",
     "render field.safetensors --at nan 0 0 --output s": "expected finite numbers",
     f"render field.safetensors {AT} {AT} --output two.wav": "is one file and there are 2 contacts",
     f"render field.safetensors {AT} --output words.csv": "words.csv is a file",

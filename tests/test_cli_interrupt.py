@@ -70,7 +70,7 @@ def test_an_interruption_before_training_keeps_nothing(
         raise KeyboardInterrupt
 
     folder = fill_plate(tmp_path / "plate")
-    monkeypatch.setattr(kept, "extract", stop)
+    monkeypatch.setattr(kept, "extract_modes", stop)
     assert main(["fit", str(folder), "--output", str(tmp_path / "field.safetensors"), *NETWORK]) == 130
     assert capsys.readouterr().err.splitlines()[-1] == "avmsf fit: interrupted"
     assert [path.name for path in tmp_path.iterdir()] == ["plate"]
@@ -79,8 +79,8 @@ def test_an_interruption_before_training_keeps_nothing(
 def test_an_interruption_as_training_begins_keeps_the_modes(
     tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from avmsf.cli import fit as verb
     from avmsf.modal.extraction import extract as kept
+    from avmsf.pipeline import fitting
 
     def stop(*arguments: object, **named: object) -> None:
         raise KeyboardInterrupt
@@ -90,11 +90,11 @@ def test_an_interruption_as_training_begins_keeps_the_modes(
 
     words = ["fit", str(fill_plate(tmp_path / "plate")), "--output", str(tmp_path / "field.safetensors"), *NETWORK]
     with monkeypatch.context() as patched:
-        patched.setattr(verb, "fit", stop)
+        patched.setattr(fitting, "fit", stop)
         assert main(words) == 130
     assert capsys.readouterr().err.splitlines()[-1].endswith("go on from the start of training")
     with monkeypatch.context() as patched:
-        patched.setattr(kept, "extract", refuse)
+        patched.setattr(kept, "extract_modes", refuse)
         # The modes that are kept are this method's alone.
         with pytest.raises(AssertionError, match="sought again"):
             main([*words, "--method", "short-time"])

@@ -196,7 +196,7 @@ def test_one_bad_recording_does_not_cost_the_others(place: Place, capsys: Stream
 
 def test_the_fields_quality_is_said_once(place: Place, tmp_path: Path, capsys: Streams) -> None:
     known = load(Path(place.field))
-    quality = {"places": 9, "error": 0.321, "averaging": 0.72}
+    quality = {"positions": 9, "error": 0.321, "nearest_mean": 0.72}
     judged = replace(known, origin=replace(known.origin, report={"quality": quality}))
     save(judged, tmp_path / "judged.safetensors")
     hits = [place.wav(f"judged-{row}.wav", place.blow(row)) for row in (STRUCK, SECOND)]

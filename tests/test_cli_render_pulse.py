@@ -73,7 +73,7 @@ def test_the_noise_knows_no_hammer() -> None:
     """Modes alone are softened, so that what a pulse changes is their convolution with it."""
     sound_field, pulse = sounding(), ForcePulse(2e-3)
     noise = sound_field.noise()
-    hard, soft = (sound_field.render(PLACE, force=3.0, pulse=each) for each in (None, pulse))
+    hard, soft = (sound_field.render(PLACE, forces=3.0, pulse=each) for each in (None, pulse))
     expected = 3.0 * (pulse.soften(hard / 3.0 - noise, sample_rate=8000.0) + noise)
     torch.testing.assert_close(soft, expected, rtol=0, atol=1e-6 * float(hard.abs().max()))
 

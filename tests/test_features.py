@@ -87,14 +87,14 @@ def test_normals_follow_the_positions():
 def test_a_mesh_gives_points_on_it_and_points_alone_are_kept():
     vertices = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.1, 0.0]])
     generator = torch.Generator().manual_seed(3)
-    mesh = FeatureField.from_mesh(Surface(vertices, torch.tensor([[0, 1, 2]])), generator=generator, count=500)
+    mesh = FeatureField.from_mesh(Surface(vertices, torch.tensor([[0, 1, 2]])), seed=generator, count=500)
     assert mesh.points.shape == (500, 3)
     x, y, z = mesh.points.T
     # On the triangle x / 0.2 + y / 0.1 <= 1 in the plane z = 0, to float32.
     assert float((x / 0.2 + y / 0.1).max()) <= 1 + 1e-6
     assert float(torch.minimum(x, y).min()) >= 0
     assert float(z.abs().max()) == 0
-    cloud = FeatureField.from_mesh(Surface(vertices, torch.zeros(0, 3, dtype=torch.long)), generator=generator)
+    cloud = FeatureField.from_mesh(Surface(vertices, torch.zeros(0, 3, dtype=torch.long)), seed=generator)
     assert torch.equal(cloud.points, vertices)
 
 

@@ -225,7 +225,7 @@ def test_patience_ends_a_trial_early_and_shortens_the_fit():
 
 def test_few_contacts_are_not_divided():
     report = fitted(VALIDATED, train=plate_impacts(5)).origin.report
-    assert report == {"gains": "attention", "damping": "shared", "validated": False}
+    assert report == {"gain_model": "attention", "damping": "shared", "validated": False}
 
 
 @pytest.mark.parametrize("damping", ["shared", "per-contact"])

@@ -101,10 +101,10 @@ def test_no_contacts_make_no_sounds():
 
 def test_force_scales_all_of_the_sound():
     sounds = field().render(CONTACTS)
-    assert torch.equal(field().render(CONTACTS, force=4.0), 4.0 * sounds)
-    assert torch.equal(field().render(CONTACTS, force=0.0), torch.zeros(40, 2400))
+    assert torch.equal(field().render(CONTACTS, forces=4.0), 4.0 * sounds)
+    assert torch.equal(field().render(CONTACTS, forces=0.0), torch.zeros(40, 2400))
     # Noise and modes alike, to float32.
-    torch.testing.assert_close(field().render(CONTACTS, force=0.3), 0.3 * sounds, rtol=1e-6, atol=0)
+    torch.testing.assert_close(field().render(CONTACTS, forces=0.3), 0.3 * sounds, rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("samples", [1, 511, 2400, 5000])

@@ -78,7 +78,7 @@ def test_a_file_names_its_tensors_and_itself(tmp_path):
     with safe_open(tmp_path / "plate.safetensors", framework="pt") as file:
         names, record = set(file.keys()), json.loads(file.metadata()["avmsf"])
     assert {"bank.frequency", "bank.damping", "phase", "residual.magnitude"} < names
-    assert {name.removeprefix("gain_field.") for name in names if name.startswith("gain_field.")} == set(
+    assert {name.removeprefix("gains.") for name in names if name.startswith("gains.")} == set(
         field().gain_field.state_dict()
     )
     assert record["format"] == FORMAT
@@ -281,23 +281,40 @@ def test_a_newer_format_is_refused_by_name(tmp_path):
     assert "install a newer avmsf" in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("report", "command"),
+    [
+        ({}, "avmsf fit FOLDER --output"),
+        ({"pipeline": {"scene": {"views": {}}}}, "avmsf reconstruct FOLDER --output"),
+        ({"guess": "…", "material": {"name": "glass"}}, "avmsf fit FOLDER --material glass --output"),
+    ],
+)
+def test_an_older_format_is_refused_with_the_command_that_makes_the_field_again(tmp_path, report, command):
+    def change(_: dict, record: dict) -> None:
+        record.update(format=7, gain_field=record.pop("gains"))
+        record["origin"]["report"] = report
+
+    with pytest.raises(FieldFileError) as caught:
+        load(changed(tmp_path, change))
+    assert f"{command} {tmp_path}" in str(caught.value)
+    assert "'a plate'" in str(caught.value)
+
+
 def test_missing_and_unexpected_tensors_are_named(tmp_path):
     def change(tensors: dict[str, torch.Tensor], _: dict) -> None:
-        tensors["gain_field.to_dampings.bias"] = tensors.pop("gain_field.to_gains.bias")
+        tensors["gains.to_dampings.bias"] = tensors.pop("gains.to_gains.bias")
 
-    with pytest.raises(
-        FieldFileError, match=r"missing gain_field\.to_gains\.bias; unexpected gain_field\.to_dampings\.bias"
-    ):
+    with pytest.raises(FieldFileError, match=r"missing gains\.to_gains\.bias; unexpected gains\.to_dampings\.bias"):
         load(changed(tmp_path, change))
 
 
 @pytest.mark.parametrize(
     ("name", "made", "message"),
     [
-        ("gain_field.centers", lambda each: each[:-1].clone(), r"as float32\[8, 3\], found float32\[7, 3\]"),
+        ("gains.centers", lambda each: each[:-1].clone(), r"as float32\[8, 3\], found float32\[7, 3\]"),
         ("bank.damping", lambda each: each.float(), r"as float64\[12\], found float32\[12\]"),
         ("residual.magnitude", lambda each: each[None], r"as float32\[33\], found float32\[1, 33\]"),
-        ("gain_field.to_gains.weight", lambda each: each * torch.nan, "to be finite"),
+        ("gains.to_gains.weight", lambda each: each * torch.nan, "to be finite"),
         ("bank.damping", lambda each: -each, "to be positive"),
         ("bank.frequency", lambda each: each * 0, "to be positive"),
         ("bank.frequency", lambda each: each * torch.inf, "to be positive"),
@@ -316,14 +333,14 @@ def test_tensors_of_another_form_or_of_impossible_values_are_refused(tmp_path, n
     ("keys", "value"),
     [
         (("sizes", "modes"), 13),
-        (("gain_field", "shape", "clusters"), 9),
-        (("gain_field", "shape", "width"), 10**7),
-        (("gain_field", "shape", "spatial_damping"), True),
+        (("gains", "shape", "clusters"), 9),
+        (("gains", "shape", "width"), 10**7),
+        (("gains", "shape", "spatial_damping"), True),
     ],
 )
 def test_a_record_that_is_not_of_these_tensors_is_refused(tmp_path, keys, value):
     with pytest.raises(
-        FieldFileError, match=r"missing gain_field\.to_dampings|do not belong together|12 modes have gains, 13 have"
+        FieldFileError, match=r"missing gains\.to_dampings|do not belong together|12 modes have gains, 13 have"
     ):
         load(changed(tmp_path, lambda _, record: put(record, keys, value)))
 
@@ -337,13 +354,13 @@ def test_a_record_that_is_not_of_these_tensors_is_refused(tmp_path, keys, value)
         (("samples",), 0, "samples"),
         (("sizes",), {}, "modes"),
         (("sizes", "bins"), True, "sizes.bins"),
-        (("gain_field",), {}, "kind"),
-        (("gain_field", "points"), 0, "points"),
-        (("gain_field", "dim"), True, "dim"),
-        (("gain_field", "encoder"), 5, "encoder"),
-        (("gain_field", "kind"), "splines", "splines"),
-        (("gain_field", "shape", "width"), 1.5, "width"),
-        (("gain_field", "shape", "heads"), 4, "heads"),
+        (("gains",), {}, "kind"),
+        (("gains", "points"), 0, "points"),
+        (("gains", "dim"), True, "dim"),
+        (("gains", "encoder"), 5, "encoder"),
+        (("gains", "kind"), "splines", "splines"),
+        (("gains", "shape", "width"), 1.5, "width"),
+        (("gains", "shape", "heads"), 4, "heads"),
         (("config", "clusters"), 0, "clusters"),
         (("config", "fft_sizes"), "1024", "fft_sizes"),
         (("config", "unheard_of"), 1, "unheard_of"),
@@ -351,7 +368,7 @@ def test_a_record_that_is_not_of_these_tensors_is_refused(tmp_path, keys, value)
         (("origin", "trained_on"), [1], "trained_on"),
         (("origin",), None, "NoneType"),
         (("origin", "settings", "highpass"), -1.0, "highpass"),
-        (("origin", "report", "quality"), {"places": 9, "error": 0.3, "averaging": 0.7, "errors": 0.3}, "errors"),
+        (("origin", "report", "quality"), {"positions": 9, "error": 0.3, "nearest_mean": 0.7, "errors": 0.3}, "errors"),
     ],
 )
 def test_a_damaged_record_is_refused_with_what_is_wrong(tmp_path, keys, value, reason):
@@ -361,7 +378,7 @@ def test_a_damaged_record_is_refused_with_what_is_wrong(tmp_path, keys, value, r
 
 
 @pytest.mark.parametrize(
-    "keys", [("config", "seed"), ("config", "residual_noise"), ("gain_field", "shape", "layers"), ("origin", "report")]
+    "keys", [("config", "seed"), ("config", "residual_noise"), ("gains", "shape", "layers"), ("origin", "report")]
 )
 def test_nothing_that_a_record_lacks_is_made_up(tmp_path, keys):
     def change(_: dict, record: dict) -> None:

@@ -220,7 +220,7 @@ def changed(name: str, folder: Path, tensors: dict[str, torch.Tensor], record: d
     with safe_open(folder / "whole", framework="pt") as file:
         header = json.loads(file.metadata()["avmsf"])
     held = from_bytes((folder / "whole").read_bytes())
-    for old, new in ((held, {f"gain_field.{key}": each for key, each in tensors.items()}), (header, record)):
+    for old, new in ((held, {f"gains.{key}": each for key, each in tensors.items()}), (header, record)):
         old |= new
         for key in [key for key, value in new.items() if value is None]:
             del old[key]
@@ -232,7 +232,7 @@ def changed(name: str, folder: Path, tensors: dict[str, torch.Tensor], record: d
 def test_a_record_is_refused_where_anything_is_missing_or_wrong(name, tmp_path):
     field = ALL[name]()
     whole = {"kind": field.kind, **field.record()}
-    load(changed(name, tmp_path, {}, {"gain_field": whole}))
+    load(changed(name, tmp_path, {}, {"gains": whole}))
     for key, value in whole.items():
         # No number of things is a fraction.
         wrong = {
@@ -245,10 +245,10 @@ def test_a_record_is_refused_where_anything_is_missing_or_wrong(name, tmp_path):
         }
         for other in wrong[type(value)]:
             with pytest.raises(FieldFileError, match=r"plate\.safetensors"):
-                load(changed(name, tmp_path, {}, {"gain_field": whole | {key: other}}))
+                load(changed(name, tmp_path, {}, {"gains": whole | {key: other}}))
         missing = {each: whole[each] for each in whole if each != key}
         with pytest.raises(FieldFileError, match=rf"plate\.safetensors.*{key}"):
-            load(changed(name, tmp_path, {}, {"gain_field": missing}))
+            load(changed(name, tmp_path, {}, {"gains": missing}))
 
 
 @every_kind
@@ -256,28 +256,28 @@ def test_sizes_that_are_not_the_tensors_are_refused(name, tmp_path):
     field = ALL[name]()
     whole = {"kind": field.kind, **field.record()}
     wrong = [{key: whole[key] + 1} for key in ("points", "contacts", "dim", "nodes", "triangles") if key in whole]
-    if "kept" in whole:
-        wrong.append({"kept": [1 + each for each in whole["kept"]]})
+    if "kernels" in whole:
+        wrong.append({"kernels": [1 + each for each in whole["kernels"]]})
     for body in whole.get("bodies", []):
         wrong += [{"bodies": [body | {key: size + 1}]} for key, size in body.items()]
     for each in wrong:
-        with pytest.raises(FieldFileError, match=r"gain_field\."):
-            load(changed(name, tmp_path, {}, {"gain_field": whole | each}))
+        with pytest.raises(FieldFileError, match=r"gains\."):
+            load(changed(name, tmp_path, {}, {"gains": whole | each}))
     with pytest.raises(FieldFileError, match="6 modes have gains, 5 have frequencies"):
-        load(changed(name, tmp_path, {}, {"gain_field": whole | {"modes": MODES + 1}}))
+        load(changed(name, tmp_path, {}, {"gains": whole | {"modes": MODES + 1}}))
 
 
 @every_kind
 def test_damaged_tensors_are_refused_by_name(name, tmp_path):
     for key, tensor in ALL[name]().tensors().items():
-        with pytest.raises(FieldFileError, match=rf"missing gain_field\.{key}; unexpected none"):
+        with pytest.raises(FieldFileError, match=rf"missing gains\.{key}; unexpected none"):
             load(changed(name, tmp_path, {key: None}, {}))
         # Not finite, or no whole numbers.
-        with pytest.raises(FieldFileError, match=rf"expected gain_field\.{key}"):
+        with pytest.raises(FieldFileError, match=rf"expected gains\.{key}"):
             load(changed(name, tmp_path, {key: tensor * torch.nan}, {}))
-        with pytest.raises(FieldFileError, match=rf"expected gain_field\.{key} as .*, found float16"):
+        with pytest.raises(FieldFileError, match=rf"expected gains\.{key} as .*, found float16"):
             load(changed(name, tmp_path, {key: tensor.half()}, {}))
-    with pytest.raises(FieldFileError, match=r"unexpected gain_field\.more"):
+    with pytest.raises(FieldFileError, match=r"unexpected gains\.more"):
         load(changed(name, tmp_path, {"more": torch.ones(3)}, {}))
 
 
@@ -289,6 +289,6 @@ def test_gains_of_other_modes_than_the_banks_are_not_saved(tmp_path):
 
 
 def test_an_unknown_kind_of_gain_field_is_refused(tmp_path):
-    path = changed("positional", tmp_path, {}, {"gain_field": {"kind": "wavelets"}})
-    with pytest.raises(FieldFileError, match=r"gain_field\.kind is 'wavelets', not attention, mixture, body, scaled"):
+    path = changed("positional", tmp_path, {}, {"gains": {"kind": "wavelets"}})
+    with pytest.raises(FieldFileError, match=r"gains\.kind is 'wavelets', not attention, mixture, body, scaled"):
         load(path)

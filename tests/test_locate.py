@@ -260,7 +260,7 @@ def test_another_plate_is_refused_with_the_number(length):
         found = locate(true_field(), sound, locator=locator)
         assert re.search(r"explain \d+ % of the sound and, .*a misfit of \d\.\d\d; its own", found.refusal)
         with pytest.raises(LocationError):
-            _ = found.place
+            _ = found.position
 
 
 @pytest.mark.parametrize("noise_db", [-40.0, 0.0])
@@ -313,7 +313,7 @@ def test_a_sound_whose_modes_are_so_strong_at_no_place_has_none(taps):
         assert found.misfit < 0.01
         assert found.evidence <= 0.0
         with pytest.raises(LocationError):
-            _ = found.place
+            _ = found.position
 
 
 def test_the_evidence_depends_on_neither_level_nor_force():

@@ -75,11 +75,11 @@ def test_a_symmetric_plate_is_ambiguous_and_each_counterpart_is_named():
     for each in others:
         assert each.symmetry is not None
         image = (
-            each.symmetry.reflect(found.place[None])
+            each.symmetry.reflect(found.position[None])
             if isinstance(each.symmetry, MirrorSymmetry)
-            else each.symmetry.turn(found.place[None], each.angle)
+            else each.symmetry.turn(found.position[None], each.angle)
         )[0]
-        assert float((image - each.place).norm()) < 2 * found.radius
+        assert float((image - each.position).norm()) < 2 * found.radius
     words = " ".join(str(each) for each in others)
     assert "its image in the mirror plane with normal (1 0 0)" in words
     assert "it turned by 180 degrees about the axis (0 0 1)" in words

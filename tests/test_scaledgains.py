@@ -64,12 +64,12 @@ def test_lengths_and_inner_fields_that_cannot_be_are_refused():
         with pytest.raises(ValueError, match="length is"):
             ScaledGains(inner, FACTORS, length)
     record = ScaledGains(inner, FACTORS).record()
-    with pytest.raises(ValueError, match="inner is 'scaled', not attention, mixture"):
-        ScaledGains.skeleton(record | {"inner": "scaled"})
+    with pytest.raises(ValueError, match="fitted_kind is 'scaled'"):
+        ScaledGains.skeleton(record | {"fitted_kind": "scaled"})
 
 
 def test_a_file_whose_factors_are_no_numbers_is_refused(tmp_path):
     broken = ScaledGains(FIELDS["positional"](), FACTORS * torch.nan)
     field = SoundField(BANK, broken, torch.zeros(5).double(), Residual(torch.zeros(9)), 8e3, 9, Origin())
-    with pytest.raises(FieldFileError, match=r"expected gain_field\.scale to be finite throughout"):
+    with pytest.raises(FieldFileError, match=r"gains\.mode_factors"):
         save(field, tmp_path / "one")

@@ -23,7 +23,7 @@ def draw(mesh: trimesh.Trimesh, *, seed: int = 0, count: int = 4000) -> np.ndarr
 
 def find(points: np.ndarray, *, seed: int = 0, scale: float = 1.0, shift: float = 0.0) -> Symmetries:
     posed = torch.from_numpy(scale * POSE.apply(points) + shift)
-    return find_symmetries(posed, generator=torch.Generator().manual_seed(seed))
+    return find_symmetries(posed, seed=seed)
 
 
 def degrees(found: torch.Tensor, true: tuple[float, float, float]) -> float:
@@ -156,9 +156,9 @@ def test_a_scanned_bowl_is_round(shared: Path):
 )
 def test_points_without_a_surface_are_refused(points, message):
     with pytest.raises(SceneError, match=message):
-        find_symmetries(points, generator=torch.Generator().manual_seed(0))
+        find_symmetries(points, seed=0)
 
 
 def test_a_tolerance_is_positive():
     with pytest.raises(SceneError, match="a tolerance above 0"):
-        find_symmetries(torch.rand(300, 3), generator=torch.Generator().manual_seed(0), tolerance=0.0)
+        find_symmetries(torch.rand(300, 3), seed=0, tolerance=0.0)

@@ -22,8 +22,8 @@ FFT_SIZE, HOP, SECONDS, MAX_HZ, RANGE_DB = 1024, 128, 0.35, 12_000, 70
 
 def main() -> None:
     """Read the field and the capture, draw, write the picture."""
-    field, capture = avmsf.load(Path(sys.argv[1])), avmsf.read_capture(sys.argv[2])
-    train, test = avmsf.split(capture.impacts, fraction=0.75)
+    field, capture = avmsf.SoundField.load(sys.argv[1]), avmsf.Capture.read(sys.argv[2])
+    train, test = (part.impacts for part in capture.split(0.75))
     test = test.take([test.names.index(name) for name in CONTACTS])
     columns = {
         "recorded, held out": test.sounds,

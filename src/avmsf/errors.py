@@ -30,6 +30,19 @@ class FolderInUseError(AvmsfError):
         return type(self), (self.folder, self.holder, self.advice)
 
 
+class ArrayError(AvmsfError):
+    """An array given to a function has a shape or values that cannot be used."""
+
+    def __init__(self, message: str, *, name: str = "", row: int | None = None) -> None:
+        super().__init__(message)
+        self.name, self.row = name, row
+        """The argument, and its first row at fault."""
+
+
+class PositionError(ArrayError):
+    """A position is not on the object."""
+
+
 class CaptureError(AvmsfError):
     """A capture folder, its table, its settings or one of its sound files cannot be used."""
 

@@ -17,7 +17,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.store import save
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.reconstruct import Reconstruction
 from avmsf.pipeline.scene import CLOUD
 from avmsf.scene.features import FeatureField
@@ -37,7 +37,7 @@ def sounds_of(folder: Path, kind: str) -> Tensor:
 def test_the_demos_page_and_sounds_do_not_depend_on_delays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     delayed = strikes(COUNT, starts=delays(COUNT))
     train, test = split(delayed, count=demo.TRAIN)
-    modes = extract(train)
+    modes = extract_modes(train)
     config = FitConfig(steps=0, residual=False)
     field = fit(
         train, FeatureField.from_contacts(delayed.contacts), modes, config, gains=MixtureEstimator(("thin-plate",))

@@ -11,7 +11,7 @@ from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.residual import Residual
 from made_fields import BANK, positional
 
-FOUND = {"places": 9, "error": 0.3, "averaging": 0.7, "next_contact": [0.02, -0.01, 0.08], "next_distance": 0.041}
+FOUND = {"positions": 9, "error": 0.3, "nearest_mean": 0.7, "next_contact": [0.02, -0.01, 0.08], "next_distance": 0.041}
 
 
 def field_with(report: dict[str, object]) -> SoundField:
@@ -29,7 +29,7 @@ def test_the_command_can_be_given_as_it_stands(tmp_path: Path) -> None:
 
 
 def test_without_a_contact_no_command_is_named() -> None:
-    found = {name: FOUND[name] for name in ("places", "error", "averaging")}
+    found = {name: FOUND[name] for name in ("positions", "error", "nearest_mean")}
     (words,) = quality_words(field_with({"quality": found}), Path("f"))
     assert "suggest" not in words
 

@@ -7,7 +7,7 @@ from avmsf.cli.scores import compare
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import extract_modes
 from avmsf.scene.features import FeatureField
 from delayed_plate import ALIGNED, delays, strikes, without_delays
 
@@ -17,7 +17,7 @@ COUNT, TRAIN = 16, 12
 def errors_of(impacts: Impacts) -> dict[str, list[float]]:
     """Return each method's relative STFT errors at the last contacts; all but the floor know the first alone."""
     train, test = impacts.take(range(TRAIN)), impacts.take(range(TRAIN, COUNT))
-    modes, features = extract(train), FeatureField.from_contacts(impacts.contacts)
+    modes, features = extract_modes(train), FeatureField.from_contacts(impacts.contacts)
     field = fit(train, features, modes, FitConfig(steps=0, residual=False), gains=MixtureEstimator(("thin-plate",)))
     scores = compare(field, train, test, modes)
     return {method: each.values["relative_stft"].tolist() for method, each in scores.items()}
@@ -26,7 +26,7 @@ def errors_of(impacts: Impacts) -> dict[str, list[float]]:
 def test_errors_do_not_depend_on_delays() -> None:
     starts = delays(COUNT)
     delayed = strikes(COUNT, starts=starts)
-    same = without_delays(delayed, extract(delayed.take(range(TRAIN))), starts)
+    same = without_delays(delayed, extract_modes(delayed.take(range(TRAIN))), starts)
     found, expected = errors_of(delayed), errors_of(same)
     for method, errors in expected.items():
         assert found[method] == pytest.approx(errors, rel=ALIGNED, abs=ALIGNED), method

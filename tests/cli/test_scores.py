@@ -12,7 +12,7 @@ from avmsf.cli.scores import compare
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import extract_modes
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate, sample_contacts, strike
 
@@ -42,7 +42,7 @@ def test_jitter_of_the_starts_does_not_count() -> None:
     errors = {}
     for deviation in (0.0, 3.0):
         train, test = split(shaken(exact, deviation), count=14)
-        modes = extract(train)
+        modes = extract_modes(train)
         features = FeatureField.from_contacts(exact.contacts)
         field = fit(train, features, modes, FitConfig(steps=0), gains=MixtureEstimator(("thin-plate",)))
         scores = compare(field, train, test, modes)
@@ -62,7 +62,7 @@ def test_neighbors_by_direction_are_scored_where_directions_are_known(directed: 
     directions = torch.tensor([0.0, 0.0, -1.0]) * signs
     impacts = replace(straight, sounds=signs * straight.sounds, directions=directions if directed else None)
     train, test = split(impacts, count=7)
-    modes = extract(train)
+    modes = extract_modes(train)
     field = fit(
         train, FeatureField.from_contacts(contacts), modes, FitConfig(steps=0), gains=MixtureEstimator(("thin-plate",))
     )

@@ -38,7 +38,7 @@ def test_a_blow_sounds_as_the_fields(name, phase, scaled, pulse):
     sound_field = sounding(name, phase=phase, scaled=scaled)
     table = SampledField.of(sound_field)
     rows = torch.tensor([0, 17, 149])
-    expected = sound_field.render(table.points[rows], force=2.5, pulse=pulse)
+    expected = sound_field.render(table.points[rows], forces=2.5, pulse=pulse)
     error = (table.render(rows, force=2.5, pulse=pulse) - expected).abs().max() / expected.abs().max()
     assert float(error) < 1e-5
     assert table.shared_damping == (name != "attention with dampings")

@@ -33,7 +33,7 @@ def write_changed(path: Path, *, words: str | None = None, noise: float = 1e-3, 
     tensors = from_bytes(content)
     tensors["residual.magnitude"][:] = noise
     record = json.loads(metadata["avmsf"])
-    record["gain_field"] |= changes.pop("gain_field", {})
+    record["gains"] |= changes.pop("gains", {})
     record = json.dumps(record | changes)
     path.write_bytes(to_bytes(tensors, metadata | {"avmsf": record if words is None else words}))
     return path
@@ -44,7 +44,7 @@ def write_changed(path: Path, *, words: str | None = None, noise: float = 1e-3, 
     [
         {"samples": 10**9}, {"samples": 10**12}, {"sample_rate": 1e300}, {"sample_rate": 1e-300},
         {"sample_rate": 10**400}, {"noise": 1e38},
-        {"words": "[" * 100_000}, {"gain_field": {"modes": 10**30}},
+        {"words": "[" * 100_000}, {"gains": {"modes": 10**30}},
     ],
     ids=lambda changes: str(changes)[:30],
 )  # fmt: skip

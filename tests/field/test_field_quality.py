@@ -12,7 +12,7 @@ from avmsf.field.fit import fit
 from avmsf.field.soundfield import FieldQuality
 from avmsf.field.store import load, save
 from avmsf.field.suggest import suggest
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import extract_modes
 from avmsf.scene.features import FeatureField
 from delayed_plate import SAMPLES, strikes
 
@@ -26,7 +26,7 @@ def parted(recorded):
 
 
 def fitted(train, config=CONFIG):
-    return fit(train, FeatureField.from_contacts(strikes(20).contacts, count=300), extract(train), config)
+    return fit(train, FeatureField.from_contacts(strikes(20).contacts, count=300), extract_modes(train), config)
 
 
 def with_clicks(recorded):
@@ -40,12 +40,12 @@ def test_the_error_at_contacts_left_out_is_about_that_at_new_ones():
     train, test = parted(strikes(20))
     field = fitted(train)
     # Two of the sixteen contacts are in one place.
-    assert field.quality.places == 15
-    assert field.quality.error < field.quality.averaging
+    assert field.quality.positions == 15
+    assert field.quality.error < field.quality.nearest_mean
     new = evaluate(field, test).mean()["relative_stft"]
     assert new / 2 < field.quality.error < 2 * new
     averaged = evaluate(MeanWaveform(train), test).mean()["relative_stft"]
-    assert averaged / 2 < field.quality.averaging < 2 * averaged
+    assert averaged / 2 < field.quality.nearest_mean < 2 * averaged
 
 
 def test_what_recordings_have_in_common_beside_their_modes_is_kept(tmp_path):
@@ -100,7 +100,7 @@ def on_plate(train):
     """Return a field whose points are those of the whole plate, the unit square."""
     side = torch.linspace(0.0, 1.0, 30)
     points = torch.cat([torch.cartesian_prod(side, side), torch.zeros(900, 1)], 1)
-    return fit(train, FeatureField.from_points(points), extract(train), CONFIG)
+    return fit(train, FeatureField.from_points(points), extract_modes(train), CONFIG)
 
 
 def test_the_next_contact_is_where_no_contact_is_and_lowers_the_expected_error_most(tmp_path):

@@ -10,7 +10,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.recipes import gain_case
-from avmsf.modal.extraction.extract import Extraction, extract
+from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.scene.features import FeatureField
 from delayed_plate import ALIGNED, delays, distance, strikes, without_delays
 
@@ -22,13 +22,13 @@ CONFIG = FitConfig(steps=0, damping="shared")
 @pytest.fixture(scope="module")
 def delayed() -> tuple[Impacts, Extraction]:
     train = strikes(COUNT, starts=delays(COUNT))
-    return train, extract(train)
+    return train, extract_modes(train)
 
 
 @pytest.fixture(scope="module")
 def exact(delayed: tuple[Impacts, Extraction]) -> tuple[Impacts, Extraction]:
     train = without_delays(*delayed, delays(COUNT))
-    return train, extract(train)
+    return train, extract_modes(train)
 
 
 def test_gains_to_spread_do_not_depend_on_delays(
@@ -57,7 +57,7 @@ def test_recordings_in_double_precision_are_recognized_by_their_alignment(delaye
     assert train.before is not None
     assert train.after is not None
     double = replace(train, sounds=train.sounds.double(), before=train.before.double(), after=train.after.double())
-    modes = extract(double)
+    modes = extract_modes(double)
     assert modes.alignment is not None
     aligned = double.delayed(modes.alignment.delays).sounds.float()
     assert torch.equal(gain_case(double, FEATURES, modes, CONFIG).train.sounds, aligned)

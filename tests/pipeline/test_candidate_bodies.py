@@ -104,7 +104,7 @@ def test_the_true_wall_and_its_stiffness_are_the_most_probable() -> None:
     first, *others = estimator().start(case(), "shared").report["bodies"]
     assert first["body"] == bodies()[1].name
     # Factors of the grid are 5 % apart.
-    assert first["factor"] == pytest.approx(STIFFER, rel=0.06)
+    assert first["frequency_factor"] == pytest.approx(STIFFER, rel=0.06)
     assert first["weight"] > 10 * max(each["weight"] for each in others)
 
 
@@ -117,8 +117,8 @@ def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> No
     assert bad.name == good.name
     first, second = estimator(bad, good, finer=finer).start(case(), "shared").report["bodies"]
     assert finer.asked == [good]
-    assert (first["wall"], first["fine"]) == (0.00396, True)
-    assert (second["wall"], second["fine"]) == (0.00404, False)
+    assert (first["wall_thickness"], first["refined"]) == (0.00396, True)
+    assert (second["wall_thickness"], second["refined"]) == (0.00404, False)
 
 
 @dataclass
@@ -169,7 +169,9 @@ def test_estimators_of_other_bodies_or_elements_have_other_digests() -> None:
 
 def test_reasons_against_other_bodies_are_reported() -> None:
     known = CandidateBodies(NominalBodies(bodies()[1:2], {None: "the mesh is open"}))
-    assert MixtureEstimator(bodies=known).start(case(), "shared").report["missing"] == {"filled": "the mesh is open"}
+    assert MixtureEstimator(bodies=known).start(case(), "shared").report["unavailable"] == {
+        "filled": "the mesh is open"
+    }
 
 
 @pytest.mark.parametrize("directions", [None, torch.zeros(12, 3)], ids=["no directions", "directions of length zero"])
@@ -214,7 +216,7 @@ def test_a_body_that_the_contacts_do_not_lie_on_takes_no_part_and_the_remedy_is_
     body = moved_body(ELSEWHERE[remedy])
     report = estimator(body).start(case(), "shared").report
     assert report["bodies"] == []
-    assert remedy in report["missing"]["elastic"]
+    assert remedy in report["unavailable"]["elastic"]
     with pytest.raises(FitError, match=remedy):
         estimator(body, kinds=("elastic",)).start(case(), "shared")
 

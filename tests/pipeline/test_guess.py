@@ -9,10 +9,11 @@ import pytest
 import torch
 import trimesh
 
-import avmsf
+from avmsf.capture import CaptureSettings
 from avmsf.capture.surface import Surface, write_surface
 from avmsf.cli import main
 from avmsf.errors import FitError, SimulationError
+from avmsf.export import SampledField
 from avmsf.fem.radiation import radiated_pressure
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
@@ -139,9 +140,9 @@ def test_a_guess_is_kept_whole_and_says_what_it_is(tmp_path: Path):
     assert read.origin.report["guess"].startswith("No recordings")
     assert read.origin.trained_on == ()
     with pytest.raises(FitError, match="guess"):
-        avmsf.suggest(read)
+        read.suggest()
     assert made_of(read, option="--from").material == STEEL
-    assert avmsf.SampledField.of(read, limit=20).sine.shape == (20, 12)
+    assert SampledField.of(read, limit=20).sine.shape == (20, 12)
 
 
 def test_what_cannot_vibrate_or_is_in_another_unit_is_refused():
@@ -161,7 +162,7 @@ def test_what_cannot_vibrate_or_is_in_another_unit_is_refused():
 
 def test_recordings_are_not_passed_over(tmp_path: Path):
     write_surface(box(LENGTH, WIDTH, HEIGHT), tmp_path / "surface.ply")
-    settings = avmsf.CaptureSettings()
+    settings = CaptureSettings()
     for rows in ("", "file,x,y,z\n"):
         (tmp_path / "impacts.csv").write_text(rows)
         assert len(known_surface(tmp_path, settings).faces)

@@ -42,7 +42,7 @@ def test_photographs_alone_give_elastic_mode_shapes(slab: Path, capsys: Streams)
     assert main(["reconstruct", str(slab), *SMALL, *bodies, "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     report = made["report"]
-    assert Elastic.kind not in report["missing"]
+    assert Elastic.kind not in report["unavailable"]
     assert report["bodies"][0]["body"].startswith("filled")
     assert report["bodies"][0]["weight"] > 0
     assert main(["reconstruct", str(slab), *SMALL, *bodies, "--json"]) == 0

@@ -134,7 +134,7 @@ def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are
     assert not run()
     failures[:] = [None]
     assert run()
-    assert load(tmp_path / "cache" / "field.safetensors").origin.report["missing"] == {}
+    assert load(tmp_path / "cache" / "field.safetensors").origin.report["unavailable"] == {}
     asked.clear()
     assert not run()
     assert asked == []

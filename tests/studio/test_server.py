@@ -273,8 +273,8 @@ def test_only_the_current_revision_is_prepared_and_symmetries_once(
 def test_a_larger_object_has_the_same_symmetries_farther_out() -> None:
     grid = torch.cartesian_prod(torch.linspace(-0.1, 0.1, 21), torch.linspace(-0.06, 0.06, 13))
     points = torch.cat([grid, torch.full((len(grid), 1), 0.03)], dim=1) + torch.tensor([0.2, 0.0, 0.0])
-    found = find_symmetries(points, generator=torch.Generator().manual_seed(0))
-    expected = find_symmetries(1.5 * points, generator=torch.Generator().manual_seed(0))
+    found = find_symmetries(points, seed=0)
+    expected = find_symmetries(1.5 * points, seed=0)
     larger = enlarged(found, 1.5)
     assert len(larger.mirrors) == len(expected.mirrors) > 0
     assert larger.spacing == pytest.approx(expected.spacing, rel=1e-5)

@@ -1,23 +1,20 @@
 """Values out of a file's JSON as what they were before: each of its type, all of them there, none besides."""
 
 import sys
-from collections.abc import Collection
 from dataclasses import fields
 from typing import Any, TypeVar
 
 _Record = TypeVar("_Record")
 
 
-def record_of(example: _Record, values: Any, name: str, *, later: Collection[str] = ()) -> _Record:
+def record_of(example: _Record, values: Any, name: str) -> _Record:
     """Return a record of settings from a dict of exactly the example's fields, each of the type that it has there.
 
-    `example` is a dataclass's instance; `name` is what errors call the record. Older files may lack the fields named by
-    `later`, which then have the example's values. Raises ValueError for fields that are missing or unknown, TypeError
-    for one of another type and for what is no dict.
+    `example` is a dataclass's instance; `name` is what errors call the record. Raises ValueError for fields that are
+    missing or unknown, TypeError for one of another type and for what is no dict.
     """
     like(values, {}, name)
     examples = {each.name: getattr(example, each.name) for each in fields(example)}  # type: ignore[arg-type]
-    values = {each: examples[each] for each in later} | values
     if values.keys() != examples.keys():
         differing = ", ".join(sorted(values.keys() ^ examples.keys()))
         raise ValueError(f"{name} lacks or adds {differing}")

@@ -46,7 +46,7 @@ def draw_contact(
     rows = torch.arange(0, len(points), max(1, len(points) // _DRAWN))
     rows = torch.unique(torch.cat([rows, torch.topk(contact.probability, min(64, len(points))).indices]))
     marks: list[tuple[Tensor, tuple[float, float, float]]] = [] if others is None else [(o, _OTHER) for o in others]
-    marks.append((contact.place, _FOUND))
+    marks.append((contact.position, _FOUND))
     if truth is not None:
         marks.append((truth, _TRUTH))
     likely, alike = (

@@ -27,7 +27,7 @@ from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.extract import Extraction, extract
+from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.residual import Residual
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import farthest_points
@@ -134,7 +134,7 @@ def recorded_objects(dataset: Dataset, materials: Mapping[str, str] = REALIMPACT
     found = []
     for name in held:
         impacts = dataset.capture(name).impacts
-        found.append(KnownObject(name, materials[name], impacts, extract(impacts)))
+        found.append(KnownObject(name, materials[name], impacts, extract_modes(impacts)))
     return tuple(found)
 
 

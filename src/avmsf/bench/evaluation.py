@@ -8,18 +8,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.summary import short_repr
 from avmsf.bench.cases import Places
 from avmsf.bench.conventions import PAPER, Convention
 from avmsf.bench.metrics import PerContact, default_fft_sizes, relative_stft_error, validate
 from avmsf.bench.renderer import Renderer
+from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
+from avmsf.field.soundfield import SoundField
 from avmsf.scene.points import farthest_points
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
     """How far rendered sounds are from recorded ones, by several metrics; lower is better."""
+
+    __repr__ = short_repr
 
     convention: str
     """Name of the convention that the metrics follow, `relative_stft` apart, which is the same in all."""
@@ -61,15 +66,19 @@ def split(
 
 def evaluate(
     renderer: Renderer,
-    impacts: Impacts,
+    test: Capture | Impacts,
     *,
     convention: Convention = PAPER,
     fft_sizes: Sequence[int] | None = None,
 ) -> Scores:
-    """Score what `renderer` makes of the impacts' contacts against what was recorded there.
+    """Score the sounds that `renderer` renders at the contacts of recordings against these recordings.
 
-    Raises as `score`, and for a renderer at another sample rate.
+    For a SoundField, recordings that are not aligned yet are aligned as its fit aligned those it was fitted to. Raises
+    as `score`, and for a renderer at another sample rate.
     """
+    impacts = test.impacts if isinstance(test, Capture) else test
+    if isinstance(renderer, SoundField):
+        impacts = renderer.aligned(impacts)
     if renderer.sample_rate != impacts.sample_rate:
         raise EvaluationError(
             f"the renderer's sounds are at {renderer.sample_rate:g} Hz and the impacts at {impacts.sample_rate:g} Hz; "

@@ -198,7 +198,7 @@ def _finder(
 
         def by_field(sound: Float[Tensor, " samples"]) -> dict[str, Float64[Tensor, " 3"]]:
             found = locator.locate(sound)
-            return {"rmed": points[int(found.distance.argmin())], "rmed_posterior": found.place.double()}
+            return {"rmed": points[int(found.distance.argmin())], "rmed_posterior": found.position.double()}
 
         return by_field
     if isinstance(renderer, DiffSound):
@@ -272,7 +272,7 @@ def _located(
             except LocationError as error:
                 more = {"refusal": " ".join(str(error).split())}
         elif method != "random" and isinstance(found, ContactMap):
-            place = ground.points[int(found.distance.argmin())] if method == "cosine" else found.place.double()
+            place = ground.points[int(found.distance.argmin())] if method == "cosine" else found.position.double()
             more = {"explained": found.explained}
             more |= _regions(found, ground, truth) if method == "posterior" else {}
         elif method != "random":

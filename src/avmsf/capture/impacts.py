@@ -11,7 +11,10 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from avmsf._utils.arrays import ArrayLike, as_numbers, as_rows, as_vectors
+from avmsf.capture.places import rows_by_place
 from avmsf.compiled import compiled
+from avmsf.errors import ArrayError
 
 _SINC_HALF_WIDTH = 32
 """Samples on either side that a value between two samples is interpolated from."""
@@ -47,6 +50,36 @@ class Impacts:
         if (self.before is None) != (self.after is None):
             raise ValueError("expected both before and after, or neither, got one of them")
 
+    @classmethod
+    def of(
+        cls,
+        contacts: ArrayLike,
+        sounds: ArrayLike,
+        sample_rate: float | int,
+        *,
+        names: Sequence[str] | None = None,
+        directions: ArrayLike | None = None,
+        forces: ArrayLike | None = None,
+    ) -> "Impacts":
+        """Return final impacts of contacts in meters and of sounds that start with them, one row each.
+
+        Recordings without `names` are numbered. `forces` are those that the sounds were divided by. Raises ArrayError
+        for arrays of other shapes and values that are not finite.
+        """
+        places = as_vectors(contacts, "contacts").double()
+        count = len(places)
+        named = tuple(f"{row:03d}" for row in range(1, count + 1)) if names is None else tuple(names)
+        if len(named) != count:
+            raise ArrayError(f"names: expected {count}, one for each contact, got {len(named)}", name="names")
+        return cls(
+            places,
+            as_rows(sounds, "sounds", count=count).float(),
+            float(sample_rate),
+            named,
+            None if directions is None else as_vectors(directions, "directions", count=count).float(),
+            None if forces is None else as_numbers(forces, "forces", count=count).float(),
+        )
+
     @property
     def duration(self) -> float:
         """Length of every sound, seconds."""
@@ -54,6 +87,12 @@ class Impacts:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def __repr__(self) -> str:
+        places = len(rows_by_place(self.contacts))
+        return (
+            f"Impacts({len(self)} recordings at {places} positions, {self.duration:.3g} s at {self.sample_rate:g} Hz)"
+        )
 
     def digest(self) -> str:
         """Return a digest of all that can be learnt from the recordings."""

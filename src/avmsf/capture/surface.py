@@ -10,9 +10,10 @@ import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from avmsf._utils.arrays import ArrayLike, as_vectors
 from avmsf.capture.mesh_file import load_parts
 from avmsf.capture.settings import CaptureSettings
-from avmsf.errors import CaptureError
+from avmsf.errors import ArrayError, CaptureError
 
 SurfaceKind = Literal["ply", "obj", "glb"]
 """Formats that surfaces are written in."""
@@ -27,6 +28,37 @@ class Surface:
     """Object frame, metres."""
     faces: Int[Tensor, "faces 3"]
     """Rows of `vertices` at the corners of each triangle; no rows for a point cloud."""
+
+    @classmethod
+    def of(cls, vertices: ArrayLike, faces: ArrayLike = ()) -> "Surface":
+        """Return the surface of vertices in meters, [points, 3], and triangles, [faces, 3]; points alone without these.
+
+        Raises ArrayError for other shapes, for vertices that are not finite and for corners that are no vertices.
+        """
+        places = as_vectors(vertices, "vertices").float()
+        corners = as_vectors(faces, "faces").long() if len(faces) else torch.zeros(0, 3, dtype=torch.long)
+        wrong = torch.nonzero(((corners < 0) | (corners >= len(places))).any(1)).flatten()
+        if len(wrong):
+            row = int(wrong[0])
+            raise ArrayError(
+                f"faces: expected rows of vertices, 0 to {len(places) - 1}, got {corners[row].tolist()} (row {row})",
+                name="faces",
+                row=row,
+            )
+        return cls(places, corners)
+
+    @classmethod
+    def read(cls, path: str | Path, *, metres: float = 1.0) -> "Surface":
+        """Read a mesh or a point cloud, see `read_surface`. Raises CaptureError for a file without points."""
+        return read_surface(path, metres=metres)
+
+    def write(self, path: str | Path) -> None:
+        """Write a binary PLY file in meters."""
+        write_surface(self, Path(path))
+
+    def __repr__(self) -> str:
+        size = " x ".join(f"{side:.3g}" for side in (self.vertices.amax(0) - self.vertices.amin(0)).tolist())
+        return f"Surface({len(self.vertices)} vertices, {len(self.faces)} triangles, {size} m)"
 
 
 def read_surface(path: str | Path, *, metres: float = 1.0) -> Surface:

@@ -16,7 +16,7 @@ from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.errors import CaptureError, ExtractionError
-from avmsf.modal.extraction.extract import Extraction, extract
+from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.wording import counted
 
@@ -106,7 +106,7 @@ def _modes(folder: Path, settings: CaptureSettings | None) -> tuple[Extraction, 
         warnings.simplefilter("ignore", CaptureWarning)
         impacts = read_capture(folder, settings).impacts
     try:
-        return extract(impacts, HighResolution(modes=_STRONGEST)), impacts
+        return extract_modes(impacts, HighResolution(modes=_STRONGEST)), impacts
     except ExtractionError:
         return None
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from avmsf.capture.table import read_cells
 from avmsf.cli.writing import OutputError
-from avmsf.errors import CaptureError
-from avmsf.field.soundfield import SoundField
+from avmsf.errors import CaptureError, PositionError
+from avmsf.field.soundfield import SoundField, expect_near
 
 _COLUMNS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
@@ -74,18 +74,12 @@ def read_contacts(path: Path, *, metres: float) -> Contacts:
 
 
 def refuse_far(contacts: Contacts, field: SoundField) -> None:
-    """Raise `OutputError` for a contact farther outside the object's box than the object is large: a wrong unit."""
-    points = field.gain_field.points.double()
-    low, high = points.amin(0), points.amax(0)
-    size = float((high - low).norm())
-    outside = torch.clamp(torch.maximum(low - contacts.places, contacts.places - high), min=0).norm(dim=1)
-    worst = int(outside.argmax())
-    if not float(outside[worst]) <= size:
-        place = ", ".join(f"{value:.4g}" for value in contacts.places[worst].tolist())
-        raise OutputError(
-            f"{contacts.names[worst]}: the contact ({place}) m lies {float(outside[worst]):.3g} m outside an object "
-            f"{size:.3g} m across; if its numbers count another unit, say so with --unit"
-        )
+    """Raise `OutputError` for a contact that is not on the object, see `expect_near`."""
+    try:
+        expect_near(contacts.places, field.gain_field.points)
+    except PositionError as error:
+        name = contacts.names[error.row or 0]
+        raise OutputError(f"{name}: {error}; --unit says what the numbers count") from error
 
 
 def _number(text: str, where: str, separator: str) -> float:

@@ -1,18 +1,16 @@
 """`avmsf fit`: a capture folder in, a field file out."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 import tyro
 from rich.console import Console
 
-from avmsf._utils.caching import discard
 from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.bench.evaluation import Scores, split
-from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
+from avmsf.capture import CaptureSettings, Impacts, read_capture
 from avmsf.capture.folder import settings_of
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
@@ -23,28 +21,19 @@ from avmsf.cli.scores import compare, parts_words, quality_words, score_table, s
 from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
-from avmsf.field.fit import fit
-from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.estimator import GainModel, estimator_for
-from avmsf.field.recipes import GainRecipe
+from avmsf.field.gains.estimator import GainModel
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
-from avmsf.modal.extraction.extract import extract_once
-from avmsf.modal.extraction.finders import ExtractionMethod, finder_named
-from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
+from avmsf.modal.extraction.finders import ExtractionMethod
+from avmsf.pipeline.bodies import BodyConfig
 from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero, with_record
+from avmsf.pipeline.fitting import discard_unfinished, fit_capture, unfinished
 from avmsf.pipeline.guess import guess_field, known_surface
-from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.pipeline.scene import SceneConfig
-from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
-from avmsf.scene.symmetry import Symmetries
-from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.wording import counted
 
-_FEW = 8
-"""Recordings below which little is told of the gains between contacts."""
 _SHOWN = 8
 """Names of recordings in a line, at most."""
 
@@ -147,46 +136,31 @@ def run(options: Options) -> int:
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
     )
-    if options.features is None:
-        features, made = features_of(capture, options.config), {}
-    else:
+    features, made = None, {}
+    if options.features is not None:
         features, made = load_features(options.features), read_report(options.features)
-        expect_on_object(capture.impacts, features.points)
-    if len(train) < _FEW:
-        say(f"{len(train)} recordings tell little of how loud modes are between contacts; {_FEW} or more tell much")
-    # Before the modes: what is wrong with the object's shape shows in less time than they take.
-    gains = _estimator(options, capture, train)
-    say(f"finding the modes of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
-    modes = extract_once(train, finder_named(options.method, options.modes), _beside(options.output, "modes"))
-    for sentence in describe_alignment(modes, train):
-        say(sentence)
-    say(f"fitting a field of {len(modes.bank)} modes")
-    checkpoint = _beside(options.output, "checkpoint")
     try:
         with FitBar() as bar:
-            fitted = fit(
-                train,
-                features,
-                modes,
-                options.config,
-                gains=gains,
-                capture=capture.name,
-                settings=capture.settings,
-                checkpoint=checkpoint,
+            fitted, modes = fit_capture(
+                replace(capture, impacts=train),
+                options.pipeline,
+                features=features,
+                features_report=made,
+                output=options.output,
+                log=say,
                 progress=bar.show,
-                device=options.device,
             )
     except KeyboardInterrupt:
+        if not unfinished(options.output, "modes").exists():
+            raise
+        checkpoint = unfinished(options.output, "checkpoint")
         where = f"from {checkpoint}, or delete it" if checkpoint.exists() else "from the start of training"
         say(f"avmsf fit: interrupted; give the same command again to go on {where}")
         return INTERRUPTED
-    except FitError:
-        discard(_beside(options.output, "modes"))
-        raise
-    fitted = with_record(fitted, options.pipeline, made)
+    for sentence in describe_alignment(modes, train):
+        say(sentence)
     save(fitted, options.output)
-    for ending in ("modes", "checkpoint"):
-        discard(_beside(options.output, ending))
+    discard_unfinished(options.output)
     doing("comparing the field with the recordings that it was not fitted to")
     scores = {} if test is None else compare(fitted, train, test, modes)
     screen = console(errors=options.json)
@@ -234,7 +208,7 @@ def _run_guess(options: Options, material: str, settings: CaptureSettings) -> in
         config=options.config,
         settings=settings,
         name=settings.name or options.capture.resolve().stem,
-        cache=_beside(options.output, "bodies"),
+        cache=unfinished(options.output, "bodies"),
         tell=say,
     )
     guessed = with_record(guessed, options.pipeline, {})
@@ -272,41 +246,6 @@ def show_guess(guessed: SoundField, output: Path, *, json: bool) -> None:
         print_json(values | {"sample_rate": guessed.sample_rate, "trained_on": [], "report": report})
 
 
-def _estimator(options: Options, capture: Capture, train: Impacts) -> GainRecipe:
-    """Return what makes the gain model."""
-
-    def bodies() -> CandidateBodies:
-        if capture.surface is None:
-            raise FitError("the capture has no mesh: lay it into the folder as surface.obj")
-        cache = _beside(options.output, "bodies")
-        return candidate_bodies(capture.surface, options.body, impacts=train, cache=cache, tell=say)
-
-    def symmetries() -> Symmetries | None:
-        if capture.surface is None:
-            return None
-        generator = torch.Generator().manual_seed(options.config.seed)
-        points = FeatureField.from_mesh(capture.surface, generator=generator).points
-        return find_symmetries(points, generator=generator)
-
-    return estimator_for(options.gain_model, bodies, symmetries=symmetries, log=say)
-
-
-def _beside(output: Path, ending: str) -> Path:
-    """Return where a part of an unfinished fit is kept: beside the field that it will become."""
-    return output.with_name(f"{output.name}.{ending}")
-
-
-def features_of(capture: Capture, config: FitConfig) -> FeatureField:
-    """Return the object's points: of its surface where there is one, else those that fill the contacts' box."""
-    if capture.surface is None:
-        say(
-            "the capture has no surface: points that fill the box of its contacts stand for the object. Photographs, a "
-            "video or Gaussians are used by avmsf reconstruct"
-        )
-        return FeatureField.from_contacts(capture.impacts.contacts)
-    return FeatureField.from_mesh(capture.surface, generator=torch.Generator().manual_seed(config.seed))
-
-
 def part_contacts(
     impacts: Impacts, *, fraction: float | None, count: int | None, start: int
 ) -> tuple[Impacts, Impacts | None]:
@@ -334,17 +273,17 @@ def summary(fitted: SoundField, contacts: int) -> str:
     """Say in a sentence what a fit came to."""
     report = fitted.origin.report
     how = "chosen on validation contacts" if report.get("validated") else "as set"
-    gains = report.get("gains", "attention")
+    gains = report.get("gain_model", "attention")
     credibility = report.get("credibility") or {}
     if credibility.get("credible"):
         best, thickness = report["bodies"][0], report.get("thickness")
-        between = "{low:.2g} to {high:.2g} mm" if thickness and best["wall"] is not None else ""
+        between = "{low:.2g} to {high:.2g} mm" if thickness and best["wall_thickness"] is not None else ""
         interval = between.format(**{key: 1000 * value for key, value in (thickness or {}).items()})
         gained = credibility["with_body"] - credibility["without_body"]
         gains += (
             f" (most probable body: {best['body']}{interval and ', 90 % interval of the wall ' + interval}, its "
-            f"frequencies {best['factor']:.2f} times those of aluminum; adds {gained:.1f} nats per mode at contacts "
-            "left out)"
+            f"frequencies {best['frequency_factor']:.2f} times those of aluminum; adds {gained:.1f} nats per mode at "
+            "contacts left out)"
         )
     return (
         f"field of {fitted.origin.capture}: {len(fitted.bank)} modes from {counted(contacts, 'recording')}, gains by "

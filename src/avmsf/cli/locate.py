@@ -184,7 +184,7 @@ def _error(contact: ContactMap, truth: Float64[Tensor, " 3"]) -> dict[str, Any]:
     `rmed` is of the point of least cosine distance, as in `avmsf evaluate localize`.
     """
     diagonal = float((contact.points.amax(0) - contact.points.amin(0)).norm())
-    places = (contact.points[int(contact.distance.argmin())], contact.place)
+    places = (contact.points[int(contact.distance.argmin())], contact.position)
     cosine, likely = (float((place.double() - truth).norm()) for place in places)
     relative = {"rmed": cosine / diagonal, "rmed_posterior": likely / diagonal}
     return {"true_contact": truth.tolist(), "error_metres": likely, **relative}

@@ -11,7 +11,7 @@ from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_rows, quality_rows
 from avmsf.cli.printing import console, decimals, figure, print_json, say, table
-from avmsf.modal.extraction.extract import extract
+from avmsf.modal.extraction.extract import extract_modes
 from avmsf.modal.extraction.finders import ExtractionMethod, finder_named
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.wording import counted
@@ -55,7 +55,7 @@ def run(options: Options) -> int:
     impacts = capture.impacts
     count = counted(len(impacts), "recording")
     say(f"finding the modes of {count}, {impacts.duration:.3g} s at {impacts.sample_rate:g} Hz")
-    extraction = extract(impacts, finder_named(options.method, options.modes))
+    extraction = extract_modes(impacts, finder_named(options.method, options.modes))
     level = levels(amplitudes(extraction))
     rows = mode_rows(extraction.bank, level)
     quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)

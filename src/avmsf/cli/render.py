@@ -143,13 +143,13 @@ def render_sounds(
 ) -> Float[Tensor, "contacts samples"]:
     """Render blows of `force` for `seconds`; raises `OutputError` for a time that holds no sample."""
     if seconds is None:
-        return field.render(places, directions=directions, force=force, pulse=pulse)
+        return field.render(places, directions=directions, forces=force, pulse=pulse)
     samples = round(seconds * field.sample_rate) if math.isfinite(seconds) else 0
     if not 1 <= samples <= MAX_SAMPLES:
         raise OutputError(
             f"--seconds is {seconds:g}; expected a time above 0 and at most {MAX_SAMPLES / field.sample_rate:g} s"
         )
-    return field.render(places, directions=directions, force=force, samples=samples, pulse=pulse)
+    return field.render(places, directions=directions, forces=force, samples=samples, pulse=pulse)
 
 
 def _pulse(options: Options) -> ForcePulse | None:

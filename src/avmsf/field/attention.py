@@ -179,7 +179,7 @@ class AttentionGains(TrainableGains):
     def _empty(cls, record: Mapping[str, Any]) -> "AttentionGains":
         points, dim, modes = (count_of(record[name], name) for name in ("points", "dim", "modes"))
         encoder = like(record["encoder"], "", "encoder")
-        shape = record_of(_EXAMPLE, record["shape"], "shape", later=("projection",))
+        shape = record_of(_EXAMPLE, record["shape"], "shape")
         if shape.layers > _MAX_LAYERS or shape.bands > _MAX_LAYERS:
             raise ValueError(f"layers and bands: expected at most {_MAX_LAYERS}, got {shape.layers} and {shape.bands}")
         with torch.device("meta"):

@@ -11,9 +11,6 @@ from avmsf.modal.spectra import scaled_fft_size
 _COUNTS = ("clusters", "width", "hidden", "interleave", "early")
 _POSITIVE = ("feature_scale", "warmup_rate", "learning_rate")
 
-LATER = ("warmup_gains", "warmup_weights", "spectral_norm", "residual_start", "projection")
-"""Settings that the first files of the current format lack."""
-
 
 @dataclass(frozen=True)
 class FitConfig:

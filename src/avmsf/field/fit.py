@@ -97,7 +97,7 @@ def fit(
     run = job.run("fit", list(range(len(train))), chosen)
     # Close modes may have passed one another on the way.
     order = torch.argsort(run.bank.frequency.detach())
-    report = {"gains": recipe.name, **run.network.report, **report}
+    report = {"gain_model": recipe.name, **run.network.report, **report}
     bank = ModalBank(*(each.detach()[order] for each in (run.bank.frequency, run.bank.damping)))
     finished: GainField
     if isinstance(run.network, RefinedGains):
@@ -113,6 +113,7 @@ def fit(
         train.sample_rate,
         train.sounds.shape[1],
         Origin(capture, train.names, train.forces is not None, config, report, settings),
+        modes.alignment,
     )
     used = train.take(run.network.used_rows(len(train)))
     if config.residual and not config.noise_rate and config.steps:

@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
 from avmsf._utils.records import count_of, like
+from avmsf._utils.summary import short_repr
 from avmsf.field.attention import AttentionGains
 from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.gains.body import BodyGains
@@ -17,7 +18,7 @@ from avmsf.field.gains.model import MixtureGains
 
 FITTED: dict[str, type[GainField]] = {each.kind: each for each in (AttentionGains, MixtureGains, BodyGains)}
 """The gain fields beneath all edits, fitted to recordings or guessed, by what a file calls them."""
-_INNER = "field."
+_INNER = "fitted."
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +27,8 @@ class ScaledGains:
 
     Of a field that is scaled already only the factors change: what is held is always a fitted field.
     """
+
+    __repr__ = short_repr
 
     field: GainField
     """The gains as they were fitted."""
@@ -71,26 +74,26 @@ class ScaledGains:
 
     def record(self) -> dict[str, Any]:
         """Return the fitted field's record, what a file calls that field, and the length."""
-        return {**self.field.record(), "inner": self.field.kind, "length": self.length}
+        return {**self.field.record(), "fitted_kind": self.field.kind, "size_factor": self.length}
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the factors and the fitted field's tensors."""
-        return {"scale": self.scale, **{_INNER + name: tensor for name, tensor in self.field.tensors().items()}}
+        return {"mode_factors": self.scale, **{_INNER + name: tensor for name, tensor in self.field.tensors().items()}}
 
     @classmethod
     def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return tensors like those of a field of these sizes."""
-        if not 0.0 < like(record["length"], 1.0, "length") < math.inf:
-            raise ValueError(f"length is {record['length']}")
+        if not 0.0 < like(record["size_factor"], 1.0, "size_factor") < math.inf:
+            raise ValueError(f"size_factor is {record['size_factor']}")
         inner = FITTED[_inner(record)].skeleton(record)
         scale = torch.empty(count_of(record["modes"], "modes"), dtype=torch.float64, device="meta")
-        return {"scale": scale, **{_INNER + name: tensor for name, tensor in inner.items()}}
+        return {"mode_factors": scale, **{_INNER + name: tensor for name, tensor in inner.items()}}
 
     @classmethod
     def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "ScaledGains":
         """Return the field."""
         inner = {name.removeprefix(_INNER): each for name, each in tensors.items() if name.startswith(_INNER)}
-        return cls(FITTED[_inner(record)].restore(record, inner), tensors["scale"], float(record["length"]))
+        return cls(FITTED[_inner(record)].restore(record, inner), tensors["mode_factors"], float(record["size_factor"]))
 
     def _scaled(self, gains: Float[Tensor, "contacts modes"]) -> Float32[Tensor, "contacts modes"]:
         return (gains.double() * self.scale).float()
@@ -102,7 +105,7 @@ def fitted_gains(gains: GainField) -> GainField:
 
 
 def _inner(record: Mapping[str, Any]) -> str:
-    kind: str = like(record["inner"], "", "inner")
+    kind: str = like(record["fitted_kind"], "", "fitted_kind")
     if kind not in FITTED:
-        raise ValueError(f"inner is {kind!r}, not {', '.join(FITTED)}")
+        raise ValueError(f"fitted_kind is {kind!r}, not {', '.join(FITTED)}")
     return kind

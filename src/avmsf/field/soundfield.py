@@ -2,21 +2,36 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Bool, Complex, Float, Float64
 from torch import Tensor
 
+from avmsf._utils.arrays import ArrayLike, as_numbers, as_vectors
+from avmsf._utils.summary import short_repr
+from avmsf.capture.folder import Capture
+from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
+from avmsf.errors import PositionError
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField, Gains
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.scaledgains import ScaledGains, fitted_gains
 from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.pulse import ForcePulse
 from avmsf.modal.residual import Residual, low_fluctuation_noise, shape_noise
 from avmsf.modal.synthesis import synthesise_phased
+
+if TYPE_CHECKING:
+    from avmsf.field.gains.estimator import GainModel
+    from avmsf.field.suggest import Suggestions
+    from avmsf.pipeline.config import PipelineConfig
+    from avmsf.scene.features import FeatureField
+    from avmsf.tasks.contactmap import ContactMap
+    from avmsf.tasks.hearing import Sound
 
 _BATCH = 32
 """Contacts rendered at once, which bounds the memory."""
@@ -42,14 +57,14 @@ class Origin:
 
 @dataclass(frozen=True)
 class FieldQuality:
-    """Relative STFT errors at training contacts, each predicted from those at all other places."""
+    """Relative STFT errors at training contacts, each predicted from those at all other positions."""
 
-    places: int
-    """Places that were left out in turn, each with all of its recordings."""
+    positions: int
+    """Positions that were left out in turn, each with all of its recordings."""
     error: float
     """Of the field; modes, and the prior of its gain model's hypotheses, are those of all contacts."""
-    averaging: float
-    """Of the mean of the three nearest recordings at other places."""
+    nearest_mean: float
+    """Of the mean of the three nearest recordings at other positions."""
     next_contact: tuple[float, float, float] | None = None
     """The contact (object frame, meters) that reduces the field's expected error most; None if there is no other."""
     next_distance: float | None = None
@@ -68,15 +83,15 @@ class FieldQuality:
     @property
     def verdict(self) -> str:
         """How good the field is. Leaving out mostly overstates the error: spread contacts are far from each other."""
-        if self.error < self.averaging:
+        if self.error < self.nearest_mean:
             return (
-                f"At contacts left out the relative STFT error of the field is about {self.error:.2f}, of "
-                f"averaging the three nearest recordings {self.averaging:.2f} ({self.places} places)."
+                f"By leave-one-out, the relative STFT error of the field is about {self.error:.2f}, of the mean of "
+                f"the three nearest recordings {self.nearest_mean:.2f} ({self.positions} positions)."
             )
         return (
-            f"No better than averaging the three nearest recordings: relative STFT errors of {self.error:.2f} and "
-            f"{self.averaging:.2f} at contacts left out ({self.places} places). Record more places; without a mesh, "
-            "give one."
+            "By leave-one-out, the field is no better than the mean of the three nearest recordings: relative STFT "
+            f"errors of {self.error:.2f} and {self.nearest_mean:.2f} ({self.positions} positions). Record more "
+            "positions; without a mesh, give one."
         )
 
     @property
@@ -92,8 +107,25 @@ class FieldQuality:
 
 
 @dataclass(frozen=True, eq=False)
+class GainPosterior:
+    """The posterior distribution of complex gains A, which sound as the real part of A exp((-d + 2 pi i f) t)."""
+
+    __repr__ = short_repr
+
+    mean: Complex[Tensor, "contacts modes"]
+    """In the unit of the training sounds."""
+    std: Float[Tensor, "contacts modes"]
+    """Standard deviation: the square root of the expected squared distance of a gain from its mean."""
+
+
+@dataclass(frozen=True, eq=False)
 class SoundField:
-    """Renders the sound of an impact anywhere on one object (paper, eq. 4)."""
+    """Renders the sound of an impact anywhere on one object (paper, eq. 4).
+
+    Positions, directions and forces are lists, numpy arrays or tensors. Methods raise ArrayError for other shapes and
+    for values that are not finite, and PositionError for a position that lies farther from the object than this is
+    large.
+    """
 
     bank: ModalBank
     """Frequencies and dampings, shared by all contacts."""
@@ -108,6 +140,21 @@ class SoundField:
     samples: int
     """Length of rendered sounds."""
     origin: Origin
+    alignment: Alignment | None = None
+    """How the recordings that it was fitted to were aligned with one another; None where they were not."""
+
+    def __repr__(self) -> str:
+        fitted, seconds = len(self.origin.trained_on), self.samples / self.sample_rate
+        text = (
+            f"SoundField({self.origin.capture!r}, {self.bank}, gains {self.gain_field.kind!r} of {fitted} recordings, "
+            f"{seconds:.3g} s at {self.sample_rate:g} Hz)"
+        )
+        quality = self.quality
+        if quality is None:
+            return text
+        return (
+            f"{text}\nleave-one-out error {quality.error:.2f}, mean of 3 nearest recordings {quality.nearest_mean:.2f}"
+        )
 
     @property
     def quality(self) -> FieldQuality | None:
@@ -123,23 +170,100 @@ class SoundField:
         """Which modes sound: those below half the sample rate, above which an edit may have moved some."""
         return self.bank.frequency < 0.5 * self.sample_rate
 
-    def gains(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts modes"]:
+    @classmethod
+    def fit(
+        cls,
+        capture: Capture,
+        gain_model: "GainModel | None" = None,
+        *,
+        features: "FeatureField | None" = None,
+        config: "PipelineConfig | None" = None,
+        seed: int | None = None,
+        device: str | None = None,
+        progress: bool = True,
+    ) -> "SoundField":
+        """Fit a field to the recordings of a capture, as `avmsf fit` does.
+
+        The recordings are aligned and their modes found, the object's elastic modes are computed where the capture has
+        a mesh, and the gain model is fitted and compared with the recordings by leave-one-out (`quality`). It takes
+        seconds to minutes. `gain_model`, `seed` and `device` take the place of those of `config`: by default "auto",
+        the Gaussian process over all kernel families, seed 0, and a CUDA GPU where there is one. `features` describe
+        the object's points for the gain models "visual" and "network"; without them these are positions on the mesh.
+        With `progress`, the standard error says what is done.
+
+        Raises AvmsfError for a capture that no field can be fitted to.
+        """
+        from avmsf.pipeline.fitting import fit_with_progress
+
+        return fit_with_progress(
+            capture, gain_model, features=features, config=config, seed=seed, device=device, progress=progress
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> "SoundField":
+        """Read a field that `save` wrote. Raises FieldFileError for a missing or damaged file, and for another kind."""
+        from avmsf.field.store import load
+
+        return load(path)
+
+    def save(self, path: str | Path) -> None:
+        """Write the field to one safetensors file. Raises FieldFileError where it cannot be written."""
+        from avmsf.field.store import save
+
+        save(self, path)
+
+    def posterior(self, positions: ArrayLike, directions: ArrayLike | None = None) -> GainPosterior:
+        """Return the posterior of the gains of impacts at positions (object frame, meters), [contacts, 3].
+
+        `directions` as in `render`. Raises FitError for a field without a posterior: of the attention network, of
+        recordings in one place, or guessed without recordings.
+        """
+        from avmsf.field.uncertainty import std_of
+
+        contacts, ways = self._impacts(positions, directions)
+        std = std_of(self, contacts, ways).square().sum(2).sqrt()
+        return GainPosterior(self.complex_gains(contacts, directions=ways), std)
+
+    def suggest(self, count: int = 5) -> "Suggestions":
+        """Return where the next `count` impacts lower the field's expected error most.
+
+        Raises FitError as `posterior`.
+        """
+        from avmsf.field.suggest import suggest
+
+        return suggest(self, count)
+
+    def locate(self, recording: "Sound", *, sample_rate: float | int | None = None) -> "ContactMap":
+        """Return where on the object a recorded impact was: points with probabilities.
+
+        `recording` is the path of a sound file, or the samples of one channel at `sample_rate` Hz (by default the
+        field's). `avmsf.locate` takes more arguments. Raises LocationError for a recording that is silent or too short.
+        """
+        from avmsf.tasks.locate import locate
+
+        return locate(self, recording, sample_rate=sample_rate)
+
+    def aligned(self, impacts: Impacts) -> Impacts:
+        """Return recordings of the object with the starts that the field's sounds have."""
+        return impacts if self.alignment is None else self.alignment.apply(impacts)
+
+    def gains(self, contacts: ArrayLike, *, directions: ArrayLike | None = None) -> Float[Tensor, "contacts modes"]:
         """Return the signed amplitudes at the contacts (object frame, metres), in the unit of the training sounds.
 
         `directions`, unit vectors, are those of the impacts; without them they go straight into the surface.
         """
-        return self.known(contacts, directions=directions).mean
+        places, ways = self._impacts(contacts, directions)
+        return self.known(places, directions=ways).mean
 
     def complex_gains(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+        self, contacts: ArrayLike, *, directions: ArrayLike | None = None
     ) -> Complex[Tensor, "contacts modes"]:
         """Return amplitudes A at the contacts: their sounds are the real part of the sum of A exp((-d + 2 pi i f) t).
 
         Contacts, directions and unit as in `gains`; dampings d are those of the contacts.
         """
-        sines, cosines = self.known(contacts, directions=directions).parts.unbind(2)
+        places, ways = self._impacts(contacts, directions)
+        sines, cosines = self.known(places, directions=ways).parts.unbind(2)
         return torch.complex(cosines, -sines) * torch.exp(1j * self.phase)
 
     def known(
@@ -157,33 +281,46 @@ class SoundField:
 
     def render(
         self,
-        contacts: Float[Tensor, "contacts 3"],
+        positions: ArrayLike,
+        directions: ArrayLike | None = None,
+        forces: float | int | ArrayLike | None = None,
         *,
-        directions: Float[Tensor, "contacts 3"] | None = None,
-        force: float = 1.0,
         samples: int | None = None,
         pulse: ForcePulse | None = None,
     ) -> Float[Tensor, "contacts samples"]:
-        """Return the sound of an impact at each contact, along `directions` as in `gains`, times `force`.
+        """Return the sound of an impact at each position (object frame, meters), [contacts, 3].
 
-        `force` in newtons where the recordings were divided by theirs, else relative to an average one of them. Of
-        `samples` samples, or as long as the training sounds. The noise is the same at every contact and in every call,
-        so that a contact's sound depends on nothing else. Modes that are not `audible` are silent.
+        `directions`, unit vectors, [contacts, 3], are those of the impacts; without them they go straight into the
+        surface. `forces`, one for all or one for each, are in newtons where the recordings were divided by theirs, else
+        relative to an average one of them; without them they are 1. Of `samples` samples, or as long as the training
+        sounds. The noise is the same at every contact and in every call, so that a contact's sound depends on nothing
+        else. Modes that are not `audible` are silent.
 
         `pulse` is what a softer hammer adds to the recorded impacts' own pulses; it has the same impulse, however long
-        it is, and leaves the noise as it is. The noise grows with `force` as the modes do, which is a simplification:
+        it is, and leaves the noise as it is. The noise grows with the force as the modes do, which is a simplification:
         recorded background noise does not depend on the force of an impact.
         """
+        contacts, ways = self._impacts(positions, directions)
         length = self.samples if samples is None else samples
         noise = None if self.residual.recordings is not None else self.noise(samples)
-        parts = []
+        parts = [torch.zeros(0, length)]
         for rows in torch.split(torch.arange(len(contacts)), _BATCH):
-            known = self.known(contacts[rows], directions=None if directions is None else directions[rows])
-            modes = self.modal_sounds(known, length)
+            way = None if ways is None else ways[rows]
+            modes = self.modal_sounds(self.known(contacts[rows], directions=way), length)
             sounds = modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate)
-            way = None if directions is None else directions[rows]
             parts.append(sounds + (self._recorded(contacts[rows], way, length) if noise is None else noise))
-        return force * torch.cat(parts)
+        sounds = torch.cat(parts)
+        if forces is None:
+            return sounds
+        return as_numbers(forces, "forces", count=len(contacts)).to(sounds)[:, None] * sounds
+
+    def _impacts(
+        self, positions: ArrayLike, directions: ArrayLike | None
+    ) -> tuple[Float[Tensor, "contacts 3"], Float[Tensor, "contacts 3"] | None]:
+        """Return positions and directions as tensors."""
+        contacts = as_vectors(positions, "positions")
+        expect_near(contacts, self.gain_field.points)
+        return contacts, None if directions is None else as_vectors(directions, "directions", count=len(contacts))
 
     def _recorded(
         self,
@@ -224,4 +361,25 @@ class SoundField:
             samples=samples,
             sample_rate=self.sample_rate,
             quadrature=None if known.quadrature is None else known.quadrature[:, rows],
+        )
+
+
+def expect_near(positions: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"]) -> None:
+    """Raise PositionError for a position farther outside the box of an object's points than the object is large.
+
+    Such a position counts another unit, or is in another frame.
+    """
+    places, known = positions.double(), points.detach().cpu().double()
+    low, high = known.amin(0), known.amax(0)
+    size = float((high - low).norm())
+    outside = torch.clamp(torch.maximum(low - places, places - high), min=0).norm(dim=1)
+    far = torch.nonzero(~(outside <= size)).flatten()
+    if len(far):
+        row = int(far[outside[far].argmax()])
+        where = ", ".join(f"{value:.4g}" for value in places[row].tolist())
+        raise PositionError(
+            f"expected positions on the object, in meters, got ({where}) m (row {row}), which is "
+            f"{float(outside[row]):.3g} m outside an object {size:.3g} m across: check the unit and the frame",
+            name="positions",
+            row=row,
         )

@@ -1,11 +1,12 @@
 """A sound field as one file: safetensors, and one JSON in its header for all that is no tensor.
 
-Tensors are named by the path of their field: `bank.frequency`, `phase`, `gain_field.points`. The header's metadata
+Tensors are named by the path of their field: `bank.frequency`, `phase`, `gains.points`. The header's metadata
 holds under the key `avmsf` a record:
 
-{"format": 7, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
+{"format": 8, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
  "sizes": {"modes": 43, "bins": 1025, "recordings": [8, 132300]},
- "gain_field": {"kind": "attention", what the gain field says of itself},
+ "gains": {"kind": "attention", what the gain model says of itself},
+ "alignment": null or {"modes": 32, "names": [...], "keys": [...]},
  "config": {FitConfig}, "origin": {"capture": "bowl", "trained_on": [...], "per_newton": true, "report": {...},
                                    "settings": {CaptureSettings}}}
 """
@@ -28,18 +29,19 @@ from avmsf._utils.text_files import parse_json
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, FieldFileError, FitError
-from avmsf.field.config import LATER, FitConfig
+from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField
 from avmsf.field.scaledgains import FITTED, ScaledGains
 from avmsf.field.soundfield import FieldQuality, Origin, SoundField
 from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.residual import Residual
 
-FORMAT = 7
-"""Number of this format; it grows with every change that older versions could not read."""
+FORMAT = 8
+"""Number of this format; it grows with every change that older versions could not read. Later versions read it."""
 _KEY = "avmsf"
-_GAIN_FIELD = "gain_field."
+_GAINS, _ALIGNMENT = "gains.", "alignment."
 _POSITIVE = ("bank.frequency", "bank.damping")
 _MAX = {"bank.frequency": 1e9, "bank.damping": 1e9, "residual.magnitude": MAX_PEAK}
 """Largest values: hertz and 1/s beyond any solid's modes, and noise as loud as the loudest recording."""
@@ -90,11 +92,11 @@ def load(path: str | Path) -> SoundField:
             raise FieldFileError(
                 f"{path}: expected a sound field of format {FORMAT}, found format {found}, written by avmsf {writer} "
                 f"(this is avmsf {version('avmsf')}): "
-                + ("fit the field again" if isinstance(found, int) and found < FORMAT else "install a newer avmsf")
+                + (_remake(record, path) if isinstance(found, int) and found < FORMAT else "install a newer avmsf")
             )
         header = _Header.of(record)
         _expect_tensors(tensors, header.skeleton, path)
-        named = {name.removeprefix(_GAIN_FIELD): each for name, each in tensors.items() if name.startswith(_GAIN_FIELD)}
+        named = {name.removeprefix(_GAINS): each for name, each in tensors.items() if name.startswith(_GAINS)}
         gains = _KINDS[header.kind].restore(header.gain_field, named)
     except _UNREADABLE as error:
         raise FieldFileError(
@@ -109,6 +111,7 @@ def load(path: str | Path) -> SoundField:
         header.sample_rate,
         header.samples,
         header.origin,
+        _alignment(record["alignment"], tensors),
     )
 
 
@@ -128,7 +131,7 @@ class _Header:
     @classmethod
     def of(cls, record: Mapping[str, Any]) -> "_Header":
         """Return the header of a file's record. Raises one of `_UNREADABLE`, also for sounds that no recording has."""
-        sizes, gains, origin = record["sizes"], dict(record["gain_field"]), record["origin"]
+        sizes, gains, origin = record["sizes"], dict(record["gains"]), record["origin"]
         rate, samples = float(like(record["sample_rate"], 1.0, "sample_rate")), count_of(record["samples"], "samples")
         # Those of the recordings that a field is fitted to.
         if not LOWEST_RATE <= rate <= HIGHEST_RATE:
@@ -136,9 +139,9 @@ class _Header:
         if samples > MAX_SAMPLES:
             raise ValueError(f"samples: expected at most {MAX_SAMPLES:,}, got {samples:,}")
         modes, bins = (count_of(sizes[name], f"sizes.{name}") for name in ("modes", "bins"))
-        kind = like(gains.pop("kind"), "", "gain_field.kind")
+        kind = like(gains.pop("kind"), "", "gains.kind")
         if kind not in _KINDS:
-            raise ValueError(f"gain_field.kind is {kind!r}, not {', '.join(_KINDS)}")
+            raise ValueError(f"gains.kind is {kind!r}, not {', '.join(_KINDS)}")
         bank = torch.empty(modes, dtype=torch.float64, device="meta")
         skeleton = {"bank.frequency": bank, "bank.damping": bank, "phase": bank}
         skeleton["residual.magnitude"] = torch.empty(bins, device="meta")
@@ -147,14 +150,20 @@ class _Header:
             if gains.get("contacts") != contacts:
                 raise ValueError(f"sizes.recordings is {sizes['recordings']}, of other contacts than the gains")
             skeleton["residual.recordings"] = torch.empty(contacts, length, device="meta")
-        skeleton |= {_GAIN_FIELD + name: each for name, each in _KINDS[kind].skeleton(gains).items()}
+        skeleton |= {_GAINS + name: each for name, each in _KINDS[kind].skeleton(gains).items()}
+        if (alignment := record["alignment"]) is not None:
+            names, keys = (like(alignment[name], [], f"alignment.{name}") for name in ("names", "keys"))
+            if len(names) != len(keys) or not all(isinstance(each, str) for each in (*names, *keys)):
+                raise ValueError(f"alignment has {len(names)} names and {len(keys)} keys")
+            aligned = Alignment.skeleton(len(names), count_of(alignment["modes"], "alignment.modes", least=0))
+            skeleton |= {_ALIGNMENT + name: each for name, each in aligned.items()}
         if gains["modes"] != modes:
             raise ValueError(f"{gains['modes']} modes have gains, {modes} have frequencies")
         read = Origin(
             capture=like(origin["capture"], "", "origin.capture"),
             trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
             per_newton=like(origin["per_newton"], True, "origin.per_newton"),
-            config=record_of(FitConfig(), record["config"], "config", later=LATER),
+            config=record_of(FitConfig(), record["config"], "config"),
             report=like(origin["report"], {}, "origin.report"),
             settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
         )
@@ -165,7 +174,7 @@ class _Header:
 
 def _record(field: SoundField) -> dict[str, Any]:
     origin = {name: getattr(field.origin, name) for name in ("capture", "trained_on", "per_newton", "report")}
-    recordings = field.residual.recordings
+    recordings, alignment = field.residual.recordings, field.alignment
     return {
         "format": FORMAT,
         "version": version("avmsf"),
@@ -176,7 +185,10 @@ def _record(field: SoundField) -> dict[str, Any]:
             "bins": len(field.residual.magnitude),
             "recordings": None if recordings is None else list(recordings.shape),
         },
-        "gain_field": {"kind": field.gain_field.kind, **field.gain_field.record()},
+        "gains": {"kind": field.gain_field.kind, **field.gain_field.record()},
+        "alignment": None
+        if alignment is None
+        else {"modes": len(alignment.phases.bank), "names": alignment.names, "keys": alignment.keys},
         "config": asdict(field.origin.config),
         "origin": origin | {"settings": asdict(field.origin.settings)},
     }
@@ -191,9 +203,27 @@ def _tensors(field: SoundField) -> dict[str, Tensor]:
     }
     if field.residual.recordings is not None:
         named["residual.recordings"] = field.residual.recordings
-    named |= {_GAIN_FIELD + name: tensor for name, tensor in field.gain_field.tensors().items()}
+    if field.alignment is not None:
+        named |= {_ALIGNMENT + name: tensor for name, tensor in field.alignment.tensors().items()}
+    named |= {_GAINS + name: tensor for name, tensor in field.gain_field.tensors().items()}
     # Safetensors refuses tensors that share memory, as a field's points may with its features.
     return {name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in named.items()}
+
+
+def _alignment(record: Mapping[str, Any] | None, tensors: Mapping[str, Tensor]) -> Alignment | None:
+    if record is None:
+        return None
+    named = {name.removeprefix(_ALIGNMENT): each for name, each in tensors.items() if name.startswith(_ALIGNMENT)}
+    return Alignment.restore(named, record["names"], record["keys"])
+
+
+def _remake(record: Mapping[str, Any], path: Path) -> str:
+    """Return the command that makes the field of an older file again."""
+    report = record["origin"]["report"]
+    verb = "reconstruct" if (report.get("pipeline") or {}).get("scene") else "fit"
+    material = f" --material {report['material']['name']}" if "guess" in report else ""
+    capture = record["origin"]["capture"]
+    return f"fit it again: avmsf {verb} FOLDER{material} --output {path}, where FOLDER is that of {capture!r}"
 
 
 def _expect_tensors(tensors: dict[str, Tensor], skeleton: dict[str, Tensor], path: Path) -> None:

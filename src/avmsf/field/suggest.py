@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Float64, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from avmsf._utils.summary import short_repr
 from avmsf.errors import FitError
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.model import MixtureGains
@@ -33,6 +34,8 @@ class Suggestions:
     Errors are relative: the square root of the expected squared error of the gains, as energy, over the energy that is
     expected on the mean over the surface. 0 is certainty, 1 as wrong as silence.
     """
+
+    __repr__ = short_repr
 
     contacts: Float64[Tensor, "contacts 3"]
     """Object frame, metres."""

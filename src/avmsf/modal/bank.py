@@ -15,5 +15,11 @@ class ModalBank:
     damping: Float64[Tensor, " modes"]
     """Amplitude decay rates, 1/s, positive."""
 
+    def __repr__(self) -> str:
+        if not len(self):
+            return "ModalBank(0 modes)"
+        ranges = [f"{float(each.min()):.5g} to {float(each.max()):.5g}" for each in (self.frequency, self.damping)]
+        return f"ModalBank({len(self)} modes, {ranges[0]} Hz, damping {ranges[1]} 1/s)"
+
     def __len__(self) -> int:
         return self.frequency.shape[0]

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from avmsf._utils.summary import short_repr
 from avmsf.modal.low_fluctuation import white_sequence
 
 _REFERENCE = 1 << 17
@@ -27,6 +28,8 @@ _ROUNDING = 1e-16
 @dataclass(frozen=True, eq=False)
 class Residual:
     """Stationary noise by frequency band."""
+
+    __repr__ = short_repr
 
     magnitude: Float[Tensor, " bins"]
     """Standard deviation of the white noise that each band is cut from (bins evenly spaced from 0 Hz to half the

@@ -1,1 +1,5 @@
-"""All the way from a capture folder to a field, stage by stage; only what changed is made anew."""
+"""Stages from a capture folder to a sound field."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

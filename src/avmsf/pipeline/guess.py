@@ -77,10 +77,10 @@ def guess_field(
     loudness = push * radiated_pressure(found.elastic, vibration) * _pulse(elastic, vibration.poles)
     # As a file holds them, so that a field read back has the same sounds.
     shapes = (elastic.shapes * loudness[:, None]).float().double()
-    points = FeatureField.from_mesh(seen, generator=torch.Generator().manual_seed(0)).points
+    points = FeatureField.from_mesh(seen, seed=0).points
     described = f"{len(elastic)} modes of a {material.name} body ({found.name})"
     report = {
-        "gains": "mode shapes of a guessed body",
+        "gain_model": "mode shapes of a guessed body",
         "guess": f"No recordings: a guess of {described} from its shape and the material's constants alone.",
         "material": asdict(material),
         "body": found.name,

@@ -156,7 +156,7 @@ def _reconstruct(
 
     def is_final(path: Path) -> bool:
         """Whether a kept field has the elastic family, or there is still none, as for want of memory."""
-        if config.gain_model == NETWORK or Elastic.kind not in load(path).origin.report.get("missing", {}):
+        if config.gain_model == NETWORK or Elastic.kind not in load(path).origin.report.get("unavailable", {}):
             return True
         try:
             bodies()

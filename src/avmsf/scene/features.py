@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from avmsf._utils.arrays import Seed, generator_of
+from avmsf._utils.summary import short_repr
 from avmsf.capture.surface import Surface
 from avmsf.errors import FitError
 from avmsf.scene.points import cluster, lattice, nearest_points, sample_surface
@@ -30,6 +32,8 @@ class Regions:
 class FeatureField:
     """Points of an object, each with a feature vector."""
 
+    __repr__ = short_repr
+
     points: Float[Tensor, "points 3"]
     """Object frame, metres."""
     features: Float[Tensor, "points dim"]
@@ -41,7 +45,7 @@ class FeatureField:
 
     @classmethod
     def from_mesh(
-        cls, surface: Surface, *, generator: torch.Generator, count: int = 8192, normal_scale: float = 0.0
+        cls, surface: Surface, *, seed: Seed = None, count: int = 8192, normal_scale: float = 0.0
     ) -> "FeatureField":
         """Return `count` points drawn evenly from a surface's triangles, with their positions as features.
 
@@ -51,7 +55,7 @@ class FeatureField:
         """
         if len(surface.faces) == 0:
             return cls.from_points(surface.vertices)
-        samples = sample_surface(surface.vertices, surface.faces, count, generator=generator)
+        samples = sample_surface(surface.vertices, surface.faces, count, generator=generator_of(seed))
         return cls.from_points(
             samples.points, normals=samples.normals if normal_scale else None, normal_scale=normal_scale
         )

@@ -7,10 +7,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from avmsf._utils.summary import short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class GaussianCloud:
     """The Gaussians of one object, in the object frame (Kerbl et al. 2023, "3D Gaussian Splatting")."""
+
+    __repr__ = short_repr
 
     centers: Float[Tensor, "points 3"]
     """Metres."""

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import SceneError
 from avmsf.scene.neighbourhoods import NEIGHBOURS, read_neighbourhoods
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
@@ -39,7 +40,7 @@ _MIRRORS, _AXES, _TURNS = 24, 30, 40
 def find_symmetries(
     points: Float[Tensor, "points 3"],
     *,
-    generator: torch.Generator,
+    seed: Seed = None,
     tolerance: float = TOLERANCE,
     missing: float = MISSING,
     limit: int = LIMIT,
@@ -77,7 +78,7 @@ def find_symmetries(
         raise SceneError(
             f"expected a tolerance above 0 and a limit of at least {_FEWEST} points, found {tolerance:g} and {limit}"
         )
-    random = np.random.default_rng(int(torch.randint(2**31 - 1, (1,), generator=generator)))
+    random = np.random.default_rng(int(torch.randint(2**31 - 1, (1,), generator=generator_of(seed))))
     places, middle, diagonal = _normalised(points)
     places = _evened(places, limit, random)
     surface = read_neighbourhoods(places)

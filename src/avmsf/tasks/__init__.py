@@ -1,1 +1,5 @@
-"""What a sound field is for: find the blow, change the material."""
+"""Uses of a sound field: localization of impacts and editing."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

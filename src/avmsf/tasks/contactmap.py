@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from avmsf._utils.summary import short_repr
 from avmsf.errors import LocationError
 from avmsf.scene.symmetry import Symmetries
 from avmsf.tasks.counterparts import Counterpart, name_counterpart
@@ -30,9 +31,11 @@ _NEIGHBOUR_PART = 0.04
 class Peak:
     """A place, as large as it may be, where the blow may have fallen."""
 
+    __repr__ = short_repr
+
     row: int
     """Its likeliest point."""
-    place: Float32[Tensor, " 3"]
+    position: Float32[Tensor, " 3"]
     """Where that is, object frame, metres."""
     probability: float
     """That the blow fell here: of all points that hang together with this one."""
@@ -43,6 +46,14 @@ class Peak:
 @dataclass(frozen=True, eq=False)
 class ContactMap:
     """Scores of all points of a surface for one blow (paper, section Contact Localization, and beyond it)."""
+
+    def __repr__(self) -> str:
+        if self.refusal is not None:
+            return f"ContactMap({len(self.points)} points, no position: {self.refusal})"
+        first, *others = self.peaks()
+        where = ", ".join(f"{value + 0.0:.3f}" for value in self.position.tolist())
+        more = f", {len(others)} more positions as probable" if others else ""
+        return f"ContactMap({len(self.points)} points, most probable ({where}) m with {first.probability:.0%}{more})"
 
     points: Float32[Tensor, "points 3"]
     """Object frame, metres."""
@@ -83,7 +94,7 @@ class ContactMap:
         return int(torch.argmax(self.probability))
 
     @property
-    def place(self) -> Float32[Tensor, " 3"]:
+    def position(self) -> Float32[Tensor, " 3"]:
         """Where the most probable point is, object frame, metres. Raises LocationError after a `refusal`."""
         if self.refusal is not None:
             raise LocationError(self.refusal)
@@ -150,7 +161,7 @@ class ContactMap:
         first, *others = self.peaks(level)
         return tuple(
             name_counterpart(
-                first.place, other.place, symmetries, probability=other.probability, tolerance=2.0 * self.radius
+                first.position, other.position, symmetries, probability=other.probability, tolerance=2.0 * self.radius
             )
             for other in others
         )

@@ -17,7 +17,7 @@ _ANGLES = 360
 class Counterpart:
     """A place that may have been struck as well as the likeliest one."""
 
-    place: Float32[Tensor, " 3"]
+    position: Float32[Tensor, " 3"]
     """Object frame, metres."""
     probability: float
     """That the blow fell there."""
@@ -27,7 +27,7 @@ class Counterpart:
     """By which it is turned, radians, for a rotation."""
 
     def __str__(self) -> str:
-        where = " ".join(f"{round(value, 4) + 0.0:.4g}" for value in self.place.tolist())
+        where = " ".join(f"{round(value, 4) + 0.0:.4g}" for value in self.position.tolist())
         if self.symmetry is None:
             why = "no known symmetry of the object explains it"
         elif isinstance(self.symmetry, MirrorSymmetry):

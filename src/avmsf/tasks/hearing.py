@@ -3,14 +3,16 @@
 import math
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import scipy.signal
 import torch
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from avmsf.capture.audio import Recording
+from avmsf._utils.arrays import ArrayLike, as_floats
+from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.blow import clipping, expect_sudden
 from avmsf.capture.onset import Pulse, find_second_blow, find_second_push
 from avmsf.capture.prepare import prepare, shortest_allowed
@@ -19,8 +21,8 @@ from avmsf.capture.starts import latest_start
 from avmsf.errors import CaptureError, LocationError
 from avmsf.field.soundfield import SoundField
 
-Sound = Recording | Float[Tensor, "..."] | Float[np.ndarray, "..."]
-"""A recording, or samples alone: [samples], of which `as_recording` says what else was found."""
+Sound = str | Path | Recording | ArrayLike
+"""The path of a sound file, a recording, or samples alone: [samples]."""
 _HELD = 0.9
 """Part of half a sample rate up to which a recording of another rate still holds all of a sound."""
 _FINEST = 2000
@@ -45,7 +47,7 @@ def hear(
     recording: Sound,
     field: SoundField,
     *,
-    sample_rate: float | None = None,
+    sample_rate: float | int | None = None,
     settings: CaptureSettings | None = None,
 ) -> Heard:
     """Prepare a recorded blow for a field as the recordings were that it was fitted to.
@@ -57,6 +59,7 @@ def hear(
     recording lacks are not asked for. Raises LocationError for recordings that are silent, too short, not finite, or
     never sudden enough to hold a blow.
     """
+    recording = read_if_path(recording)
     whole = as_recording(recording, field, sample_rate=sample_rate)
     chosen = settings_for(whole, own_settings(recording, field) if settings is None else settings)
     notes = describe(whole, chosen)
@@ -85,13 +88,20 @@ def hear(
     return Heard(at_rate, prepared.onset, highest, (*notes, *remark))
 
 
-def as_recording(recording: Sound, field: SoundField, *, sample_rate: float | None = None) -> Recording:
+def read_if_path(recording: Sound) -> Recording | ArrayLike:
+    """Return a recording as it is, or read it from its path. Raises CaptureError as `read_recording`."""
+    return read_recording(Path(recording)) if isinstance(recording, str | Path) else recording
+
+
+def as_recording(
+    recording: Recording | ArrayLike, field: SoundField, *, sample_rate: float | int | None = None
+) -> Recording:
     """Return a recording that can be listened to.
 
     Raises LocationError for samples of more than one channel, rates that are none, silence and what is not finite.
     """
     if not isinstance(recording, Recording):
-        samples = torch.as_tensor(recording).detach().cpu().double().numpy()
+        samples = as_floats(recording, "recording").double().numpy()
         if samples.ndim != 1:
             raise LocationError(
                 f"expected the samples of one channel, found the shape {samples.shape}: give one row or column of it, "
@@ -159,7 +169,7 @@ def at_field_rate(
     return torch.from_numpy(resampled.astype(np.float32)), highest, [note]
 
 
-def own_settings(recording: Sound, field: SoundField) -> CaptureSettings:
+def own_settings(recording: Recording | ArrayLike, field: SoundField) -> CaptureSettings:
     """Return the settings by which a field's own capture was read; bare samples are read already."""
     return replace(field.origin.settings, align=True) if isinstance(recording, Recording) else CaptureSettings()
 

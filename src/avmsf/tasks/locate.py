@@ -3,9 +3,7 @@
 from dataclasses import replace
 from functools import lru_cache
 
-from jaxtyping import Float
-from torch import Tensor
-
+from avmsf._utils.arrays import ArrayLike
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
@@ -26,21 +24,22 @@ def locate(
     field: SoundField,
     recording: Sound,
     *,
-    sample_rate: float | None = None,
+    sample_rate: float | int | None = None,
     settings: CaptureSettings | None = None,
-    points: Float[Tensor, "..."] | None = None,
-    directions: Float[Tensor, "..."] | None = None,
+    points: ArrayLike | None = None,
+    directions: ArrayLike | None = None,
     force: Force | None = None,
     locator: Locator | None = None,
 ) -> ContactMap:
-    """Return where on the object a recorded blow fell (paper, section Contact Localization, and a posterior).
+    """Return where on the object a recorded impact was (paper, section Contact Localization, and a posterior).
 
-    Bare samples are at `sample_rate` Hz, or at the field's rate. `settings` take the place of those of the capture
-    that the field was fitted to (see `hear`), `points` and `directions` as for `Locator.of`, `force` as for
-    `Locator.locate`; `locator` is one made of the field before, with points of its own. That of the last field and its
-    own points is kept, so that of several recordings only the first waits for it. The sound of another object has a
-    `refusal` in place of a place, see `judged`. Raises LocationError as `hear` and `Locator.locate`, and for a locator
-    of another field or given with points.
+    `recording` is the path of a sound file, a Recording, or the samples of one channel. Bare samples are at
+    `sample_rate` Hz, or at the field's rate. `settings` take the place of those of the capture that the field was
+    fitted to (see `hear`), `points` and `directions` as for `Locator.of`, `force` as for `Locator.locate`; `locator` is
+    one made of the field before, with points of its own. That of the last field and its own points is kept, so that of
+    several recordings only the first waits for it. The sound of another object has a `refusal` in place of a place, see
+    `judged`. Raises LocationError as `hear` and `Locator.locate`, and for a locator of another field or given with
+    points.
     """
     if locator is not None and (locator.field is not field or points is not None or directions is not None):
         what = "points or directions" if locator.field is field else "another field"

@@ -22,9 +22,7 @@ _CLOSED = 0.02
 def symmetries_of(field: SoundField) -> Symmetries | None:
     """Return the symmetries of a field's points; None where these are too few to tell."""
     try:
-        return find_symmetries(
-            field.gain_field.points, generator=torch.Generator().manual_seed(0), missing=_CLOSED, limit=_JUDGED
-        )
+        return find_symmetries(field.gain_field.points, seed=0, missing=_CLOSED, limit=_JUDGED)
     except AvmsfError:
         return None
 
@@ -56,7 +54,7 @@ def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: flo
     others = contact.counterparts(symmetries, level)
     return {
         "status": LOCATED,
-        "place": contact.place.tolist(),
+        "place": contact.position.tolist(),
         "region": {
             "level": level,
             "radius_metres": _radius(contact, level),
@@ -73,7 +71,8 @@ def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: flo
         },
         "ambiguous": bool(others),
         "counterparts": [
-            {"place": other.place.tolist(), "probability": other.probability, "words": str(other)} for other in others
+            {"place": other.position.tolist(), "probability": other.probability, "words": str(other)}
+            for other in others
         ],
         "notes": list(contact.notes),
     }
@@ -86,7 +85,7 @@ def not_located(reason: str) -> dict[str, Any]:
 
 def _radius(contact: ContactMap, level: float) -> float:
     """Return how far from the likeliest place the blow fell at most, with a probability of `level`, metres."""
-    apart = (contact.points.double() - contact.place.double()).norm(dim=1)
+    apart = (contact.points.double() - contact.position.double()).norm(dim=1)
     order = torch.argsort(apart, stable=True)
     reached = torch.cumsum(contact.probability[order], 0) >= level * contact.probability.sum()
     return float(apart[order][int(reached.double().argmax())])

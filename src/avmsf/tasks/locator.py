@@ -10,6 +10,8 @@ from jaxtyping import Complex64, Complex128, Float, Float32, Float64
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from avmsf._utils.arrays import ArrayLike, as_floats
+from avmsf._utils.summary import short_repr
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
@@ -31,6 +33,8 @@ _KEPT_LENGTHS = 8
 @dataclass(frozen=True, eq=False)
 class Locator:
     """What blows at all points of a field's surface are foretold to sound like, ready for any number of sounds."""
+
+    __repr__ = short_repr
 
     field: SoundField
     points: Float32[Tensor, "points 3"]
@@ -57,9 +61,9 @@ class Locator:
         cls,
         field: SoundField,
         *,
-        points: Float[Tensor, "..."] | None = None,
-        directions: Float[Tensor, "..."] | None = None,
-        areas: Float[Tensor, "..."] | None = None,
+        points: ArrayLike | None = None,
+        directions: ArrayLike | None = None,
+        areas: ArrayLike | None = None,
         use_residual: bool = True,
     ) -> "Locator":
         """Return the locator of a field, over the points (metres) of its gains unless others are given.
@@ -69,18 +73,19 @@ class Locator:
         `use_residual` nothing is taken for noise (the paper's ablation). Raises LocationError for points, directions
         or areas that are none.
         """
-        places = (field.gain_field.points if points is None else points).detach().cpu()
-        directions = None if directions is None else directions.detach().cpu()
-        _expect_points(places, directions, areas)
-        gains, dampings = foretell(field, places, directions)
-        variance = unknown(field, places, directions, factor=widened(field))
+        places = as_floats(field.gain_field.points if points is None else points, "points")
+        ways = None if directions is None else as_floats(directions, "directions")
+        parts = None if areas is None else as_floats(areas, "areas")
+        _expect_points(places, ways, parts)
+        gains, dampings = foretell(field, places, ways)
+        variance = unknown(field, places, ways, factor=widened(field))
         return cls(
             field,
             places.float(),
             gains,
             variance + patches(places, gains),
             dampings,
-            torch.ones(len(places), dtype=torch.float64) if areas is None else areas.detach().cpu().double(),
+            torch.ones(len(places), dtype=torch.float64) if parts is None else parts.double(),
             spread_by(places, contacts=contacts_of(field)),
             use_residual,
         )

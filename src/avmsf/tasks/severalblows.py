@@ -21,7 +21,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.synthesis import synthesise
 from avmsf.tasks.amplitudes import Extractor
 from avmsf.tasks.contactmap import ContactMap
-from avmsf.tasks.hearing import Sound, as_recording, at_field_rate, describe, own_settings, settings_for
+from avmsf.tasks.hearing import Sound, as_recording, at_field_rate, describe, own_settings, read_if_path, settings_for
 from avmsf.tasks.locate import judged
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
@@ -39,7 +39,7 @@ def locate_blows(
     field: SoundField,
     recording: Sound,
     *,
-    sample_rate: float | None = None,
+    sample_rate: float | int | None = None,
     settings: CaptureSettings | None = None,
     force: Force | None = None,
     locator: Locator | None = None,
@@ -52,6 +52,7 @@ def locate_blows(
     and blows closer than 30 ms are not told apart. Raises LocationError as `hear`, where the settings ask for the pulse
     that the recording holds to be divided out, and where no blow can be located.
     """
+    recording = read_if_path(recording)
     whole = as_recording(recording, field, sample_rate=sample_rate)
     chosen = settings_for(whole, own_settings(recording, field) if settings is None else settings)
     if chosen.normalise == "deconvolve":

@@ -318,7 +318,7 @@ WRONG = {
     "modes": [None, 0, 1.5],
     "directional": [None, 1, "yes"],
     "families": [None, 3, [], ["smooth"], ["attention", "smooth", "elastic"], "smooth", NO_LIST],
-    "kept": [None, 3, [], [1], ["2", 1, 1], [0, 1, 1]],
+    "kernels": [None, 3, [], [1], ["2", 1, 1], [0, 1, 1]],
     "bodies": [None, 3, [], [{}], [[]], [{"nodes": 0, "triangles": 3, "shapes": 2}], ["nodes"], [1]],
 }
 

@@ -14,7 +14,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.onset import find_onset
 from avmsf.modal.extraction import alignment
 from avmsf.modal.extraction.alignment import align, coherence, strongest_modes
-from avmsf.modal.extraction.extract import extract, extract_once
+from avmsf.modal.extraction.extract import extract_modes, extract_once
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.extraction.phase_likelihood import MeasuredPhases, background_power
 
@@ -161,9 +161,9 @@ def test_one_recording_and_noise_alone_are_not_aligned() -> None:
 def test_extraction_aligns_first_and_its_file_keeps_the_alignment(tmp_path: Path) -> None:
     starts = jitter(8, 2.0)
     impacts = damped(gains(8, 6), starts, noise_db=-50.0)
-    found = extract(impacts, HighResolution())
+    found = extract_modes(impacts, HighResolution())
     plain = replace(impacts, before=None, after=None)
-    assert extract(plain, HighResolution()).alignment is None
+    assert extract_modes(plain, HighResolution()).alignment is None
     once, again = (extract_once(impacts, HighResolution(), tmp_path / "modes.safetensors") for _ in range(2))
     assert found.alignment is not None
     assert once.alignment is not None

@@ -15,7 +15,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.onset import find_onset
 from avmsf.errors import ExtractionError
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.extract import extract, extract_sounds
+from avmsf.modal.extraction.extract import extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ShortTime, lowest_frequency
 from avmsf.modal.synthesis import synthesise
 from avmsf.simulate.plate import Plate, PlateModes, plate_modes, sample_contacts, strike
@@ -62,7 +62,7 @@ def make(bank: ModalBank, gains: Tensor, *, rate: float, samples: int, noise: fl
 @pytest.mark.parametrize("noise_db", [-20.0, -40.0])
 def test_the_plates_modes_are_found(noise_db: float):
     impacts, truth = recorded(noise_db)
-    found = extract(impacts)
+    found = extract_modes(impacts)
     frequency, damping, energy = matched(found.bank, truth)
     strong = energy > energy.max() * 1e-4
     assert int(strong.sum()) >= 20
@@ -89,7 +89,7 @@ def test_errors_fall_with_the_noise():
 
 def test_gains_are_the_plates():
     impacts, truth = recorded(-60.0)
-    found = extract(impacts)
+    found = extract_modes(impacts)
     nearest = (found.bank.frequency[:, None] - truth.frequency).abs().argmin(0)
     scale = float(truth.gains.abs().max())
     assert float((found.gains[:, nearest] - truth.gains).abs().max()) < 0.01 * scale
@@ -142,7 +142,7 @@ def test_played_faster_all_rates_rise_alike(stretch: float):
 def test_the_order_of_recordings_does_not_matter():
     impacts, _ = recorded(-40.0, seconds=0.25)
     order = [3, 5, 0, 2, 1, 4]
-    one, two = extract(impacts), extract(impacts.take(order))
+    one, two = extract_modes(impacts), extract_modes(impacts.take(order))
     torch.testing.assert_close(two.bank.frequency, one.bank.frequency, rtol=1e-6, atol=0)
     torch.testing.assert_close(two.bank.damping, one.bank.damping, rtol=1e-3, atol=0)
     torch.testing.assert_close(two.gains, one.gains[order], rtol=0, atol=1e-2 * float(one.gains.abs().max()))
@@ -209,7 +209,7 @@ def test_a_single_sound_is_enough_without_its_contact():
 
 def test_the_papers_method_finds_the_plates_strong_modes():
     impacts, truth = recorded(-40.0)
-    found = extract(impacts, ShortTime())
+    found = extract_modes(impacts, ShortTime())
     energy = matched(found.bank, truth)[2]
     strongest = truth.frequency[energy.argsort(descending=True)[:6]]
     # A bin is 8 Hz wide.
@@ -218,7 +218,7 @@ def test_the_papers_method_finds_the_plates_strong_modes():
 
 def test_one_recording_has_the_modes_of_its_sound():
     impacts, truth = recorded(-40.0, contacts=1)
-    found = extract(impacts)
+    found = extract_modes(impacts)
     assert torch.equal(found.bank.frequency, extract_sounds(impacts.sounds, sample_rate=RATE).bank.frequency)
     assert float((found.bank.frequency[:, None] / truth.frequency - 1).abs().amin(1).median()) < 1e-4
 
@@ -228,13 +228,13 @@ def test_one_recording_has_the_modes_of_its_sound():
 def test_noise_is_blamed(seed: int, contacts: int):
     noise = 0.01 * torch.randn(contacts, 8000, generator=seeded(seed))
     with pytest.raises(ExtractionError, match=r"in \d recordings of 0\.5 s.* noise or hum"):
-        extract(impacts_of(noise))
+        extract_modes(impacts_of(noise))
 
 
 def test_length_is_blamed():
     impacts, _ = recorded(-40.0, seconds=0.25)
     with pytest.raises(ExtractionError, match=r"only 200 samples .* Keep more seconds"):
-        extract(impacts_of(impacts.sounds[:, :200]))
+        extract_modes(impacts_of(impacts.sounds[:, :200]))
 
 
 def test_band_is_blamed():
@@ -243,18 +243,18 @@ def test_band_is_blamed():
     sounds = make(bank, torch.ones(3, 1), rate=RATE, samples=8000, noise=1e-3)
     assert lowest_frequency(8000, RATE) == 100.0
     with pytest.raises(ExtractionError, match=r"between 100 and 8000 Hz.* lies below that band\. Keep more seconds"):
-        extract(impacts_of(sounds))
+        extract_modes(impacts_of(sounds))
 
 
 def test_a_thud_is_blamed():
     with pytest.raises(ExtractionError, match="nothing rings above the noise"):
-        extract(impacts_of(thud(600.0)))
+        extract_modes(impacts_of(thud(600.0)))
 
 
 def test_what_alternates_from_sample_to_sample_is_no_mode():
     """Sampled in sine phase it is next to nothing, so that gains of what is heard would be enormous."""
     with pytest.raises(ExtractionError, match="nothing rings above the noise"):
-        extract(impacts_of(thud(RATE / 2 - 20.0)))
+        extract_modes(impacts_of(thud(RATE / 2 - 20.0)))
 
 
 def thud(frequency: float) -> Tensor:
@@ -266,7 +266,7 @@ def thud(frequency: float) -> Tensor:
 
 def test_silence_is_blamed():
     with pytest.raises(ExtractionError, match="they are silent"):
-        extract(impacts_of(torch.zeros(2, 4000)))
+        extract_modes(impacts_of(torch.zeros(2, 4000)))
 
 
 def test_samples_that_are_no_numbers_are_refused():
@@ -274,7 +274,7 @@ def test_samples_that_are_no_numbers_are_refused():
     broken = impacts.sounds.clone()
     broken[3, 17] = math.nan
     with pytest.raises(ExtractionError, match=r"sound 3 .* not finite"):
-        extract(impacts_of(broken))
+        extract_modes(impacts_of(broken))
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
 from avmsf._utils.records import count_of
+from avmsf._utils.summary import short_repr
 from avmsf.fem.modestate import mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gainfield import Gains
 from avmsf.field.gains.family import sites_along
@@ -18,6 +19,8 @@ from avmsf.simulate.elastic import ElasticModes
 @dataclass(frozen=True, eq=False)
 class BodyGains:
     """Gains that are the components of mode shapes along the impacts."""
+
+    __repr__ = short_repr
 
     points: Float32[Tensor, "points 3"]
     """Points of the object's surface, object frame, meters."""

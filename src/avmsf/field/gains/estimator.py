@@ -364,16 +364,16 @@ def _report(
     found = [
         {
             "body": body.name,
-            "wall": body.wall,
+            "wall_thickness": body.wall,
             "support": FREE if body.support is None else body.support.name,
             "updating_nats": body.updated,
-            "fine": body.fine,
+            "refined": body.fine,
             "weight": weight,
-            "factor": float(FACTORS[family.factor_weights.argmax()]),
+            "frequency_factor": float(FACTORS[family.factor_weights.argmax()]),
         }
         for body, family, weight in zip(bodies, elastic, weights, strict=True)
     ]
-    return {"bodies": sorted(found, key=lambda each: -each["weight"]), "missing": missing}
+    return {"bodies": sorted(found, key=lambda each: -each["weight"]), "unavailable": missing}
 
 
 def _judgment_report(judgment: Judgment, case: GainCase, used: Int[Tensor, " used"]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf._utils.records import count_of, like
+from avmsf._utils.summary import short_repr
 from avmsf.capture.places import places_of
 from avmsf.fem.modestate import mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gainfield import Gains
@@ -44,6 +45,8 @@ class PlaceCovariance:
 @dataclass(frozen=True, eq=False)
 class MixtureGains:
     """Gains as a Gaussian process over several kernel families, each kernel weighed by its evidence."""
+
+    __repr__ = short_repr
 
     points: Float32[Tensor, "points 3"]
     """Points of the object's surface, object frame, metres."""
@@ -215,7 +218,7 @@ class MixtureGains:
             "modes": modes,
             "directional": self.directional,
             "families": [family.kind for family in self.families],
-            "kept": [len(each) for each in self.kept],
+            "kernels": [len(each) for each in self.kept],
             "bodies": [mode_sizes(family.modes) for family in self._of(Elastic)],
             "symmetries": [[list(group.characters.shape) for group in family.groups] for family in self._of(Symmetric)],
             "features": [family.features.shape[1] for family in self._of(Visual)],
@@ -227,11 +230,11 @@ class MixtureGains:
             "points": self.points,
             "contacts": self.training.points,
             "directions": self.training.directions,
-            "scale": torch.tensor([family.size for family in self.families], dtype=torch.float64),
+            "object_size": torch.tensor([family.size for family in self.families], dtype=torch.float64),
             "values": torch.view_as_real(self.values),
             "measured": torch.view_as_real(self.values if self.measured is None else self.measured),
-            "floor": self.mixture.floor,
-            "kept": torch.cat(self.kept),
+            "noise_floor": self.mixture.floor,
+            "kernels": torch.cat(self.kept),
             "weights": self.mixture.weights,
         }
         for family in self._of(Visual):
@@ -247,7 +250,7 @@ class MixtureGains:
         """Return tensors like those of a model of these sizes."""
         points, contacts, modes = (count_of(record[name], name) for name in ("points", "contacts", "modes"))
         families, bodies = (like(record[name], [], name) for name in ("families", "bodies"))
-        kept = [count_of(each, "kept") for each in like(record["kept"], [], "kept")]
+        kept = [count_of(each, "kernels") for each in like(record["kernels"], [], "kernels")]
         unknown = sorted(set(families) - {*_POSITIONAL, *_OF_OBJECT})
         if unknown or len(families) != len(kept):
             raise ValueError(f"families are {families}, with {len(kept)} numbers")
@@ -261,11 +264,11 @@ class MixtureGains:
             "points": (single, points, 3),
             "contacts": (double, contacts, 3),
             "directions": (double, contacts, 3),
-            "scale": (double, len(families)),
+            "object_size": (double, len(families)),
             "values": (double, contacts, modes, 2),
             "measured": (double, contacts, modes, 2),
-            "floor": (double, 2 * modes),
-            "kept": (integer, sum(kept)),
+            "noise_floor": (double, 2 * modes),
+            "kernels": (integer, sum(kept)),
             "weights": (double, sum(kept), len(NOISE_SHARES), 2 * modes),
         }
         for dim in record["features"]:
@@ -296,14 +299,14 @@ class MixtureGains:
                 return Visual(training, size, tensors["points"], tensors["features"])
             return _POSITIONAL[kind](training, size)
 
-        scale = tensors["scale"].tolist()
-        families = tuple(family_of(kind, size) for kind, size in zip(record["families"], scale, strict=True))
-        kept = torch.split(tensors["kept"], record["kept"])
+        sizes = tensors["object_size"].tolist()
+        families = tuple(family_of(kind, size) for kind, size in zip(record["families"], sizes, strict=True))
+        kept = torch.split(tensors["kernels"], record["kernels"])
         for family, rows in zip(families, kept, strict=True):
             _expect_rows(rows, len(family.shares), f"kept {family.kind} kernels")
         kernels = torch.cat([family.kernels()[rows] for family, rows in zip(families, kept, strict=True)])
         values, measured = (torch.view_as_complex(tensors[name].contiguous()) for name in ("values", "measured"))
-        mixture = KernelMixture(kernels, series_of(values), tensors["floor"], tensors["weights"])
+        mixture = KernelMixture(kernels, series_of(values), tensors["noise_floor"], tensors["weights"])
         return cls(tensors["points"], training, families, tuple(kept), mixture, record["directional"], measured)
 
     def _of(self, kind: type[Family]) -> list[Family]:
@@ -346,9 +349,9 @@ class MixtureGains:
 
 def _expect_sound(tensors: Mapping[str, Tensor]) -> None:
     """Raise ValueError for values that no fit leaves: they would fail only when gains are asked for."""
-    if not bool((tensors["scale"] > 0).all()):
-        raise ValueError(f"expected scale above 0, got {float(tensors['scale'].min()):g}")
-    for name in ("weights", "floor"):
+    if not bool((tensors["object_size"] > 0).all()):
+        raise ValueError(f"expected object_size above 0, got {float(tensors['scale'].min()):g}")
+    for name in ("weights", "noise_floor"):
         if not bool((tensors[name] >= 0).all()):
             raise ValueError(f"expected {name} of 0 or more, got {float(tensors[name].min()):g}")
 

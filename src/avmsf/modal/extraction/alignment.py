@@ -20,13 +20,14 @@ several starting recordings, each of which the others are first aligned with, th
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Complex128, Float64
 from torch import Tensor
 
+from avmsf._utils.summary import short_repr
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.prepare import margin_length
 from avmsf.modal.bank import ModalBank
@@ -70,6 +71,8 @@ _CONVERGED = 1e-3
 class Phases:
     """The phases that modes have at the common start, with what aligning another recording by them needs."""
 
+    __repr__ = short_repr
+
     bank: ModalBank
     doubled: Complex128[Tensor, " modes"]
     """Sum over recordings of the concentration times exp(2 i phase)."""
@@ -86,6 +89,8 @@ class Phases:
 @dataclass(frozen=True, eq=False)
 class Alignment:
     """How recordings were aligned with one another."""
+
+    __repr__ = short_repr
 
     names: tuple[str, ...]
     delays: Float64[Tensor, " contacts"]
@@ -120,6 +125,40 @@ class Alignment:
             moved = new.delayed(delays[others])
             delays[others] += _delays_alone(moved, self.phases, usual=0.0, reach=reach)
         return impacts.delayed(delays)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return what a file holds besides the names and keys, by name."""
+        phases = self.phases
+        numbers = [self.coherence_before, self.coherence_after, phases.jitter, phases.start]
+        return {
+            "delays": self.delays,
+            "agrees": self.agrees,
+            "numbers": torch.tensor(numbers, dtype=torch.float64),
+            "frequency": phases.bank.frequency,
+            "damping": phases.bank.damping,
+            "doubled": torch.view_as_real(phases.doubled),
+            "power": phases.power,
+            "spread": phases.spread,
+        }
+
+    @classmethod
+    def skeleton(cls, recordings: int, modes: int) -> dict[str, Tensor]:
+        """Return tensors on the device `meta`, of the names, shapes and types that `tensors` has for these sizes."""
+        sizes = {"delays": (recordings,), "agrees": (recordings,), "numbers": (4,), "doubled": (modes, 2)}
+        sizes |= dict.fromkeys(("frequency", "damping", "power", "spread"), (modes,))
+        kinds = {"agrees": torch.bool}
+        return {
+            name: torch.empty(size, dtype=kinds.get(name, torch.float64), device="meta") for name, size in sizes.items()
+        }
+
+    @classmethod
+    def restore(cls, tensors: Mapping[str, Tensor], names: Sequence[str], keys: Sequence[str]) -> "Alignment":
+        """Return the alignment that `tensors` are of."""
+        before, after, jitter, start = tensors["numbers"].tolist()
+        bank = ModalBank(tensors["frequency"], tensors["damping"])
+        doubled = torch.view_as_complex(tensors["doubled"].contiguous())
+        phases = Phases(bank, doubled, tensors["power"], tensors["spread"], jitter, start)
+        return cls(tuple(names), tensors["delays"], tensors["agrees"], before, after, phases, tuple(keys))
 
 
 def align(impacts: Impacts) -> Alignment | None:

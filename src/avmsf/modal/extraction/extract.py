@@ -18,11 +18,13 @@ from safetensors.torch import save
 from torch import Tensor
 
 from avmsf._utils.caching import keep_if_possible, source_digest
+from avmsf._utils.summary import short_repr
+from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError
 from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.alignment import Alignment, Phases, align, recording_keys
+from avmsf.modal.extraction.alignment import Alignment, align, recording_keys
 from avmsf.modal.extraction.esprit import SHORTEST
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, lowest_frequency, noise_bins
 from avmsf.modal.extraction.least_squares import fit_gains
@@ -30,11 +32,14 @@ from avmsf.modal.residual import Residual, estimate_residual
 from avmsf.modal.synthesis import synthesise
 
 _KEY = "avmsf-modes"
+_ALIGNMENT = "alignment."
 
 
 @dataclass(frozen=True, eq=False)
 class Extraction:
     """Modes shared by all recordings, their gains in each, and the noise beneath them."""
+
+    __repr__ = short_repr
 
     bank: ModalBank
     gains: Float[Tensor, "contacts modes"]
@@ -50,13 +55,14 @@ class Extraction:
         return impacts if self.alignment is None else self.alignment.apply(impacts)
 
 
-def extract(impacts: Impacts, method: ModeFinder | None = None) -> Extraction:
-    """Return the modes that the recordings share, each recording's gains and the noise beneath (paper, section 3.4).
+def extract_modes(recordings: Capture | Impacts, method: ModeFinder | None = None) -> Extraction:
+    """Return the modes that the recordings share, each recording's gains and the residual noise (paper, section 3.4).
 
     `method` is `HighResolution()` unless another is given. Recordings that are not final (`Impacts.before`) are aligned
     with one another first. Gains are the least-squares amplitudes of the modes over the whole of each sound. Raises
     `ExtractionError` when no mode is found.
     """
+    impacts = recordings.impacts if isinstance(recordings, Capture) else recordings
     alignment = None if impacts.before is None or len(impacts) < 2 else align(impacts)
     final = impacts if alignment is None else alignment.apply(impacts)
     found = extract_sounds(final.sounds, sample_rate=impacts.sample_rate, method=method)
@@ -66,7 +72,7 @@ def extract(impacts: Impacts, method: ModeFinder | None = None) -> Extraction:
 def extract_sounds(
     sounds: Float[Tensor, "contacts samples"], *, sample_rate: float, method: ModeFinder | None = None
 ) -> Extraction:
-    """Return what `extract` does, from bare sounds that start at their onset; a single one is enough here."""
+    """Return what `extract_modes` does, from bare sounds that start at their onset; a single one is enough here."""
     if not bool(torch.isfinite(sounds).all()):
         row = int(torch.nonzero(~torch.isfinite(sounds))[0, 0])
         raise ExtractionError(f"sound {row} holds samples that are not finite numbers; record or export it again")
@@ -119,13 +125,13 @@ def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool
     """Return the modes that `path` keeps of these recordings and this method; find and keep them where it has none.
 
     Where the file cannot be written, the modes are found again next time; it is
-    an error if the file is `needed`. Raises as `extract`, and FieldFileError.
+    an error if the file is `needed`. Raises as `extract_modes`, and FieldFileError.
     """
     digest = _digest(train, method)
     kept = _read(path, digest, train)
     if kept is not None:
         return kept
-    found = extract(train, method)
+    found = extract_modes(train, method)
     tensors = {
         "frequency": found.bank.frequency,
         "damping": found.bank.damping,
@@ -134,7 +140,7 @@ def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool
         "residual": found.residual.magnitude,
     }
     if found.alignment is not None:
-        tensors |= _alignment_tensors(found.alignment)
+        tensors |= {_ALIGNMENT + name: each for name, each in found.alignment.tensors().items()}
     content = save({name: tensor.contiguous() for name, tensor in tensors.items()}, {_KEY: digest})
 
     def write() -> None:
@@ -156,37 +162,14 @@ def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
             read = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError):
         return None
+    kept = {name.removeprefix(_ALIGNMENT): each for name, each in read.items() if name.startswith(_ALIGNMENT)}
     return Extraction(
         ModalBank(read["frequency"], read["damping"]),
         read["gains"],
         Residual(read["residual"]),
         read["quadrature"],
-        _alignment_of(read, train) if "alignment.delays" in read else None,
+        Alignment.restore(kept, train.names, recording_keys(train)) if kept else None,
     )
-
-
-def _alignment_tensors(alignment: Alignment) -> dict[str, Tensor]:
-    phases = alignment.phases
-    numbers = [alignment.coherence_before, alignment.coherence_after, phases.jitter, phases.start]
-    tensors = {
-        "delays": alignment.delays,
-        "agrees": alignment.agrees,
-        "numbers": torch.tensor(numbers, dtype=torch.float64),
-        "frequency": phases.bank.frequency,
-        "damping": phases.bank.damping,
-        "doubled": torch.view_as_real(phases.doubled),
-        "power": phases.power,
-        "spread": phases.spread,
-    }
-    return {f"alignment.{name}": tensor for name, tensor in tensors.items()}
-
-
-def _alignment_of(read: dict[str, Tensor], train: Impacts) -> Alignment:
-    found = {name.removeprefix("alignment."): each for name, each in read.items() if name.startswith("alignment.")}
-    before, after, jitter, start = found["numbers"].tolist()
-    bank = ModalBank(found["frequency"], found["damping"])
-    phases = Phases(bank, torch.view_as_complex(found["doubled"]), found["power"], found["spread"], jitter, start)
-    return Alignment(train.names, found["delays"], found["agrees"], before, after, phases, recording_keys(train))
 
 
 def _digest(train: Impacts, method: ModeFinder) -> str:

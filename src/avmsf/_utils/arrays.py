@@ -1,0 +1,69 @@
+"""Arrays that users give, lists and numpy arrays among them, as tensors of a known shape."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf.errors import ArrayError
+
+ArrayLike = Tensor | np.ndarray | Sequence[Any]
+"""A tensor, a numpy array, or nested lists of numbers."""
+
+
+def as_vectors(values: ArrayLike, name: str, *, count: int | None = None) -> Float[Tensor, "rows 3"]:
+    """Return three numbers a row as a tensor on the CPU: a float tensor's own type, else float64.
+
+    Raises ArrayError for another shape, for another number of rows than `count`, and for values that are not finite.
+    """
+    found = as_floats(values, name)
+    rows = "contacts" if count is None else str(count)
+    if found.ndim != 2 or found.shape[1] != 3 or (count is not None and len(found) != count):
+        single = f": put a single one into a list, {name}=[[x, y, z]]" if found.shape == (3,) else ""
+        raise ArrayError(f"{name}: expected an array of shape [{rows}, 3], got {list(found.shape)}{single}", name=name)
+    return _finite(found, name)
+
+
+def as_numbers(values: float | int | ArrayLike, name: str, *, count: int) -> Float[Tensor, " rows"]:
+    """Return `count` numbers, or one that holds for all, as a tensor of `count`. Raises as `as_vectors`."""
+    found = as_floats(values, name)
+    if found.ndim > 1 or (found.ndim == 1 and len(found) != count):
+        raise ArrayError(f"{name}: expected one number or {count}, got shape {list(found.shape)}", name=name)
+    return _finite(found.expand(count), name)
+
+
+def as_rows(values: ArrayLike, name: str, *, count: int) -> Float[Tensor, "rows columns"]:
+    """Return `count` rows of numbers. Raises as `as_vectors`."""
+    found = as_floats(values, name)
+    if found.ndim != 2 or len(found) != count:
+        raise ArrayError(f"{name}: expected an array of {count} rows, got shape {list(found.shape)}", name=name)
+    return _finite(found, name)
+
+
+def as_floats(values: float | int | ArrayLike, name: str) -> Float[Tensor, "*shape"]:
+    """Return numbers of any shape as floats on the CPU. Raises ArrayError for what are no numbers."""
+    try:
+        found = torch.as_tensor(values if isinstance(values, Tensor) else np.asarray(values, dtype=np.float64))
+    except (ValueError, TypeError) as error:
+        raise ArrayError(f"{name}: expected numbers in an array or nested lists ({error})", name=name) from error
+    return found.detach().cpu() if found.is_floating_point() else found.detach().cpu().double()
+
+
+def _finite(found: Tensor, name: str) -> Tensor:
+    wrong = torch.nonzero(~torch.isfinite(found.reshape(len(found), found[:1].numel())).all(1)).flatten()
+    if len(wrong):
+        row = int(wrong[0])
+        raise ArrayError(f"{name}: expected finite numbers, got {found[row].tolist()} (row {row})", name=name, row=row)
+    return found
+
+
+Seed = int | torch.Generator | None
+"""What decides chance: a number, a generator that goes on from where it is, or None for the number 0."""
+
+
+def generator_of(seed: Seed) -> torch.Generator:
+    """Return the generator of a seed."""
+    return seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(0 if seed is None else seed)

@@ -1,0 +1,5 @@
+from .evaluation import Scores as Scores
+from .evaluation import evaluate as evaluate
+from .evaluation import score as score
+from .evaluation import split as split
+from .renderer import Renderer as Renderer

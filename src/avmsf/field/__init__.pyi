@@ -1,0 +1,11 @@
+from .config import PAPER as PAPER
+from .config import FitConfig as FitConfig
+from .gains.bodies import CandidateBodies as CandidateBodies
+from .gains.estimator import GainModel as GainModel
+from .gains.estimator import MixtureEstimator as MixtureEstimator
+from .recipes import Attention as Attention
+from .soundfield import FieldQuality as FieldQuality
+from .soundfield import GainPosterior as GainPosterior
+from .soundfield import Origin as Origin
+from .soundfield import SoundField as SoundField
+from .suggest import Suggestions as Suggestions

@@ -1,0 +1,157 @@
+"""From a capture to a field in one call: what `avmsf fit` and `SoundField.fit` do."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import Progress as Bar
+
+from avmsf._utils.caching import discard
+from avmsf.capture import Capture
+from avmsf.errors import FitError
+from avmsf.field.fit import Progress, fit
+from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.field.gains.estimator import GainModel, estimator_for
+from avmsf.field.soundfield import SoundField
+from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_once
+from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import PipelineConfig, with_record
+from avmsf.pipeline.reconstruct import expect_on_object
+from avmsf.scene.features import FeatureField
+from avmsf.scene.symmetry import Symmetries
+from avmsf.scene.symmetrysearch import find_symmetries
+from avmsf.wording import counted
+
+_FEW = 8
+"""Recordings below which little is known of the gains between contacts."""
+
+
+def fit_capture(
+    capture: Capture,
+    config: PipelineConfig | None = None,
+    *,
+    features: FeatureField | None = None,
+    features_report: Mapping[str, Any] | None = None,
+    output: Path | None = None,
+    log: Callable[[str], None] = lambda message: None,
+    progress: Callable[[Progress], None] | None = None,
+) -> tuple[SoundField, Extraction]:
+    """Fit a field to all recordings of a capture; return it and the modes that it started from.
+
+    `features` describe the object's points, and `features_report` how they were made; without them they are positions
+    on the mesh, or in the box of the contacts where there is no mesh. With the path of an `output`, files next to it
+    keep the modes, the elastic modes and the state of the training: after an interruption the same call goes on from
+    them. Who has saved the field discards them (`discard_unfinished`).
+
+    Raises as the stages do: CaptureError, ExtractionError, FitError, SimulationError, FieldFileError.
+    """
+    config = PipelineConfig() if config is None else config
+    train = capture.impacts
+    if features is None:
+        points = _points_of(capture, config, log)
+    else:
+        points = features
+        expect_on_object(train, points.points)
+    if len(train) < _FEW:
+        log(f"{len(train)} recordings tell little of how loud modes are between contacts; {_FEW} or more tell much")
+    # Before the modes: what is wrong with the object's shape shows in less time than they take.
+    gains = estimator_for(
+        config.gain_model,
+        lambda: _bodies(capture, config, None if output is None else unfinished(output, "bodies"), log),
+        symmetries=lambda: _symmetries(capture, config),
+        log=log,
+    )
+    log(f"finding the modes of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
+    if output is None:
+        modes = extract_modes(train, config.finder)
+    else:
+        modes = extract_once(train, config.finder, unfinished(output, "modes"))
+    log(f"fitting a field of {len(modes.bank)} modes")
+    try:
+        fitted = fit(
+            train,
+            points,
+            modes,
+            config.fit,
+            gains=gains,
+            capture=capture.name,
+            settings=capture.settings,
+            checkpoint=None if output is None else unfinished(output, "checkpoint"),
+            progress=progress,
+            device=config.device,
+        )
+    except FitError:
+        if output is not None:
+            discard(unfinished(output, "modes"))
+        raise
+    return with_record(fitted, config, features_report or {}), modes
+
+
+def fit_with_progress(
+    capture: Capture,
+    gain_model: GainModel | None,
+    *,
+    features: FeatureField | None,
+    config: PipelineConfig | None,
+    seed: int | None,
+    device: str | None,
+    progress: bool,
+) -> SoundField:
+    """Return what `SoundField.fit` returns."""
+    config = PipelineConfig() if config is None else config
+    if gain_model is not None:
+        config = replace(config, gain_model=gain_model)
+    if seed is not None:
+        config = replace(config, fit=replace(config.fit, seed=seed))
+    if device is not None:
+        config = replace(config, device=device)
+    if not progress:
+        return fit_capture(capture, config, features=features)[0]
+    with Bar(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("fitting", total=None)
+
+        def show(step: Progress) -> None:
+            bar.update(task, description=step.stage, completed=step.step, total=step.steps)
+
+        return fit_capture(capture, config, features=features, log=bar.console.print, progress=show)[0]
+
+
+def unfinished(output: Path, ending: str) -> Path:
+    """Return where a part of an unfinished fit is kept: next to the field's file."""
+    return output.with_name(f"{output.name}.{ending}")
+
+
+def discard_unfinished(output: Path) -> None:
+    """Remove what an unfinished fit needed, after its field has been saved; elastic modes stay."""
+    for ending in ("modes", "checkpoint"):
+        discard(unfinished(output, ending))
+
+
+def _points_of(capture: Capture, config: PipelineConfig, log: Callable[[str], None]) -> FeatureField:
+    """Return the object's points: of its surface where there is one, else those that fill the contacts' box."""
+    if capture.surface is None:
+        log(
+            "the capture has no surface: points that fill the box of its contacts stand for the object. Photographs, a "
+            "video or Gaussians are used by avmsf reconstruct"
+        )
+        return FeatureField.from_contacts(capture.impacts.contacts)
+    return FeatureField.from_mesh(capture.surface, seed=config.fit.seed)
+
+
+def _bodies(
+    capture: Capture, config: PipelineConfig, cache: Path | None, log: Callable[[str], None]
+) -> CandidateBodies:
+    if capture.surface is None:
+        raise FitError("the capture has no mesh: add it to the folder as surface.obj")
+    return candidate_bodies(capture.surface, config.body, impacts=capture.impacts, cache=cache, tell=log)
+
+
+def _symmetries(capture: Capture, config: PipelineConfig) -> Symmetries | None:
+    if capture.surface is None:
+        return None
+    generator = torch.Generator().manual_seed(config.fit.seed)
+    points = FeatureField.from_mesh(capture.surface, seed=generator).points
+    return find_symmetries(points, seed=generator)

@@ -1,0 +1,17 @@
+from .descriptors import ImageDescriptors as ImageDescriptors
+from .dino import DinoEncoder as DinoEncoder
+from .features import FeatureField as FeatureField
+from .featurestore import load_features as load_features
+from .featurestore import save_features as save_features
+from .gaussians import GaussianCloud as GaussianCloud
+from .lift import lift as lift
+from .ply import read_splats as read_splats
+from .ply import write_splats as write_splats
+from .reduction import reduce as reduce
+from .reduction import resize as resize
+from .reduction import with_positions as with_positions
+from .refine import refine as refine
+from .splat import splat as splat
+from .splatconfig import SplatConfig as SplatConfig
+from .symmetry import Symmetries as Symmetries
+from .symmetrysearch import find_symmetries as find_symmetries

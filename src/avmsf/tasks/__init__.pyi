@@ -1,0 +1,16 @@
+from .contactmap import ContactMap as ContactMap
+from .contactmap import Peak as Peak
+from .distillation import DecoderDistillation as DecoderDistillation
+from .distillation import DistillationConfig as DistillationConfig
+from .listening import Listener as Listener
+from .locate import locate as locate
+from .locator import Locator as Locator
+from .materialstatistics import MaterialStatistics as MaterialStatistics
+from .posterior import Force as Force
+from .recast import recast as recast
+from .reference import Reference as Reference
+from .retune import retune as retune
+from .severalblows import locate_blows as locate_blows
+from .stableaudio import StableAudio as StableAudio
+from .steer import SteerConfig as SteerConfig
+from .steer import steer as steer

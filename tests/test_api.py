@@ -1,0 +1,255 @@
+"""The public interface: what a user of Python starts from, end to end, with lists, arrays and paths."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+import avmsf
+from avmsf.capture import Impacts
+from avmsf.cli import main
+from avmsf.errors import ArrayError, AvmsfError, EvaluationError, FitError, PositionError
+from avmsf.field import FitConfig, SoundField
+from avmsf.pipeline import PipelineConfig
+from plate_capture import fill_plate
+from plate_field import RATE, plate_impacts
+
+NAMES = {"Capture", "SoundField", "Surface", "evaluate", "extract_modes", "locate"}
+CONTACT = [0.05, 0.06, 0.0]
+
+
+@cache
+def capture() -> avmsf.Capture:
+    return avmsf.Capture("plate", plate_impacts(forces=True))
+
+
+@cache
+def field() -> SoundField:
+    return SoundField.fit(capture(), config=PipelineConfig(modes=8), progress=False)
+
+
+def test_the_top_has_the_names_that_users_start_from_and_its_packages():
+    classes = {name for name in avmsf.__all__ if not isinstance(getattr(avmsf, name), type(avmsf))}
+    assert classes == NAMES
+    assert avmsf.__version__
+    assert {"capture", "field", "modal", "scene"} < set(avmsf.__all__)
+
+
+@pytest.mark.parametrize("package", sorted(set(avmsf.__all__) - NAMES))
+def test_every_name_of_a_package_exists(package):
+    module = getattr(avmsf, package)
+    assert all(getattr(module, name) is not None for name in getattr(module, "__all__", []))
+
+
+def test_importing_the_package_imports_no_torch():
+    code = "import sys, avmsf; assert 'torch' not in sys.modules and 'numpy' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_capture_written_is_read_back(tmp_path):
+    written = avmsf.Capture.read(fill_plate(tmp_path / "plate"))
+    written.write(tmp_path / "copy")
+    read = avmsf.Capture.read(str(tmp_path / "copy"))
+    assert torch.equal(read.impacts.sounds, written.impacts.sounds)
+    assert torch.equal(read.surface.faces, written.surface.faces)
+
+
+@pytest.mark.parametrize(("size", "positions"), [(0.75, 12), (12, 12), (5, 5), (0.5, 8)])
+def test_a_split_trains_on_a_part_of_the_positions_or_on_their_number(size, positions):
+    whole = avmsf.Capture("plate", plate_impacts(16))
+    train, test = whole.split(train_size=size)
+    assert (len(train.impacts), len(test.impacts)) == (positions, 16 - positions)
+    assert {*train.impacts.names, *test.impacts.names} == set(whole.impacts.names)
+
+
+def test_a_split_is_the_same_each_time_and_another_for_another_seed():
+    names = [capture().split(3, seed=seed)[0].impacts.names for seed in (None, None, 1, 1, 2)]
+    assert names[0] == names[1]
+    assert names[2] == names[3]
+    assert len(set(names)) > 1
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0, -0.5, 1, 1000])
+def test_a_split_that_leaves_nothing_to_train_or_to_test_is_refused(size):
+    with pytest.raises(EvaluationError):
+        capture().split(train_size=size)
+
+
+def test_fit_makes_the_field_that_the_command_makes(tmp_path):
+    folder, output = fill_plate(tmp_path / "plate", surface=False), tmp_path / "field.safetensors"
+    assert main(["fit", str(folder), "--output", str(output), "--modes", "6", "--steps", "5"]) == 0
+    made = SoundField.fit(
+        avmsf.Capture.read(folder), config=PipelineConfig(modes=6, fit=FitConfig(steps=5)), progress=False
+    )
+    one, other = made.render([CONTACT]), SoundField.load(output).render([CONTACT])
+    # Modes of two runs differ in their last digits.
+    assert float((one - other).abs().max()) < 1e-4 * float(one.abs().max())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["field.safetensors", "plate"]
+
+
+def test_fit_says_what_it_does_unless_that_is_turned_off(capfd):
+    SoundField.fit(capture(), config=PipelineConfig(modes=2, fit=FitConfig(steps=0)), progress=False)
+    assert capfd.readouterr() == ("", "")
+    SoundField.fit(capture(), config=PipelineConfig(modes=2, fit=FitConfig(steps=0)))
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "modes" in err
+
+
+def test_a_seed_takes_the_place_of_the_configurations():
+    made = SoundField.fit(capture(), seed=7, config=PipelineConfig(modes=2, fit=FitConfig(steps=0)), progress=False)
+    assert made.origin.config.seed == 7
+    assert made.origin.report["pipeline"]["gain_model"] == "auto"
+
+
+@pytest.mark.parametrize("kind", [list, np.array, np.float32, torch.tensor])
+def test_lists_and_arrays_sound_like_tensors(kind):
+    contacts = [CONTACT, [0.1, 0.02, 0.0]]
+    sounds = field().render(kind(contacts), forces=kind([2.0, 0.5]))
+    expected = torch.tensor([[2.0], [0.5]]) * field().render(torch.tensor(contacts, dtype=torch.float64))
+    torch.testing.assert_close(sounds, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
+    assert field().render(kind(contacts), kind([[0.0, 0.0, -1.0]] * 2), 2).shape == sounds.shape
+
+
+@pytest.mark.parametrize(
+    ("positions", "name", "row"),
+    [
+        (CONTACT, "positions", None),
+        ([[0.05, 0.06]], "positions", None),
+        ([["a", "b", "c"]], "positions", None),
+        ([CONTACT, [0.0, float("nan"), 0.0]], "positions", 1),
+    ],
+)
+def test_positions_of_another_shape_are_refused(positions, name, row):
+    for method in (field().render, field().posterior, field().gains):
+        with pytest.raises(ArrayError) as caught:
+            method(positions)
+        assert (caught.value.name, caught.value.row) == (name, row)
+
+
+@pytest.mark.parametrize(("name", "value"), [("directions", [[0.0, 0.0, 1.0]] * 2), ("forces", [1.0, 2.0])])
+def test_directions_and_forces_are_as_many_as_positions(name, value):
+    with pytest.raises(ArrayError) as caught:
+        field().render([CONTACT], **{name: value})
+    assert caught.value.name == name
+
+
+def test_a_position_off_the_object_is_refused_with_its_row():
+    with pytest.raises(PositionError) as caught:
+        field().render([CONTACT, [50.0, 60.0, 0.0]])  # millimeters
+    assert caught.value.row == 1
+    assert isinstance(caught.value, AvmsfError)
+
+
+def test_the_posterior_is_narrow_where_an_impact_was_recorded():
+    contacts = capture().impacts.contacts
+    far = contacts.mean(0, keepdim=True) + torch.tensor([[0.15, 0.15, 0.0]])
+    near, away = field().posterior(contacts), field().posterior(far)
+    assert torch.equal(near.mean, field().complex_gains(contacts))
+    assert near.std.shape == near.mean.shape
+    assert float(near.std.mean()) < float(away.std.mean())
+
+
+def test_the_attention_network_has_no_posterior():
+    quick = PipelineConfig(gain_model="network", modes=2, fit=FitConfig(steps=0, warmup_steps=1, clusters=4))
+    network = SoundField.fit(capture(), config=quick, progress=False)
+    with pytest.raises(FitError):
+        network.posterior([CONTACT])
+
+
+def test_a_recording_is_located_by_its_path_or_its_samples(tmp_path):
+    sound = capture().impacts.sounds[3].numpy()
+    soundfile.write(tmp_path / "hit.wav", sound, int(RATE), subtype="FLOAT")
+    places = [
+        found.points[found.most_probable]
+        for found in (
+            field().locate(sound, sample_rate=RATE),
+            field().locate(sound.tolist(), sample_rate=RATE),
+            field().locate(tmp_path / "hit.wav"),
+            avmsf.locate(field(), str(tmp_path / "hit.wav")),
+        )
+    ]
+    assert all(torch.equal(place, places[0]) for place in places[:2])
+    expected = capture().impacts.contacts[3].float()
+    assert all(float((place - expected).norm()) < 0.03 for place in places)  # meters
+
+
+def test_evaluation_aligns_recordings_as_the_fit_did(tmp_path):
+    late = 40
+    sounds = torch.nn.functional.pad(plate_impacts().sounds, (late, late))
+    generator = torch.Generator().manual_seed(0)
+    starts = late - torch.randint(0, 3, (len(sounds),), generator=generator)
+    rows = list(zip(sounds, starts.tolist(), strict=True))
+    whole: Impacts = replace(
+        plate_impacts(),
+        sounds=torch.stack([row[start : start + 2000] for row, start in rows]),
+        before=torch.stack([row[start - 32 : start] for row, start in rows]),
+        after=torch.stack([row[start + 2000 : start + 2032] for row, start in rows]),
+    )
+    train, test = avmsf.Capture("plate", whole).split(0.75)
+    made = SoundField.fit(train, config=PipelineConfig(modes=8), progress=False)
+    assert made.alignment is not None
+    made.save(tmp_path / "field.safetensors")
+    read = SoundField.load(tmp_path / "field.safetensors")
+    scores = [avmsf.evaluate(each, test).mean()["relative_stft"] for each in (made, read)]
+    assert scores[0] == scores[1]
+    assert scores[0] == avmsf.evaluate(made, made.aligned(test.impacts)).mean()["relative_stft"]
+    unaligned = avmsf.evaluate(made, replace(test.impacts, before=None, after=None)).mean()["relative_stft"]
+    assert scores[0] < unaligned
+
+
+def test_modes_are_extracted_from_a_capture_or_its_impacts():
+    one, other = (avmsf.extract_modes(each).bank for each in (capture(), capture().impacts))
+    torch.testing.assert_close(one.frequency, other.frequency)
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        capture,
+        lambda: capture().impacts,
+        field,
+        lambda: field().bank,
+        lambda: avmsf.extract_modes(capture()),
+        lambda: field().locate(capture().impacts.sounds[0]),
+        lambda: field().posterior([CONTACT]),
+    ],
+    ids=["capture", "impacts", "field", "bank", "modes", "map", "posterior"],
+)
+def test_what_is_printed_is_a_line_or_two(made):
+    text = repr(made())
+    assert len(text) < 240
+    assert text.count("\n") <= 1
+
+
+def test_a_surface_is_printed_in_a_line():
+    surface = avmsf.Surface(torch.zeros(4, 3), torch.zeros(2, 3, dtype=torch.long))
+    assert len(repr(surface)) < 120
+
+
+def test_impacts_and_surfaces_are_made_of_arrays(tmp_path):
+    given = capture().impacts
+    made = Impacts.of(given.contacts.tolist(), given.sounds.numpy(), RATE, forces=given.forces.tolist())
+    assert torch.equal(made.sounds, given.sounds)
+    assert made.names[0] == "001"
+    for wrong in ({"sounds": given.sounds[:3]}, {"contacts": given.contacts[0]}, {"names": ["a"]}):
+        with pytest.raises(ArrayError) as caught:
+            Impacts.of(**{"contacts": given.contacts, "sounds": given.sounds, "sample_rate": RATE} | wrong)
+        assert caught.value.name == next(iter(wrong))
+    surface = avmsf.Surface.of([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.array([[0, 1, 2]]))
+    surface.write(tmp_path / "a.ply")
+    assert torch.equal(avmsf.Surface.read(tmp_path / "a.ply").vertices, surface.vertices)
+    with pytest.raises(ArrayError) as caught:
+        avmsf.Surface.of(surface.vertices, [[0, 1, 2], [0, 1, 3]])
+    assert caught.value.row == 1
+
+
+def test_paths_may_be_strings(tmp_path):
+    field().save(str(tmp_path / "a.safetensors"))
+    assert Path(tmp_path / "a.safetensors").is_file()
