@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from avmsf.export.faust import write_faust
     from avmsf.export.gltf import write_gltf
     from avmsf.export.modaldemo import read_demo, write_demo
-    from avmsf.export.player import Player
     from avmsf.export.sampledfield import SampledField
     from avmsf.export.universal import write_universal
     from avmsf.export.wavgrid import write_grid
@@ -87,7 +86,6 @@ __all__ = [
     "MaterialStatistics",
     "MixtureEstimator",
     "ModalBank",
-    "Player",
     "Reference",
     "Residual",
     "SampledField",
@@ -149,7 +147,6 @@ _HOMES = {
         "read_demo",
         "write_demo",
     ),
-    "avmsf.export.player": ("Player",),
     "avmsf.export.sampledfield": ("SampledField",),
     "avmsf.export.universal": ("write_universal",),
     "avmsf.export.wavgrid": ("write_grid",),

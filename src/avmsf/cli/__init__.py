@@ -33,7 +33,6 @@ VERBS = {
     "locate": "Say where on the object a recorded blow fell, with a heat map and how sure that is.",
     "edit": "Give a field another material, size, pitch or decay, or lead it towards words or a recording.",
     "studio": "Open a page where the object is struck and heard, blows are located, and captures are made.",
-    "play": "Play a field in real time, or write what would be played to a file.",
     "export": "Write a field for other tools: web page, glTF, Faust, samplers, modal analysis.",
     "suggest": "Say where to strike next: the contacts that lower the expected error of the whole field most.",
     "show": "Say what a field file holds, and draw it.",
@@ -50,7 +49,7 @@ INTERRUPTED = 130
 """The exit code that shells give a command ended by Ctrl-C."""
 TERMINATED = 143
 """The exit code that shells give a command ended by SIGTERM."""
-_WAITING = frozenset({"studio", "play"})
+_WAITING = frozenset({"studio"})
 """Verbs that wait for their user most of the time."""
 _AGAIN = 0.05
 """Seconds after which an interruption that was dropped is raised again: a finalizer ends sooner, or it is repeated."""
