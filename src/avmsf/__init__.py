@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from avmsf.modal.extraction.finders import HighResolution, ShortTime
     from avmsf.modal.pulse import ForcePulse
     from avmsf.modal.residual import Residual
-    from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
+    from avmsf.pipeline.bodies import candidate_bodies
+    from avmsf.pipeline.config import BodyConfig
     from avmsf.pipeline.guess import guess_field
     from avmsf.scene.descriptors import ImageDescriptors
     from avmsf.scene.dino import DinoEncoder
@@ -46,7 +47,8 @@ if TYPE_CHECKING:
     from avmsf.scene.symmetry import Symmetries
     from avmsf.scene.symmetrysearch import find_symmetries
     from avmsf.simulate.material import MATERIALS, Material
-    from avmsf.tasks.distillation import DecoderDistillation, DistillationConfig
+    from avmsf.tasks.config import DistillationConfig, SteerConfig
+    from avmsf.tasks.distillation import DecoderDistillation
     from avmsf.tasks.listening import Listener
     from avmsf.tasks.locate import locate
     from avmsf.tasks.locator import Locator
@@ -56,7 +58,7 @@ if TYPE_CHECKING:
     from avmsf.tasks.retune import retune
     from avmsf.tasks.severalblows import locate_blows
     from avmsf.tasks.stableaudio import StableAudio
-    from avmsf.tasks.steer import SteerConfig, steer
+    from avmsf.tasks.steer import steer
 
 __version__ = "0.1.0"
 

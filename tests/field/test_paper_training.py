@@ -8,8 +8,8 @@ import torch
 from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 
-from avmsf.field.attention import AttentionGains, AttentionShape
-from avmsf.field.config import FitConfig
+from avmsf.field.attention import AttentionGains
+from avmsf.field.config import AttentionShape, FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.recipes import Attention, gain_case
 from avmsf.field.store import load, save

@@ -12,6 +12,7 @@ from avmsf.cli.reconstruct import parse as parse_reconstruct
 from avmsf.field.config import LATER, FitConfig
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.config import PRESETS, PipelineConfig
+from avmsf.pipeline.record import capture_settings_of, finder_of
 
 
 def test_the_default_preset_is_the_default() -> None:
@@ -21,7 +22,7 @@ def test_the_default_preset_is_the_default() -> None:
 
 def test_the_paper_preset_deviates_nowhere_that_there_is_a_switch_for() -> None:
     paper, usual = PRESETS["paper"], FitConfig()
-    assert paper.finder == ShortTime(modes=128)
+    assert finder_of(paper) == ShortTime(modes=128)
     assert paper.gain_model == "network"
     assert all(getattr(paper.fit, name) != getattr(usual, name) for name in LATER)
     assert (paper.fit.clusters, paper.fit.learning_rate, paper.fit.steps, paper.fit.early_weight) == (
@@ -51,9 +52,9 @@ def test_commands_start_from_the_preset_and_change_what_is_said() -> None:
 
 def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:
     own = CaptureSettings(seconds=1.0, time_zero="peak")
-    assert PipelineConfig().capture_settings(own) == own
-    assert PRESETS["paper"].capture_settings(replace(own, time_zero="onset")) == own
-    assert parse_fit(["mug", "--output", "f", "--time-zero", "onset"]).pipeline.capture_settings(own) == replace(
+    assert capture_settings_of(PipelineConfig(), own) == own
+    assert capture_settings_of(PRESETS["paper"], replace(own, time_zero="onset")) == own
+    assert capture_settings_of(parse_fit(["mug", "--output", "f", "--time-zero", "onset"]).pipeline, own) == replace(
         own, time_zero="onset"
     )
 

@@ -25,10 +25,9 @@ from avmsf.export.webpage import write_webpage
 from avmsf.field.config import FitConfig
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
-from avmsf.pipeline.config import PipelineConfig
-from avmsf.pipeline.features import DESCRIPTORS, LiftConfig
+from avmsf.pipeline.config import DESCRIPTORS, LiftConfig, PipelineConfig, SceneConfig
 from avmsf.pipeline.reconstruct import CACHE, reconstruct
-from avmsf.pipeline.scene import CLOUD, SceneConfig
+from avmsf.pipeline.scene import CLOUD
 from avmsf.scene.points import farthest_points
 from avmsf.scene.splatconfig import SplatConfig
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER

@@ -18,8 +18,7 @@ from avmsf.cli import INTERRUPTED
 from avmsf.cli.evaluate import evaluation_of, run_shown, title_of
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.errors import EvaluationError
-from avmsf.pipeline.bodies import BodyConfig
-from avmsf.pipeline.scene import SceneConfig
+from avmsf.pipeline.config import BodyConfig, SceneConfig
 from avmsf.wording import counted
 
 PICTURE, FIGURES = "efficiency.png", "efficiency.json"

@@ -26,13 +26,10 @@ from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.printing import console, print_json, say, table
 from avmsf.errors import EvaluationError
 from avmsf.modal.extraction.finders import HighResolution
-from avmsf.pipeline.bodies import BodyConfig
-from avmsf.pipeline.config import PRESETS
-from avmsf.pipeline.features import AUTO, LiftConfig, choose_encoder, settled
-from avmsf.pipeline.objectbodies import Geometry, ObjectBodies
+from avmsf.pipeline.config import AUTO, PRESETS, BodyConfig, Geometry, LiftConfig, SceneConfig, ViewsConfig
+from avmsf.pipeline.features import choose_encoder, settled
+from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
-from avmsf.pipeline.scene import SceneConfig
-from avmsf.pipeline.sources import ViewsConfig
 from avmsf.scene.splatconfig import SplatConfig
 
 _SHOWN = 5

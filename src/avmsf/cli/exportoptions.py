@@ -7,14 +7,13 @@ from typing import Literal
 import tyro
 
 from avmsf.errors import ExportError
-from avmsf.export.bundle import MOST_POINTS
 from avmsf.export.faust import SUFFIXES as FAUST_SUFFIXES
+from avmsf.export.formats import MOST_POINTS, Precision
 from avmsf.export.gltf import SUFFIXES as GLTF_SUFFIXES
-from avmsf.export.modaldemo import Precision
 from avmsf.export.universal import SUFFIXES as UNIVERSAL_SUFFIXES
 from avmsf.export.webpage import SUFFIXES as PAGE_SUFFIXES
 from avmsf.export.written import expect_ending
-from avmsf.modal.pulse import PulseShape
+from avmsf.modal.config import PulseShape
 
 Format = Literal["web", "gltf", "faust", "avmsf-demo", "wavs", "uff"]
 POINTS = {"web": MOST_POINTS, "gltf": 2000, "faust": 64, "avmsf-demo": 10_000, "wavs": 16, "uff": 1000}

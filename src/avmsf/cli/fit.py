@@ -22,21 +22,22 @@ from avmsf.cli.progress import FitBar
 from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
-from avmsf.field.config import FitConfig
+from avmsf.field.config import FitConfig, GainModel
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.estimator import GainModel, estimator_for
+from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.recipes import GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
+from avmsf.modal.config import ExtractionMethod
 from avmsf.modal.extraction.extract import extract_once
-from avmsf.modal.extraction.finders import ExtractionMethod, finder_named
-from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
-from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero, with_record
+from avmsf.modal.extraction.finders import finder_named
+from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import PRESETS, BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
 from avmsf.pipeline.guess import guess_field, known_surface
 from avmsf.pipeline.reconstruct import expect_on_object
-from avmsf.pipeline.scene import SceneConfig
+from avmsf.pipeline.record import capture_settings_of, with_record
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.symmetry import Symmetries
@@ -143,7 +144,7 @@ def run(options: Options) -> int:
     known = settings_of(options.capture) if options.settings is None else CaptureSettings.read(options.settings)
     if options.material is not None:
         return _run_guess(options, options.material, known)
-    capture = read_capture(options.capture, options.pipeline.capture_settings(known))
+    capture = read_capture(options.capture, capture_settings_of(options.pipeline, known))
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
     )

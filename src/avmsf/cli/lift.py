@@ -14,9 +14,8 @@ from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import SceneOptions, features_words, stage_line
 from avmsf.cli.writing import expect_writable
 from avmsf.files import copy_whole
-from avmsf.pipeline.features import LiftConfig
-from avmsf.pipeline.scene import SceneConfig, SceneStages
-from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.config import LiftConfig, SceneConfig, ViewsConfig
+from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.featurestore import read_report
 from avmsf.scene.splatconfig import SplatConfig

@@ -11,8 +11,9 @@ from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_rows, quality_rows
 from avmsf.cli.printing import console, decimals, figure, print_json, say, table
+from avmsf.modal.config import ExtractionMethod
 from avmsf.modal.extraction.extract import extract
-from avmsf.modal.extraction.finders import ExtractionMethod, finder_named
+from avmsf.modal.extraction.finders import finder_named
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.wording import counted
 

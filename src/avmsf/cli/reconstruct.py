@@ -20,18 +20,23 @@ from avmsf.cli.scenes import SceneOptions, features_words
 from avmsf.cli.scores import compare, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
-from avmsf.field.config import FitConfig
+from avmsf.field.config import FitConfig, GainModel
 from avmsf.field.fit import Progress
-from avmsf.field.gains.estimator import GainModel
 from avmsf.field.store import load
 from avmsf.files import copy_whole
-from avmsf.modal.extraction.finders import ExtractionMethod
-from avmsf.pipeline.bodies import BodyConfig
-from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
-from avmsf.pipeline.features import LiftConfig
+from avmsf.modal.config import ExtractionMethod
+from avmsf.pipeline.config import (
+    PRESETS,
+    BodyConfig,
+    LiftConfig,
+    PipelineConfig,
+    Preset,
+    SceneConfig,
+    TimeZero,
+    ViewsConfig,
+)
 from avmsf.pipeline.reconstruct import reconstruct, reconstruct_guess
-from avmsf.pipeline.scene import SceneConfig
-from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.record import capture_settings_of
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.splatconfig import SplatConfig
 
@@ -114,7 +119,7 @@ def run(options: Options) -> int:
     if options.output is not None:
         expect_writable(options.output)
     usable_device(options.device, raising=FitError, kinds=TRAINABLE)
-    settings = options.pipeline.capture_settings(options.read_settings())
+    settings = capture_settings_of(options.pipeline, options.read_settings())
     if options.material is not None:
         return _run_guess(options, options.material, settings)
     capture = read_capture(options.folder, settings)

@@ -19,8 +19,9 @@ from avmsf.cli.printing import print_text, say
 from avmsf.cli.writing import Coding, Level, OutputError, expect_writable, write_sound
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
-from avmsf.modal.pulse import ForcePulse, PulseShape
-from avmsf.simulate.hammer import LONGEST
+from avmsf.modal.config import PulseShape
+from avmsf.modal.pulse import ForcePulse
+from avmsf.simulate.recipe import LONGEST
 
 _MUCH_SOFTER = 20.0
 """Decibels under the recorded blow from which a softer mallet's are told of."""

@@ -21,13 +21,13 @@ from avmsf.cli.modetable import levels, mode_rows
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.scores import quality_words, score_table, score_values
 from avmsf.field.attention import AttentionGains
+from avmsf.field.config import NETWORK
 from avmsf.field.gains.body import BodyGains
-from avmsf.field.gains.estimator import NETWORK
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
-from avmsf.pipeline.config import RECORD
+from avmsf.pipeline.record import RECORD
 from avmsf.scene.points import farthest_points
 
 _DRAWN_POINTS = 4000

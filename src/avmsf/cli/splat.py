@@ -14,8 +14,8 @@ from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import SceneOptions, stage_line
 from avmsf.cli.writing import expect_writable
 from avmsf.files import copy_whole
-from avmsf.pipeline.scene import SceneConfig, SceneStages
-from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.config import SceneConfig, ViewsConfig
+from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.ply import read_splats
 from avmsf.scene.splatconfig import SplatConfig

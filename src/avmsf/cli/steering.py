@@ -19,14 +19,14 @@ from avmsf.cli.writing import Level, write_sound
 from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.simulate.material import Material, material_named
-from avmsf.tasks.distillation import DecoderDistillation, DistillationConfig, expect_prompt
+from avmsf.tasks.config import STABLE_AUDIO, DistillationConfig, SteerConfig
+from avmsf.tasks.distillation import DecoderDistillation, expect_prompt
 from avmsf.tasks.edits import EDITS
 from avmsf.tasks.materialstatistics import MaterialStatistics
 from avmsf.tasks.parameters import PARAMETERISATIONS
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
-from avmsf.tasks.stableaudiofiles import STABLE_AUDIO
-from avmsf.tasks.steer import Guide, SteerConfig, SteerProgress, steer
+from avmsf.tasks.steer import Guide, SteerProgress, steer
 
 _PREVIEW = Level("peak", -1.0)
 _GENERATED_SECONDS = 3.0

@@ -18,9 +18,9 @@ from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import SceneOptions, stage_line
 from avmsf.cli.writing import OutputError, expect_writable
 from avmsf.files import write_whole
+from avmsf.pipeline.config import SceneConfig, ViewsConfig
 from avmsf.pipeline.reconstruct import keep_surface, object_shape
-from avmsf.pipeline.scene import SceneConfig, SceneStages
-from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.splatconfig import SplatConfig
 
