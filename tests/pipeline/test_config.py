@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from avmsf.capture import CaptureSettings
-from avmsf.cli.fit import parse as parse_fit
-from avmsf.cli.reconstruct import parse as parse_reconstruct
+from avmsf.cli.options.fit import parse as parse_fit
+from avmsf.cli.options.reconstruct import parse as parse_reconstruct
 from avmsf.field.config import LATER, FitConfig
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.config import PRESETS, PipelineConfig
@@ -47,7 +47,7 @@ def test_commands_start_from_the_preset_and_change_what_is_said() -> None:
     assert (mixed.fit.steps, mixed.fit.clusters) == (7, 256)
     assert (mixed.scene.lift.encoder, mixed.scene.lift.onto) == ("descriptors", "gaussians")
     fitted = parse_fit(["mug", "--output", "mug.safetensors", "--preset", "paper"])
-    assert (fitted.config, fitted.method, fitted.gain_model) == (PRESETS["paper"].fit, "short-time", "network")
+    assert (fitted.config, fitted.extraction, fitted.gain_model) == (PRESETS["paper"].fit, "short-time", "network")
 
 
 def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:

@@ -1,12 +1,11 @@
 """`avmsf fit`: a capture folder in, a field file out."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
 from rich.console import Console
 
 from avmsf._utils.caching import discard
@@ -17,12 +16,13 @@ from avmsf.capture.folder import settings_of
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.heartbeat import doing
+from avmsf.cli.options.fit import Options
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
-from avmsf.field.config import FitConfig, GainModel
+from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import Elastic
@@ -30,11 +30,9 @@ from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.recipes import GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
-from avmsf.modal.config import ExtractionMethod
 from avmsf.modal.extraction.extract import extract_once
 from avmsf.modal.extraction.finders import finder_named
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import PRESETS, BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
 from avmsf.pipeline.guess import guess_field, known_surface
 from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.pipeline.record import capture_settings_of, with_record
@@ -48,93 +46,6 @@ _FEW = 8
 """Recordings below which little is told of the gains between contacts."""
 _SHOWN = 8
 """Names of recordings in a line, at most."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """Fit a sound field to a capture and write it to one file.
-
-    Without recordings, a mesh and --material give a guess. An interrupted fit leaves its state beside the output; the
-    same command goes on from it to the same result.
-    """
-
-    capture: tyro.conf.Positional[Path]
-    """Folder with impacts.csv and the wav files it names; with --material, a folder with a mesh, or a mesh file."""
-    output: Annotated[Path, tyro.conf.arg(metavar="FIELD.safetensors")]
-    """File to write the field to."""
-    settings: Path | None = None
-    """A capture.toml to use in place of the folder's own."""
-    material: str | None = None
-    """Guess the field of an object without recordings from its mesh and its material: ceramic, glass, wood, plastic,
-    iron, polycarbonate or steel."""
-    train_fraction: float | None = None
-    """Fit to all recordings at this part of the places, spread as far apart as they go, and score the field on the
-    others. Contacts nearer than 1 % of the extent of all are one place."""
-    train_count: int | None = None
-    """Likewise with so many places."""
-    start: int = 0
-    """Row of impacts.csv, counted from 0, whose place this choice starts from."""
-    features: Path | None = None
-    """File of features that `avmsf lift` wrote, in the frame of the contacts; without it positions on the surface."""
-    gain_model: GainModel = "auto"
-    """How gains vary over the object. auto: a Gaussian process over all kernel families, weighed by evidence; the
-    elastic one needs a mesh. network: the paper's attention network on the features. The others: the Gaussian process
-    over one family, for study; symmetry needs a mesh, visual needs --features."""
-    body: BodyConfig = field(default_factory=BodyConfig)
-    method: ExtractionMethod = "high-resolution"
-    """How modes are found; see `avmsf modes --help`."""
-    modes: int = 128
-    """Most modes to keep."""
-    time_zero: TimeZero | None = None
-    """Where sounds start: onset, or peak (paper); capture.toml decides where this does not."""
-    device: str | None = None
-    """What computes: cpu, or cuda; the GPU where there is one. On it run training end to end, its spectral loss
-    and the network; the modes, clusters, finite elements and the Gaussian process run on the CPU."""
-    json: bool = False
-    """Print one JSON object on the standard output, all else on the standard error."""
-    preset: Preset = "default"
-    """Where all settings start from. default: takes seconds to minutes. paper: everything as published, the middle of
-    each published list; it takes hours. `--preset paper --help` shows its values. `avmsf reconstruct` also has its
-    features; here they are those of --features."""
-    config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)
-    """Settings of the fit."""
-
-    @property
-    def pipeline(self) -> PipelineConfig:
-        """All settings as one; those of views and features are the features' file's own."""
-        scene = SceneConfig()
-        start, place = self.time_zero, self.device
-        return PipelineConfig(self.gain_model, self.body, scene, self.config, self.method, self.modes, start, place)
-
-
-@dataclass(frozen=True)
-class PaperOptions(Options):
-    """The same, starting from what the preset `paper` has otherwise."""
-
-    gain_model: GainModel = PRESETS["paper"].gain_model
-    method: ExtractionMethod = PRESETS["paper"].method
-    time_zero: TimeZero | None = PRESETS["paper"].time_zero
-    preset: Preset = "paper"
-    config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=lambda: PRESETS["paper"].fit)
-
-
-@dataclass(frozen=True)
-class _Preset:
-    preset: Preset = "default"
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell, with the preset's settings where they say nothing."""
-    kind = {"default": Options, "paper": PaperOptions}[preset_of(words)]
-    return tyro.cli(
-        kind, prog="avmsf fit", args=words, description=Options.__doc__, config=(tyro.conf.FlagCreatePairsOff,)
-    )
-
-
-def preset_of(words: Sequence[str]) -> Preset:
-    """Return the preset that the words name; it is read first, for it decides what all others start from."""
-    chosen, _ = tyro.cli(_Preset, args=words, add_help=False, return_unknown_args=True)
-    return chosen.preset
 
 
 def run(options: Options) -> int:
@@ -158,7 +69,7 @@ def run(options: Options) -> int:
     # Before the modes: what is wrong with the object's shape shows in less time than they take.
     gains = _estimator(options, capture, train)
     say(f"finding the modes of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
-    modes = extract_once(train, finder_named(options.method, options.modes), _beside(options.output, "modes"))
+    modes = extract_once(train, finder_named(options.extraction, options.modes), _beside(options.output, "modes"))
     for sentence in describe_alignment(modes, train):
         say(sentence)
     say(f"fitting a field of {len(modes.bank)} modes")

@@ -101,7 +101,7 @@ def write_demo(
     if others and not stay and not force:
         raise ExportError(
             f"{folder}: expected a free name, or variants of the same Gaussians, found {', '.join(others)} of others: "
-            "choose another folder, or add --force to lose them"
+            "choose another folder, or add --overwrite to lose them"
         )
     kept = others if stay else {}
 

@@ -19,6 +19,8 @@ Geometry = Literal["mesh", "gaussians", "noisy"]
 DINO = "facebook/dinov2-base"
 DESCRIPTORS = "descriptors"
 AUTO = "auto"
+CACHE = ".avmsf"
+"""Folder inside a capture folder that keeps the outputs of the stages."""
 
 
 @dataclass(frozen=True)

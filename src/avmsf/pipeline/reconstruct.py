@@ -43,8 +43,6 @@ from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.symmetry import Symmetries
 from avmsf.wording import counted
 
-CACHE = ".avmsf"
-"""Folder inside the capture's that keeps what each stage made."""
 SURFACE = "surface.ply"
 """What the stage of the object's surface calls its output, in meters."""
 MODES, FIELD = "modes.safetensors", "field.safetensors"

@@ -23,8 +23,8 @@ from avmsf.errors import AvmsfError
 from avmsf.field.fit import Progress
 from avmsf.field.store import load, save
 from avmsf.files import copy_whole
-from avmsf.pipeline.config import PipelineConfig, SceneConfig
-from avmsf.pipeline.reconstruct import CACHE, reconstruct
+from avmsf.pipeline.config import CACHE, PipelineConfig, SceneConfig
+from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.scene import Listener, SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.lift import LiftProgress
