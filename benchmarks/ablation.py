@@ -25,7 +25,8 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesise_phased
-from avmsf.pipeline.bodies import BodyConfig, candidate_bodies, roughened
+from avmsf.pipeline.bodies import candidate_bodies, roughened
+from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import ElasticModes, elastic_modes

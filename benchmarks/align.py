@@ -26,7 +26,8 @@ from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.modal.extraction.alignment import Alignment, align, coherence, strongest_modes
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.quality import measure_quality
-from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
+from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.example import EXAMPLE_FOLDER
 from avmsf.simulate.truth import read_truth

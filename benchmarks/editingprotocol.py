@@ -21,9 +21,9 @@ from avmsf.bench.editmethods import GENERATED, EditMethod, Recast, towards_refer
 from avmsf.bench.edittasks import RECORDED_TRANSITIONS, SEVEN_TRANSITIONS, EditTask, prompted_tasks
 from avmsf.capture.datasets.recognise import open_dataset
 from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.tasks.config import SteerConfig
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
-from avmsf.tasks.steer import SteerConfig
 from benchmarks.editing import labelled_objects, referred_task, spaces_of, strange_shapes, stranger
 from benchmarks.editingfigures import write_figures
 from benchmarks.report import Options, Report, Table, show, tell

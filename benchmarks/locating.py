@@ -30,7 +30,8 @@ from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.residual import Residual
-from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
+from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate, plate_surface_points
 from avmsf.simulate.shapes import make_shape

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from avmsf.bench.baselines import MeanWaveform
 from avmsf.bench.evaluation import evaluate, split
+from avmsf.bench.renderer import Renderer
 from avmsf.capture import Capture
 from avmsf.capture.datasets import CaptureCollection
 from avmsf.capture.impacts import Impacts
@@ -19,11 +20,10 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.recipes import SHARED, Attention, gain_case
 from avmsf.field.training import Targets, TrainingRun
-from avmsf.modal.extraction.extract import extract, extract_sounds
+from avmsf.modal.extraction.extract import extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import PRESETS
-from avmsf.pipeline.features import DESCRIPTORS
+from avmsf.pipeline.config import DESCRIPTORS, PRESETS
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.sim20 import sim20_recipe
@@ -66,7 +66,7 @@ def paper_runs(options: Options, folder: Path) -> Report:
     curves: dict[str, dict[int, float]] = {}
     rows: list[list[str | float]] = []
     figures: dict[str, float] = {}
-    config = replace(PAPER, damping=SHARED)
+    config = replace(PAPER, damping="shared")
     if options.quick_look:
         config = replace(config, warmup_steps=2, steps=2)
     for name in options.objects or OBJECTS[: 1 if options.quick_look else None]:
@@ -86,7 +86,9 @@ def paper_runs(options: Options, folder: Path) -> Report:
         figures[f"paper.{name}.minutes"] = seconds / 60
     columns = ("object", *others, "paper", "paper, best step", "minutes")
     steps = sorted({step for curve in curves.values() for step in curve})
-    points = [[f"{step}", *(curve.get(step, float("nan")) for curve in curves.values())] for step in steps]
+    points: list[list[str | float]] = [
+        [f"{step}", *(curve.get(step, float("nan")) for curve in curves.values())] for step in steps
+    ]
     tables = (
         Table("held-out error, 8 training places", columns, rows),
         Table("held-out error of the preset `paper` over its steps, warm-up included", ("step", *curves), points),
@@ -107,13 +109,13 @@ def _folder(name: str, folder: Path) -> Path:
 
 def _others(capture: Capture, train: Impacts, test: Impacts, *, quick: bool) -> dict[str, float]:
     """Return the errors of the other methods."""
-    modes = extract(train)
+    modes = extract_modes(train)
     train, test = modes.aligned(train), modes.aligned(test)
     assert capture.surface is not None
-    features = FeatureField.from_mesh(capture.surface, generator=torch.Generator().manual_seed(0))
+    features = FeatureField.from_mesh(capture.surface, seed=0)
     config = replace(FitConfig(), warmup_steps=2, steps=2) if quick else FitConfig()
     bodies = candidate_bodies(capture.surface, tell=tell)
-    renderers = {
+    renderers: dict[str, Renderer] = {
         "mean of 3": MeanWaveform(train, count=3),
         "attention, quick": fit(train, features, modes, config, gains=Attention()),
         "auto": fit(train, features, modes, config, gains=MixtureEstimator(bodies=bodies)),
@@ -125,7 +127,7 @@ def _curve(
     name: str, train: Impacts, test: Impacts, features: FeatureField, config: FitConfig
 ) -> Iterator[tuple[int, float]]:
     """Yield steps and the error at held-out contacts."""
-    shared = extract(train)
+    shared = extract_modes(train)
     train, test = shared.aligned(train), shared.aligned(test)
     modes = extract_sounds(train.sounds, sample_rate=train.sample_rate, method=ShortTime())
     case, network = gain_case(train, features, modes, config), Attention()

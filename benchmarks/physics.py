@@ -20,7 +20,8 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.uncertainty import coverage
 from avmsf.modal.extraction.extract import extract_modes
-from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
+from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.bodies import make_body
 from avmsf.simulate.material import material_named
 from avmsf.simulate.nominal import NOMINAL, nominal_bodies

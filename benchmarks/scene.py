@@ -15,11 +15,9 @@ from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.capture.views.write import write_views
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load
-from avmsf.pipeline.config import PipelineConfig
-from avmsf.pipeline.features import LiftConfig
+from avmsf.pipeline.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.reconstruct import reconstruct
-from avmsf.pipeline.scene import Listener, SceneConfig
-from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.scene import Listener
 from avmsf.scene.refine import orbit_spread, refine
 from avmsf.scene.splatconfig import SplatConfig
 from benchmarks.dino import measure_dino

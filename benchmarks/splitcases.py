@@ -18,7 +18,8 @@ from avmsf.field.uncertainty import coverage
 from avmsf.geometry import ObjectShape
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.least_squares import fit_gains
-from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
+from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrycharacters import groups_of

@@ -1,4 +1,4 @@
-"""The studio: how true and how fast the page sounds, how soon it can be struck, exports, the player, and pictures."""
+"""The studio: how true and how fast the page sounds, how soon it can be struck, exports, and pictures."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What the exports weigh and how near their own readers come to the field, and what the player sounds at once."""
+"""What the exports weigh and how near their own readers come to the field."""
 
 import json
 import math
@@ -18,7 +18,6 @@ import torch
 from avmsf.export.faust import write_faust
 from avmsf.export.gltf import write_gltf
 from avmsf.export.modaldemo import write_demo
-from avmsf.export.player import Blow, Player, measure_capacity
 from avmsf.export.sampledfield import SampledField
 from avmsf.export.universal import write_universal
 from avmsf.export.wavgrid import Grid, write_grid
@@ -27,15 +26,13 @@ from benchmarks.report import Options, Report, Table, tell
 DRIVER = Path(__file__).resolve().parents[1] / "tests" / "export" / "faust_driver.c"
 CONVENTIONS = (
     "a field of 128 modes from 80 Hz to 15 kHz that ring for .1 to 1 s, drawn at random at 1000 points, 44.1 kHz, 3 s; "
-    "sines and no noise for glTF and the demo, whose formats hold no other, phases and noise for Faust and player.",
+    "sines and no noise for glTF and the demo, whose formats hold no other, phases and noise for Faust.",
     "errors: largest difference between what a reader of the file, who knows the format alone, hears and "
     "SampledField.render, "
     "over the loudest sample of each blow, the worst of several. glTF and the demo hold frequencies as float32, which "
     "is most of theirs; Faust compiled in double precision, single: as it compiles unless told otherwise.",
     "the demo plays every mode as a cosine: its error is against the field with cosines of the same size, its waveform "
     "error against the field as it is.",
-    "voices: sets of 128 resonators, none culled, that one core rings in real time in blocks of 256 samples; blows: "
-    "how many a second ring in one set, where dampings are the same everywhere.",
 )
 
 
@@ -173,31 +170,4 @@ def _children() -> float:
     return resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
 
 
-def _player(field: SampledField) -> Report:
-    tell("studio: player")
-    capacity = measure_capacity(field)
-    player = Player(field, level=1.0)
-    blows = [Blow(row, 1.0, 97 * number) for number, row in enumerate(field.spread(8).tolist())]
-    heard = np.concatenate([np.array(block) for block in _unlimited(player, blows, field.samples)])
-    true = np.zeros(field.samples)
-    for blow in blows:
-        sound = field.render(torch.tensor([blow.row]))[0].double().numpy()
-        true[blow.start :] += sound[: field.samples - blow.start]
-    # The noise of the first blow fades at its end.
-    kept = field.samples - round(0.01 * field.sample_rate)
-    found = {
-        "player.voices": float(capacity.voices),
-        "player.blows_per_second": capacity.blows,
-        "player.render_error": float(np.abs(heard - true)[:kept].max() / np.abs(true).max()),
-    }
-    rows: list[list[str | float]] = [[name.removeprefix("player."), value] for name, value in found.items()]
-    return Report(tables=(Table("player, 128 modes, one core", ("what", "figure"), rows),), figures=found)
-
-
-def _unlimited(player: Player, blows: list[Blow], samples: int) -> list[np.ndarray]:
-    for blow in blows:
-        player.strike(blow)
-    return [player.render(min(256, samples - begin), limit=False) for begin in range(0, samples, 256)]
-
-
-PARTS: dict[str, Callable[[SampledField], Report]] = {"exports": _exports, "player": _player}
+PARTS: dict[str, Callable[[SampledField], Report]] = {"exports": _exports}

@@ -27,7 +27,7 @@ from avmsf.export.sampledfield import SampledField
 from avmsf.export.webpage import page_files
 from avmsf.scene.ply import write_splats
 from avmsf.scene.start import StartPoints, starting_cloud
-from avmsf.simulate.example import example_mesh
+from avmsf.simulate.examplemesh import example_mesh
 from avmsf.simulate.simulationfolder import write_textured
 from avmsf.studio.modules import fetch_modules, find_modules, with_local_modules
 from benchmarks.report import Report, Table

@@ -15,7 +15,8 @@ from avmsf.field.soundfield import SoundField
 from avmsf.field.suggest import suggest
 from avmsf.modal.extraction.alignment import align
 from avmsf.modal.extraction.extract import extract_modes
-from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
+from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import farthest_points
 from avmsf.simulate.sim20 import sim20_recipe

@@ -6,7 +6,8 @@ from functools import cache
 
 import torch
 
-from avmsf.field.attention import AttentionGains, AttentionShape
+from avmsf.field.attention import AttentionGains
+from avmsf.field.config import AttentionShape
 from avmsf.field.gainfield import GainField
 from avmsf.field.gains.body import BodyGains
 from avmsf.field.gains.elastic import Elastic

@@ -1,4 +1,4 @@
-"""Tables of points whose sound is known in full, for the tests of exports and player."""
+"""Tables of points whose sound is known in full, for the tests of exports."""
 
 import math
 

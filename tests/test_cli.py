@@ -21,7 +21,7 @@ from avmsf.simulate.plate import plate_modes
 from plate_capture import CONTACT_TIME, HIGHEST, PLATE, RATE, TINY, fill_plate
 
 Streams = pytest.CaptureFixture[str]
-AT = ("--at", "0.05", "0.06", "0")
+AT = ("--position", "0.05", "0.06", "0")
 
 
 @pytest.fixture(scope="module")
@@ -69,12 +69,12 @@ def error_line(streams: Streams) -> str:
 def test_help_names_every_verb_and_imports_no_torch() -> None:
     ran = python(
         "import sys\nfrom avmsf.cli import main\n"
-        "try: main(['--help'])\n"
-        "except SystemExit as ended: print('torch' in sys.modules, 'scipy' in sys.modules, ended.code)"
+        "code = main(['--help'])\n"
+        "print('torch' in sys.modules, 'scipy' in sys.modules, code)"
     )
     assert ran.stdout.splitlines()[-1] == "False False 0"
     for verb in VERBS:
-        assert f"• {verb} " in ran.stdout
+        assert f"\n  {verb} " in ran.stdout
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -89,13 +89,30 @@ def test_a_verbs_help_starts_with_the_sentence_that_the_list_has(verb: str, caps
 
 
 def test_what_is_no_verb_ends_with_2_on_the_standard_error(capsys: Streams) -> None:
-    for words in (["fti"], ["fit"], ["fit", "capture", "--output", "x", "--steps", "many"]):
+    for words in (["fit"], ["fit", "capture", "--output", "x", "--steps", "many"]):
         with pytest.raises(SystemExit) as ended:
             main(words)
         assert ended.value.code == 2
         out, err = capsys.readouterr()
         assert out == ""
         assert err
+
+
+@pytest.mark.parametrize(("word", "meant"), [("fti", "fit"), ("lcoate", "locate"), ("rendre", "render")])
+def test_a_mistyped_verb_gets_a_suggestion(word: str, meant: str, capsys: Streams) -> None:
+    assert main([word]) == 2
+    assert f"Did you mean {meant}?" in error_line(capsys)
+
+
+@pytest.mark.parametrize("verb", ["check", "modes", "fit", "reconstruct", "splat", "features", "surface"])
+def test_a_missing_input_is_refused_before_anything_that_computes_is_imported(verb: str) -> None:
+    words = [verb, "/nowhere", "--output", "out.ply"] if verb == "fit" else [verb, "/nowhere"]
+    ran = python(
+        "import sys\nfrom avmsf.cli import main\n"
+        f"print(main({words!r}), [name for name in ('torch', 'scipy', 'numpy') if name in sys.modules])"
+    )
+    assert ran.stdout == "2 []\n"
+    assert ran.stderr.startswith(f"avmsf {verb}: /nowhere: ")
 
 
 def test_every_public_name_is_there_and_no_other() -> None:
@@ -108,7 +125,7 @@ def test_every_public_name_is_there_and_no_other() -> None:
 
 def test_output_that_nobody_reads_any_more_ends_quietly(field: Path) -> None:
     main_of = "import sys; from avmsf.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", main_of, "show", str(field), "--json"]
+    command = [sys.executable, "-c", main_of, "info", str(field), "--json"]
     run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert run.stdout is not None
     run.stdout.close()
@@ -118,7 +135,12 @@ def test_output_that_nobody_reads_any_more_ends_quietly(field: Path) -> None:
     assert run.returncode == 141
 
 
-def test_a_terminal_is_told_that_something_goes_on_until_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_is_told_that_something_goes_on_until_it_does(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    nothing = tmp_path / "nothing.safetensors"
+    nothing.write_bytes(b"")
+
     class Terminal(io.StringIO):
         def isatty(self) -> bool:
             return True
@@ -128,7 +150,7 @@ def test_a_terminal_is_told_that_something_goes_on_until_it_does(monkeypatch: py
         (io.StringIO(), "avmsf suggest: "),
     ):
         monkeypatch.setattr(sys, "stderr", stream)
-        assert main(["suggest", "nothing.safetensors"]) == 2
+        assert main(["suggest", str(nothing)]) == 2
         assert stream.getvalue().startswith(begins)
 
 
@@ -212,7 +234,7 @@ def test_modes_prints_the_plates(capture: Path, tmp_path: Path, capsys: Streams)
     assert f"{strongest['frequency_hertz']:.2f}" in err
     assert picture.read_bytes().startswith(b"\x89PNG")
     # The table is the verb's output where no JSON is.
-    main(["modes", str(capture), "--method", "short-time", "--modes", "4"])
+    main(["modes", str(capture), "--extraction", "short-time", "--modes", "4"])
     assert " modes of plate" in capsys.readouterr().out
 
 
@@ -300,14 +322,14 @@ def test_a_surface_in_another_unit_is_refused_once(tmp_path: Path, capsys: Strea
 
 
 def test_a_presets_settings_hold_where_the_options_say_nothing() -> None:
-    from avmsf.cli.fit import parse
+    from avmsf.cli.options.fit import parse
 
     words = ["bowl", "--output", "bowl.safetensors"]
     assert parse(words).config == FitConfig()
     paper = parse([*words, "--preset", "paper"])
-    assert (paper.config, paper.gain_model, paper.method) == (PAPER, "network", "short-time")
-    mixed = parse(["--preset", "paper", *words, "--steps", "7", "--method", "high-resolution"])
-    assert (mixed.config.steps, mixed.config.clusters, mixed.method) == (7, PAPER.clusters, "high-resolution")
+    assert (paper.config, paper.gain_model, paper.extraction) == (PAPER, "network", "short-time")
+    mixed = parse(["--preset", "paper", *words, "--steps", "7", "--extraction", "high-resolution"])
+    assert (mixed.config.steps, mixed.config.clusters, mixed.extraction) == (7, PAPER.clusters, "high-resolution")
 
 
 def test_without_a_surface_the_contacts_box_stands_for_the_object(tmp_path: Path, capsys: Streams) -> None:
@@ -323,7 +345,7 @@ def test_without_a_surface_the_contacts_box_stands_for_the_object(tmp_path: Path
 
 def test_render_is_the_fields_own(field: Path, tmp_path: Path, capsys: Streams) -> None:
     output = tmp_path / "sounds"
-    words = ["render", str(field), *AT, "--at", "50e-3", "0.12", "-1e-3", "--output", str(output), "--force", "2"]
+    words = ["render", str(field), *AT, "--position", "50e-3", "0.12", "-1e-3", "--output", str(output), "--force", "2"]
     assert main(words) == 0
     out, err = capsys.readouterr()
     assert out.startswith(f"wrote 2 sounds to {output}")
@@ -341,7 +363,7 @@ def test_render_is_the_fields_own(field: Path, tmp_path: Path, capsys: Streams) 
 def test_render_takes_a_table_in_any_unit_and_a_length(field: Path, tmp_path: Path) -> None:
     table = tmp_path / "places.csv"
     table.write_text("File;X;Y;Z;who\nrim/one.wav;50,0;60;0;a\nwall;50;120;0;b\n")
-    words = ["render", str(field), "--contacts", str(table), "--unit", "mm", "--output", str(tmp_path / "out")]
+    words = ["render", str(field), "--contact-table", str(table), "--unit", "mm", "--output", str(tmp_path / "out")]
     assert main([*words, "--seconds", "0.1"]) == 0
     contacts = torch.tensor([[0.05, 0.06, 0.0], [0.05, 0.12, 0.0]], dtype=torch.float64)
     expected = load(field).render(contacts, samples=800)
@@ -350,8 +372,8 @@ def test_render_takes_a_table_in_any_unit_and_a_length(field: Path, tmp_path: Pa
 
 
 def test_render_sets_levels_by_one_factor_for_all(field: Path, tmp_path: Path) -> None:
-    places = ["--at", "0.05", "0.06", "0", "--at", "0.02", "0.02", "0"]
-    words = ["render", str(field), *places, "--output", str(tmp_path), "--normalise", "peak", "--level-db", "-6"]
+    places = ["--position", "0.05", "0.06", "0", "--position", "0.02", "0.02", "0"]
+    words = ["render", str(field), *places, "--output", str(tmp_path), "--normalize", "peak", "--level-db", "-6"]
     assert main([*words, "--coding", "int16"]) == 0
     plain = load(field).render(torch.tensor([[0.05, 0.06, 0.0], [0.02, 0.02, 0.0]]))
     expected = plain / plain.abs().max() * 10 ** (-6 / 20)
@@ -364,7 +386,7 @@ def test_render_sets_levels_by_one_factor_for_all(field: Path, tmp_path: Path) -
 
 def test_nothing_clips_in_silence(field: Path, tmp_path: Path, capsys: Streams) -> None:
     path = tmp_path / "loud.wav"
-    words = ["render", str(field), *AT, "--output", str(path), "--normalise", "peak", "--level-db", "6"]
+    words = ["render", str(field), *AT, "--output", str(path), "--normalize", "peak", "--level-db", "6"]
     assert main([*words, "--coding", "int16"]) == 2
     assert "peaks at 2" in error_line(capsys)
     assert not path.exists()
@@ -375,7 +397,7 @@ def test_nothing_clips_in_silence(field: Path, tmp_path: Path, capsys: Streams) 
 
 def test_show_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys: Streams) -> None:
     output = tmp_path / "pictures"
-    assert main(["show", str(field), str(capture), "--output", str(output), "--json"]) == 0
+    assert main(["info", str(field), "--capture", str(capture), "--plots", str(output), "--json"]) == 0
     out, err = capsys.readouterr()
     told, fitted = json.loads(out), load(field)
     assert told["capture"] == "plate"
@@ -390,7 +412,7 @@ def test_show_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
     for name in ("modes", "gains", "spectrograms"):
         assert (output / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     # Without a capture, and without pictures.
-    assert main(["show", str(field)]) == 0
+    assert main(["info", str(field)]) == 0
     out = capsys.readouterr().out
     assert "field of plate" in out
     assert (told["pipeline"]["method"], told["pipeline"]["fit"]["seed"]) == ("high-resolution", 0)

@@ -10,8 +10,9 @@ import soundfile
 import torch
 
 from avmsf.cli import edit, main, steering
-from avmsf.cli.edit import parse, run
+from avmsf.cli.edit import run
 from avmsf.cli.editmaterial import old_material
+from avmsf.cli.options.edit import parse
 from avmsf.errors import AvmsfError
 from avmsf.field.gains.family import Sites
 from avmsf.field.soundfield import Origin, SoundField
@@ -61,7 +62,7 @@ def expect_same(found: SoundField, expected: SoundField) -> None:
 
 def test_a_material_by_its_name_with_pictures_sounds_and_numbers(field: Path, capsys: Streams) -> None:
     folder = field.parent / "look"
-    words = ["--material", "Wood", "--from", "ceramic", "--size", "2", "--pictures", str(folder), "--json"]
+    words = ["--material", "Wood", "--from", "ceramic", "--size", "2", "--plots", str(folder), "--json"]
     new = edited(field, *words)
     out, err = capsys.readouterr()
     expect_same(new, recast(ceramic(), CERAMIC, WOOD, size=2.0))
@@ -201,7 +202,7 @@ def test_towards_a_materials_sound(field: Path, capsys: Streams) -> None:
     both = edited(field, *words, *quick, name="both")
     assert [each["edit"] for each in both.origin.report[EDITS]] == ["recast", "steer"]
     assert {name: both.origin.report[EDITS][1][name] for name in heard} == heard
-    assert main(["show", str(field.with_name("both.safetensors"))]) == 0
+    assert main(["info", str(field.with_name("both.safetensors"))]) == 0
     out = capsys.readouterr().out
     assert "edited     recast, from glass to wood, law displacement" in out
     assert "edited     steer, towards 'steel', pitch " in out
@@ -212,7 +213,7 @@ def test_towards_a_materials_sound(field: Path, capsys: Streams) -> None:
 def test_edits_are_shown_by_what_they_did(field: Path, capsys: Streams) -> None:
     words = ["--from", "ceramic", "--material", "wood", "--size", "2", "--alpha", "4000", "--pitch", "10"]
     edited(field, *words, "--mode-db", "850", "-inf", "--mode-db", "2300", "6", "--mode-decay", "1300", "4")
-    assert main(["show", str(field.with_name("new.safetensors"))]) == 0
+    assert main(["info", str(field.with_name("new.safetensors"))]) == 0
     lines = [line.strip() for line in capsys.readouterr().out.splitlines() if "edited" in line]
     law = "law displacement, modes damped too much to ring: "
     assert lines == [
@@ -284,7 +285,7 @@ def test_options_that_would_do_nothing_are_refused(field: Path, monkeypatch: pyt
     refused("--denoising and --batch go with --prompt", "--pitch", "2", "--denoising", "3", "--batch", "2")
     refused("--law goes with --material, --size or a constant", "--pitch", "2", "--law", "ratio-only")
     refused("--law goes with", "--like-material", "wood", "--law", "velocity")
-    refused("--at goes with --pictures, which is not given", "--pitch", "2", "--at", "0", "0", "0")
+    refused("--position goes with --plots, which is not given", "--pitch", "2", "--position", "0", "0", "0")
 
 
 def test_settings_of_a_model_that_cannot_be_meant_are_refused_before_it_is_loaded(
@@ -379,5 +380,5 @@ def test_what_cannot_be_done_is_said_before_any_work(field: Path, capsys: Stream
     refused("steps = 0: expected 1 or more", "--like", "like.wav", "--steps", "0")
     assert main(["edit", str(field), "--output", str(field), "--pitch", "2"]) == 2
     assert "is the field itself, which would be lost: name another file" in capsys.readouterr().err
-    far = ["--pitch", "2", "--pictures", str(field.with_name("look")), "--at", "100", "0", "0"]
+    far = ["--pitch", "2", "--plots", str(field.with_name("look")), "--position", "100", "0", "0"]
     refused("outside an object", *far)

@@ -31,14 +31,14 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-AT = "--at 0.1 0.05 0"
+AT = "--position 0.1 0.05 0"
 WRONG = {
     "check plate --settings wrong.toml": "unit is 'miles'",
-    "modes nowhere": "there is no such folder",
-    "modes plate --settings nowhere.toml": "nowhere.toml: there is no such file of capture settings",
+    "modes nowhere": "nowhere: expected a capture folder",
+    "modes plate --settings nowhere.toml": "nowhere.toml: expected a capture.toml",
     "modes plate --picture modes.gif": "ends in .png, .pdf or .svg, found .gif",
     "modes plate --modes 0": "modes = 0: expected 1 or more",
-    "fit nowhere --output f.safetensors": "there is no such folder",
+    "fit nowhere -o f.safetensors": "nowhere: expected a capture folder",
     "fit plate --output plate": "is a folder",
     "fit plate --output words.csv/f.safetensors": "is a file, so there can be no folder",
     "fit plate --output f.safetensors --train-count 8": "8 recordings at 8 places",
@@ -46,27 +46,27 @@ WRONG = {
     "fit plate --output f.safetensors --train-count 4 --start 8": "0 to 7, got 8",
     "fit plate --output f.safetensors --train-count 4 --train-fraction 0.5": "leave one of them out",
     "fit plate --output f.safetensors --validation 2": "validation = 2.0: expected 0 to 0.5",
-    "render nowhere.safetensors --at 0 0 0 --output s": "found no such file",
+    "render nowhere.safetensors --position 0 0 0 -o s": "nowhere.safetensors: expected a field file",
     f"render not-ours.safetensors {AT} --output s": "a file of another kind",
-    "render field.safetensors --output s": "expected contacts either by --at",
-    f"render field.safetensors {AT} --contacts no-z.csv --output s": "expected contacts either by --at",
-    "render field.safetensors --at 50 60 0 --output s": "--unit says",
-    "render field.safetensors --at nan 0 0 --output s": "expected finite numbers",
+    "render field.safetensors --output s": "expected contacts either by --position",
+    f"render field.safetensors {AT} --contact-table no-z.csv --output s": "expected contacts either by --position",
+    "render field.safetensors --position 50 60 0 --output s": "say so with --unit",
+    "render field.safetensors --position nan 0 0 --output s": "expected finite numbers",
     f"render field.safetensors {AT} {AT} --output two.wav": "is one file and there are 2 contacts",
     f"render field.safetensors {AT} --output words.csv": "words.csv is a file",
     f"render field.safetensors {AT} --output s --seconds 0": "expected a time above 0",
     f"render field.safetensors {AT} --output s --seconds nan": "expected a time above 0",
     f"render field.safetensors {AT} --output s --level-db nan": "--level-db is nan",
     f"render field.safetensors {AT} --output s --force inf": "--force is inf",
-    "render field.safetensors --contacts nowhere.csv --output s": "not a table that can be read",
-    "render field.safetensors --contacts no-z.csv --output s": "the column z is missing",
-    "render field.safetensors --contacts empty.csv --output s": "there is no row",
-    "render field.safetensors --contacts words.csv --output s": "line 3: y is 'left'",
-    "render field.safetensors --contacts short.csv --output s": "line 2: z is ''",
-    "render field.safetensors --contacts twice.csv --output s": "more than one row is to become a.wav",
-    "render field.safetensors --contacts outside.csv --output s": "line 2: file is '../a.wav'",
-    "show nowhere.safetensors": "found no such file",
-    "show field.safetensors fast": "9000 Hz",
+    "render field.safetensors --contact-table nowhere.csv --output s": "nowhere.csv: expected a table of contacts",
+    "render field.safetensors --contact-table no-z.csv --output s": "the column z is missing",
+    "render field.safetensors --contact-table empty.csv --output s": "there is no row",
+    "render field.safetensors --contact-table words.csv --output s": "line 3: y is 'left'",
+    "render field.safetensors --contact-table short.csv --output s": "line 2: z is ''",
+    "render field.safetensors --contact-table twice.csv --output s": "more than one row is to become a.wav",
+    "render field.safetensors --contact-table outside.csv --output s": "line 2: file is '../a.wav'",
+    "info nowhere.safetensors": "nowhere.safetensors: expected a field, Gaussians or features",
+    "info field.safetensors --capture fast": "9000 Hz",
     "demo plate": "files that no demo wrote",
     "demo words.csv": "expected a folder, got a file",
 }
@@ -92,4 +92,4 @@ def test_a_process_ends_with_2_and_an_empty_standard_output(place: Path) -> None
     command = [sys.executable, "-c", code, "modes", "nowhere", "--json"]
     ran = subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=60, check=False)
     assert (ran.returncode, ran.stdout) == (2, "")
-    assert ran.stderr.splitlines()[-1] == "avmsf modes: nowhere: there is no such folder"
+    assert ran.stderr.splitlines()[-1].startswith("avmsf modes: nowhere: expected a capture folder")

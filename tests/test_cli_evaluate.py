@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from avmsf.bench.plan import Evaluation
-from avmsf.cli.evaluate import parse, run
+from avmsf.cli.evaluate import run
+from avmsf.cli.options.evaluate import parse
 from avmsf.errors import AvmsfError
 from avmsf.pipeline.objectbodies import ObjectBodies
 from plate_set import fill_plates

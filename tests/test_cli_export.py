@@ -76,7 +76,7 @@ def test_a_strangers_file_beside_the_glb_is_left_alone(field_file: Path, tmp_pat
     assert "a.gaussians.ply: expected a free name or an earlier export" in refused(words, capsys)
     assert (tmp_path / "a.gaussians.ply").read_bytes() == b"theirs"
     assert not (tmp_path / "a.glb").exists()
-    assert main(["export", *words, "--force"]) == 0
+    assert main(["export", *words, "--overwrite"]) == 0
     assert (tmp_path / "a.gaussians.ply").read_bytes() == (tmp_path / "plate.ply").read_bytes()
 
 
@@ -200,7 +200,7 @@ def test_a_files_name_is_no_folders(
     place = tmp_path / name
     said = refused([str(field_file), "--to", to, "--output", str(place)], capsys)
     assert said == (
-        f"avmsf export: {place}: expected a folder's name, for --to {to} writes {written}, found one that ends in "
+        f"avmsf export: {place}: expected a folder's name, since --to {to} writes {written}, found one that ends in "
         f"{place.suffix}: say --output {place.with_suffix('')}\n"
     )
     assert list(tmp_path.iterdir()) == []
@@ -237,21 +237,24 @@ def test_what_cannot_be_exported_is_said(field_file: Path, tmp_path: Path, capsy
     words = [field, "--to", "wavs", "--output", out, "--forces", "1", "2", "3", "--contact-times", "0", "0"]
     assert "found 3 forces and 2 times" in refused(words, capsys)
     words = [field, "--to", "gltf", "--output", str(tmp_path / "a.glb"), "--object", str(tmp_path / "none.obj")]
-    assert "found no such file" in refused(words, capsys)
+    assert "none.obj: expected a mesh or Gaussians" in refused(words, capsys)
     words = [field, "--to", "uff", "--output", str(tmp_path / "a.uff"), "--functions", "-1"]
     assert "expected 0 response functions or more, found -1" in refused(words, capsys)
-    words = [field, "--to", "avmsf-demo", "--output", out, "--capture", str(tmp_path)]
-    assert "--capture says nothing to --to avmsf-demo, only to web, gltf: leave it out" in refused(words, capsys)
-    words = [field, "--to", "faust", "--output", str(tmp_path / "b.dsp"), "--rate", "8000"]
-    assert "--rate says nothing to --to faust, only to the demo's folders" in refused(words, capsys)
     trimesh.creation.box(SIDES).export(tmp_path / "box.ply")
     words = [field, "--to", "avmsf-demo", "--output", out, "--object", str(tmp_path / "box.ply")]
     assert "expected a .ply of Gaussians, which the demo shows, found another object" in refused(words, capsys)
     assert not (tmp_path / "out").exists()
     (tmp_path / "a.dsp").write_text("theirs")
     words = [field, "--to", "faust", "--output", str(tmp_path / "a.dsp"), "--points", "3"]
-    assert "add --force" in refused(words, capsys)
-    assert main(["export", *words, "--force"]) == 0
+    assert "add --overwrite" in refused(words, capsys)
+    assert main(["export", *words, "--overwrite"]) == 0
+
+
+def test_an_option_that_a_format_does_not_use_is_noted(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    words = ["export", str(field_file), "--to", "faust", "-o", str(tmp_path / "a.dsp"), "--points", "3", "--quiet"]
+    assert main([*words, "--rate", "8000", "--seconds", "1"]) == 0
+    notes = [line for line in capsys.readouterr().err.splitlines() if "is not used by --to faust" in line]
+    assert [line.split()[1] for line in notes] == ["--seconds", "--rate"]
 
 
 def test_a_captures_surface_is_shown(field_file: Path, tmp_path: Path) -> None:

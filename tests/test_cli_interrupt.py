@@ -97,5 +97,5 @@ def test_an_interruption_as_training_begins_keeps_the_modes(
         patched.setattr(kept, "extract_modes", refuse)
         # The modes that are kept are this method's alone.
         with pytest.raises(AssertionError, match="sought again"):
-            main([*words, "--method", "short-time"])
+            main([*words, "--extraction", "short-time"])
         assert main(words) == 0

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from avmsf.capture import CaptureSettings
 from avmsf.cli import main
-from avmsf.cli.locate import Options, parse, run
 from avmsf.cli.locate import _settings as settings_asked
+from avmsf.cli.locate import run
+from avmsf.cli.options.locate import Options, parse
 from avmsf.errors import AvmsfError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
@@ -98,7 +99,7 @@ def test_a_surer_region_is_larger(place: Place, capsys: Streams) -> None:
     hit = place.wav("sure.wav", place.blow(STRUCK))
     shares = []
     for level in ("0.5", "0.999"):
-        printed, _ = located([place.field, hit, "--level", level], capsys)
+        printed, _ = located([place.field, hit, "--probability", level], capsys)
         shares.append((printed["blows"][0]["region"]["share"], printed["blows"][0]["region"]["radius_metres"]))
     assert shares[0][0] < shares[1][0]
     assert shares[0][1] < shares[1][1]
@@ -235,7 +236,7 @@ def test_what_cannot_be_done_is_said_in_one_line(place: Place, tmp_path: Path, c
         (place.field,): "expected one recording or more",
         (place.field, str(tmp_path / "nowhere.wav")): "there is no such file",
         (place.field, str(tmp_path)): "is a folder; expected one sound file in it",
-        (place.field, hit, "--level", "1.5"): "--level is 1.5; expected a probability between 0 and 1",
+        (place.field, hit, "--probability", "1.5"): "--probability is 1.5; expected a value between 0 and 1",
         (place.field, hit, "--output", str(tmp_path / "file")): "is a file",
         (place.field, hit, "--capture", str(tmp_path / "nowhere")): "expected a capture folder",
         (hit, hit): "a file of another kind",

@@ -15,7 +15,7 @@ from avmsf.modal.residual import Residual
 from made_fields import BANK, positional
 
 PLACE = torch.tensor([[0.05, 0.03, 0.002]], dtype=torch.float64)
-AT = ("--at", "0.05", "0.03", "0.002")
+AT = ("--position", "0.05", "0.03", "0.002")
 
 
 def sounding() -> SoundField:
@@ -51,11 +51,11 @@ def test_a_much_softer_blow_says_by_how_much(path: Path, capsys: pytest.CaptureF
     assert below > 20.5
     assert said == (
         f"note: with a contact of 12 ms the sound peaks {below:.0f} dB lower than that of the recorded blow, and no "
-        "level was changed: add --normalise peak or --level-db, or a shorter --contact-time\n"
+        "level was changed: add --normalize peak or --level-db, or a shorter --contact-time\n"
     )
 
 
-@pytest.mark.parametrize("words", [("0.0005",), ("0.012", "--normalise", "peak"), ("0.012", "--level-db", "12")])
+@pytest.mark.parametrize("words", [("0.0005",), ("0.012", "--normalize", "peak"), ("0.012", "--level-db", "12")])
 def test_no_more_is_said_of_a_little_softer_blow_and_of_a_level_that_was_chosen(
     path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
 ) -> None:

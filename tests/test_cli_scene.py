@@ -13,9 +13,9 @@ from avmsf.bench.clouds import save_turntable
 from avmsf.capture import Surface
 from avmsf.capture.surface import write_surface
 from avmsf.capture.views.write import write_views
-from avmsf.cli import main, view_cloud
+from avmsf.cli import infoclouds, main
+from avmsf.cli.info import describe
 from avmsf.cli.scenebar import SceneBar
-from avmsf.cli.show import describe
 from avmsf.field.store import load
 from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.ply import read_splats
@@ -72,7 +72,7 @@ def test_pictures_and_blows_become_a_field_on_gaussians(kept: Path) -> None:
     made = describe(field)["pipeline"]
     assert (made["method"], made["gain_model"]) == ("high-resolution", "network")
     assert made["encoder"] in features.encoder
-    assert (made["scene"]["splat"]["steps"], made["scene"]["lift"]["encoder"]) == (60, "descriptors")
+    assert (made["scene"]["splat"]["steps"], made["scene"]["features"]["encoder"]) == (60, "descriptors")
     assert made["fit"] == asdict(field.origin.config)
     # The slab's box, widened by the reach of Gaussians that its pictures of 48 pixels leave unsure: a pixel is 9 mm.
     a, b, c = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
@@ -105,7 +105,9 @@ def test_a_changed_picture_makes_everything_anew(capture: Path, kept: Path, tmp_
     first, second = pictures[0].read_bytes(), pictures[1].read_bytes()
     pictures[0].write_bytes(second)
     pictures[1].write_bytes(first)
-    assert main(["lift", str(changed), "--cache", str(cache), *SMALL_SPLAT, "--encoder", "descriptors", "--json"]) == 0
+    assert (
+        main(["features", str(changed), "--cache", str(cache), *SMALL_SPLAT, "--encoder", "descriptors", "--json"]) == 0
+    )
     capsys.readouterr()
     assert (cache / "views" / "images" / pictures[0].name).read_bytes() != (
         kept / "views" / "images" / pictures[0].name
@@ -146,7 +148,7 @@ def test_a_mesh_is_the_object_itself(tmp_path: Path, capsys: Streams) -> None:
     folder.mkdir()
     write_surface_file(folder)
     output = tmp_path / "features.safetensors"
-    words = ["lift", str(folder), "--encoder", "descriptors", "--points", "700", *RENDERED]
+    words = ["features", str(folder), "--encoder", "descriptors", "--points", "700", *RENDERED]
     assert main([*words, "--output", str(output)]) == 0
     capsys.readouterr()
     features, report = load_features(output), read_report(output)
@@ -165,7 +167,7 @@ def test_gaussians_made_elsewhere_are_looked_at_from_all_sides(kept: Path, tmp_p
     folder = tmp_path / "slab"
     folder.mkdir()
     shutil.copy(kept / "cloud.ply", folder / "splats.ply")
-    assert main(["lift", str(folder), "--encoder", "descriptors", *RENDERED]) == 0
+    assert main(["features", str(folder), "--encoder", "descriptors", *RENDERED]) == 0
     out, _ = capsys.readouterr()
     assert "features: descriptors" in out
     features = load_features(folder / ".avmsf" / "features.safetensors")
@@ -184,9 +186,9 @@ def test_features_serve_the_fit_of_another_command(kept: Path, capture: Path, tm
 def test_clouds_and_features_are_drawn(
     kept: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(view_cloud, "save_turntable", partial(save_turntable, frames=3))
-    assert main(["view-cloud", str(kept / "cloud.ply"), "--output", str(tmp_path / "a")]) == 0
-    words = ["view-cloud", str(kept / "features.safetensors"), "--cloud", str(kept / "cloud.ply"), "--clusters", "8"]
+    monkeypatch.setattr(infoclouds, "save_turntable", partial(save_turntable, frames=3))
+    assert main(["info", str(kept / "cloud.ply"), "--plots", str(tmp_path / "a")]) == 0
+    words = ["info", str(kept / "features.safetensors"), "--cloud", str(kept / "cloud.ply"), "--clusters", "8"]
     assert main([*words, "--output", str(tmp_path / "b")]) == 0
     out, _ = capsys.readouterr()
     assert "features: descriptors" in out
@@ -199,7 +201,7 @@ def test_two_photographs_are_too_few(capture: Path, tmp_path: Path, capsys: Stre
     shutil.copytree(capture / "images", folder / "images")
     for extra in sorted((folder / "images").iterdir())[2:]:
         extra.unlink()
-    assert main(["lift", str(folder), "--encoder", "descriptors"]) == 2
+    assert main(["features", str(folder), "--encoder", "descriptors"]) == 2
     assert "expected 3 photographs or more, found 2" in capsys.readouterr().err
 
 
@@ -219,7 +221,7 @@ def test_a_folder_without_any_look_is_refused_by_lift_and_fitted_in_a_box_by_rec
     tmp_path: Path, capsys: Streams
 ) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
-    assert main(["lift", str(folder), "--encoder", "descriptors"]) == 2
+    assert main(["features", str(folder), "--encoder", "descriptors"]) == 2
     assert "expected photographs" in capsys.readouterr().err
     assert main(["reconstruct", str(folder), *FIT, *MODES]) == 0
     assert "shows nothing of the object" in capsys.readouterr().err

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from avmsf.cli import suggest as command
-from avmsf.cli.suggest import parse, run
+from avmsf.cli.options.suggest import parse
+from avmsf.cli.suggest import run
 from avmsf.errors import AvmsfError
 from avmsf.field.store import save
 from believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field

@@ -9,8 +9,9 @@ import torch
 
 from avmsf.errors import EditError
 from avmsf.tasks.clips import level, levelled
-from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, DistillationConfig, noised, partial_denoising
-from avmsf.tasks.steer import Guide, SteerConfig, steer
+from avmsf.tasks.config import DistillationConfig, SteerConfig
+from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, noised, partial_denoising
+from avmsf.tasks.steer import Guide, steer
 from ringing_field import RATE, ringing_field, sound_of
 
 HOP = 8

@@ -44,7 +44,7 @@ from avmsf.modal.synthesis import synthesise
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
 from avmsf.simulate.material import GLASS, MATERIALS, STEEL, WOOD
-from avmsf.tasks.distillation import DistillationConfig
+from avmsf.tasks.config import DistillationConfig
 from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio

@@ -12,7 +12,8 @@ from avmsf.capture.views import read_views
 from avmsf.geometry.closest import ClosestPoints
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
-from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER, example_mesh
+from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
+from avmsf.simulate.examplemesh import example_mesh
 from avmsf.simulate.truth import read_truth
 
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from avmsf.errors import FitError
-from avmsf.field.attention import AttentionGains, AttentionShape, encode
+from avmsf.field.attention import AttentionGains, encode
+from avmsf.field.config import AttentionShape
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import cluster
 

@@ -21,7 +21,8 @@ from avmsf.bench.metrics import (
     validate,
 )
 from avmsf.errors import EvaluationError
-from avmsf.modal.spectra import magnitude_stft, scaled_fft_size
+from avmsf.modal.config import scaled_fft_size
+from avmsf.modal.spectra import magnitude_stft
 from corpus import make as corpus
 
 RATE = 24000.0

@@ -12,11 +12,9 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.views.write import write_views
 from avmsf.errors import SceneError
-from avmsf.pipeline.config import PRESETS
-from avmsf.pipeline.features import LiftConfig
+from avmsf.pipeline.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.objectlooks import ObjectLooks
-from avmsf.pipeline.scene import SceneConfig
-from avmsf.pipeline.sources import ViewsConfig, find_source
+from avmsf.pipeline.sources import find_source
 from avmsf.scene.features import FeatureField
 from avmsf.scene.ply import read_splats
 from avmsf.scene.splatconfig import SplatConfig

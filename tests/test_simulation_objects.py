@@ -17,8 +17,7 @@ from avmsf.capture.texturedmesh import TexturedMesh, read_textured_mesh
 from avmsf.capture.views.read import read_views
 from avmsf.cli import simulate
 from avmsf.errors import SimulationError
-from avmsf.simulate.imperfections import Imperfections
-from avmsf.simulate.recipe import ObjectRecipe, key_of
+from avmsf.simulate.recipe import Imperfections, ObjectRecipe, key_of
 from avmsf.simulate.sim20 import sim20_recipe
 from avmsf.simulate.simulation import Simulation, simulate_object
 from avmsf.simulate.simulationfolder import is_written, write_simulation, write_textured

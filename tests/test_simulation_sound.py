@@ -12,10 +12,11 @@ import scipy.signal
 import torch
 
 from avmsf.errors import SimulationError
-from avmsf.simulate.hammer import Hammer, contact_times, peak_forces, pulse_spectrum
-from avmsf.simulate.imperfections import Imperfections, damping_matrix, smooth_field, stream, support_places
+from avmsf.simulate.hammer import contact_times, peak_forces, pulse_spectrum
+from avmsf.simulate.imperfections import damping_matrix, smooth_field, stream, support_places
 from avmsf.simulate.material import CERAMIC, STEEL, WOOD
 from avmsf.simulate.radiation import AIR_DENSITY, SOUND_SPEED, radiated
+from avmsf.simulate.recipe import Hammer, Imperfections
 from avmsf.simulate.ringing import ring
 from avmsf.simulate.roomnoise import room_noise
 from avmsf.simulate.soundingbody import SoundingBody

@@ -13,13 +13,14 @@ import pytest
 import torch
 
 from avmsf.errors import EditError
-from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, DistillationConfig, partial_denoising
+from avmsf.tasks.config import STABLE_AUDIO, DistillationConfig, SteerConfig
+from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, partial_denoising
 from avmsf.tasks.modaledit import ModalEdit, Struck
 from avmsf.tasks.parameters import HIERARCHICAL
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
-from avmsf.tasks.stableaudiofiles import STABLE_AUDIO, _expect_weights
-from avmsf.tasks.steer import SteerConfig, SteerProgress, steer
+from avmsf.tasks.stableaudiofiles import _expect_weights
+from avmsf.tasks.steer import SteerProgress, steer
 from made_audio import DIM, FRAMES, RATE, save_audio, tiny_pipeline
 from ringing_field import ringing_field, sound_of
 

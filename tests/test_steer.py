@@ -8,11 +8,12 @@ import torch
 
 from avmsf.errors import EditError
 from avmsf.tasks.clips import level
+from avmsf.tasks.config import SteerConfig
 from avmsf.tasks.modaledit import ModalEdit
 from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, PUBLISHED, SEARCHED
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.retune import retune
-from avmsf.tasks.steer import Guide, SteerConfig, steer
+from avmsf.tasks.steer import Guide, steer
 from ringing_field import RATE, SameGains, ringing_field, sound_of
 
 QUICK = SteerConfig(steps=12, contacts=2, preview_every=5, seconds=0.25, fft_sizes=(2048, 512))

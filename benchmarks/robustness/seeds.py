@@ -15,7 +15,8 @@ import trimesh
 from torch import Tensor
 
 from avmsf.capture import Surface
-from avmsf.field.attention import AttentionGains, AttentionShape
+from avmsf.field.attention import AttentionGains
+from avmsf.field.config import AttentionShape
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture

@@ -93,7 +93,3 @@ class ExportError(AvmsfError):
 
 class StudioError(AvmsfError):
     """The page's server cannot start, or was asked for what it does not do."""
-
-
-class PlayerError(AvmsfError):
-    """No sound can be played here, or not as asked."""

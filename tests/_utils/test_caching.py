@@ -16,7 +16,8 @@ from avmsf.compiled import compiled
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.store import load
 from avmsf.files import write_whole
-from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
+from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import BodyConfig
 from plate_capture import TINY, fill_plate
 
 Streams = pytest.CaptureFixture[str]

@@ -16,13 +16,11 @@ from avmsf.cli.demo import verdict, wall_words
 from avmsf.cli.overallbar import REFINEMENT, OverallBar
 from avmsf.field.fit import Progress
 from avmsf.field.store import load
-from avmsf.pipeline.config import PipelineConfig
-from avmsf.pipeline.features import LiftConfig
-from avmsf.pipeline.scene import SceneConfig
-from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.scene.ply import read_splats
 from avmsf.scene.splatconfig import SplatConfig
-from avmsf.simulate.example import EXAMPLE, example_mesh
+from avmsf.simulate.example import EXAMPLE
+from avmsf.simulate.examplemesh import example_mesh
 from plate_field import QUICK
 
 METHODS = {

@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 
 from avmsf.bench.clap import Clap
 from avmsf.cli import edit, main, steering
-from avmsf.cli.edit import parse, run
+from avmsf.cli.edit import run
+from avmsf.cli.options.edit import parse
 from avmsf.errors import AvmsfError
 from avmsf.field.store import load, save
 from avmsf.tasks.edits import EDITS
@@ -37,7 +38,7 @@ def test_the_curve_is_stored_drawn_and_shown(
     drawn: dict[str, Figure] = {}
     monkeypatch.setattr(edit, "save_picture", lambda figure, path: drawn.update({path.name: figure}))
     output, folder = tmp_path / "new.safetensors", tmp_path / "look"
-    assert run(parse([*words, "--output", str(output), "--pictures", str(folder)])) == 0
+    assert run(parse([*words, "--output", str(output), "--plots", str(folder)])) == 0
     new, clap = load(output), Clap.load(tmp_path / "clap")
     curve = new.origin.report[EDITS][-1]["clap"]
     assert curve["steps"] == [0, 2, 4, 5]
@@ -50,7 +51,7 @@ def test_the_curve_is_stored_drawn_and_shown(
     assert np.asarray(axes.lines[0].get_xydata()) == pytest.approx(np.array([curve["steps"], curve["scores"]]).T)
     assert not list(tmp_path.glob("new.safetensors.*"))
     capsys.readouterr()
-    assert main(["show", str(output)]) == 0
+    assert main(["info", str(output)]) == 0
     assert f"CLAP score {curve['scores'][0]:.3f} to {curve['scores'][-1]:.3f}" in capsys.readouterr().out
 
 

@@ -27,7 +27,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], object]], int
             return 0
 
         monkeypatch.setattr(check, "run", stand_in)
-        return main(["check", "folder"])
+        return main(["check", "."])
 
     return run
 

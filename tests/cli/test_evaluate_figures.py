@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 
 from avmsf.bench import report
 from avmsf.bench.results import ResultsFolder
-from avmsf.cli.evaluate import parse, run
+from avmsf.cli.evaluate import run
+from avmsf.cli.options.evaluate import parse
 from plate_set import RATE, fill_plates
 
 CHEAP = ("--methods", "knn3,nearest", "--no-cdpam")

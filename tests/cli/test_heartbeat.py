@@ -37,7 +37,7 @@ def run_check(act: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> None:
         return 0
 
     monkeypatch.setattr(check, "run", stand_in)
-    assert main(["check", "folder"]) == 0
+    assert main(["check", "."]) == 0
 
 
 @pytest.mark.usefixtures("fast")

@@ -17,7 +17,7 @@ VERBS = {
     "fit": ["OUT.safetensors"],
     "splat": ["OUT.ply"],
     "surface": ["OUT.ply"],
-    "lift": ["OUT.safetensors"],
+    "features": ["OUT.safetensors"],
     "reconstruct": ["OUT.safetensors"],
 }
 

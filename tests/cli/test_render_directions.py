@@ -34,7 +34,7 @@ def test_directions_of_a_table_are_rendered(path: Path, tmp_path: Path) -> None:
         for number, (place, way) in enumerate(zip(PLACES.tolist(), DIRECTIONS.tolist(), strict=True))
     ]
     (tmp_path / "impacts.csv").write_text("\n".join(["file,x,y,z,nx,ny,nz", *rows]) + "\n")
-    table = ("--contacts", str(tmp_path / "impacts.csv"))
+    table = ("--contact-table", str(tmp_path / "impacts.csv"))
     assert main(["render", str(path), *table, "--output", str(tmp_path / "all")]) == 0
     expected = sounding().render(PLACES, directions=DIRECTIONS)
     for number, sound in enumerate(expected):
@@ -44,13 +44,13 @@ def test_directions_of_a_table_are_rendered(path: Path, tmp_path: Path) -> None:
 
 
 def test_the_direction_of_a_contact_is_rendered(path: Path, tmp_path: Path) -> None:
-    words = ["--at", "0.05", "0.03", "0.002", "--direction", "0", "0", "1", "--output", str(tmp_path / "up.wav")]
+    words = ["--position", "0.05", "0.03", "0.002", "--direction", "0", "0", "1", "--output", str(tmp_path / "up.wav")]
     assert main(["render", str(path), *words]) == 0
     expected = sounding().render(PLACES[1:2], directions=DIRECTIONS[1:2])[0]
     assert np.array_equal(soundfile.read(tmp_path / "up.wav", dtype="float32")[0], expected.numpy())
 
 
 def test_directions_and_contacts_are_as_many(path: Path, tmp_path: Path) -> None:
-    words = ["--at", "0.05", "0.03", "0.002", *(["--direction", "0", "0", "1"] * 2)]
+    words = ["--position", "0.05", "0.03", "0.002", *(["--direction", "0", "0", "1"] * 2)]
     assert main(["render", str(path), *words, "--output", str(tmp_path / "up.wav")]) == 2
     assert not (tmp_path / "up.wav").exists()

@@ -93,6 +93,6 @@ def test_the_picture_is_written_beside_the_surface_and_with_a_field(tmp_path: Pa
     contacts = bar_contacts(6)
     for name, made in (("with", elastic_field), ("without", positional_field)):
         save(sound_field(made(contacts, drawn_gains(contacts, seed=1))), tmp_path / f"{name}.safetensors")
-        assert main(["show", str(tmp_path / f"{name}.safetensors"), "--output", str(tmp_path / name)]) == 0
+        assert main(["info", str(tmp_path / f"{name}.safetensors"), "--output", str(tmp_path / name)]) == 0
     assert (tmp_path / "with" / "surface.png").is_file()
     assert not (tmp_path / "without" / "surface.png").exists()

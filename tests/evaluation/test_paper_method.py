@@ -12,8 +12,9 @@ from avmsf.bench.task import Task
 from avmsf.cli.evaluate import settled_lifts
 from avmsf.errors import SceneError
 from avmsf.modal.extraction.finders import ShortTime
-from avmsf.pipeline.config import PRESETS
-from avmsf.pipeline.features import DESCRIPTORS, DINO, DinoEncoder, LiftConfig
+from avmsf.pipeline.config import DESCRIPTORS, DINO, PRESETS, LiftConfig
+from avmsf.pipeline.features import DinoEncoder
+from avmsf.pipeline.record import finder_of
 from plate_field import QUICK, plate_features, plate_impacts
 
 PAPER = METHODS["paper"]
@@ -22,7 +23,11 @@ PAPER = METHODS["paper"]
 def test_the_method_is_the_preset_with_one_damping() -> None:
     preset = PRESETS["paper"]
     assert isinstance(PAPER, FieldMethod)
-    assert (PAPER.config, PAPER.finder, PAPER.look) == (replace(preset.fit, damping="shared"), preset.finder, "paper")
+    assert (PAPER.config, PAPER.finder, PAPER.look) == (
+        replace(preset.fit, damping="shared"),
+        finder_of(preset),
+        "paper",
+    )
 
 
 def test_a_method_may_find_modes_in_its_own_way() -> None:

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from avmsf.bench.cases import Choosing, Closest, Farthest, LeaveOneOut, Places, Shots
-from avmsf.bench.efficiency import Growing
+from avmsf.bench.cases import Choosing, Closest, Farthest, Growing, LeaveOneOut, Places, Shots
 from avmsf.bench.evaluation import split
 from avmsf.capture import CaptureSettings, CaptureWarning, read_capture
 from avmsf.capture.impacts import Impacts

@@ -179,7 +179,7 @@ def test_another_ending_and_anothers_file_are_refused(tmp_path):
     with pytest.raises(ExportError, match=r"ends in \.glb, found '\.obj'"):
         write_gltf(table(), tmp_path / "thing.obj")
     (tmp_path / "theirs.glb").write_bytes(b"glTF of someone else")
-    with pytest.raises(ExportError, match="add --force"):
+    with pytest.raises(ExportError, match="add --overwrite"):
         write_gltf(table(), tmp_path / "theirs.glb")
     assert (tmp_path / "theirs.glb").read_bytes() == b"glTF of someone else"
     write_gltf(table(), tmp_path / "theirs.glb", force=True)

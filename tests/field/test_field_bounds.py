@@ -72,7 +72,7 @@ def test_no_sound_that_is_not_finite_is_written(tmp_path: Path) -> None:
 def test_render_writes_finite_sounds_or_none(tmp_path: Path, words: tuple[str, ...], code: int) -> None:
     save(replace(field(), residual=Residual(torch.full((9,), 1e6))), tmp_path / "x.safetensors")
     output = tmp_path / "x.wav"
-    place = ("--at", "0.01", "0.02", "0.002", "--output", str(output))
+    place = ("--position", "0.01", "0.02", "0.002", "--output", str(output))
     assert main(["render", str(tmp_path / "x.safetensors"), *place, *words]) == code
     assert output.exists() == (code == 0)
     if code == 0:

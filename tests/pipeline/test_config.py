@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 
 from avmsf.capture import CaptureSettings
-from avmsf.cli.fit import parse as parse_fit
-from avmsf.cli.reconstruct import parse as parse_reconstruct
+from avmsf.cli.options.fit import parse as parse_fit
+from avmsf.cli.options.reconstruct import parse as parse_reconstruct
 from avmsf.field.config import FitConfig
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.config import PRESETS, PipelineConfig
+from avmsf.pipeline.record import capture_settings_of, finder_of
 
 PUBLISHED = ("warmup_gains", "warmup_weights", "spectral_norm", "residual_start", "projection")
 """Settings that were made for the paper's values."""
@@ -24,7 +25,7 @@ def test_the_default_preset_is_the_default() -> None:
 
 def test_the_paper_preset_deviates_nowhere_that_there_is_a_switch_for() -> None:
     paper, usual = PRESETS["paper"], FitConfig()
-    assert paper.finder == ShortTime(modes=128)
+    assert finder_of(paper) == ShortTime(modes=128)
     assert paper.gain_model == "network"
     assert all(getattr(paper.fit, name) != getattr(usual, name) for name in PUBLISHED)
     assert (paper.fit.clusters, paper.fit.learning_rate, paper.fit.steps, paper.fit.early_weight) == (
@@ -49,14 +50,14 @@ def test_commands_start_from_the_preset_and_change_what_is_said() -> None:
     assert (mixed.fit.steps, mixed.fit.clusters) == (7, 256)
     assert (mixed.scene.lift.encoder, mixed.scene.lift.onto) == ("descriptors", "gaussians")
     fitted = parse_fit(["mug", "--output", "mug.safetensors", "--preset", "paper"])
-    assert (fitted.config, fitted.method, fitted.gain_model) == (PRESETS["paper"].fit, "short-time", "network")
+    assert (fitted.config, fitted.extraction, fitted.gain_model) == (PRESETS["paper"].fit, "short-time", "network")
 
 
 def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:
     own = CaptureSettings(seconds=1.0, time_zero="peak")
-    assert PipelineConfig().capture_settings(own) == own
-    assert PRESETS["paper"].capture_settings(replace(own, time_zero="onset")) == own
-    assert parse_fit(["mug", "--output", "f", "--time-zero", "onset"]).pipeline.capture_settings(own) == replace(
+    assert capture_settings_of(PipelineConfig(), own) == own
+    assert capture_settings_of(PRESETS["paper"], replace(own, time_zero="onset")) == own
+    assert capture_settings_of(parse_fit(["mug", "--output", "f", "--time-zero", "onset"]).pipeline, own) == replace(
         own, time_zero="onset"
     )
 

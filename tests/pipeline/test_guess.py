@@ -17,7 +17,7 @@ from avmsf.export import SampledField
 from avmsf.fem.radiation import radiated_pressure
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
-from avmsf.pipeline.bodies import BodyConfig
+from avmsf.pipeline.config import BodyConfig
 from avmsf.pipeline.guess import guess_field, known_surface
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.material import STEEL

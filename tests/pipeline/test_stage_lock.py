@@ -40,7 +40,7 @@ def held(folder: Path) -> Iterator[None]:
         thread.join()
 
 
-@pytest.mark.parametrize("verb", ["splat", "lift"])
+@pytest.mark.parametrize("verb", ["splat", "features"])
 def test_a_command_is_refused_while_another_one_makes_stages(verb: str, tmp_path: Path, capsys: Streams) -> None:
     trimesh.creation.icosphere(subdivisions=1, radius=0.05).export(tmp_path / "surface.ply")
     with held(tmp_path / CACHE):

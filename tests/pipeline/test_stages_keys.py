@@ -21,8 +21,8 @@ from avmsf.field.recipes import fingerprint, gain_case
 from avmsf.field.store import load
 from avmsf.pipeline import reconstruct as module
 from avmsf.pipeline import stages
-from avmsf.pipeline.bodies import BodyConfig, candidate_bodies
-from avmsf.pipeline.config import PipelineConfig
+from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import BodyConfig, PipelineConfig
 from avmsf.pipeline.scene import Listener
 from avmsf.pipeline.stages import StageFolder
 from avmsf.simulate import nominal, recipe

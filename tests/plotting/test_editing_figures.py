@@ -14,7 +14,7 @@ from avmsf.bench.editmethods import towards_words
 from avmsf.bench.edittasks import EditTask
 from avmsf.bench.modefeatures import Pitches
 from avmsf.bench.modespace import MaterialSpace
-from avmsf.tasks.distillation import DistillationConfig
+from avmsf.tasks.config import DistillationConfig
 from made_clap import save_clap
 from test_editing import QUICK, Speaker, flat_space, struck
 

@@ -46,7 +46,7 @@ def test_a_verb_that_runs_out_of_memory_or_depth_refuses_nothing(
         raise error
 
     monkeypatch.setattr(check, "run", fail)
-    result, message = files.outcome_of(lambda: files.run_verb("check", "folder"))
+    result, message = files.outcome_of(lambda: files.run_verb("check", "."))
     assert (result, message.split(":")[0]) == ("traceback", type(error).__name__)
 
 

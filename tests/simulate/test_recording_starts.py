@@ -12,11 +12,11 @@ import torch
 from avmsf.capture import read_capture
 from avmsf.capture.audio import read_sound
 from avmsf.capture.onset import find_onset
-from avmsf.simulate.hammer import Hammer, contact_times, pulse_spectrum
-from avmsf.simulate.imperfections import Imperfections, recording_starts, stream
+from avmsf.simulate.hammer import contact_times, pulse_spectrum
+from avmsf.simulate.imperfections import recording_starts, stream
 from avmsf.simulate.material import CERAMIC
 from avmsf.simulate.radiation import SOUND_SPEED, travel_time
-from avmsf.simulate.recipe import ObjectRecipe
+from avmsf.simulate.recipe import Hammer, Imperfections, ObjectRecipe
 from avmsf.simulate.ringing import recorded, ring
 from avmsf.simulate.simulation import Simulation, simulate_object
 from avmsf.simulate.simulationfolder import write_simulation

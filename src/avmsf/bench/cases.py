@@ -17,6 +17,11 @@ from avmsf.errors import EvaluationError
 from avmsf.scene.points import closest_points, farthest_points
 from avmsf.wording import counted
 
+COUNTS = (3, 4, 6, 8, 12, 16, 24, 32, 48)
+"""Numbers of places learnt from, where no others are asked for."""
+_LEFT = 0.25
+"""Part of the places that is kept to be judged by, where counts are not asked for."""
+
 
 @dataclass(frozen=True)
 class Case:
@@ -106,6 +111,66 @@ class Shots:
         test = places.case("", order).test
         cases = [places.case(f"{count} shots" if count > 1 else "1 shot", order[:count]) for count in counts]
         return tuple(Case(case.label, case.train, test) for case in cases)
+
+
+@dataclass(frozen=True)
+class Growing:
+    """More and more places to learn from, spread as far apart as they go, from several first ones.
+
+    Each choice holds the smaller ones of its start, and all of a start are judged by the same places: those that the
+    largest leaves over.
+    """
+
+    counts: tuple[int, ...] = ()
+    """Numbers of places to learn from; of `COUNTS` those that leave a quarter to judge by, where there is none."""
+    starts: int = 3
+    """First places, spread evenly over the table."""
+
+    def __post_init__(self) -> None:
+        if any(count < 1 for count in self.counts):
+            raise EvaluationError(f"expected numbers of places of 1 or more, got {list(self.counts)}")
+        if self.starts < 1:
+            raise EvaluationError(f"starts = {self.starts}: expected 1 or more")
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return a case for each start and number. Raises EvaluationError where a number leaves nothing to judge by."""
+        places = Places.of(impacts)
+        total = len(places.rows)
+        counts = self._counts(total)
+        firsts = dict.fromkeys(round(number * total / self.starts) for number in range(self.starts))
+        orders = {first: farthest_points(places.contacts, max(counts), start=first).tolist() for first in firsts}
+        tests = {first: places.case("", order).test for first, order in orders.items()}
+        return tuple(
+            Case(
+                label_of(count),
+                places.case("", order[:count]).train,
+                tests[first],
+                fold=f"from {impacts.names[places.rows[first][0]]}",
+            )
+            for count in counts
+            for first, order in orders.items()
+        )
+
+    def _counts(self, places: int) -> tuple[int, ...]:
+        if not self.counts:
+            counts = tuple(count for count in COUNTS if count <= (1.0 - _LEFT) * places)
+            if counts:
+                return counts
+            raise EvaluationError(
+                f"expected more places than {places} to learn from {min(COUNTS)} and be judged by a quarter: record "
+                "more, or name the numbers of places"
+            )
+        if max(self.counts) >= places:
+            raise EvaluationError(
+                f"expected fewer places to learn from than all {places}, got {max(self.counts)}: ask for {places - 1} "
+                "at most"
+            )
+        return tuple(sorted(set(self.counts)))
+
+
+def label_of(count: int) -> str:
+    """Return what a number of places is called."""
+    return counted(count, "place")
 
 
 @dataclass(frozen=True)

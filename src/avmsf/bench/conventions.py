@@ -23,7 +23,7 @@ from avmsf.bench.metrics import (
     spectrogram_distance,
 )
 from avmsf.errors import EvaluationError
-from avmsf.modal.spectra import scaled_fft_size
+from avmsf.modal.config import scaled_fft_size
 
 
 class Convention(ABC):

@@ -32,11 +32,11 @@ from avmsf.modal.residual import Residual
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import farthest_points
 from avmsf.simulate.elastic import ElasticModes, elastic_modes
-from avmsf.simulate.hammer import Hammer
 from avmsf.simulate.imperfections import stream
 from avmsf.simulate.material import MATERIALS, Material
 from avmsf.simulate.nominal import NominalBodies, NominalBody
 from avmsf.simulate.radiation import radiated
+from avmsf.simulate.recipe import Hammer
 from avmsf.simulate.ringing import ring
 from avmsf.simulate.shapes import make_shape
 from avmsf.simulate.simulation import HIGHEST

@@ -20,10 +20,11 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_sounds
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.simulate.material import MATERIALS
-from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, DistillationConfig
+from avmsf.tasks.config import DistillationConfig, SteerConfig
+from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation
 from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, SEARCHED, Parameterisation
 from avmsf.tasks.recast import recast
-from avmsf.tasks.steer import Guide, SteerConfig, SteerProgress, steer
+from avmsf.tasks.steer import Guide, SteerProgress, steer
 
 GENERATED = 3.0
 """Seconds of a sound that is made from words alone."""

@@ -11,7 +11,8 @@ from matplotlib.ticker import StrMethodFormatter
 from torch import Tensor
 
 from avmsf.field.soundfield import SoundField
-from avmsf.modal.spectra import magnitude_stft, scaled_fft_size
+from avmsf.modal.config import scaled_fft_size
+from avmsf.modal.spectra import magnitude_stft
 
 _INK, _ACCENT = "#1f3b5c", "#c8502d"
 _RANGE_DB = 80.0

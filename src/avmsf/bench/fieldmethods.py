@@ -6,9 +6,9 @@ import torch
 
 from avmsf.bench.task import Look, Task
 from avmsf.capture.impacts import Impacts
-from avmsf.field.config import FitConfig
+from avmsf.field.config import FitConfig, GainModel
 from avmsf.field.fit import fit
-from avmsf.field.gains.estimator import GainModel, estimator_for
+from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_sounds

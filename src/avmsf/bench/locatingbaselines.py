@@ -9,7 +9,7 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
-from avmsf.modal.spectra import scaled_fft_size
+from avmsf.modal.config import scaled_fft_size
 
 _FFT_SIZE = 4096
 """Samples of a Hann window at 44.1 and 48 kHz: its bins part modes some twenty hertz apart."""

@@ -25,14 +25,8 @@ from scipy.signal import resample_poly
 from torch import Tensor
 
 from avmsf.errors import EvaluationError
-from avmsf.modal.spectra import (
-    envelope,
-    htk_filters,
-    log_mel,
-    magnitude_stft,
-    scaled_fft_size,
-    slaney_filters,
-)
+from avmsf.modal.config import scaled_fft_size
+from avmsf.modal.spectra import envelope, htk_filters, log_mel, magnitude_stft, slaney_filters
 
 # Shapes that differ are what `validate` explains, so the annotations leave them open.
 Sounds = Float[Tensor, "..."]

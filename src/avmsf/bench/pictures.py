@@ -19,7 +19,8 @@ from avmsf.bench.evaluation import Scores
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.spectra import magnitude_stft, scaled_fft_size
+from avmsf.modal.config import scaled_fft_size
+from avmsf.modal.spectra import magnitude_stft
 
 FORMATS = ("png", "pdf", "svg")
 _RANGE_DB = 80.0

@@ -3,7 +3,7 @@
 import difflib
 from dataclasses import dataclass
 
-from avmsf.bench.cases import Choosing, Closest, Farthest, FewerViews, LeaveOneOut, Shots
+from avmsf.bench.cases import Choosing, Closest, Farthest, FewerViews, Growing, LeaveOneOut, Shots
 from avmsf.errors import EvaluationError
 
 BASELINE = "knn3"
@@ -25,6 +25,19 @@ _TABLE = (
     "field-elastic",
     "field-auto",
 )
+LEARNING_CURVE = "learning-curve"
+_CURVES = (
+    BASELINE,
+    "knn3-directions",
+    "knn-gains",
+    "spline-gains",
+    "field-positions",
+    "field-smooth",
+    "field-elastic",
+    "field-auto",
+)
+"""Methods that take part, where no others are asked for: those that need no pictures of the object. All but
+the network, `field-positions`, take seconds for each figure."""
 _ABLATED = ("field-positions", "field-no-initialisation", "field-unaligned", "field-no-residual")
 
 
@@ -66,6 +79,13 @@ PROTOCOLS = {
             "Train on 16, 8, 4, 2 and 1 places, each choice within the one before; test on the same others.",
             Shots(),
             subset="ablation",
+        ),
+        EvaluationProtocol(
+            LEARNING_CURVE,
+            "Train on more and more contacts, spread as far apart as possible; test on those that the most leave over.",
+            Growing(),
+            _CURVES,
+            metrics=("l1", "l1_log", "envelope", *OWN_METRICS),
         ),
         EvaluationProtocol(
             "views",

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
-from avmsf.modal.spectra import scaled_fft_size
+from avmsf.modal.config import scaled_fft_size
 from avmsf.scene.points import nearest_points
 
 

@@ -2,56 +2,58 @@
 
 import _thread
 import os
+import shutil
 import signal
 import sys
+import textwrap
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from difflib import get_close_matches
 from importlib import import_module
 from types import FrameType
 from typing import TextIO
 
-import tyro
-
 import avmsf
 from avmsf._utils.memory import NO_MEMORY, lacks_memory
 from avmsf._utils.text import printable
-from avmsf.cli.heartbeat import beating
+from avmsf.cli.heartbeat import beating, verbosity
+from avmsf.cli.options.common import check_inputs
 from avmsf.errors import AvmsfError, AvmsfWarning
 
 VERBS = {
-    "check": "Say what each recording of a capture is worth, and what is wrong.",
-    "modes": "List the modes that a capture's recordings have in common.",
+    "check": "Check the recordings of a capture: levels, noise, clipping, onsets, double hits and alignment.",
+    "modes": "List the modes of an object: frequencies, dampings and levels, from all recordings of a capture.",
+    "splat": "Fit 3D Gaussians to photographs, a video or a mesh, as a .ply file that any 3DGS viewer opens.",
+    "features": "Compute visual features on an object's surface, equal at points that are symmetric to each other.",
+    "surface": "Write an object's surface as a mesh: the folder's own, or one reconstructed from its views.",
     "fit": "Fit a sound field to a capture and write it to one file.",
-    "splat": "Turn photographs, a video or a mesh into Gaussians, as a .ply file that any 3DGS viewer opens.",
-    "lift": "Describe what each place of an object looks like, and make that obey the object's symmetries.",
-    "surface": "Write an object's surface alone: its mesh, or without one what its views show.",
-    "reconstruct": "Go all the way from a capture folder to a field: views, Gaussians, features, modes, gains.",
-    "view-cloud": "Draw Gaussians or features from all sides: colours, features, clusters, symmetries.",
-    "render": "Write the sounds of blows anywhere on the object as wav files.",
-    "locate": "Say where on the object a recorded blow fell, with a heat map and how sure that is.",
-    "edit": "Give a field another material, size, pitch or decay, or lead it towards words or a recording.",
-    "studio": "Open a page where the object is struck and heard, blows are located, and captures are made.",
-    "play": "Play a field in real time, or write what would be played to a file.",
+    "reconstruct": "Make a field from a capture folder with pictures or a mesh: Gaussians, features, modes, gains.",
+    "render": "Write the sounds of impacts anywhere on the object as wav files.",
+    "info": "Describe a field, Gaussians or features, and draw them with --plots.",
+    "locate": "Find where on the object the impact of a recording was, with a heat map and the uncertainty.",
+    "edit": "Change a field's material, size, pitch or decay, or optimize it towards a text prompt or recordings.",
+    "suggest": "Suggest where to record next: the contacts that reduce the expected error of the field most.",
+    "evaluate": "Evaluate methods at held-out contacts, on all objects of a dataset.",
+    "simulate": "Simulate objects, their recordings and pictures, as capture folders with ground truth.",
     "export": "Write a field for other tools: web page, glTF, Faust, samplers, modal analysis.",
-    "suggest": "Say where to strike next: the contacts that lower the expected error of the whole field most.",
-    "show": "Say what a field file holds, and draw it.",
-    "dataset": "Say what of a dataset is there, object by object, and what is missing.",
-    "simulate": "Simulate objects, how they sound and how they look, as capture folders with their truth.",
-    "evaluate": "Judge methods by contacts that they were not trained on, on all objects of a dataset.",
-    "efficiency": "Show how the error falls with the number of places learnt from, for several methods.",
-    "demo": "Go all the way on a built-in example: photographs, Gaussians, shape, features, a field, sounds, pictures.",
+    "studio": "Open a page in the browser to strike an object and hear it, locate impacts, edit fields and record "
+    "captures.",
+    "dataset": "List the objects of a published dataset: what can be read, and what is missing.",
+    "demo": "Run a complete example: from photographs and recordings of a mug to its sound field, sounds and pictures.",
 }
-"""Each verb's module in this package, and the first sentence of its help."""
+"""Each verb's module in this package and in `options`, and the first sentence of its help, in the order of the work."""
 CLOSED = 141
 """The exit code that shells give a command whose output nobody reads any more."""
 INTERRUPTED = 130
 """The exit code that shells give a command ended by Ctrl-C."""
 TERMINATED = 143
 """The exit code that shells give a command ended by SIGTERM."""
-_WAITING = frozenset({"studio", "play"})
+_WAITING = frozenset({"studio"})
 """Verbs that wait for their user most of the time."""
+_WIDEST = 120
+"""Columns of the list of verbs, at most."""
 _AGAIN = 0.05
 """Seconds after which an interruption that was dropped is raised again: a finalizer ends sooner, or it is repeated."""
 
@@ -59,25 +61,26 @@ _AGAIN = 0.05
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb and return its exit code: 0, 2 for input that cannot be used, 130 after Ctrl-C, 143 after SIGTERM.
 
-    Raises SystemExit, as command lines do, for help (0) and for arguments that cannot be understood (2).
+    Raises SystemExit, as command lines do, for a verb's help (0) and for options that cannot be understood (2).
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words[:1] == ["--version"]:
         print(avmsf.__version__)
         return 0
     if not words or words[0] not in VERBS:
-        _explain(words)
-        return 2
+        return _explain(words)
     # Threads that wait actively for each other make many small sums several times slower where other programs run.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     heart = nullcontext() if words[0] in _WAITING else beating(f"avmsf {words[0]}")
     with warnings.catch_warnings(), _interrupting() as received, heart:
         try:
-            # Only the verb that is asked for is imported: torch takes seconds, and help on the whole needs none of it.
-            with _loading():
-                verb = import_module(f"avmsf.cli.{words[0].replace('-', '_')}")
+            # Options import nothing that computes: help and mistakes are answered before torch is loaded for seconds.
+            options = import_module(f"avmsf.cli.options.{words[0]}").parse(words[1:])
+            check_inputs(options)
+            verbosity.quiet, verbosity.verbose = options.quiet, options.verbose
+            with _loading(quiet=options.quiet):
+                verb = import_module(f"avmsf.cli.{words[0]}")
             _show_plainly()
-            options = verb.parse(words[1:])
             with _compilation_announced():
                 code: int = verb.run(options)
         except BrokenPipeError:
@@ -142,9 +145,9 @@ def _interrupting() -> Iterator[list[int]]:
 
 
 @contextmanager
-def _loading() -> Iterator[None]:
-    """Tell a terminal that something goes on, for as long as it does."""
-    if not sys.stderr.isatty():
+def _loading(*, quiet: bool) -> Iterator[None]:
+    """Print on a terminal that something is going on, for as long as it is."""
+    if quiet or not sys.stderr.isatty():
         yield
         return
     print("loading ...", end="", file=sys.stderr, flush=True)
@@ -166,27 +169,30 @@ def _compilation_announced() -> AbstractContextManager[None]:
     return announced
 
 
-def _explain(words: list[str]) -> None:
-    """Print the list of verbs, or say that there is no such verb; leaves by SystemExit."""
-    listed: dict[str, Callable[[], None]] = {}
-    for verb, summary in VERBS.items():
-
-        def stand_in() -> None:
-            pass
-
-        stand_in.__doc__ = summary
-        listed[verb] = stand_in
-    tyro.extras.subcommand_cli_from_dict(
-        listed,
-        prog="avmsf",
-        description="The sound of an object wherever it is struck, from a few taps. `avmsf VERB --help` explains each.",
-        args=words or ["--help"],
-    )
+def _explain(words: list[str]) -> int:
+    """Print the list of verbs and return 0, or print that there is no such verb and return 2."""
+    if words and words[0] not in ("-h", "--help"):
+        near = get_close_matches(words[0], VERBS, n=1)
+        guess = f" Did you mean {near[0]}?" if near else ""
+        problem = f"expected a command, got {printable(words[0])!r}.{guess} `avmsf --help` lists all."
+        print(f"avmsf: {problem}", file=sys.stderr)
+        return 2
+    indent = max(map(len, VERBS)) + 4
+    width = min(shutil.get_terminal_size().columns, _WIDEST)
+    rows = {**VERBS, "--help": "Print this list.", "--version": "Print the version."}
+    print("usage: avmsf COMMAND [OPTIONS]\n")
+    print("The sound of an object wherever it is struck, from a few recordings.")
+    print("`avmsf COMMAND --help` explains a command; `avmsf demo` runs a complete example.\n")
+    separator = "\n" + " " * indent
+    for name, sentence in rows.items():
+        lines = textwrap.wrap(sentence, max(30, width - indent))
+        print(f"  {name:{indent - 2}}{separator.join(lines)}")
+    return 0
 
 
 def _show_plainly() -> None:
     """Let what a user should know appear as a sentence, without Python's file, line and category."""
-    others = warnings.showwarning
+    others, shown = warnings.showwarning, set[str]()
 
     def show(
         message: Warning | str,
@@ -197,6 +203,9 @@ def _show_plainly() -> None:
         line: str | None = None,
     ) -> None:
         if issubclass(category, AvmsfWarning):
+            if str(message) in shown:
+                return
+            shown.add(str(message))
             print(f"note: {printable(str(message))}", file=sys.stderr)
         else:
             others(message, category, filename, lineno, file, line)

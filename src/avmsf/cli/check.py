@@ -2,10 +2,9 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
-import tyro
 from rich.console import Console
 
 from avmsf.capture import CaptureReport, CaptureSettings, CaptureWarning, Impacts, check, read_capture
@@ -14,6 +13,7 @@ from avmsf.capture.measure import shared_problems
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.heartbeat import doing
+from avmsf.cli.options.check import Options
 from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.errors import CaptureError, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract_modes
@@ -25,30 +25,6 @@ _STRONGEST = 32
 """Modes that recordings of inverted polarity are looked for by."""
 MAX_PRINTED = 1000
 """Rows, and sentences below them, of the printed report: what a terminal's scrollback holds."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """Say what each recording of a capture is worth, and what is wrong.
-
-    One row a recording, problems below. The delay, in samples, is what aligns a recording with the others. The exit
-    code is 0 where the capture can be read, with or without warnings, and 2 where it cannot.
-    """
-
-    capture: tyro.conf.Positional[Path]
-    """Folder with impacts.csv and the wav files it names."""
-    settings: Path | None = None
-    """A capture.toml to use in place of the folder's own."""
-    write_settings: bool = False
-    """Write the settings that would help, with the reasons, to the folder's capture.toml, and check with them. A
-    capture.toml that exists is left as it is."""
-    json: bool = False
-    """Print one JSON object on the standard output, all else on the standard error."""
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf check", args=words, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def run(options: Options) -> int:

@@ -1,46 +1,17 @@
 """`avmsf dataset check`: what of a dataset is there, and what is missing."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
-
-import tyro
+from dataclasses import asdict
 
 from avmsf.capture.datasets import DatasetReport, ObjectReport, open_dataset
+from avmsf.cli.options.dataset import Options
 from avmsf.cli.printing import console, print_json, say, table
 
 UNREADABLE = 2
 
 
-@dataclass(frozen=True)
-class Options:
-    """Say what of a dataset is there, object by object, and what is missing.
-
-    Recognised are ObjectFolder Real (as published, or its compact copy), RealImpact, and folders of captures. Sounds
-    are not read. The exit code is 0 where at least one object can be read, and 2 where none can.
-    """
-
-    dataset: tyro.conf.Positional[Path]
-    """The dataset's folder."""
-    contacts: Path | None = None
-    """Where ObjectFolder Real's contacts are: a folder of arrays, or one of SonicGauss's lists."""
-    table: Path | None = None
-    """A CSV or JSON list id, name, material of ObjectFolder Real's objects, numbered as published."""
-    json: bool = False
-    """Print one JSON object on the standard output, all else on the standard error."""
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    options: Options = tyro.extras.subcommand_cli_from_dict(
-        {"check": Options}, prog="avmsf dataset", args=words, config=(tyro.conf.FlagCreatePairsOff,)
-    )
-    return options
-
-
 def run(options: Options) -> int:
     """Print the report; return 2 where no object can be read."""
-    report = open_dataset(options.dataset, contacts=options.contacts, table=options.table).check()
+    report = open_dataset(options.dataset, contacts=options.contact_data, table=options.table).check()
     screen = console(errors=options.json)
     screen.print(_table(report, f"{report.dataset} in {options.dataset}"))
     for line in _lines(report):

@@ -3,13 +3,12 @@
 import shlex
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 
 from avmsf.bench.baselines import MeanWaveform
 from avmsf.bench.evaluation import Scores, split
@@ -17,6 +16,7 @@ from avmsf.bench.pictures import draw_modes, draw_scores, draw_spectrograms, sav
 from avmsf.capture import CaptureSettings, Impacts, check, read_capture
 from avmsf.cli.demofolder import RECORD, record, replaced_whole
 from avmsf.cli.modetable import amplitudes, levels
+from avmsf.cli.options.demo import Options
 from avmsf.cli.overallbar import REFINEMENT, OverallBar
 from avmsf.cli.printing import console, figure, json_text, print_text
 from avmsf.cli.scores import compare, parts_words, score_markdown, score_table, score_values
@@ -25,10 +25,9 @@ from avmsf.export.webpage import write_webpage
 from avmsf.field.config import FitConfig
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
-from avmsf.pipeline.config import PipelineConfig
-from avmsf.pipeline.features import DESCRIPTORS, LiftConfig
-from avmsf.pipeline.reconstruct import CACHE, reconstruct
-from avmsf.pipeline.scene import CLOUD, SceneConfig
+from avmsf.pipeline.config import CACHE, DESCRIPTORS, LiftConfig, PipelineConfig, SceneConfig
+from avmsf.pipeline.reconstruct import reconstruct
+from avmsf.pipeline.scene import CLOUD
 from avmsf.scene.points import farthest_points
 from avmsf.scene.splatconfig import SplatConfig
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
@@ -57,24 +56,6 @@ STAGES = {
 FIELD, GAUSSIANS, SHAPE, PAGE, SCORES = "mug.safetensors", "mug.ply", "mug-surface.ply", "mug.html", "scores.md"
 _HEARD = 2
 """Contacts whose sounds and spectrograms are written."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """Go all the way on a built-in example: photographs, Gaussians, shape, features, a field, sounds, pictures.
-
-    A ceramic mug, made by `avmsf simulate example`: 48 photographs and 16 impacts. Gaussians are fitted to the
-    photographs, and the mug's shape is made from both. A field is fitted to 12 of the impacts, which also show how
-    thick the mug's wall is, and scored on the other 4.
-    """
-
-    folder: tyro.conf.Positional[Path] = Path("demo")
-    """Folder to leave everything in; one that holds an earlier demo is replaced."""
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf demo", args=words)
 
 
 def run(options: Options) -> int:
@@ -214,7 +195,7 @@ Open {folder / PAGE} in a browser and click the mug to strike it.
 {surface}  {folder / "capture"}: what all was made of; record your own object in the same way
 
 Next, try:
-  {command} render {place}/{FIELD} --at {x:.3f} {y:.3f} {z:.3f} --output strike.wav   # a strike at a place, in meters
+  {command} render {place}/{FIELD} --position {x:.3f} {y:.3f} {z:.3f} -o impact.wav   # an impact anywhere, in meters
   {command} locate {place}/{FIELD} {place}/capture/{test.names[0]}   # where was the mug struck?
   {command} reconstruct YOUR_FOLDER --output yours.safetensors   # your own object"""
 

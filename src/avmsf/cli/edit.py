@@ -1,14 +1,11 @@
 """`avmsf edit`: a field in, the field of another material, size, pitch or sound out."""
 
-import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
 from jaxtyping import Float
 from rich.table import Table
 from torch import Tensor
@@ -19,6 +16,7 @@ from avmsf.cli import INTERRUPTED
 from avmsf.cli.clapcurve import CLAP
 from avmsf.cli.contacts import contacts_at, refuse_far
 from avmsf.cli.editmaterial import MaterialChange
+from avmsf.cli.options.edit import ModeOptions, Options
 from avmsf.cli.printing import console, decimals, figure, print_json, say, table
 from avmsf.cli.steering import Steering, beside
 from avmsf.cli.writing import Level, OutputError, expect_writable, write_sound
@@ -41,25 +39,8 @@ _NEAR = 0.02
 
 
 @dataclass(frozen=True)
-class Sliders:
+class Sliders(ModeOptions):
     """Every mode by hand."""
-
-    pitch: float = 1.0
-    """Factor on all frequencies."""
-    decay: float = 1.0
-    """Factor on the times in which modes die away."""
-    brightness: float = 0.0
-    """Tilt of the spectrum about its middle, dB an octave."""
-    mode_db: Annotated[tyro.conf.UseAppendAction[tuple[tuple[float, float], ...]], tyro.conf.arg(metavar="HZ DB")] = ()
-    """Raise the mode of this frequency, as the field has it before the edit, by so many dB; -inf mutes it."""
-    mode_pitch: Annotated[
-        tyro.conf.UseAppendAction[tuple[tuple[float, float], ...]], tyro.conf.arg(metavar="HZ FACTOR")
-    ] = ()
-    """Factor on the frequency of the mode that is called by this one, beside --pitch."""
-    mode_decay: Annotated[
-        tyro.conf.UseAppendAction[tuple[tuple[float, float], ...]], tyro.conf.arg(metavar="HZ FACTOR")
-    ] = ()
-    """Factor on the time in which the mode of this frequency dies away, beside --decay."""
 
     @property
     def asked(self) -> bool:
@@ -87,55 +68,27 @@ def _called(frequency: float, named: Float[Tensor, " modes"], option: str) -> in
     row = int((named - frequency).abs().argmin())
     if not abs(float(named[row]) - frequency) <= _NEAR * float(named[row]):
         raise EditError(
-            f"{option} {frequency:g}: no mode is there, the nearest is at {float(named[row]):.5g} Hz; `avmsf show` "
+            f"{option} {frequency:g}: no mode is there, the nearest is at {float(named[row]):.5g} Hz; `avmsf info` "
             "lists them"
         )
     return row
 
 
-@dataclass(frozen=True)
-class Options:
-    """Give a field another material, size, pitch or decay, or lead it towards words or a recording.
-
-    First the material, then the sliders, then the words, the recording or what a material sounds like. Where on the
-    object a mode is loud stays, so the edited field renders and locates like any other.
-    """
-
-    field: tyro.conf.Positional[Path]
-    """Field file, as `avmsf fit` writes it."""
-    output: Annotated[Path, tyro.conf.arg(metavar="NEW.safetensors")]
-    """File to write the edited field to."""
-    change: tyro.conf.OmitArgPrefixes[MaterialChange] = dataclasses.field(default_factory=MaterialChange)
-    sliders: tyro.conf.OmitArgPrefixes[Sliders] = dataclasses.field(default_factory=Sliders)
-    steering: tyro.conf.OmitArgPrefixes[Steering] = dataclasses.field(default_factory=Steering)
-    pictures: Path | None = None
-    """Folder for modes.png and spectrograms.png, and to listen, before.wav and after.wav; with --clap also clap.png,
-    the score over the steps; none without it."""
-    at: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Contact of these sounds, metres, on the object as it was; where it is loudest without it."""
-    json: bool = False
-    """Print one JSON object on the standard output, all else on the standard error."""
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf edit", args=words, config=(tyro.conf.FlagCreatePairsOff,))
-
-
 def run(options: Options) -> int:
     """Edit, write, and say what came of it; return 130 where Ctrl-C stopped it."""
-    _expect(options)
+    asked = _Edit.of(options)
+    _expect(options, asked)
     old = load(options.field)
-    contact = _contact(old, options.at)
+    contact = _contact(old, options.position)
     try:
-        new = _edited(options, old)
+        new = _edited(options, asked, old)
     except KeyboardInterrupt:
         kept = beside(options.output, "checkpoint")
         where = f"from {kept}, or delete it" if kept.exists() else "from the start"
         say(f"avmsf edit: interrupted; give the same command again to go on {where}")
         return INTERRUPTED
     save(new, options.output)
-    if options.steering.asked:
+    if asked.steering.asked:
         for ending in ("checkpoint", "preview.wav", "clap.json"):
             beside(options.output, ending).unlink(missing_ok=True)
     edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
@@ -144,10 +97,10 @@ def run(options: Options) -> int:
     screen.print(_table(before, after))
     for words in remarks(edits, new):
         screen.print(f"note: {words}", soft_wrap=True)
-    if options.pictures is not None:
-        _show(options.pictures, (old, contact), (new, options.change.size * contact))
+    if options.plots is not None:
+        _show(options.plots, (old, contact), (new, options.change.size * contact))
         if CLAP in edits[-1]:
-            _show_scores(options.pictures / CURVE, edits[-1])
+            _show_scores(options.plots / CURVE, edits[-1])
     screen.print(f"wrote {options.output}", soft_wrap=True)
     if options.json:
         print_json(
@@ -163,43 +116,59 @@ def run(options: Options) -> int:
     return 0
 
 
-def _edited(options: Options, field: SoundField) -> SoundField:
+@dataclass(frozen=True)
+class _Edit:
+    """What is asked for, in the order in which it is done."""
+
+    change: MaterialChange
+    sliders: Sliders
+    steering: Steering
+
+    @classmethod
+    def of(cls, options: Options) -> "_Edit":
+        """Return what options ask for."""
+        parts = (options.change, options.sliders, options.steering)
+        kinds = (MaterialChange, Sliders, Steering)
+        return cls(*(kind(**vars(part)) for kind, part in zip(kinds, parts, strict=True)))
+
+
+def _edited(options: Options, asked: _Edit, field: SoundField) -> SoundField:
     named = field.bank.frequency
-    needed = options.change.asked or options.steering.like_material is not None
-    old = options.change.made_of(field) if needed else None
-    if options.change.asked and old is not None:
-        field, old = options.change.apply(field, old=old), options.change.target(old)
-    if options.sliders.asked:
-        field = options.sliders.apply(field, named=named)
-    if options.steering.asked:
-        field = options.steering.apply(field, output=options.output, old=old)
+    needed = asked.change.asked or asked.steering.like_material is not None
+    old = asked.change.made_of(field) if needed else None
+    if asked.change.asked and old is not None:
+        field, old = asked.change.apply(field, old=old), asked.change.target(old)
+    if asked.sliders.asked:
+        field = asked.sliders.apply(field, named=named)
+    if asked.steering.asked:
+        field = asked.steering.apply(field, output=options.output, old=old)
     return field
 
 
-def _expect(options: Options) -> None:
+def _expect(options: Options, asked: _Edit) -> None:
     """Raise before any work for what cannot be done or written."""
-    options.steering.expect_usable()
-    if options.change.law != MaterialChange.law and not options.change.asked:
+    asked.steering.expect_usable()
+    if asked.change.law != MaterialChange.law and not asked.change.asked:
         raise EditError("--law goes with --material, --size or a constant of a material, and none of them is given")
-    if options.at is not None and options.pictures is None:
-        raise EditError("--at goes with --pictures, which is not given: it is where their sounds are struck")
-    if options.change.old is not None and not (options.change.asked or options.steering.like_material):
+    if options.position is not None and options.plots is None:
+        raise EditError("--position goes with --plots, which is not given: it is where their sounds are struck")
+    if asked.change.old is not None and not (asked.change.asked or asked.steering.like_material):
         raise EditError(
             "--from is given without anything to lead to: add --material, --size, a constant or --like-material"
         )
-    if not (options.change.asked or options.sliders.asked or options.steering.asked):
+    if not (asked.change.asked or asked.sliders.asked or asked.steering.asked):
         raise EditError(
             "nothing is asked for: give --material, --size or a constant of a material, --pitch, --decay, "
             "--brightness, --mode-db, --mode-pitch or --mode-decay, --prompt, --like or --like-material"
         )
     expect_writable(options.output)
-    if options.steering.generated is not None:
-        expect_writable(options.steering.generated)
+    if asked.steering.generated is not None:
+        expect_writable(asked.steering.generated)
     if options.output.exists() and options.field.exists() and options.output.samefile(options.field):
         raise OutputError(f"{options.output}: is the field itself, which would be lost: name another file")
-    if options.pictures is not None:
+    if options.plots is not None:
         for name in (MODES, SPECTROGRAMS, BEFORE, AFTER, CURVE):
-            expect_writable(options.pictures / name)
+            expect_writable(options.plots / name)
 
 
 def _contact(field: SoundField, at: tuple[float, float, float] | None) -> Float[Tensor, " 3"]:

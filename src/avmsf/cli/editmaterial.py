@@ -1,10 +1,8 @@
 """Which material an edit starts from and which it leads to, as the command line has it."""
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
 
-import tyro
-
+from avmsf.cli.options.edit import MaterialOptions
 from avmsf.cli.printing import say
 from avmsf.field.soundfield import SoundField
 from avmsf.simulate.material import Material, material_named
@@ -13,29 +11,8 @@ from avmsf.tasks.recast import LAWS, recast
 
 
 @dataclass(frozen=True)
-class MaterialChange:
+class MaterialChange(MaterialOptions):
     """Another material and size, by the laws of linear modal analysis: the shape stays."""
-
-    material: str | None = None
-    """New material: ceramic, glass, wood, plastic, iron, polycarbonate or steel."""
-    old: Annotated[str | None, tyro.conf.arg(name="from")] = None
-    """Material that the object is of; told by how fast its modes die away where it is not given."""
-    size: float = 1.0
-    """The new object's lengths over the old one's."""
-    young: float | None = None
-    """Young's modulus of the new material, Pa, in place of the table's, as the others below; without --material, in
-    place of the old one's."""
-    density: float | None = None
-    """Density of the new material, kg/m3."""
-    poisson: float | None = None
-    """Poisson's ratio of the new material, of which no more is said than what it would change."""
-    alpha: float | None = None
-    """Rayleigh damping in proportion to mass of the new material, 1/s."""
-    beta: float | None = None
-    """Rayleigh damping in proportion to stiffness of the new material, s."""
-    law: Literal["displacement", "velocity", "acceleration", "ratio-only"] = "displacement"
-    """What the recordings go with, which decides how loud each mode becomes; ratio-only is the paper's law, which
-    leaves mass and size out."""
 
     @property
     def constants(self) -> dict[str, float]:

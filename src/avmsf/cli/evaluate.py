@@ -1,113 +1,58 @@
 """`avmsf evaluate`: how good methods are on a dataset, as tables and as a page."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
-import tyro
 from rich.console import Console
 
+from avmsf.bench.cases import Growing
 from avmsf.bench.judging import Judging
+from avmsf.bench.learningcurve import curves, draw_learning_curve
 from avmsf.bench.methods import method_named
 from avmsf.bench.parallel import RunProgress, Workers, run_objects
+from avmsf.bench.pictures import save_picture
 from avmsf.bench.plan import Evaluation
-from avmsf.bench.protocols import EvaluationProtocol, protocol_named
+from avmsf.bench.protocols import LEARNING_CURVE, EvaluationProtocol, protocol_named
 from avmsf.bench.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
 from avmsf.bench.reporttables import Section
-from avmsf.bench.results import ResultsFolder
+from avmsf.bench.results import ResultsFolder, write_json
 from avmsf.bench.subsets import choose_objects, members
 from avmsf.bench.task import Method
 from avmsf.capture.datasets import CaptureCollection, open_dataset
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.objectbar import ObjectBar
-from avmsf.cli.printing import console, print_json, say, table
+from avmsf.cli.options.evaluate import Options
+from avmsf.cli.printing import console, decimals, print_json, say, table
 from avmsf.errors import EvaluationError
 from avmsf.modal.extraction.finders import HighResolution
-from avmsf.pipeline.bodies import BodyConfig
-from avmsf.pipeline.config import PRESETS
-from avmsf.pipeline.features import AUTO, LiftConfig, choose_encoder, settled
-from avmsf.pipeline.objectbodies import Geometry, ObjectBodies
+from avmsf.pipeline.config import AUTO, PRESETS, BodyConfig, Geometry, LiftConfig, SceneConfig, ViewsConfig
+from avmsf.pipeline.features import choose_encoder, settled
+from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
-from avmsf.pipeline.scene import SceneConfig
-from avmsf.pipeline.sources import ViewsConfig
-from avmsf.scene.splatconfig import SplatConfig
+from avmsf.wording import counted
 
 _SHOWN = 5
 """Failures that are printed; the report lists all."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """Judge methods by contacts that they were not trained on, on all objects of a dataset.
-
-    Every figure is kept as it comes: after an interruption the same command goes on, and methods or objects may be
-    added later. The folder of results holds summary.json, report.md and report.html, which shows and plays sounds.
-    """
-
-    protocol: tyro.conf.Positional[str]
-    """The experiment: farthest, leave-one-out, closest, shots, views, ablation, non-symmetric or grid."""
-    data: tyro.conf.Positional[Path]
-    """Folder of a dataset, of capture folders, or of one capture."""
-    methods: tuple[str, ...] = ()
-    """Methods, apart from each other by commas or blanks; the protocol's own where none is named."""
-    objects: tuple[str, ...] = ()
-    """Objects, likewise; the protocol's own where none is named."""
-    output: Path | None = None
-    """Folder of results; evaluation/DATASET/PROTOCOL in the current folder where it is not given."""
-    features: Path | None = None
-    """Folder that keeps what objects look like, which several evaluations of one dataset may share; features in the
-    folder of results where it is not given."""
-    look: Literal["best", "mesh"] = "best"
-    """What looks are lifted from: the best of what shows an object, photographs before a mesh, which takes Gaussians;
-    or its mesh, onto whose own surface they go."""
-    splat: SplatConfig = field(default_factory=SplatConfig)
-    lift: LiftConfig = field(default_factory=LiftConfig)
-    """Settings of the features. The methods `paper` have the paper's own, of which they take the encoder alone from
-    here: DINOv2 without `--lift.encoder`, which then must be there."""
-    workers: int = 1
-    """Objects at a time, each on one thread; more than one needs the extra `scale`."""
-    ray: str | None = None
-    """Address of a ray cluster to compute on, or auto; its computers must see data and results under the same paths."""
-    seed: int = 0
-    """Start of all chance in the methods."""
-    geometry: Geometry = "mesh"
-    """What physics knows of an object's shape: its mesh; the surface of Gaussians fitted to its views; noisy, its mesh
-    with vertices displaced by 2 % of its size."""
-    body: BodyConfig = field(default_factory=BodyConfig)
-    level: Literal["full-scale", "raw"] = "full-scale"
-    """full-scale: an object's sounds by one factor that brings its loudest recording to a peak of one, so that figures
-    of different objects can be averaged; raw: in the recordings' unit."""
-    cdpam: bool = True
-    """Whether CDPAM is taken, which needs the extra `eval`."""
-    cdpam_contacts: int = 8
-    """Test contacts of a case that CDPAM is taken of, spread evenly; 0 for all."""
-    modes: int = 128
-    """Most modes that are sought in the training recordings."""
-    contacts: Path | None = None
-    """Where ObjectFolder Real's contacts are, for its raw form."""
-    table: Path | None = None
-    """The published table of ObjectFolder Real's names and materials."""
-    figures: bool = False
-    """Also draw figures/OBJECT.png: spectrograms of the recording and of all methods, 20 Hz to 20 kHz, first second."""
-    json: bool = False
-    """Print the summary as one JSON object on the standard output, all else on the standard error."""
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf evaluate", args=words, config=(tyro.conf.FlagCreatePairsOff,))
-
-
 def run(options: Options) -> int:
     """Evaluate, and say what came of it; return 130 where Ctrl-C stopped it."""
     protocol = protocol_named(options.protocol)
+    if protocol.name == LEARNING_CURVE:
+        protocol = replace(protocol, choosing=Growing(options.counts, options.starts))
+    elif options.counts or options.starts != Options.starts or options.metric != Options.metric:
+        say(f"note: --counts, --starts and --metric are not used by {protocol.name}, only by {LEARNING_CURVE}")
     methods = tuple(method_named(name) for name in _words(options.methods) or protocol.methods)
+    cdpam = not options.no_cdpam and "cdpam" in protocol.metrics
     workers = Workers(options.workers, options.ray)
     # All paths are made absolute: workers may run in folders of their own.
-    contacts, table_of_names = (None if path is None else path.resolve() for path in (options.contacts, options.table))
+    contacts, table_of_names = (
+        None if path is None else path.resolve() for path in (options.contact_data, options.table)
+    )
     dataset = open_dataset(options.data.resolve(), contacts=contacts, table=table_of_names)
     title = title_of(dataset, options.data)
     objects = choose_objects(dataset, protocol, _words(options.objects))
@@ -117,11 +62,11 @@ def run(options: Options) -> int:
         title,
         protocol,
         methods,
-        (options.features or folder / "features").resolve(),
+        (options.cache or folder / "features").resolve(),
         scene=SceneConfig(ViewsConfig(source=options.look), options.splat, options.lift),
         geometry=options.geometry,
         body=options.body,
-        judging=Judging(level=options.level, cdpam=options.cdpam, cdpam_contacts=options.cdpam_contacts),
+        judging=Judging(level=options.amplitude_scale, cdpam=cdpam, cdpam_contacts=options.cdpam_contacts),
         modes=options.modes,
         seed=options.seed,
     )
@@ -141,6 +86,7 @@ def run(options: Options) -> int:
     screen = console(errors=options.json)
     for part in parts[1:3]:
         _print(part, screen)
+    drawn = _draw_curves(results, objects, options, screen) if protocol.name == LEARNING_CURVE else {}
     failures = len(summary["failures"])
     if failures:
         for each in summary["failures"][:_SHOWN]:
@@ -150,8 +96,32 @@ def run(options: Options) -> int:
     for path in figures:
         screen.print(f"wrote {path}", soft_wrap=True)
     if options.json:
-        print_json({**summary, "results": str(folder)})
+        print_json({**summary, "results": str(folder), **({"curves": drawn} if drawn else {})})
     return 0
+
+
+def _draw_curves(
+    results: ResultsFolder, objects: Sequence[str], options: Options, screen: Console
+) -> dict[str, dict[str, Any]]:
+    """Write and print each object's learning curves; return their values by object and method."""
+    drawn = {}
+    for name in objects:
+        record = results.read(name)
+        assert record is not None
+        found = curves(record, metric=options.metric)
+        starts = counted(options.starts, "choice")
+        title = f"{record.identifier}: {counted(record.contacts, 'contact')}, {starts} of training contacts"
+        picture, values = (results.path / name / f"learning-curve.{ending}" for ending in ("png", "json"))
+        save_picture(draw_learning_curve(found, metric=options.metric, title=title), picture)
+        drawn[name] = {curve.method: curve.values() for curve in found}
+        write_json(values, {"object": name, "metric": options.metric, "methods": drawn[name]})
+        counts = sorted({count for curve in found for count in curve.counts})
+        by_method = [(curve.method, dict(zip(curve.counts, curve.mean, strict=True))) for curve in found]
+        rows = [[method, *(decimals(means.get(count), 3) for count in counts)] for method, means in by_method]
+        heading = f"{options.metric} of {name} by the number of training contacts"
+        screen.print(table(heading, ("method", *map(str, counts)), rows))
+        screen.print(f"wrote {picture} and {values}", soft_wrap=True)
+    return drawn
 
 
 def evaluation_of(

@@ -1,19 +1,19 @@
 """`avmsf export`: a field in the formats of other tools."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import torch
-import tyro
 
 from avmsf.capture.folder import read_capture, settings_of
 from avmsf.capture.surface import find_surface_file
-from avmsf.cli.exportoptions import POINTS, Options, refuse_idle, refuse_name
+from avmsf.cli.options.export import Options, unused_options
 from avmsf.cli.printing import figure, print_text, say
 from avmsf.cli.render import METRES
 from avmsf.errors import ExportError
 from avmsf.export.faust import fitted, write_faust
+from avmsf.export.formats import FAUST_SUFFIXES, GLTF_SUFFIXES, PAGE_SUFFIXES, POINTS, UNIVERSAL_SUFFIXES, Format
 from avmsf.export.gltf import write_gltf
 from avmsf.export.look import Look, read_look
 from avmsf.export.modaldemo import SCENE, is_demo, read_demo, write_demo
@@ -22,24 +22,39 @@ from avmsf.export.sampledfield import SampledField, spread_rows
 from avmsf.export.universal import write_universal
 from avmsf.export.wavgrid import Grid, Layer, write_grid
 from avmsf.export.webpage import write_webpage
-from avmsf.export.written import Written, expect_free, write_file
+from avmsf.export.written import Written, expect_ending, expect_free, write_file
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats
 
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf export", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+_FILES: dict[Format, tuple[str, ...]] = {"gltf": GLTF_SUFFIXES, "faust": FAUST_SUFFIXES, "uff": UNIVERSAL_SUFFIXES}
+"""Formats that are one file, and what its name may end in."""
+_FOLDERS: dict[Format, str] = {
+    "web": "a page as a folder, or as one file whose name ends in .html",
+    "avmsf-demo": "a folder in the layout of the paper's demo",
+    "wavs": "a folder with a wav file for each blow, a table and an SFZ instrument",
+}
+"""Formats that are folders, and what is written."""
+_ENDINGS = frozenset(
+    (
+        *(".aif", ".aiff", ".flac", ".mp3", ".ogg", ".wav"),
+        *(".csv", ".json", ".sfz", ".txt", ".safetensors"),
+        *(".obj", ".ply", ".stl"),
+        *(".gz", ".tar", ".zip"),
+        *(*GLTF_SUFFIXES, *FAUST_SUFFIXES, *UNIVERSAL_SUFFIXES, *PAGE_SUFFIXES),
+    )
+)
+"""Endings by which a name is that of a file: a folder's may have a dot too, as in bowl-1.2 or name.github.io."""
 
 
 def run(options: Options) -> int:
     """Read, write, and say how large it is and what it lacks."""
     if options.points is not None and options.points < 1:
         raise ExportError(f"--points is {options.points}; expected 1 or more")
-    refuse_idle(options)
-    refuse_name(options)
+    expect_name(options)
+    for sentence in unused_options(options):
+        say(f"note: {sentence}")
     field = _read(options)
     written = _WRITERS[options.to](field, options)
     for remark in written.remarks:
@@ -52,6 +67,18 @@ def run(options: Options) -> int:
     files = f"{len(written.sizes)} files, the largest {largest.name}" if len(written.sizes) > 1 else "one file"
     print_text(f"wrote {options.output}: {options.to}, {written.size / 1e6:.3g} MB, {files}")
     return 0
+
+
+def expect_name(options: Options) -> None:
+    """Raise `ExportError` for a file's name without an ending of this format, or with one where a folder is written."""
+    output, suffix = options.output, options.output.suffix.lower()
+    if options.to in _FILES:
+        expect_ending(output, _FILES[options.to])
+    elif suffix in _ENDINGS and not output.is_dir() and not (options.to == "web" and suffix in PAGE_SUFFIXES):
+        raise ExportError(
+            f"{output}: expected a folder's name, since --to {options.to} writes {_FOLDERS[options.to]}, found one "
+            f"that ends in {output.suffix}: say --output {output.with_suffix('')}"
+        )
 
 
 def _read(options: Options) -> SoundField | SampledField:
@@ -102,7 +129,7 @@ def _web(field: SoundField | SampledField, options: Options) -> Written:
         metres=metres,
         strikes=None if options.capture is None else read_capture(options.capture).impacts,
         limit=options.points or POINTS["web"],
-        force=options.force,
+        force=options.overwrite,
     )
 
 
@@ -112,12 +139,12 @@ def _gltf(field: SoundField | SampledField, options: Options) -> Written:
     cloud = _gaussians(source, metres, sampled)
     if cloud is not None and source is not None:
         beside, content = options.output.with_suffix(".gaussians.ply"), source.read_bytes()
-        expect_free(beside, content, force=options.force)
-        written = write_gltf(sampled, options.output, look=Look.of_gaussians(cloud, sampled), force=options.force)
-        copied = write_file(beside, content, force=options.force)
+        expect_free(beside, content, force=options.overwrite)
+        written = write_gltf(sampled, options.output, look=Look.of_gaussians(cloud, sampled), force=options.overwrite)
+        copied = write_file(beside, content, force=options.overwrite)
         return replace(written, sizes={**written.sizes, **copied})
     shown, remarks = (None, ()) if source is None else read_look(source, sampled, metres=metres)
-    written = write_gltf(sampled, options.output, look=shown, force=options.force)
+    written = write_gltf(sampled, options.output, look=shown, force=options.overwrite)
     return replace(written, remarks=remarks + written.remarks)
 
 
@@ -128,7 +155,7 @@ def _faust(field: SoundField | SampledField, options: Options) -> Written:
         sampled, noise = fitted(sampled, noise=noise)
         if len(sampled) < asked:
             say(f"note: of these {len(sampled)}, as many as Faust compiles in reasonable time")
-    return write_faust(sampled, options.output, noise=noise, force=options.force)
+    return write_faust(sampled, options.output, noise=noise, force=options.overwrite)
 
 
 def _demo(field: SoundField | SampledField, options: Options) -> Written:
@@ -154,7 +181,7 @@ def _demo(field: SoundField | SampledField, options: Options) -> Written:
         cloud=cloud,
         variant=options.variant or "original",
         precision=options.precision,
-        force=options.force,
+        force=options.overwrite,
     )
 
 
@@ -173,11 +200,13 @@ def _wavs(field: SoundField | SampledField, options: Options) -> Written:
         )
     layers = tuple(Layer(force, each, options.pulse) for force, each in zip(forces, times, strict=True))
     sampled = _sampled(field, options)
-    return write_grid(sampled, options.output, Grid(len(sampled), layers, options.seconds), force=options.force)
+    return write_grid(sampled, options.output, Grid(len(sampled), layers, options.seconds), force=options.overwrite)
 
 
 def _uff(field: SoundField | SampledField, options: Options) -> Written:
-    return write_universal(_sampled(field, options), options.output, functions=options.functions, force=options.force)
+    return write_universal(
+        _sampled(field, options), options.output, functions=options.functions, force=options.overwrite
+    )
 
 
 _WRITERS: dict[str, Callable[[SoundField | SampledField, Options], Written]] = {

@@ -1,11 +1,10 @@
 """`avmsf fit`: a capture folder in, a field file out."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
 from rich.console import Console
 
 from avmsf._utils.device import TRAINABLE, usable_device
@@ -15,114 +14,23 @@ from avmsf.capture.folder import settings_of
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.heartbeat import doing
+from avmsf.cli.options.fit import Options
 from avmsf.cli.printing import console, print_json, say
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
-from avmsf.field.config import FitConfig
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.estimator import GainModel
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
-from avmsf.modal.extraction.finders import ExtractionMethod
-from avmsf.pipeline.bodies import BodyConfig
-from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero, with_record
 from avmsf.pipeline.fitting import discard_unfinished, fit_capture, unfinished
 from avmsf.pipeline.guess import guess_field, known_surface
-from avmsf.pipeline.scene import SceneConfig
+from avmsf.pipeline.record import capture_settings_of, with_record
 from avmsf.scene.featurestore import load_features, read_report
 from avmsf.wording import counted
 
 _SHOWN = 8
 """Names of recordings in a line, at most."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """Fit a sound field to a capture and write it to one file.
-
-    Without recordings, a mesh and --material give a guess. An interrupted fit leaves its state beside the output; the
-    same command goes on from it to the same result.
-    """
-
-    capture: tyro.conf.Positional[Path]
-    """Folder with impacts.csv and the wav files it names; with --material, a folder with a mesh, or a mesh file."""
-    output: Annotated[Path, tyro.conf.arg(metavar="FIELD.safetensors")]
-    """File to write the field to."""
-    settings: Path | None = None
-    """A capture.toml to use in place of the folder's own."""
-    material: str | None = None
-    """Guess the field of an object without recordings from its mesh and its material: ceramic, glass, wood, plastic,
-    iron, polycarbonate or steel."""
-    train_fraction: float | None = None
-    """Fit to all recordings at this part of the places, spread as far apart as they go, and score the field on the
-    others. Contacts nearer than 1 % of the extent of all are one place."""
-    train_count: int | None = None
-    """Likewise with so many places."""
-    start: int = 0
-    """Row of impacts.csv, counted from 0, whose place this choice starts from."""
-    features: Path | None = None
-    """File of features that `avmsf lift` wrote, in the frame of the contacts; without it positions on the surface."""
-    gain_model: GainModel = "auto"
-    """How gains vary over the object. auto: a Gaussian process over all kernel families, weighed by evidence; the
-    elastic one needs a mesh. network: the paper's attention network on the features. The others: the Gaussian process
-    over one family, for study; symmetry needs a mesh, visual needs --features."""
-    body: BodyConfig = field(default_factory=BodyConfig)
-    method: ExtractionMethod = "high-resolution"
-    """How modes are found; see `avmsf modes --help`."""
-    modes: int = 128
-    """Most modes to keep."""
-    time_zero: TimeZero | None = None
-    """Where sounds start: onset, or peak (paper); capture.toml decides where this does not."""
-    device: str | None = None
-    """What computes: cpu, or cuda; the GPU where there is one. On it run training end to end, its spectral loss
-    and the network; the modes, clusters, finite elements and the Gaussian process run on the CPU."""
-    json: bool = False
-    """Print one JSON object on the standard output, all else on the standard error."""
-    preset: Preset = "default"
-    """Where all settings start from. default: takes seconds to minutes. paper: everything as published, the middle of
-    each published list; it takes hours. `--preset paper --help` shows its values. `avmsf reconstruct` also has its
-    features; here they are those of --features."""
-    config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)
-    """Settings of the fit."""
-
-    @property
-    def pipeline(self) -> PipelineConfig:
-        """All settings as one; those of views and features are the features' file's own."""
-        scene = SceneConfig()
-        start, place = self.time_zero, self.device
-        return PipelineConfig(self.gain_model, self.body, scene, self.config, self.method, self.modes, start, place)
-
-
-@dataclass(frozen=True)
-class PaperOptions(Options):
-    """The same, starting from what the preset `paper` has otherwise."""
-
-    gain_model: GainModel = PRESETS["paper"].gain_model
-    method: ExtractionMethod = PRESETS["paper"].method
-    time_zero: TimeZero | None = PRESETS["paper"].time_zero
-    preset: Preset = "paper"
-    config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=lambda: PRESETS["paper"].fit)
-
-
-@dataclass(frozen=True)
-class _Preset:
-    preset: Preset = "default"
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell, with the preset's settings where they say nothing."""
-    kind = {"default": Options, "paper": PaperOptions}[preset_of(words)]
-    return tyro.cli(
-        kind, prog="avmsf fit", args=words, description=Options.__doc__, config=(tyro.conf.FlagCreatePairsOff,)
-    )
-
-
-def preset_of(words: Sequence[str]) -> Preset:
-    """Return the preset that the words name; it is read first, for it decides what all others start from."""
-    chosen, _ = tyro.cli(_Preset, args=words, add_help=False, return_unknown_args=True)
-    return chosen.preset
 
 
 def run(options: Options) -> int:
@@ -132,7 +40,7 @@ def run(options: Options) -> int:
     known = settings_of(options.capture) if options.settings is None else CaptureSettings.read(options.settings)
     if options.material is not None:
         return _run_guess(options, options.material, known)
-    capture = read_capture(options.capture, options.pipeline.capture_settings(known))
+    capture = read_capture(options.capture, capture_settings_of(options.pipeline, known))
     train, test = part_contacts(
         capture.impacts, fraction=options.train_fraction, count=options.train_count, start=options.start
     )

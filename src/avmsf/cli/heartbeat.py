@@ -14,6 +14,16 @@ SILENCE_SECONDS = 4.0
 _TICK_SECONDS = 0.25
 
 
+class _Verbosity:
+    """How much is printed besides results, warnings and errors, for the whole process: by --quiet and --verbose."""
+
+    quiet = False
+    verbose = False
+
+
+verbosity = _Verbosity()
+
+
 class _Activity:
     """The last line, and when it was printed and repeated."""
 
@@ -27,7 +37,11 @@ class _Activity:
     def repeat(self) -> None:
         """Print the line again if nothing has been printed for long, unless a progress bar moves on the terminal."""
         moment, rich = time.monotonic(), sys.modules.get("rich.file_proxy")
-        if moment - self.printed < SILENCE_SECONDS or (rich and isinstance(sys.stderr, rich.FileProxy)):
+        if (
+            verbosity.quiet
+            or moment - self.printed < SILENCE_SECONDS
+            or (rich and isinstance(sys.stderr, rich.FileProxy))
+        ):
             return
         self.printed = moment
         # On a terminal the line may begin behind "loading ...".
@@ -47,6 +61,8 @@ def doing(text: str) -> None:
     """Take note of what is going on, to be printed after a silence; costs next to nothing."""
     if _without_numbers(text) != _without_numbers(_activity.text):
         _activity.since = time.monotonic()
+        if verbosity.verbose:
+            print(printable(text), file=sys.stderr, flush=True)
     _activity.text = text
 
 

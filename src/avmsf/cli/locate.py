@@ -1,14 +1,12 @@
 """`avmsf locate`: where recorded blows fell, in words, as heat maps and as point clouds."""
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
 from jaxtyping import Float64
 from torch import Tensor
 
@@ -19,6 +17,7 @@ from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.folder import settings_of
 from avmsf.cli.contacts import Contacts, refuse_far
 from avmsf.cli.heartbeat import doing
+from avmsf.cli.options.locate import Options
 from avmsf.cli.printing import console, figure, print_json, say
 from avmsf.cli.writing import OutputError, expect_writable
 from avmsf.errors import AvmsfError, LocationError
@@ -36,48 +35,14 @@ UNLOCATED = 2
 """The exit code where a recording could not be located."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """Say where on the object a recorded blow fell, with a heat map and how sure that is.
-
-    Each recording holds one blow, of any force and polarity; with --several, any number of them.
-    """
-
-    field: tyro.conf.Positional[Path]
-    """Field file, as `avmsf fit` writes it."""
-    recordings: tyro.conf.Positional[tuple[Path, ...]]
-    """Recordings of blows on the same object: wav, flac or another format that libsndfile reads."""
-    capture: Path | None = None
-    """Capture folder whose capture.toml says how recordings are read; by itself they are as those of the fit were."""
-    settings: Path | None = None
-    """A capture.toml that says so."""
-    several: bool = False
-    """The recordings hold several blows each; every one of them is located."""
-    force: float | None = None
-    """How hard every blow was, newtons at its peak: it tells places apart that differ in loudness alone. For a field of
-    recordings that were not divided by their forces, over the mean blow among them."""
-    level: float = 0.9
-    """Probability of the region that is said to hold the contact."""
-    true_contact: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Where every impact really was, metres: its distance is printed, and the heat maps mark it red, the found one
-    blue."""
-    output: Path | None = None
-    """Folder for a heat map and a coloured point cloud of every blow, NAME.png and NAME.ply; none without it."""
-    json: bool = False
-    """Print one JSON object on the standard output, all else on the standard error."""
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf locate", args=words, config=(tyro.conf.FlagCreatePairsOff,))
-
-
 def run(options: Options) -> int:
     """Locate, print and draw; return 2 where a recording could not be located."""
     if not options.recordings:
         raise OutputError("expected one recording or more after the field, such as HIT.wav")
-    if not 0.0 < options.level < 1.0:
-        raise OutputError(f"--level is {options.level:g}; expected a probability between 0 and 1, such as 0.9")
+    if not 0.0 < options.probability < 1.0:
+        raise OutputError(
+            f"--probability is {options.probability:g}; expected a probability between 0 and 1, such as 0.9"
+        )
     if options.output is not None:
         expect_writable(options.output / "blow.png")
     settings = _settings(options)
@@ -144,7 +109,7 @@ def _answers(
     except LocationError as error:
         return [({"recording": str(path), "seconds": None, **not_located(str(error))}, None)]
     return [
-        (_describe(str(path), seconds, contact, known, options.level), None if contact.refusal else contact)
+        (_describe(str(path), seconds, contact, known, options.probability), None if contact.refusal else contact)
         for seconds, contact in blows
     ]
 

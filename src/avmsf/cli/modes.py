@@ -1,18 +1,16 @@
 """`avmsf modes`: the modes that a capture's recordings have in common."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
-
-import tyro
+from dataclasses import asdict
 
 from avmsf.bench.pictures import draw_modes, expect_format, save_picture
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_rows, quality_rows
+from avmsf.cli.options.modes import Options
 from avmsf.cli.printing import console, decimals, figure, print_json, say, table
 from avmsf.modal.extraction.extract import extract_modes
-from avmsf.modal.extraction.finders import ExtractionMethod, finder_named
+from avmsf.modal.extraction.finders import finder_named
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.wording import counted
 
@@ -20,30 +18,6 @@ _EXPLANATION = """\
 ±: spread over recordings. energy: share of all. phase: coherence over recordings, 1 if the same in
 all. orders: part of the model orders that find the pole. left out: energy explained in a recording
 that is left out, 50 % by chance."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """List the modes that a capture's recordings have in common."""
-
-    capture: tyro.conf.Positional[Path]
-    """Folder with impacts.csv and the wav files it names."""
-    method: ExtractionMethod = "high-resolution"
-    """high-resolution: matrix pencils in subbands, which part modes a few hertz apart. short-time: the paper's, bin by
-    bin of a short-time spectrum."""
-    modes: int = 128
-    """Most modes to keep."""
-    settings: Path | None = None
-    """A capture.toml to use in place of the folder's own."""
-    json: bool = False
-    """Print one JSON object on the standard output, all else on the standard error."""
-    picture: Path | None = None
-    """Where to draw the modes as stems: a file that ends in .png, .pdf or .svg."""
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf modes", args=words, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def run(options: Options) -> int:
@@ -55,7 +29,7 @@ def run(options: Options) -> int:
     impacts = capture.impacts
     count = counted(len(impacts), "recording")
     say(f"finding the modes of {count}, {impacts.duration:.3g} s at {impacts.sample_rate:g} Hz")
-    extraction = extract_modes(impacts, finder_named(options.method, options.modes))
+    extraction = extract_modes(impacts, finder_named(options.extraction, options.modes))
     level = levels(amplitudes(extraction))
     rows = mode_rows(extraction.bank, level)
     quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)
@@ -81,7 +55,7 @@ def run(options: Options) -> int:
                 "recordings": len(impacts),
                 "sample_rate": impacts.sample_rate,
                 "seconds": impacts.duration,
-                "method": options.method,
+                "method": options.extraction,
                 "alignment": None if aligned is None else asdict(aligned),
                 "modes": [asdict(row) | asdict(how) for row, how in modes],
                 "supporting_poles": [asdict(row) | asdict(how) for row, how in supporting],

@@ -1,4 +1,4 @@
-"""Modes as a table: what `avmsf modes` and `avmsf show` print."""
+"""Modes as a table: what `avmsf modes` and `avmsf info` print."""
 
 import math
 from dataclasses import dataclass

@@ -6,7 +6,7 @@ from types import TracebackType
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 
-from avmsf.cli.heartbeat import doing
+from avmsf.cli.heartbeat import doing, verbosity
 from avmsf.cli.printing import SafeColumn, console, say
 
 
@@ -22,7 +22,7 @@ class ObjectBar:
             MofNCompleteColumn(),
             TimeElapsedColumn(),
             console=console(errors=True),
-            disable=not self.live,
+            disable=not self.live or verbosity.quiet,
         )
         self.task = self.bar.add_task("", total=None)
         self.done = 0

@@ -8,7 +8,7 @@ from types import TracebackType
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
-from avmsf.cli.heartbeat import doing
+from avmsf.cli.heartbeat import doing, verbosity
 from avmsf.cli.printing import SafeColumn, console, say
 from avmsf.field.fit import Progress as FitProgress
 from avmsf.pipeline.scene import Listener
@@ -38,7 +38,7 @@ class OverallBar:
             TextColumn("{task.percentage:.0f} %"),
             _TimeLeft(self),
             console=console(errors=True),
-            disable=not self._live,
+            disable=not self._live or verbosity.quiet,
             transient=True,
         )
         self._task = self._bar.add_task(self._stage, total=1.0)

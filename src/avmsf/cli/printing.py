@@ -2,8 +2,10 @@
 
 import json
 import math
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -12,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from avmsf._utils.text import printable
-from avmsf.cli.heartbeat import printed
+from avmsf.cli.heartbeat import printed, verbosity
 
 _WIDTH = 120
 """Columns of tables that go to a file or a pipe, which have no width of their own."""
@@ -69,9 +71,16 @@ def decimals(value: float | int | None, places: int) -> str:
 
 
 def say(text: str) -> None:
-    """Print one line of progress or remark to the standard error."""
-    print(printable(text), file=sys.stderr, flush=True)
+    """Print a line of progress to the standard error, unless --quiet is given; a note or a warning always."""
+    if not verbosity.quiet or text.startswith(("note: ", "avmsf ")):
+        print(printable(text), file=sys.stderr, flush=True)
     printed(text)
+
+
+def next_command(command: str, path: Path | None = None, options: str = "") -> None:
+    """Print a command that is useful next, unless --quiet is given."""
+    words = [command, *([] if path is None else [shlex.quote(str(path))]), *([options] if options else [])]
+    say(f"next: {' '.join(words)}")
 
 
 def print_text(text: str) -> None:

@@ -5,7 +5,7 @@ from types import TracebackType
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from avmsf.cli.heartbeat import doing
+from avmsf.cli.heartbeat import doing, verbosity
 from avmsf.cli.printing import console, figure, say
 from avmsf.field.fit import Progress as FitProgress
 
@@ -23,7 +23,7 @@ class FitBar:
             TextColumn("loss {task.fields[loss]}"),
             TimeRemainingColumn(),
             console=console(errors=True),
-            disable=not self.live,
+            disable=not self.live or verbosity.quiet,
         )
         self.task = self.bar.add_task("", total=None, loss="–", visible=False)
 

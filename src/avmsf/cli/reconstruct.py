@@ -1,112 +1,27 @@
 """`avmsf reconstruct`: a capture folder with all that it shows and sounds like in, a field out."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import Annotated
-
-import tyro
+from dataclasses import asdict
 
 from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
-from avmsf.cli.fit import part_contacts, preset_of, print_fitted, refuse_with_material, show_guess
+from avmsf.cli.fit import part_contacts, print_fitted, refuse_with_material, show_guess
 from avmsf.cli.heartbeat import doing
+from avmsf.cli.options.reconstruct import Options
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scenebar import SceneBar
-from avmsf.cli.scenes import SceneOptions, features_words
+from avmsf.cli.scenes import features_words, settings_for
 from avmsf.cli.scores import compare, score_values
 from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
-from avmsf.field.config import FitConfig
 from avmsf.field.fit import Progress
-from avmsf.field.gains.estimator import GainModel
 from avmsf.field.store import load
 from avmsf.files import copy_whole
-from avmsf.modal.extraction.finders import ExtractionMethod
-from avmsf.pipeline.bodies import BodyConfig
-from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
-from avmsf.pipeline.features import LiftConfig
 from avmsf.pipeline.reconstruct import reconstruct, reconstruct_guess
-from avmsf.pipeline.scene import SceneConfig
-from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.record import capture_settings_of
 from avmsf.pipeline.stages import StageFolder
-from avmsf.scene.splatconfig import SplatConfig
-
-
-@dataclass(frozen=True)
-class Options(SceneOptions):
-    """Go all the way from a capture folder to a field: views, Gaussians, features, modes, gains.
-
-    FOLDER also has impacts.csv and the wav files it names. Each stage's output is kept in the cache, only what changed
-    is made anew, and an interrupted run goes on with the same command.
-    """
-
-    output: Annotated[Path | None, tyro.conf.arg(metavar="FIELD.safetensors")] = None
-    """File to copy the field to."""
-    material: str | None = None
-    """Guess the field of an object without recordings from its shape and its material; see `avmsf fit --help`."""
-    train_fraction: float | None = None
-    """Fit to all recordings at this part of the places, spread as far apart as they go, and score the field on the
-    others. Contacts nearer than 1 % of the extent of all are one place."""
-    train_count: int | None = None
-    """Likewise with so many places."""
-    start: int = 0
-    """Row of impacts.csv, counted from 0, whose place this choice starts from."""
-    method: ExtractionMethod = "high-resolution"
-    """How modes are found; see `avmsf modes --help`."""
-    modes: int = 128
-    """Most modes to keep."""
-    time_zero: TimeZero | None = None
-    """Where sounds start: onset, or peak (paper); capture.toml decides where this does not."""
-    device: str | None = None
-    """What computes: cpu, or cuda; the GPU where there is one. On it run the Gaussians
-    (with gsplat), DINOv2, training end to end, its spectral loss
-    and the network; the modes, clusters, finite elements and the Gaussian process run on the CPU."""
-    json: bool = False
-    """Print one JSON object on the standard output, all else on the standard error."""
-    gain_model: GainModel = "auto"
-    """How gains vary over the object; see `avmsf fit --help`."""
-    body: BodyConfig = field(default_factory=BodyConfig)
-    views: ViewsConfig = field(default_factory=ViewsConfig)
-    splat: SplatConfig = field(default_factory=SplatConfig)
-    lift: LiftConfig = field(default_factory=LiftConfig)
-    preset: Preset = "default"
-    """Where all settings start from, from views to the fit; see `avmsf fit --help`. `--preset paper --help` shows its
-    values."""
-    fit: FitConfig = field(default_factory=FitConfig)
-
-    @property
-    def pipeline(self) -> PipelineConfig:
-        """All settings as one."""
-        scene = SceneConfig(self.views, self.splat, self.lift)
-        start, place = self.time_zero, self.device
-        return PipelineConfig(self.gain_model, self.body, scene, self.fit, self.method, self.modes, start, place)
-
-
-@dataclass(frozen=True)
-class PaperOptions(Options):
-    """The same, starting from what the preset `paper` has otherwise."""
-
-    gain_model: GainModel = PRESETS["paper"].gain_model
-    method: ExtractionMethod = PRESETS["paper"].method
-    lift: LiftConfig = field(default_factory=lambda: PRESETS["paper"].scene.lift)
-    time_zero: TimeZero | None = PRESETS["paper"].time_zero
-    preset: Preset = "paper"
-    fit: FitConfig = field(default_factory=lambda: PRESETS["paper"].fit)
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell, with the preset's settings where they say nothing."""
-    return tyro.cli(
-        {"default": Options, "paper": PaperOptions}[preset_of(words)],
-        prog="avmsf reconstruct",
-        args=words,
-        description=Options.__doc__,
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
 
 
 def run(options: Options) -> int:
@@ -114,7 +29,7 @@ def run(options: Options) -> int:
     if options.output is not None:
         expect_writable(options.output)
     usable_device(options.device, raising=FitError, kinds=TRAINABLE)
-    settings = options.pipeline.capture_settings(options.read_settings())
+    settings = capture_settings_of(options.pipeline, settings_for(options))
     if options.material is not None:
         return _run_guess(options, options.material, settings)
     capture = read_capture(options.folder, settings)

@@ -1,94 +1,47 @@
 """`avmsf render`: the sounds of blows anywhere on the object."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
 
 import torch
-import tyro
 from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.audio import MAX_SAMPLES
 from avmsf.cli.contacts import Contacts, contacts_at, read_contacts, refuse_far
 from avmsf.cli.heartbeat import doing
+from avmsf.cli.options.render import Options
 from avmsf.cli.printing import print_text, say
-from avmsf.cli.writing import Coding, Level, OutputError, expect_writable, write_sound
+from avmsf.cli.writing import Level, OutputError, expect_writable, write_sound
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
-from avmsf.modal.pulse import ForcePulse, PulseShape
-from avmsf.simulate.hammer import LONGEST
+from avmsf.modal.pulse import ForcePulse
+from avmsf.simulate.recipe import LONGEST
 
 _MUCH_SOFTER = 20.0
 """Decibels under the recorded blow from which a softer mallet's are told of."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 
 
-@dataclass(frozen=True)
-class Options:
-    """Write the sounds of blows anywhere on the object as wav files.
-
-    Contacts come from `--at`, once a contact, or from a table with the columns x,y,z and perhaps file and nx,ny,nz,
-    such as a capture's own impacts.csv. Each is heard at the object's point nearest to it. An impact without a
-    direction goes straight into the surface.
-    """
-
-    field: tyro.conf.Positional[Path]
-    """Field file, as `avmsf fit` writes it."""
-    output: Annotated[Path, tyro.conf.arg(metavar="FOLDER|FILE.wav")]
-    """Folder for the sounds; or for one contact alone, a file that ends in .wav."""
-    at: Annotated[
-        tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]], tyro.conf.arg(metavar="X Y Z")
-    ] = ()
-    """A contact in the object frame."""
-    direction: Annotated[
-        tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]], tyro.conf.arg(metavar="X Y Z")
-    ] = ()
-    """The direction of the impact at each contact of --at, in the same order."""
-    contacts: Path | None = None
-    """Table of contacts."""
-    unit: Literal["m", "cm", "mm", "in", "ft"] = "m"
-    """What the contacts' coordinates count. A field itself is in metres, whatever its capture's unit was."""
-    force: float = 1.0
-    """Peak force of the blow, newtons, where the field knows forces; else relative to an average recorded blow."""
-    contact_time: float = 0.0
-    """How long a softer mallet stays on the object, seconds, with the same impulse: 0.002 is felt. 0: the recorded."""
-    pulse: PulseShape = "half-sine"
-    """How its force rises and falls. half-sine: a linear contact. hertz: two round bodies that flatten each other."""
-    seconds: float | None = None
-    """Length of the sounds; that of the training sounds where it is not given."""
-    normalise: Literal["none", "peak"] = "none"
-    """none: the recordings' own scale. peak: all sounds by one factor, so that the loudest reaches full scale."""
-    level_db: float = 0.0
-    """Gain on top of that, dB."""
-    coding: Coding = "float32"
-    """How a sample is written. float32 holds any level; int16 refuses sounds that would clip."""
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf render", args=words, config=(tyro.conf.FlagCreatePairsOff,))
-
-
 def run(options: Options) -> int:
     """Render and write."""
     metres = METRES[options.unit]
-    if bool(options.at) == (options.contacts is not None):
-        raise OutputError("expected contacts either by --at X Y Z, once or more, or by --contacts TABLE.csv")
-    if options.direction and len(options.direction) != len(options.at):
-        raise OutputError(f"expected one --direction for each --at, got {len(options.direction)} for {len(options.at)}")
-    contacts = contacts_at(options.at, metres=metres, directions=options.direction)
-    if options.contacts is not None:
-        contacts = read_contacts(options.contacts, metres=metres)
+    if bool(options.position) == (options.contact_table is not None):
+        raise OutputError("expected contacts either by --position X Y Z, once or more, or by --contact-table TABLE.csv")
+    if options.direction and len(options.direction) != len(options.position):
+        raise OutputError(
+            f"expected one --direction for each --position, got {len(options.direction)} for {len(options.position)}"
+        )
+    contacts = contacts_at(options.position, metres=metres, directions=options.direction)
+    if options.contact_table is not None:
+        contacts = read_contacts(options.contact_table, metres=metres)
     paths = _paths(options.output, contacts)
     for name in ("force", "level_db"):
         if not math.isfinite(getattr(options, name)):
             raise OutputError(f"--{name.replace('_', '-')} is {getattr(options, name)}; expected a finite number")
     if not bool(torch.isfinite(contacts.places).all()):
-        raise OutputError("--at: expected finite numbers as coordinates")
+        raise OutputError("--position: expected finite numbers as coordinates")
     field = load(options.field)
     refuse_far(contacts, field)
     if options.force != 1 and not field.origin.per_newton:
@@ -99,18 +52,18 @@ def run(options: Options) -> int:
     pulse = _pulse(options)
     rendered = partial(render_sounds, field, force=options.force, seconds=options.seconds)
     sounds = rendered(contacts.places, contacts.directions, pulse=pulse)
-    if pulse is not None and options.normalise == "none" and options.level_db == 0:
+    if pulse is not None and options.normalize == "none" and options.level_db == 0:
         loudest = int(sounds.abs().amax(1).argmax())
         place = contacts.places[loudest : loudest + 1]
         way = None if contacts.directions is None else contacts.directions[loudest : loudest + 1]
         hard = rendered(place, way)
         _say_softer(hard[0], sounds[loudest], pulse.contact_time)
-    sounds = sounds * Level(options.normalise, options.level_db).factor(sounds)
+    sounds = sounds * Level(options.normalize, options.level_db).factor(sounds)
     peak = float(sounds.abs().max())
     if options.coding == "float32" and peak > 1:
         say(
             f"note: the loudest sound peaks at {20 * math.log10(peak):+.1f} dB over full scale, where players clip; "
-            "add --normalise peak, or lower --level-db"
+            "add --normalize peak, or lower --level-db"
         )
     for path, sound in zip(paths, sounds, strict=True):
         write_sound(path, sound, sample_rate=field.sample_rate, coding=options.coding)
@@ -127,7 +80,7 @@ def _say_softer(hard: Float[Tensor, " samples"], soft: Float[Tensor, " samples"]
     if faint > 0 and (softer := 20 * math.log10(loud / faint)) > _MUCH_SOFTER:
         say(
             f"note: with a contact of {1e3 * contact_time:.3g} ms the sound peaks {softer:.0f} dB lower than that of "
-            "the recorded blow, and no level was changed: add --normalise peak or --level-db, or a shorter "
+            "the recorded blow, and no level was changed: add --normalize peak or --level-db, or a shorter "
             "--contact-time"
         )
 

@@ -5,7 +5,7 @@ from types import TracebackType
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from avmsf.cli.heartbeat import doing
+from avmsf.cli.heartbeat import doing, verbosity
 from avmsf.cli.printing import SafeColumn, console, figure, say
 from avmsf.pipeline.scene import Listener
 from avmsf.scene.lift import LiftProgress
@@ -27,7 +27,7 @@ class SceneBar:
             SafeColumn("{task.fields[words]}"),
             TimeRemainingColumn(),
             console=console(errors=True),
-            disable=not self.live,
+            disable=not self.live or verbosity.quiet,
         )
         self.tasks: dict[str, TaskID] = {}
         self.told = 0

@@ -1,38 +1,18 @@
 """What the verbs that turn a folder's look into features have in common."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
-
-import tyro
 
 from avmsf.capture import CaptureSettings
 from avmsf.capture.folder import settings_of
-from avmsf.pipeline.reconstruct import CACHE
+from avmsf.cli.options.scenes import SceneOptions
 from avmsf.pipeline.stages import Kept
 from avmsf.scene.symmetry import Symmetries
 
 
-@dataclass(frozen=True)
-class SceneOptions:
-    """Where a folder's look is read and its stages are kept."""
-
-    folder: tyro.conf.Positional[Path]
-    """Folder with photographs (transforms.json, a COLMAP model, or images/ alone), a video, a mesh or Gaussians."""
-    cache: Path | None = None
-    """Folder to keep each stage's output in, so that it need not be made again; FOLDER/.avmsf without it."""
-    settings: Path | None = None
-    """A capture.toml to use in place of the folder's own."""
-
-    @property
-    def kept(self) -> Path:
-        """The folder of kept stages."""
-        return self.folder / CACHE if self.cache is None else self.cache
-
-    def read_settings(self) -> CaptureSettings:
-        """Return the settings of the capture that the folder is, or the defaults."""
-        return settings_of(self.folder) if self.settings is None else CaptureSettings.read(self.settings)
+def settings_for(options: SceneOptions) -> CaptureSettings:
+    """Return the settings of the capture that the folder is, or the defaults."""
+    return settings_of(options.folder) if options.settings is None else CaptureSettings.read(options.settings)
 
 
 def stage_line(name: str, kept: Kept) -> str:

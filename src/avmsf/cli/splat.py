@@ -1,50 +1,24 @@
 """`avmsf splat`: a folder's photographs, video or mesh in, Gaussians out."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated
-
-import tyro
-
 from avmsf.capture.together import expect_one_unit
 from avmsf.cli import INTERRUPTED
+from avmsf.cli.options.splat import Options
 from avmsf.cli.printing import print_text, say
 from avmsf.cli.scenebar import SceneBar
-from avmsf.cli.scenes import SceneOptions, stage_line
+from avmsf.cli.scenes import settings_for, stage_line
 from avmsf.cli.writing import expect_writable
 from avmsf.files import copy_whole
-from avmsf.pipeline.scene import SceneConfig, SceneStages
-from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.config import SceneConfig
+from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.ply import read_splats
-from avmsf.scene.splatconfig import SplatConfig
-
-
-@dataclass(frozen=True)
-class Options(SceneOptions):
-    """Turn photographs, a video or a mesh into Gaussians, as a .ply file that any 3DGS viewer opens.
-
-    Views and Gaussians are kept in the cache; an interrupted run goes on with the same command.
-    """
-
-    output: Annotated[Path | None, tyro.conf.arg(metavar="CLOUD.ply")] = None
-    """File to copy the Gaussians to."""
-    views: ViewsConfig = field(default_factory=ViewsConfig)
-    config: tyro.conf.OmitArgPrefixes[SplatConfig] = field(default_factory=SplatConfig)
-    """Settings of the splatting."""
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf splat", args=words, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def run(options: Options) -> int:
     """Make the Gaussians; return 130 where Ctrl-C stopped it."""
     if options.output is not None:
         expect_writable(options.output)
-    settings = options.read_settings()
+    settings = settings_for(options)
     expect_one_unit(options.folder, settings)
     stages = StageFolder(options.kept)
     try:
@@ -55,6 +29,7 @@ def run(options: Options) -> int:
                 SceneConfig(views=options.views, splat=options.config),
                 settings=settings,
                 listener=bar.listener,
+                device=options.device,
             )
             scene.expect_any()
             with stages.lock("avmsf splat"):

@@ -3,30 +3,29 @@
 import dataclasses
 import math
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from avmsf.bench.clap import Clap
 from avmsf.cli.clapcurve import CLAP, ClapCurve
-from avmsf.cli.heartbeat import doing
+from avmsf.cli.heartbeat import doing, verbosity
+from avmsf.cli.options.edit import GuideOptions
 from avmsf.cli.printing import console, figure, say
 from avmsf.cli.writing import Level, write_sound
 from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.simulate.material import Material, material_named
-from avmsf.tasks.distillation import DecoderDistillation, DistillationConfig, expect_prompt
+from avmsf.tasks.distillation import DecoderDistillation, expect_prompt
 from avmsf.tasks.edits import EDITS
 from avmsf.tasks.materialstatistics import MaterialStatistics
 from avmsf.tasks.parameters import PARAMETERISATIONS
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
-from avmsf.tasks.stableaudiofiles import STABLE_AUDIO
-from avmsf.tasks.steer import Guide, SteerConfig, SteerProgress, steer
+from avmsf.tasks.steer import Guide, SteerProgress, steer
 
 _PREVIEW = Level("peak", -1.0)
 _GENERATED_SECONDS = 3.0
@@ -36,41 +35,12 @@ _OF_THE_MODEL = ("--model", "--negative", "--model-seconds", "--device", "--gene
 
 
 @dataclass(frozen=True)
-class Steering:
+class Steering(GuideOptions):
     """A descent towards a prompt, recordings, or the sound of a material; only one of them.
 
     While it runs, the sound as it stands can be heard beside the output. An interrupted edit leaves its state there;
     the same command goes on from it to the same result.
     """
-
-    prompt: str | None = None
-    """Lead the sound towards these words, as "a wooden bowl is hit", by a text-to-audio model; needs the extra
-    `text`."""
-    like: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="WAV|FOLDER")] = ()
-    """Lead the sound towards recordings of blows on another object, files or folders of them."""
-    like_material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Lead the sound towards what objects of a material sound like, made up from this object's modes by the laws of
-    elasticity: a pull towards its pitches and rings, where --material follows the laws to the letter."""
-    model: str = STABLE_AUDIO
-    """Folder that holds a Stable Audio pipeline, or its name on the hub."""
-    negative: str | None = None
-    """Words to lead away from."""
-    model_seconds: float | None = None
-    """Seconds that the model works at; all that it was made for where not given, which costs in proportion."""
-    device: str | None = None
-    """Where the model computes: cuda, cpu; the GPU where there is one."""
-    generated: Annotated[Path | None, tyro.conf.arg(metavar="WAV")] = None
-    """Also write the sound that the model makes of the prompt alone, without the field: the paper's baseline."""
-    clap: Annotated[str | None, tyro.conf.arg(metavar="FOLDER|NAME")] = None
-    """Also take the CLAP score of the unedited field and of every preview by this network, a folder or a name on the
-    hub; needs the extra `eval`."""
-    parameters: Literal["hierarchical", "published", "independent", "searched"] = "hierarchical"
-    """What is free to move. hierarchical: factors on all frequencies and all dampings, then single modes, with a
-    penalty. published: the paper's form, a factor on all frequencies and single modes without a penalty, gains times
-    f1/f2 at the end. independent: single modes alone (Audio-SDS). searched: the same from where the search for common
-    factors ends."""
-    distillation: tyro.conf.OmitArgPrefixes[DistillationConfig] = field(default_factory=DistillationConfig)
-    config: tyro.conf.OmitArgPrefixes[SteerConfig] = field(default_factory=SteerConfig)
 
     @property
     def asked(self) -> bool:
@@ -187,7 +157,7 @@ class SteerBar:
             TextColumn("loss {task.fields[loss]}, pitch x {task.fields[pitch]}"),
             TimeRemainingColumn(),
             console=console(errors=True),
-            disable=not self.live,
+            disable=not self.live or verbosity.quiet,
         )
         self.task = self.bar.add_task("", total=None, loss="–", pitch="–")
 

@@ -3,16 +3,13 @@
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
-
-import tyro
 
 from avmsf.bench.doubtpictures import draw_doubt
 from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.heartbeat import doing
+from avmsf.cli.options.suggest import Options
 from avmsf.cli.printing import console, figure, print_json, say, table
 from avmsf.cli.writing import expect_writable, write_text
 from avmsf.errors import FitError
@@ -23,36 +20,6 @@ from avmsf.field.uncertainty import relative_gain_std, unedited_mixture
 TABLE, PICTURE = "suggested.csv", "suggested.png"
 """What the folder of results holds."""
 _DRAWN_POINTS = 4000
-
-
-@dataclass(frozen=True)
-class Options:
-    """Say where to strike next: the contacts that lower the expected error of the whole field most.
-
-    Each contact takes those before it as struck, so they are worth most in this order. Strike them, fit again with all
-    recordings, and ask again. The field has to know how sure it is, as those with physics or splines do.
-    """
-
-    field: tyro.conf.Positional[Path]
-    """Field file, as `avmsf fit` writes it."""
-    count: int = 5
-    """How many contacts."""
-    candidates: Path | None = None
-    """Capture whose contacts are the places that can be struck. Without it: all of the surface that a straight hammer
-    of 10 mm gets to from outside, at most 45 degrees from straight on."""
-    unseen: bool = False
-    """Consider all of the surface of the field's body, also what no photograph showed, as the side that it stood on."""
-    settings: Path | None = None
-    """A capture.toml to use in place of that capture's own."""
-    output: Path | None = None
-    """Folder for suggested.csv, a list to walk by, and suggested.png, the contacts on the object; none without it."""
-    json: bool = False
-    """Print one JSON object on the standard output, all else on the standard error."""
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf suggest", args=words, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def run(options: Options) -> int:

@@ -1,53 +1,26 @@
 """`avmsf surface`: a folder's mesh, photographs or video in, the object's surface out."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import get_args
 
 import trimesh
-import tyro
 
 from avmsf.bench.pictures import expect_format, save_picture
 from avmsf.bench.surfacepictures import draw_surface
 from avmsf.capture.surface import Surface, SurfaceKind, find_surface, read_surface, write_surface
 from avmsf.capture.together import expect_one_unit
 from avmsf.cli import INTERRUPTED
+from avmsf.cli.options.scenes import with_seed
+from avmsf.cli.options.surface import Options
 from avmsf.cli.printing import print_text, say
 from avmsf.cli.scenebar import SceneBar
-from avmsf.cli.scenes import SceneOptions, stage_line
+from avmsf.cli.scenes import settings_for, stage_line
 from avmsf.cli.writing import OutputError, expect_writable
 from avmsf.files import write_whole
+from avmsf.pipeline.config import SceneConfig
 from avmsf.pipeline.reconstruct import keep_surface, object_shape
-from avmsf.pipeline.scene import SceneConfig, SceneStages
-from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import StageFolder
-from avmsf.scene.splatconfig import SplatConfig
-
-
-@dataclass(frozen=True)
-class Options(SceneOptions):
-    """Write an object's surface alone: its mesh, or without one what its views show.
-
-    In meters and in the frame of the folder. Views show both sides of a wall where both were seen, and cavities as deep
-    as they were seen. `avmsf reconstruct` tries this as one of the bodies that may vibrate; the others have walls of
-    several thicknesses below its outer side, since views do not show how thick a wall is. Views and Gaussians are made
-    first where the cache does not have them.
-    """
-
-    output: Annotated[Path | None, tyro.conf.arg(metavar="SURFACE.ply")] = None
-    """File to write the surface to; surface.ply in the cache holds it anyway."""
-    format: SurfaceKind | None = None
-    """Format of that file; what its name ends in without it."""
-    picture: Path | None = None
-    """Where to draw the surface, and two cuts through it: a file that ends in .png, .pdf or .svg."""
-    views: ViewsConfig = field(default_factory=ViewsConfig)
-    splat: SplatConfig = field(default_factory=SplatConfig)
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf surface", args=words, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def run(options: Options) -> int:
@@ -56,8 +29,8 @@ def run(options: Options) -> int:
         expect_writable(options.output)
     if options.picture is not None:
         expect_format(options.picture)
-    kind = options.format or ("ply" if options.output is None else kind_of(options.output))
-    settings = options.read_settings()
+    kind = "ply" if options.output is None else kind_of(options.output)
+    settings = settings_for(options)
     expect_one_unit(options.folder, settings)
     stages = StageFolder(options.kept)
     try:
@@ -65,9 +38,10 @@ def run(options: Options) -> int:
             scene = SceneStages(
                 options.folder,
                 stages,
-                SceneConfig(views=options.views, splat=options.splat),
+                with_seed(SceneConfig(views=options.views, splat=options.splat), options.seed),
                 settings=settings,
                 listener=bar.listener,
+                device=options.device,
             )
             scene.expect_any()
             with stages.lock("avmsf surface"):
@@ -99,7 +73,7 @@ def kind_of(path: Path) -> SurfaceKind:
             return kind
     raise OutputError(
         f"{path}: expected a name that ends in {', '.join(f'.{kind}' for kind in kinds)}, got "
-        f"{path.suffix or 'no ending'}: rename it, or give --format"
+        f"{path.suffix or 'no ending'}: rename it"
     )
 
 

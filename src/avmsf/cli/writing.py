@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf.cli.options.render import Coding
 from avmsf.errors import AvmsfError
 from avmsf.files import write_whole
 
 SUBTYPES = {"float32": "FLOAT", "int16": "PCM_16"}
-Coding = Literal["float32", "int16"]
 
 
 class OutputError(AvmsfError):
@@ -27,7 +27,7 @@ class OutputError(AvmsfError):
 class Level:
     """How loud sounds are written."""
 
-    normalise: Literal["none", "peak"] = "none"
+    normalize: Literal["none", "peak"] = "none"
     """none: as they are. peak: all sounds by one factor, so that the loudest reaches full scale."""
     level_db: float = 0.0
     """Gain on top of that, dB."""
@@ -36,7 +36,7 @@ class Level:
         """Return what the sounds are multiplied by: one factor for all keeps loud contacts louder than faint ones."""
         peak = float(sounds.abs().max())
         gain = 10 ** (self.level_db / 20)
-        return gain / peak if self.normalise == "peak" and peak > 0 else gain
+        return gain / peak if self.normalize == "peak" and peak > 0 else gain
 
 
 def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: float, coding: Coding) -> None:
@@ -55,7 +55,7 @@ def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: fl
     if coding == "int16" and peak > 1 - 2**-15:
         raise OutputError(
             f"{path}: 16 bits hold amplitudes up to 1 and this sound peaks at {peak:.3g} "
-            f"({20 * math.log10(peak):+.1f} dB), so it would clip: add --normalise peak --level-db -0.1, lower "
+            f"({20 * math.log10(peak):+.1f} dB), so it would clip: add --normalize peak --level-db -0.1, lower "
             "--level-db, or write float32"
         )
     memory = io.BytesIO()

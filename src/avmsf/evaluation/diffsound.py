@@ -35,9 +35,10 @@ from avmsf.evaluation.material_fit import (
 )
 from avmsf.fem.family import BodyFamily
 from avmsf.modal.bank import ModalBank
+from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import Residual, low_fluctuation_noise
-from avmsf.modal.spectra import magnitude_stft, scaled_fft_size
+from avmsf.modal.spectra import magnitude_stft
 from avmsf.modal.synthesis import synthesise
 from avmsf.simulate.elastic import ElasticModes
 

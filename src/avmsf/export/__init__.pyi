@@ -3,7 +3,6 @@ from .faust import write_faust as write_faust
 from .gltf import write_gltf as write_gltf
 from .modaldemo import read_demo as read_demo
 from .modaldemo import write_demo as write_demo
-from .player import Player as Player
 from .sampledfield import SampledField as SampledField
 from .universal import write_universal as write_universal
 from .wavgrid import write_grid as write_grid

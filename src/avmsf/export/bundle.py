@@ -19,6 +19,7 @@ from jaxtyping import Shaped
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import Surface
 from avmsf.errors import ExportError
+from avmsf.export.formats import MOST_POINTS
 from avmsf.export.objectfile import ObjectFile, read_object
 from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, write_folder
@@ -28,8 +29,6 @@ FORMAT = 1
 """Number of this format; it grows with every change that older pages could not read."""
 SURFACE = "surface.glb"
 """What the file of the surface is called."""
-MOST_POINTS = 20_000
-"""Contacts that a page gets unless more are asked for: 128 modes at each are 20 MB."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,10 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.errors import ExportError
+from avmsf.export.formats import FAUST_SUFFIXES
 from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, expect_ending, generator, write_file
 
-SUFFIXES = (".dsp", ".lib")
 _FEWEST = 16
 """Points below which the noise is given up for more of them."""
 _ROW = 8
@@ -31,7 +31,7 @@ def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, fo
     compiles in reasonable time.
     """
     path = Path(path)
-    expect_ending(path, SUFFIXES)
+    expect_ending(path, FAUST_SUFFIXES)
     with_noise = noise and bool(field.noise.any())
     text = faust_library(field, noise=with_noise)
     if path.suffix == ".dsp":

@@ -20,12 +20,12 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from avmsf.errors import ExportError
+from avmsf.export.formats import GLTF_SUFFIXES
 from avmsf.export.look import Look
 from avmsf.export.onephase import deviation, importance, shared_dampings, signed_amplitudes
 from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, expect_ending, generator, write_file
 
-SUFFIXES = (".glb",)
 EXTENSION = "KHR_audio_rigid_bodies"
 _FLOAT, _UNSIGNED = 5126, 5125
 _POINTS, _TRIANGLES = 0, 4
@@ -39,7 +39,7 @@ def write_gltf(sampled: SampledField, path: str | Path, *, look: Look | None = N
     Raises `ExportError` for a name that does not end in .glb, and a field without modes.
     """
     path = Path(path)
-    expect_ending(path, SUFFIXES)
+    expect_ending(path, GLTF_SUFFIXES)
     if not len(sampled.frequency):
         raise ExportError("expected a field with modes that sound below half the sample rate, found none to export")
     damping = shared_dampings(sampled)

@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from torch import Tensor
 from avmsf.errors import ExportError
 from avmsf.export.bundle import write_files
 from avmsf.export.discs import discs
+from avmsf.export.formats import Precision
 from avmsf.export.normals import outward_normals
 from avmsf.export.onephase import deviation, signed_amplitudes
 from avmsf.export.packedarrays import described, number_in, pack, read_array, read_manifest
@@ -29,7 +30,6 @@ from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import write_splats
 
 PICKING, SCENE, MODAL = "picking.bin", "scene.ply", "modal.bin"
-Precision = Literal["float16", "float32"]
 _PICKED = {"means": 3, "scales": 3, "quaternions": 4, "opacities": 1}
 _MOST_RATE, _MOST_SECONDS = 768_000, 600
 """Hz and seconds that sounds have at most; what is beyond is taken for a slip."""
@@ -101,7 +101,7 @@ def write_demo(
     if others and not stay and not force:
         raise ExportError(
             f"{folder}: expected a free name, or variants of the same Gaussians, found {', '.join(others)} of others: "
-            "choose another folder, or add --force to lose them"
+            "choose another folder, or add --overwrite to lose them"
         )
     kept = others if stay else {}
 

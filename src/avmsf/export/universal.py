@@ -19,11 +19,11 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from avmsf.errors import ExportError
+from avmsf.export.formats import UNIVERSAL_SUFFIXES
 from avmsf.export.onephase import shared_dampings
 from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, expect_ending, generator, write_file
 
-SUFFIXES = (".uff", ".unv")
 _NORMAL_MODE, _COMPLEX_MODE = 2, 3
 _TRANSLATION = 2
 _STRAIGHT = 1.0
@@ -42,7 +42,7 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
     or .unv, and where pyuff is missing.
     """
     path = Path(path)
-    expect_ending(path, SUFFIXES)
+    expect_ending(path, UNIVERSAL_SUFFIXES)
     if functions < 0:
         raise ExportError(f"expected 0 response functions or more, found {functions}: say how many are wanted")
     pyuff = _pyuff()

@@ -15,7 +15,8 @@ from torch import Tensor
 from avmsf.errors import ExportError
 from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, write_folder
-from avmsf.modal.pulse import ForcePulse, PulseShape
+from avmsf.modal.config import PulseShape
+from avmsf.modal.pulse import ForcePulse
 
 TABLE, INSTRUMENT, SOUNDS = "strikes.csv", "instrument.sfz", "sounds"
 _WHERE = ("x", "y", "z", "nx", "ny", "nz")

@@ -16,14 +16,13 @@ from typing import Any
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import Surface
 from avmsf.errors import ExportError
-from avmsf.export.bundle import MOST_POINTS, Bundle, make_bundle, write_files
+from avmsf.export.bundle import Bundle, make_bundle, write_files
+from avmsf.export.formats import MOST_POINTS, PAGE_SUFFIXES
 from avmsf.export.policy import directives_of, with_policy
 from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, generator, write_file, write_folder
 from avmsf.field.soundfield import SoundField
 
-SUFFIXES = (".html", ".htm")
-"""Endings of a page in one file."""
 IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
 """Where the page says from where three and spark come."""
 _STYLE = re.compile(r'<link\b[^>]*\bhref="(?:\./)?page/(\w+\.css)"[^>]*>')
@@ -66,7 +65,7 @@ def write_webpage(
     """
     output = Path(output)
     bundle = make_bundle(field, object=object, metres=metres, surface=surface, strikes=strikes, limit=limit)
-    if output.suffix.lower() in SUFFIXES:
+    if output.suffix.lower() in PAGE_SUFFIXES:
         return Written(write_file(output, single_file(bundle).encode(), force=force), bundle.remarks)
     content = {**page_files(), **bundle.files}
     html = content["index.html"].decode()

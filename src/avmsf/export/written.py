@@ -150,6 +150,6 @@ def _folder_made_here(folder: Path) -> bool:
 
 def _foreign(path: Path, what: str) -> ExportError:
     return ExportError(
-        f"{path}: expected a free name or an earlier export, found {what}: choose another name, or add --force to "
+        f"{path}: expected a free name or an earlier export, found {what}: choose another name, or add --overwrite to "
         "write over files of the same names"
     )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -11,31 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from avmsf._utils.records import count_of, like, record_of
+from avmsf.field.config import AttentionShape
 from avmsf.field.gainfield import Gains, TrainableGains
 from avmsf.scene.features import FeatureField, Regions
-
-
-@dataclass(frozen=True)
-class AttentionShape:
-    """The network's sizes."""
-
-    clusters: int
-    """Regions K that the network attends to."""
-    bands: int
-    """Octaves of sines and cosines in the encoding of offsets."""
-    width: int
-    """Size d of queries, keys and values."""
-    hidden: int
-    """Neurons in each hidden layer of the head."""
-    layers: int
-    """Hidden layers of the head."""
-    feature_scale: float
-    """Factor on the features as the network reads them."""
-    spatial_damping: bool = False
-    """Whether damping, too, depends on the contact."""
-    projection: bool = False
-    """Whether what attention reads is projected before it is joined with the contact's feature."""
-
 
 _MAX_LAYERS = 64
 """Hidden layers, or bands of frequency, of a network in a file: thirty times those of the paper's. Each takes time

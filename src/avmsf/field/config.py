@@ -5,11 +5,36 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 from avmsf.errors import FitError
-from avmsf.field.attention import AttentionShape
-from avmsf.modal.spectra import scaled_fft_size
+from avmsf.modal.config import scaled_fft_size
+
+AUTO, NETWORK = "auto", "network"
+GainModel = Literal["auto", "network", "smooth", "thin-plate", "symmetry", "visual", "elastic"]
+"""How gains vary over an object: see `avmsf.field.gains.estimator`."""
 
 _COUNTS = ("clusters", "width", "hidden", "interleave", "early")
 _POSITIVE = ("feature_scale", "warmup_rate", "learning_rate")
+
+
+@dataclass(frozen=True)
+class AttentionShape:
+    """The network's sizes."""
+
+    clusters: int
+    """Regions K that the network attends to."""
+    bands: int
+    """Octaves of sines and cosines in the encoding of offsets."""
+    width: int
+    """Size d of queries, keys and values."""
+    hidden: int
+    """Neurons in each hidden layer of the head."""
+    layers: int
+    """Hidden layers of the head."""
+    feature_scale: float
+    """Factor on the features as the network reads them."""
+    spatial_damping: bool = False
+    """Whether damping, too, depends on the contact."""
+    projection: bool = False
+    """Whether what attention reads is projected before it is joined with the contact's feature."""
 
 
 @dataclass(frozen=True)

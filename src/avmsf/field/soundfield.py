@@ -26,7 +26,7 @@ from avmsf.modal.residual import Residual, low_fluctuation_noise, shape_noise
 from avmsf.modal.synthesis import synthesise_phased
 
 if TYPE_CHECKING:
-    from avmsf.field.gains.estimator import GainModel
+    from avmsf.field.config import GainModel
     from avmsf.field.suggest import Suggestions
     from avmsf.pipeline.config import PipelineConfig
     from avmsf.scene.features import FeatureField

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -10,7 +9,8 @@ from jaxtyping import Float, Float64
 from scipy.special import betainc
 from torch import Tensor
 
-PulseShape = Literal["half-sine", "hertz"]
+from avmsf.modal.config import PulseShape
+
 _EXPONENTS: dict[str, float] = {"half-sine": 1.0, "hertz": 1.5}
 
 

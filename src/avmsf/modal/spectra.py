@@ -14,20 +14,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def scaled_fft_size(fft_size: int, *, sample_rate: float) -> int:
-    """Return the FFT size that spans at `sample_rate` Hz nearly the time that `fft_size` samples span at 44.1 kHz.
-
-    A power of two times `fft_size`, never below a quarter of it: a rate below 15.6 kHz marks a large, slow object whose
-    modes need as many samples to tell apart, not a coarse recording of a small one. So 44.1 and 48 kHz have the size as
-    it stands, 96 kHz twice the size, and a structure measured at 400 Hz a quarter. Hops and lengths scale alike. Raises
-    ValueError for a rate that is not positive.
-    """
-    if not sample_rate > 0.0:
-        raise ValueError(f"a sample rate must be positive, got {sample_rate:g} Hz")
-    octaves = max(-2, round(math.log2(sample_rate / 44100.0)))
-    return max(2, round(fft_size * 2.0**octaves))
-
-
 def magnitude_stft(
     sounds: Float[Tensor, "contacts samples"], *, fft_size: int, hop: int
 ) -> Float[Tensor, "contacts bins frames"]:

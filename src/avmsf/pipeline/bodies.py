@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -11,33 +10,10 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.placement import expect_placed, surface_points
 from avmsf.capture.surface import Surface
-from avmsf.errors import SimulationError
 from avmsf.fem.supports import Support
 from avmsf.field.gains.bodies import CandidateBodies
+from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.nominal import NominalBody, Shape, nominal_bodies, refined, supported, with_wall
-
-
-@dataclass(frozen=True)
-class BodyConfig:
-    """How an object's shape becomes bodies that vibrate."""
-
-    wall: float | None = None
-    """Thickness of the object's wall, metres, where it is known; 0 for a body that its surface encloses whole. By
-    itself it tries several, and the recordings choose."""
-    shapes: int = 80
-    """Lowest elastic mode shapes that gains are made of, and on which stiffness and density are updated."""
-    freedoms: int = 40_000
-    """Degrees of freedom of the finite elements, about."""
-    supports: Literal["auto", "free", "try"] = "auto"
-    """Whether the object may have been held at its lowest face or point, or along a lower edge (z is upwards). auto:
-    tried if the free body predicts recordings left out little better than no body. free: it lay on foam or hung. try:
-    always tried, which takes 10 to 30 s more."""
-
-    def __post_init__(self) -> None:
-        if self.wall is not None and not 0 <= self.wall < float("inf"):
-            raise SimulationError(f"wall = {self.wall}: expected metres, or 0 for a body without a cavity")
-        if self.shapes < 1:
-            raise SimulationError(f"shapes = {self.shapes}: expected 1 or more")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,8 @@
 """From Gaussians and views to the features that a gain field reads: described, lifted, pooled over symmetries."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
@@ -11,6 +10,7 @@ from avmsf._utils.device import usable_device
 from avmsf.capture.cameras import View
 from avmsf.capture.surface import Surface
 from avmsf.errors import SceneError
+from avmsf.pipeline.config import AUTO, DESCRIPTORS, DINO, LiftConfig
 from avmsf.scene.descriptors import ImageDescriptors
 from avmsf.scene.dino import DinoEncoder
 from avmsf.scene.encode import Encoder
@@ -20,64 +20,12 @@ from avmsf.scene.lift import Lifted, LiftProgress, by_presence, by_visibility, l
 from avmsf.scene.points import sample_surface
 from avmsf.scene.rasteriser import Rasteriser
 from avmsf.scene.reduction import reduce, resize, with_positions
-from avmsf.scene.refine import ANGLES, orbit_spread, refine
+from avmsf.scene.refine import orbit_spread, refine
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrysearch import find_symmetries
 from avmsf.scene.visibility import depth_of_surface
 
-DINO = "facebook/dinov2-base"
-DESCRIPTORS = "descriptors"
-AUTO = "auto"
 _WEIGHTINGS = {"plain": by_presence, "visibility": by_visibility}
-
-
-@dataclass(frozen=True)
-class LiftConfig:
-    """Settings of the features."""
-
-    encoder: str = AUTO
-    """What describes the images: the name of a DINOv2 model (such as facebook/dinov2-base), a folder that holds one,
-    `descriptors` (built in, no download), or `auto`: DINOv2 base where it is to be had, else the built-in ones."""
-    longest: int = 518
-    """Pixels of an image's longer side as DINOv2 sees it."""
-    background: Literal["inpainted", "kept"] = "inpainted"
-    """What the encoder sees outside an object's mask: the object's colors carried on, or the image as it is (paper)."""
-    weighting: Literal["plain", "visibility"] = "visibility"
-    """How the views that see a point are averaged: by how well they see it, or plainly (paper)."""
-    components: int = 32
-    """Principal components of the features to keep; 0 keeps the features as they are."""
-    symmetry: bool = True
-    """Whether features are made alike where the object's symmetries make its shape alike."""
-    missing: float = 0.1
-    """Part of the object's surface that may have its counterpart in a hole of the points, for a symmetry to count: more
-    where large parts of the object were not seen, up to .45."""
-    iterations: int = 3
-    """How often features are pooled over the symmetries (paper: T)."""
-    angles: int = ANGLES
-    """Angles that stand for all of a continuous rotation (paper: the size of Theta)."""
-    reach: float = 3.0
-    """Point spacings within which the nearest point is a symmetric counterpart; 0 takes it at any distance (paper)."""
-    positions: bool = True
-    """Whether the points' positions, relative to the object's size, stand before the features."""
-    size: float = 0.3
-    """Root mean square length of the features beside positions, which are about .5 long; alone they have length 1."""
-    onto: Literal["mesh", "gaussians"] = "mesh"
-    """What is the object where a folder shows a mesh alone: its own surface, or Gaussians fitted to pictures of it."""
-    points: int = 8192
-    """Points of a mesh whose own surface is the object."""
-    seed: int = 0
-    """Start of all chance: which points of a mesh, which of them the search for symmetries looks at."""
-
-    def __post_init__(self) -> None:
-        for name, least in {"longest": 1, "components": 0, "iterations": 1, "angles": 2, "points": 100}.items():
-            if getattr(self, name) < least:
-                raise SceneError(f"{name} = {getattr(self, name)}: expected {least} or more")
-        if not 0 <= self.missing <= 0.45:
-            raise SceneError(f"missing = {self.missing}: expected 0 to 0.45")
-        if not 0 <= self.reach < math.inf:
-            raise SceneError(f"reach = {self.reach}: expected a number of point spacings, or 0 for any distance")
-        if not 0 < self.size < math.inf:
-            raise SceneError(f"size = {self.size}: expected more than 0")
 
 
 @dataclass(frozen=True, eq=False)

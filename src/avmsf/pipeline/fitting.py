@@ -12,14 +12,16 @@ from rich.progress import Progress as Bar
 from avmsf._utils.caching import discard
 from avmsf.capture import Capture
 from avmsf.errors import FitError
+from avmsf.field.config import GainModel
 from avmsf.field.fit import Progress, fit
 from avmsf.field.gains.bodies import CandidateBodies
-from avmsf.field.gains.estimator import GainModel, estimator_for
+from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_once
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import PipelineConfig, with_record
+from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.reconstruct import expect_on_object
+from avmsf.pipeline.record import finder_of, with_record
 from avmsf.scene.features import FeatureField
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrysearch import find_symmetries
@@ -66,9 +68,9 @@ def fit_capture(
     )
     log(f"finding the modes of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     if output is None:
-        modes = extract_modes(train, config.finder)
+        modes = extract_modes(train, finder_of(config))
     else:
-        modes = extract_once(train, config.finder, unfinished(output, "modes"))
+        modes = extract_once(train, finder_of(config), unfinished(output, "modes"))
     log(f"fitting a field of {len(modes.bank)} modes")
     try:
         fitted = fit(

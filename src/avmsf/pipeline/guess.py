@@ -19,12 +19,13 @@ from avmsf.field.gains.body import BodyGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
-from avmsf.pipeline.bodies import BodyConfig
+from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.elastic import ElasticModes
-from avmsf.simulate.hammer import Hammer, contact_times, pulse_spectrum
+from avmsf.simulate.hammer import contact_times, pulse_spectrum
 from avmsf.simulate.material import Material, material_named
 from avmsf.simulate.nominal import NominalBody, Shape, nominal_bodies
+from avmsf.simulate.recipe import Hammer
 from avmsf.simulate.vibration import damped, rayleigh
 
 SAMPLE_RATE = 44_100.0

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 from avmsf._utils.locks import NO_LIMIT
 from avmsf.capture.datasets.dataset import Dataset
@@ -12,12 +11,11 @@ from avmsf.evaluation.material_fit import MODES as DIFFSOUND_MODES
 from avmsf.fem.family import BodyFamily, body_family
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.geometry import ObjectShape
-from avmsf.pipeline.bodies import BodyConfig, candidate_bodies, roughened
-from avmsf.pipeline.scene import SceneConfig, SceneStages
-from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.bodies import candidate_bodies, roughened
+from avmsf.pipeline.config import BodyConfig, Geometry, SceneConfig, ViewsConfig
+from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import StageFolder
 
-Geometry = Literal["mesh", "gaussians", "noisy"]
 """What an object's shape is known by: its mesh; Gaussians fitted to its views; its mesh as a bad scan has it."""
 NOISE = 0.02
 """Displacement of a noisy mesh's vertices over the object's size."""

@@ -8,10 +8,8 @@ from avmsf._utils.locks import NO_LIMIT
 from avmsf.bench.task import Look
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.errors import SceneError
-from avmsf.pipeline.config import PRESETS
-from avmsf.pipeline.features import LiftConfig
-from avmsf.pipeline.scene import FEATURES, SceneConfig, SceneStages
-from avmsf.pipeline.sources import ViewsConfig
+from avmsf.pipeline.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
+from avmsf.pipeline.scene import FEATURES, SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features

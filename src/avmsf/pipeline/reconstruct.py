@@ -20,10 +20,11 @@ from avmsf.capture.surface import find_surface, read_surface, write_surface
 from avmsf.capture.views import read_views
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import AvmsfError, CaptureError, SceneError
+from avmsf.field.config import NETWORK
 from avmsf.field.fit import Progress, fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.estimator import NETWORK, estimator_for
+from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.gains.positional import Visual
 from avmsf.field.store import load, save
 from avmsf.files import write_whole
@@ -31,8 +32,9 @@ from avmsf.geometry import ObjectShape
 from avmsf.geometry.closest import ClosestPoints
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import PipelineConfig, with_record
+from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.guess import expect_no_recordings, guess_field
+from avmsf.pipeline.record import finder_of, with_record
 from avmsf.pipeline.scene import Listener, SceneStages
 from avmsf.pipeline.silhouettes import expect_contacts_in_outlines, judge_outlines
 from avmsf.pipeline.stages import Kept, StageFolder
@@ -41,8 +43,6 @@ from avmsf.scene.featurestore import load_features, read_report
 from avmsf.scene.symmetry import Symmetries
 from avmsf.wording import counted
 
-CACHE = ".avmsf"
-"""Folder inside the capture's that keeps what each stage made."""
 SURFACE = "surface.ply"
 """What the stage of the object's surface calls its output, in meters."""
 MODES, FIELD = "modes.safetensors", "field.safetensors"
@@ -122,7 +122,7 @@ def _reconstruct(
     fitting: Callable[[Progress], None] | None,
 ) -> Reconstruction:
     shape = _shape(folder, capture, config, stages, settings=settings, listener=listener)
-    method = config.finder
+    method = finder_of(config)
     heard = {"impacts": train.digest(), "method": repr(method)}
     listener.tell(f"modes: of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path, needed=True))

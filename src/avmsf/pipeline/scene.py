@@ -3,7 +3,7 @@
 import hashlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -14,8 +14,9 @@ from avmsf.capture.views import read_sparse_points, read_views
 from avmsf.errors import SceneError
 from avmsf.geometry import ObjectShape
 from avmsf.pipeline.cloudshape import masks_suffice, shape_of_cloud, views_of_cloud
-from avmsf.pipeline.features import LiftConfig, choose_encoder, finish_features, lift_to_cloud, lift_to_surface
-from avmsf.pipeline.sources import Source, ViewsConfig, find_source, find_splats, keep_views, replace_views
+from avmsf.pipeline.config import SceneConfig
+from avmsf.pipeline.features import choose_encoder, finish_features, lift_to_cloud, lift_to_surface
+from avmsf.pipeline.sources import Source, find_source, find_splats, keep_views, replace_views
 from avmsf.pipeline.stages import Kept, StageFolder, digest_of
 from avmsf.scene.encode import Encoder
 from avmsf.scene.featurestore import save_features
@@ -25,7 +26,6 @@ from avmsf.scene.lift import Lifted, LiftProgress
 from avmsf.scene.ply import read_splats, write_splats
 from avmsf.scene.rasteriser import choose_rasteriser
 from avmsf.scene.splat import SplatProgress, splat
-from avmsf.scene.splatconfig import SplatConfig
 from avmsf.scene.start import StartPoints
 
 CLOUD, FEATURES = "cloud.ply", "features.safetensors"
@@ -44,18 +44,6 @@ class Listener:
     """Hears a sentence as each stage begins."""
     splatting: Callable[[SplatProgress], None] | None = None
     lifting: Callable[[LiftProgress], None] | None = None
-
-
-@dataclass(frozen=True)
-class SceneConfig:
-    """Settings of all stages up to the features."""
-
-    views: ViewsConfig = field(default_factory=ViewsConfig)
-    """How views are made of what the folder holds."""
-    splat: SplatConfig = field(default_factory=SplatConfig)
-    """How Gaussians are fitted to views."""
-    lift: LiftConfig = field(default_factory=LiftConfig)
-    """How features are made of views and Gaussians."""
 
 
 class SceneStages:

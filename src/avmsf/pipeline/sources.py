@@ -20,6 +20,7 @@ from avmsf.capture.views.colmap import find_model
 from avmsf.capture.views.pictures import SUFFIXES
 from avmsf.capture.views.write import write_views
 from avmsf.errors import SceneError
+from avmsf.pipeline.config import ViewsConfig
 from avmsf.pipeline.stages import Kept, StageFolder, digest_files
 from avmsf.scene.points import farthest_points
 
@@ -29,32 +30,6 @@ SPLATS = ("splats.ply", "point_cloud.ply")
 
 Kind = Literal["cameras", "photographs", "video", "mesh"]
 Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class ViewsConfig:
-    """How views are made of what a folder holds."""
-
-    source: Literal["best", "mesh"] = "best"
-    """What shows the object: the best of what the folder holds, photographs with cameras before a mesh, or its mesh."""
-    count: int = 0
-    """Views to use at most, of cameras as far apart as they stand; 0 uses all."""
-    longest: int = 640
-    """Pixels of a photograph's longer side; larger ones are scaled down."""
-    masks: bool = True
-    """Whether photographs without masks get them, which needs a plain background."""
-    frames: int = 72
-    """Frames to pick from a video."""
-    rendered: int = 256
-    """Pixels along each side of the 72 pictures that are rendered of a mesh."""
-    minutes: float = 30.0
-    """Time that structure from motion may take."""
-    seed: int = 0
-    """Start of the chance in structure from motion."""
-
-    def __post_init__(self) -> None:
-        if self.count < 0:
-            raise SceneError(f"count = {self.count}: expected 0 for all views, or how many to use")
 
 
 @dataclass(frozen=True)

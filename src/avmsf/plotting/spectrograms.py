@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
 from torch import Tensor
 
-from avmsf.modal.spectra import magnitude_stft, scaled_fft_size
+from avmsf.modal.config import scaled_fft_size
+from avmsf.modal.spectra import magnitude_stft
 
 LOWEST_HZ, HIGHEST_HZ, SECONDS = 20.0, 20000.0, 1.0
 """Band and time of the paper's spectrograms (its figure of qualitative comparisons)."""

@@ -21,6 +21,8 @@ from avmsf.scene.features import FeatureField
 FORMAT = 1
 """Number of this format; it grows with every change that older versions could not read."""
 _KEY = "avmsf_features"
+_LONGEST_HEADER = 100_000_000
+"""Bytes of a header, as the format bounds them."""
 
 
 def save_features(features: FeatureField, path: str | Path, *, report: dict[str, Any] | None = None) -> None:
@@ -110,3 +112,13 @@ def _expect_values(tensors: dict[str, Tensor], path: Path) -> None:
     for name, tensor in tensors.items():
         if not tensor.numel() or not bool(torch.isfinite(tensor).all()):
             raise SceneError(f"{path}: expected {name} to be finite numbers, found otherwise: lift the features again")
+
+
+def holds_features(path: Path) -> bool:
+    """Return whether the header of a file says that it holds features, and not for example a field."""
+    try:
+        with path.open("rb") as file:
+            length = int.from_bytes(file.read(8), "little")
+            return f'"{_KEY}"'.encode() in file.read(min(length, _LONGEST_HEADER))
+    except OSError:
+        return False

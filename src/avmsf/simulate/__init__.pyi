@@ -1,4 +1,4 @@
 from .example import EXAMPLE_FOLDER as EXAMPLE_FOLDER
-from .example import example_mesh as example_mesh
+from .examplemesh import example_mesh as example_mesh
 from .material import MATERIALS as MATERIALS
 from .material import Material as Material

@@ -2,9 +2,7 @@
 
 from pathlib import Path
 
-from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.simulate.recipe import ObjectRecipe
-from avmsf.simulate.shapes import make_shape, textured
 
 EXAMPLE = ObjectRecipe(
     kind="mug",
@@ -21,9 +19,3 @@ EXAMPLE = ObjectRecipe(
 """`avmsf simulate example` makes it anew; `--surface` adds the mesh."""
 EXAMPLE_FOLDER = Path(__file__).parents[1] / "example"
 """The capture folder that the package ships, made of that recipe: recordings and photographs, no mesh."""
-
-
-def example_mesh() -> TexturedMesh:
-    """Return the mesh, in its colors, that the example's recordings and photographs were computed from."""
-    shape = make_shape(EXAMPLE.kind, seed=EXAMPLE.seed, size=EXAMPLE.size, wall=EXAMPLE.thickness)
-    return textured(shape)

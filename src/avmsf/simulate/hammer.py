@@ -14,8 +14,6 @@ the vibration's pole, in size and in phase.
 """
 
 import math
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -25,44 +23,11 @@ from torch import Tensor
 
 from avmsf.errors import SimulationError
 from avmsf.simulate.material import Material
+from avmsf.simulate.recipe import LONGEST, Hammer
 
-LONGEST = 0.02
-"""Seconds of contact beyond which a blow is a push."""
 _HERTZ_SCALE = 2.868
 _HERTZ_AREA = math.sqrt(math.pi) * math.gamma(1.25) / math.gamma(1.75)
 """Integral of sin(x)^(3/2) from 0 to pi."""
-
-
-@dataclass(frozen=True)
-class Hammer:
-    """A small steel hammer with a round tip, unless told otherwise."""
-
-    mass: float = 0.02
-    """Of its head, kilograms."""
-    radius: float = 0.003
-    """Of its tip, metres."""
-    young: float = 2e11
-    """Young's modulus of its tip, pascals: 2e11 is steel, 3e9 a hard plastic, 1e7 rubber."""
-    poisson: float = 0.29
-    """Poisson's ratio of its tip."""
-    speed: float = 0.5
-    """With which it meets the body, metres per second."""
-    pulse: Literal["hertz", "half-sine"] = "hertz"
-    """hertz: a round tip; half-sine: a flat one."""
-    contact_time: float = 0.0
-    """Seconds that the tip stays on the body at `speed`; 0 computes it from the above."""
-
-    def __post_init__(self) -> None:
-        for name, unit in (("mass", "kg"), ("radius", "m"), ("young", "Pa"), ("speed", "m/s")):
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise SimulationError(f"hammer: {name} = {value:g} {unit}: expected more than 0")
-        if not -1 < self.poisson < 0.5:
-            raise SimulationError(f"hammer: poisson = {self.poisson:g}: expected more than -1 and less than .5")
-        if not 0 <= self.contact_time <= LONGEST:
-            raise SimulationError(
-                f"hammer: contact_time = {self.contact_time:g} s: expected 0 to compute it, or up to {LONGEST:g}"
-            )
 
 
 def moving_mass(hammer: Hammer, mass: float) -> float:

@@ -5,15 +5,14 @@ All random numbers of one thing come from a stream of its own, so that switching
 
 import math
 import zlib
-from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf.errors import SimulationError
 from avmsf.simulate.elastic import ElasticModes
+from avmsf.simulate.recipe import Imperfections
 from avmsf.simulate.vibration import rayleigh
 
 _LEGS = 3
@@ -23,78 +22,6 @@ _WAVES = 24
 """Plane waves of which a smooth random field is made."""
 _GRAIN = 0.4
 """Shortest wavelength of such a field, in object diagonals; the longest is five times that."""
-
-
-@dataclass(frozen=True)
-class Imperfections:
-    """How far an object and its recordings stray from a textbook; 0 switches each off."""
-
-    thickness: float = 0.03
-    """Variation of the walls' thickness, root mean square over its mean."""
-    stiffness: float = 0.05
-    """Variation of Young's modulus over the body, root mean square of its logarithm."""
-    density: float = 0.02
-    """Variation of the density, likewise."""
-    support: float = 15.0
-    """Frequency at which the object would bounce on three soft springs under it, Hz."""
-    support_damping: float = 0.015
-    """Damping of that bouncing, over the critical one."""
-    coupling: float = 0.2
-    """Part of all damping that sits at places of its own and so couples modes, 0 to 1."""
-    retardation: float = 1.0
-    """Part of the differences of delay between the body and the microphone that is heard, 0 to 1."""
-    contact: float = 0.0015
-    """Distance between where a blow was written down and where it fell, along the surface, metres, root mean square."""
-    direction: float = 5.0
-    """Angle between the blow's direction as written and as it was, degrees, root mean square."""
-    force: float = 0.02
-    """Error of the written peak force, relative, root mean square."""
-    speed: float = 0.3
-    """Variation of the impacts' speeds, root mean square of their logarithm.
-
-    The peak forces of 74 impacts by hand (the aircraft test of the benchmarks) vary by .37, 3.2 dB, with a range of 16
-    dB. By Hertz's law force goes with speed to the power 6/5, so speeds vary by .31.
-    """
-    contact_time: float = 0.1
-    """Variation of the contact times that does not follow from the speeds, root mean square of their logarithm.
-
-    The hand adds mass to the hammer, and the tip does not meet the surface square. In 31 impacts by hand on ceramic,
-    wood, polycarbonate and steel (the recordings published with DiffImpact, Clarke et al. 2021) the pulses' widths
-    depart from Hertz's law by .11.
-    """
-    pretrigger: float = 0.05
-    """Time that a recording runs before the impact's sound arrives, seconds; the next two add to it."""
-    jitter: float = 0.001
-    """Variation of that time from recording to recording, seconds, root mean square.
-
-    A recorder's clock is not locked to the impact: at 48 kHz the default is 48 samples, so the fraction of a sample at
-    which a sound starts is uniformly random.
-    """
-    propagation: float = 1.0
-    """Part of the time that sound takes from the object's nearest point to the microphone that delays the recordings,
-    0 to 1."""
-
-    def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
-            highest = {
-                "coupling": 1.0, "retardation": 1.0, "contact": 1.0, "direction": 45.0, "support": math.inf,
-                "pretrigger": 10.0, "propagation": 1.0,
-            }  # fmt: skip
-            most = highest.get(each.name, 0.5)
-            if not (0 <= value <= most and math.isfinite(value)):
-                raise SimulationError(
-                    f"imperfections: {each.name} = {value:g}: expected 0 to switch it off"
-                    f"{f', or up to {most:g}' if math.isfinite(most) else ' or a finite number above it'}"
-                )
-
-    @classmethod
-    def none(cls) -> "Imperfections":
-        """Return the record with everything switched off, sounds heard from all parts of the body at their times.
-
-        Every recording then starts with the sound of its impact.
-        """
-        return replace(cls(**{each.name: 0.0 for each in fields(cls)}), retardation=1.0)
 
 
 def stream(seed: int, name: str) -> np.random.Generator:

@@ -7,7 +7,8 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from avmsf.simulate.elastic import ElasticModes
-from avmsf.simulate.hammer import Hammer, contact_times, peak_forces, pulse_spectrum
+from avmsf.simulate.hammer import contact_times, peak_forces, pulse_spectrum
+from avmsf.simulate.recipe import Hammer
 from avmsf.simulate.vibration import Vibration
 
 

@@ -14,7 +14,8 @@ from torch import Tensor
 from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.geometry.closest import ClosestPoints
-from avmsf.simulate.imperfections import Imperfections, stream
+from avmsf.simulate.imperfections import stream
+from avmsf.simulate.recipe import Imperfections
 
 STEEPEST = -0.35
 """Least height of a unit normal where a hammer gets beneath: 20 degrees of overhang above a table."""

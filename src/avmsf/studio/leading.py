@@ -8,7 +8,7 @@ from typing import Any
 
 from avmsf.errors import EditError
 from avmsf.studio.refusal import RefusedError, echo
-from avmsf.tasks.stableaudiofiles import STABLE_AUDIO
+from avmsf.tasks.config import STABLE_AUDIO
 
 _KEYS = ("base", "prompt")
 _MAX_PROMPT = 2000

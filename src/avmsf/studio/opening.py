@@ -13,7 +13,8 @@ from avmsf.capture.table import TABLE
 from avmsf.errors import StudioError
 from avmsf.export.objectfile import holds_gaussians
 from avmsf.files import copy_whole
-from avmsf.pipeline.reconstruct import CACHE, FIELD, SURFACE
+from avmsf.pipeline.config import CACHE
+from avmsf.pipeline.reconstruct import FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
 from avmsf.pipeline.sources import SPLATS, find_source, find_splats
 

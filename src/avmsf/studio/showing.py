@@ -20,7 +20,8 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import Surface, read_surface
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError, StudioError
-from avmsf.export.bundle import MOST_POINTS, write_bundle
+from avmsf.export.bundle import write_bundle
+from avmsf.export.formats import MOST_POINTS
 from avmsf.export.normals import outward_normals
 from avmsf.export.sampledfield import SampledField
 from avmsf.field.soundfield import SoundField

@@ -19,7 +19,7 @@ from avmsf._utils.text_files import read_json
 from avmsf.capture.audio import Recording
 from avmsf.errors import CaptureError, FolderInUseError
 from avmsf.files import write_whole
-from avmsf.pipeline.reconstruct import CACHE
+from avmsf.pipeline.config import CACHE
 from avmsf.studio.refusal import RefusedError
 
 JOURNAL, REMOVED = "studio.json", "removed"

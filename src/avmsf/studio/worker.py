@@ -23,18 +23,19 @@ from avmsf.errors import AvmsfError
 from avmsf.field.fit import Progress
 from avmsf.field.store import load, save
 from avmsf.files import copy_whole
-from avmsf.pipeline.config import PipelineConfig
-from avmsf.pipeline.reconstruct import CACHE, reconstruct
-from avmsf.pipeline.scene import Listener, SceneConfig, SceneStages
+from avmsf.pipeline.config import CACHE, PipelineConfig, SceneConfig
+from avmsf.pipeline.reconstruct import reconstruct
+from avmsf.pipeline.scene import Listener, SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.lift import LiftProgress
 from avmsf.scene.splat import SplatProgress
 from avmsf.studio.lifeline import end_with_server
 from avmsf.studio.strikefiles import COMMAND
+from avmsf.tasks.config import SteerConfig
 from avmsf.tasks.distillation import DecoderDistillation
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
-from avmsf.tasks.steer import Guide, SteerConfig, SteerProgress, steer
+from avmsf.tasks.steer import Guide, SteerProgress, steer
 
 Values = Mapping[str, Any]
 _RARELY = 10

@@ -1,7 +1,8 @@
+from .config import DistillationConfig as DistillationConfig
+from .config import SteerConfig as SteerConfig
 from .contactmap import ContactMap as ContactMap
 from .contactmap import Peak as Peak
 from .distillation import DecoderDistillation as DecoderDistillation
-from .distillation import DistillationConfig as DistillationConfig
 from .listening import Listener as Listener
 from .locate import locate as locate
 from .locator import Locator as Locator
@@ -12,5 +13,4 @@ from .reference import Reference as Reference
 from .retune import retune as retune
 from .severalblows import locate_blows as locate_blows
 from .stableaudio import StableAudio as StableAudio
-from .steer import SteerConfig as SteerConfig
 from .steer import steer as steer

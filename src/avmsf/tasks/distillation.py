@@ -8,7 +8,6 @@ the model: the decoded result is a target like a recording.
 
 import math
 import warnings
-from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.tasks.clips import lasting, levelled, resampled
+from avmsf.tasks.config import DistillationConfig
 from avmsf.tasks.modaledit import ModalEdit, Struck
 
 
@@ -112,33 +112,6 @@ def partial_denoising(
         clean = model.denoised(noisy, above, conditioning, guidance=guidance)
         noisy = noised(clean, (noisy - torch.cos(angle) * clean) / torch.sin(angle), below)
     return clean
-
-
-@dataclass(frozen=True)
-class DistillationConfig:
-    """How targets are drawn from a model."""
-
-    guidance: float = 15.0
-    """How many times the step from the negative words, or from none, to the prompt is taken; Audio-SDS is said to have
-    gone up to 60."""
-    denoising: int = 4
-    """Partial denoising steps for a target, 2 to 10."""
-    lowest: float = 0.025
-    """Least noise level that a target begins at, above 0."""
-    highest: float = 0.875
-    """Greatest noise level that a target begins at, below 1."""
-    batch: int = 10
-    """Sounds that the model is given at once; halved where memory runs out."""
-
-    def __post_init__(self) -> None:
-        """Raise `EditError` for values that cannot be meant."""
-        if not 0 < self.lowest <= self.highest < 1:
-            raise EditError(f"noise levels {self.lowest:g} to {self.highest:g}: expected 0 < lowest <= highest < 1")
-        for name in ("denoising", "batch"):
-            if getattr(self, name) < 1:
-                raise EditError(f"{name} = {getattr(self, name)}: expected 1 or more")
-        if not (self.guidance >= 0 and math.isfinite(self.guidance)):
-            raise EditError(f"guidance = {self.guidance:g}: expected a number that is not negative, such as 15")
 
 
 def expect_prompt(prompt: str) -> str:

@@ -12,8 +12,8 @@ from torch import nn
 
 from avmsf.errors import EditError
 from avmsf.hub import expect_answer, is_hub_name, read_settings
+from avmsf.tasks.config import STABLE_AUDIO
 
-STABLE_AUDIO: Final = "stabilityai/stable-audio-open-1.0"
 """The model that the paper edits with, by its name on the hub."""
 _CLASS, _INDEX = "StableAudioPipeline", "model_index.json"
 _NETWORKS: Final = ("vae", "text_encoder", "projection_model", "transformer")

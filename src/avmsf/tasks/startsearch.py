@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.field.losses import spectral_loss, spectral_target
-from avmsf.modal.spectra import scaled_fft_size
+from avmsf.modal.config import scaled_fft_size
 from avmsf.tasks.modaledit import ModalEdit, Struck
 
 Wanted = Callable[

@@ -16,9 +16,10 @@ from avmsf._utils.state import read_checkpoint, write_checkpoint
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.soundfield import SoundField
-from avmsf.modal.spectra import scaled_fft_size
+from avmsf.modal.config import scaled_fft_size
 from avmsf.scene.points import farthest_points
 from avmsf.tasks.clips import level
+from avmsf.tasks.config import SteerConfig
 from avmsf.tasks.modaledit import ModalEdit, Struck
 from avmsf.tasks.parameters import HIERARCHICAL, EditVariables, Parameterisation
 from avmsf.tasks.steercheckpoint import asked
@@ -30,8 +31,6 @@ _LISTENED = 2000
 _SPOILT = 20
 """Steps in a row without a usable target after which there is no hope."""
 _CHECKPOINT_SECONDS = 30.0
-_LARGEST_SEED = 1 << 40
-"""A step's own seed, a million times as large, still fits into 64 bits."""
 
 
 @runtime_checkable
@@ -59,44 +58,6 @@ class Guide(Protocol):
         A row with a sample that is not finite is left out of the step.
         """
         ...
-
-
-@dataclass(frozen=True)
-class SteerConfig:
-    """How an edit descends."""
-
-    steps: int = 300
-    """Steps; Audio-SDS is said to take about 1,000."""
-    contacts: int = 10
-    """Places struck in each step, drawn anew from all over the surface."""
-    modes: int = 128
-    """Most modes that move by themselves, the loudest; the others follow the common factors."""
-    seconds: float | None = None
-    """How much of each sound is compared; as long as the field's sounds where it is not given."""
-    fft_sizes: tuple[int, ...] = (2048, 1024, 512, 256)
-    """Resolutions of the loss, samples at 44.1 kHz; frames are a quarter of each apart."""
-    seed: int = 0
-    """Of all chance: places, noise levels, noise; at most 2^40."""
-    preview_every: int = 50
-    """Steps between previews that can be listened to; 0 for none."""
-
-    def __post_init__(self) -> None:
-        """Raise `EditError` for values that cannot be meant."""
-        for name, least in (("steps", 1), ("contacts", 1), ("modes", 1), ("preview_every", 0), ("seed", 0)):
-            if getattr(self, name) < least:
-                raise EditError(f"{name} = {getattr(self, name)}: expected {least} or more")
-        if self.seed > _LARGEST_SEED:
-            raise EditError(f"seed = {self.seed}: expected at most {_LARGEST_SEED}: choose a smaller number")
-        if self.seconds is not None and not 0 < self.seconds < math.inf:
-            raise EditError(f"seconds = {self.seconds:g}: expected more than 0")
-        if not self.fft_sizes or any(size < 4 or size % 4 for size in self.fft_sizes):
-            raise EditError(f"fft_sizes = {self.fft_sizes}: expected multiples of 4, such as 2048, 1024, 512, 256")
-        longest = max(self.fft_sizes) / 44100
-        if self.seconds is not None and self.seconds < longest:
-            raise EditError(
-                f"seconds = {self.seconds:g}: expected at least {longest:.2g}, what a window of {max(self.fft_sizes)} "
-                "samples at 44.1 kHz hears: compare more of the sounds, or leave the largest of fft_sizes out"
-            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float64, Int
@@ -17,6 +17,7 @@ from avmsf.errors import AvmsfError, FitError
 from avmsf.fem.supports import FREE, FREE_PRIOR
 from avmsf.fem.thickness import search_thickness
 from avmsf.fem.updating import update
+from avmsf.field.config import AUTO, NETWORK, GainModel
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.elastic import FACTORS, Elastic
 from avmsf.field.gains.family import KernelFamily, Sites, sites_along
@@ -36,8 +37,6 @@ from avmsf.simulate.nominal import NominalBody, body_name
 
 POSITIONAL: dict[str, type[KernelFamily]] = {Smooth.kind: Smooth, ThinPlate.kind: ThinPlate}
 """Families that need nothing but the contacts, by name."""
-AUTO, NETWORK = "auto", "network"
-GainModel = Literal["auto", "network", "smooth", "thin-plate", "symmetry", "visual", "elastic"]
 """The Gaussian process over all kernel families, the paper's attention network, or the process over one family."""
 FAMILIES = (*POSITIONAL, Symmetric.kind, Elastic.kind)
 """What the model is made of besides the unstructured family, which is always there."""

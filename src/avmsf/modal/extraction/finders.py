@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Float64
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from avmsf.errors import ExtractionError
 from avmsf.modal.bank import ModalBank
+from avmsf.modal.config import ExtractionMethod
 from avmsf.modal.extraction.esprit import SHORTEST, candidates
 from avmsf.modal.extraction.least_squares import refine
 from avmsf.modal.extraction.selection import Candidates, chance_ratio, merge, prune, select
@@ -27,7 +28,6 @@ nothing in sine phase, and the gain of what is heard would be enormous."""
 _PERIODS = 50
 """How many periods of the lowest frequency the sounds last: with fewer, a mode is not told from rumble."""
 
-ExtractionMethod = Literal["high-resolution", "short-time"]
 """Finders by name."""
 
 

@@ -1,12 +1,10 @@
-"""`avmsf show`: what a field file holds, in words and pictures."""
+"""`avmsf info`: what a field, Gaussians or features hold, as text and pictures."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 from jaxtyping import Float
 from torch import Tensor
 
@@ -16,18 +14,21 @@ from avmsf.bench.pictures import draw_gains, draw_modes, draw_spectrograms, save
 from avmsf.bench.surfacepictures import draw_surface
 from avmsf.capture import CaptureSettings, Impacts, Surface, read_capture
 from avmsf.cli.heartbeat import doing
+from avmsf.cli.infoclouds import describe_cloud, describe_features
 from avmsf.cli.modes import mode_table
 from avmsf.cli.modetable import levels, mode_rows
-from avmsf.cli.printing import console, print_json, say
+from avmsf.cli.options.info import Options
+from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.scores import quality_words, score_table, score_values
 from avmsf.field.attention import AttentionGains
+from avmsf.field.config import NETWORK
 from avmsf.field.gains.body import BodyGains
-from avmsf.field.gains.estimator import NETWORK
 from avmsf.field.gains.model import MixtureGains
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
 from avmsf.field.uncertainty import has_posterior, relative_gain_std, spectrum_band, training_contacts
-from avmsf.pipeline.config import RECORD
+from avmsf.pipeline.record import RECORD
+from avmsf.scene.featurestore import holds_features
 from avmsf.scene.points import farthest_points
 
 _DRAWN_POINTS = 4000
@@ -36,50 +37,37 @@ _BATCH = 1024
 """Points whose gains are taken at once: the encoding of their offsets to many clusters is large."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """Say what a field file holds, and draw it: its modes, their gains on the object, and with a capture its sounds."""
-
-    field: tyro.conf.Positional[Path]
-    """Field file, as `avmsf fit` writes it."""
-    capture: tyro.conf.Positional[Path | None] = None
-    """Capture to set beside the field: its recordings that the field was not fitted to, or all where there are none."""
-    output: Path | None = None
-    """Folder for the pictures modes.png, gains.png, doubt.png and spectrum.png where the gains know how sure they are,
-    surface.png where they know a body, and spectrograms.png with a capture; none without it."""
-    settings: Path | None = None
-    """A capture.toml to use in place of the capture's own."""
-    json: bool = False
-    """Print one JSON object on the standard output, all else on the standard error."""
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf show", args=words, config=(tyro.conf.FlagCreatePairsOff,))
-
-
 def run(options: Options) -> int:
-    """Print and draw."""
-    field = load(options.field)
+    """Describe and draw a file; which kind it is, its content tells."""
+    suffix = options.file.suffix.lower()
+    if suffix == ".ply" or (suffix == ".safetensors" and holds_features(options.file)):
+        values = describe_cloud(options) if suffix == ".ply" else describe_features(options)
+        if options.json:
+            print_json(values)
+        elif options.plots is None:
+            next_command("avmsf info", options.file, "--plots plots")
+        return 0
+    field = load(options.file)
     points = _some(field.gain_field.points)
     gains = gains_at(field, points)
     level = levels(gains)
     rows = mode_rows(field.bank, level)
     values = describe(field)
     screen = console(errors=options.json)
-    screen.print(_words(values, quality_words(field, options.field)), soft_wrap=True)
+    screen.print(_words(values, quality_words(field, options.file)), soft_wrap=True)
     screen.print(mode_table(f"{len(rows)} modes, levels on average over the object", rows))
-    heard = None
+    recorded = None
     if options.capture is not None:
         settings = None if options.settings is None else CaptureSettings.read(options.settings)
         doing("comparing the field with the capture's recordings")
-        heard, what = _unheard(read_capture(options.capture, settings).impacts, field)
-        scores = {"field": evaluate(Fitted(field, heard.sounds.shape[1]), heard)}
-        screen.print(score_table(f"{len(heard)} contacts, {what}; lower is better", scores))
-        values |= {"compared_with": {"recordings": list(heard.names), "which": what, "scores": score_values(scores)}}
-    if options.output is not None:
+        recorded, what = _held_out(read_capture(options.capture, settings).impacts, field)
+        scores = {"field": evaluate(Fitted(field, recorded.sounds.shape[1]), recorded)}
+        screen.print(score_table(f"{len(recorded)} contacts, {what}; lower is better", scores))
+        values |= {"compared_with": {"recordings": list(recorded.names), "which": what, "scores": score_values(scores)}}
+    if options.plots is not None:
         doing("drawing the pictures")
-        draw_field(field, options.output, points=points, gains=gains, level=level, heard=heard)
+        draw_field(field, options.plots, points=points, gains=gains, level=level, recorded=recorded)
+    next_command("avmsf render", options.file, "--position X Y Z -o impact.wav")
     if options.json:
         print_json(values | {"modes": [asdict(row) for row in rows]})
     return 0
@@ -136,16 +124,16 @@ def draw_field(
     points: Float[Tensor, "points 3"],
     gains: Float[Tensor, "points modes"],
     level: Float[Tensor, " modes"],
-    heard: Impacts | None,
+    recorded: Impacts | None,
 ) -> None:
-    """Write the pictures of a field, with some of the recordings `heard` beside its own sounds."""
+    """Write the pictures of a field, with some of the recordings `recorded` beside its own sounds."""
     name = field.origin.capture or "field"
     pictures = {
         "modes": draw_modes(field.bank, level, title=f"{len(field.bank)} modes of {name}"),
         "gains": draw_gains(points, gains, field.bank.frequency, title=f"gains of the strongest modes of {name}"),
     }
-    if heard is not None:
-        chosen = heard.take(farthest_points(heard.contacts, min(_DRAWN_CONTACTS, len(heard))).tolist())
+    if recorded is not None:
+        chosen = recorded.take(farthest_points(recorded.contacts, min(_DRAWN_CONTACTS, len(recorded))).tolist())
         pictures["spectrograms"] = draw_spectrograms(
             chosen.sounds,
             field.render(chosen.contacts, directions=chosen.directions, samples=chosen.sounds.shape[1]),
@@ -155,9 +143,11 @@ def draw_field(
         )
     if has_posterior(field):
         doubt = relative_gain_std(field, points)
-        title = f"doubt of {name}"
+        title = f"uncertainty of the gains of {name}"
         pictures["doubt"] = draw_doubt(points, doubt, title=title, struck=training_contacts(field))
-        pictures["spectrum"] = draw_band(spectrum_band(field, points[0]), title=f"{name}: one blow, and its doubt")
+        pictures["spectrum"] = draw_band(
+            spectrum_band(field, points[0]), title=f"{name}: one impact, with its uncertainty"
+        )
     body = field.gain_field.body if isinstance(field.gain_field, MixtureGains | BodyGains) else None
     if body is not None:
         surface = Surface(body.nodes.float(), body.triangles[:, :3])
@@ -174,7 +164,7 @@ def _some(points: Float[Tensor, "points 3"]) -> Float[Tensor, "chosen 3"]:
     return points[::step]
 
 
-def _unheard(impacts: Impacts, field: SoundField) -> tuple[Impacts, str]:
+def _held_out(impacts: Impacts, field: SoundField) -> tuple[Impacts, str]:
     known = set(field.origin.trained_on)
     rows = [row for row, name in enumerate(impacts.names) if name not in known]
     if not rows:
@@ -188,7 +178,7 @@ def _gains_words(gains: dict[str, Any]) -> str:
     if gains.get("inner", gains["kind"]) == AttentionGains.kind:
         return f"the network's on features: {gains['encoder']}"
     if gains.get("inner", gains["kind"]) == BodyGains.kind:
-        return "guessed: mode shapes of a body, each times its loudness"
+        return "guessed: mode shapes of a body, each times its level"
     return (
         f"Gaussian process over {', '.join(dict.fromkeys(gains['families']))} kernels, by {gains['contacts']} contacts"
     )
@@ -222,7 +212,7 @@ def _words(values: dict[str, Any], quality: list[str]) -> str:
 
 
 def _pipeline_lines(pipeline: dict[str, Any]) -> list[str]:
-    """Return lines on the stages that made the field, as far as its file names them."""
+    """Return lines on the stages that made the field, if its file names them."""
     fit, scene = pipeline["fit"], pipeline.get("scene")
     lines = []
     if "method" in pipeline:
@@ -242,22 +232,22 @@ def _pipeline_lines(pipeline: dict[str, Any]) -> list[str]:
 
 def _edit_words(edit: dict[str, Any]) -> str:
     """Return what an edit did, without what left all as it was."""
-    told = [str(edit.get("edit"))]
+    parts = [str(edit.get("edit"))]
     if "from" in edit:
-        told.append(f"from {edit['from']['name']} to {edit['to']['name']}")
-    told += [f"towards {edit[name]!r}" for name in ("prompt", "reference") if name in edit]
+        parts.append(f"from {edit['from']['name']} to {edit['to']['name']}")
+    parts += [f"towards {edit[name]!r}" for name in ("prompt", "reference") if name in edit]
     usual = {"size": 1.0, "pitch": 1.0, "decay": 1.0, "brightness_db": 0.0, "gains_db": 0.0}
-    told += [f"{name} {_by_mode(edit[name])}" for name, same in usual.items() if edit.get(name, same) != same]
-    told += [f"{name} {edit[name]}" for name in ("law", "negative", "model", "guidance", "steps") if edit.get(name)]
+    parts += [f"{name} {_by_mode(edit[name])}" for name, same in usual.items() if edit.get(name, same) != same]
+    parts += [f"{name} {edit[name]}" for name in ("law", "negative", "model", "guidance", "steps") if edit.get(name)]
     for name, what in (
         ("silent_hertz", "beyond half the sample rate"),
-        ("overdamped_hertz", "damped too much to ring"),
+        ("overdamped_hertz", "overdamped"),
     ):
         if edit.get(name):
-            told.append(f"modes {what}: {len(edit[name])}")
+            parts.append(f"modes {what}: {len(edit[name])}")
     if scores := edit.get("clap", {}).get("scores"):
-        told.append(f"CLAP score {scores[0]:.3f} to {scores[-1]:.3f}")
-    return ", ".join(told)
+        parts.append(f"CLAP score {scores[0]:.3f} to {scores[-1]:.3f}")
+    return ", ".join(parts)
 
 
 def _by_mode(values: float | list[float | None] | None) -> str:

@@ -7,12 +7,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from avmsf.bench.cases import Choosing
-from avmsf.bench.efficiency import Growing, curves, draw_efficiency
+from avmsf.bench.cases import Choosing, Growing
+from avmsf.bench.learningcurve import curves, draw_learning_curve
 from avmsf.bench.plan import Evaluation
+from avmsf.bench.protocols import protocol_named
 from avmsf.bench.results import CaseRecord, ObjectRecord, Outcome
 from avmsf.capture.impacts import Impacts
-from avmsf.cli.efficiency import parse, run
+from avmsf.cli.evaluate import run
+from avmsf.cli.options.evaluate import parse
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.pipeline.objectbodies import ObjectBodies
 from plate_capture import fill_plate
@@ -92,7 +94,7 @@ def test_curves_are_means_over_contacts_then_over_starts() -> None:
     assert knn.mean == pytest.approx((3.0, 0.6))
     assert (knn.lowest, knn.highest) == (pytest.approx((2.0, 0.6)), pytest.approx((4.0, 0.6)))
     assert (nearest.counts, nearest.mean) == ((12,), (2.0,))
-    axes = draw_efficiency((knn, nearest), metric="l1", title="mug").axes[0]
+    axes = draw_learning_curve((knn, nearest), metric="l1", title="mug").axes[0]
     drawn = {str(line.get_label()): line.get_xydata() for line in axes.get_lines()}
     assert drawn["knn3"] == pytest.approx(torch.tensor([[4.0, 3.0], [12.0, 0.6]]).numpy())
     with pytest.raises(EvaluationError, match="no method has the metric 'l2'; there are l1"):
@@ -100,34 +102,28 @@ def test_curves_are_means_over_contacts_then_over_starts() -> None:
 
 
 def test_a_capture_becomes_a_picture_and_figures_and_methods_may_be_added(tmp_path: Path, capsys: Streams) -> None:
-    capture = fill_plate(tmp_path / "plate")
-    words = [str(capture), "--counts", "2", "4", "--starts", "2", "--modes", "6", "--output", str(tmp_path / "results")]
-    assert run(parse([*words, "--methods", "knn3"])) == 0
-    first = json.loads((tmp_path / "results" / "plate" / "efficiency.json").read_text())
+    capture, results = fill_plate(tmp_path / "plate"), tmp_path / "results"
+    words = ["learning-curve", str(capture), "--starts", "2", "--modes", "6", "--output", str(results)]
+    counts = ["--counts", "2", "4"]
+    assert run(parse([*words, *counts, "--methods", "knn3"])) == 0
+    first = json.loads((results / "plate" / "learning-curve.json").read_text())
     assert list(first["methods"]) == ["knn3"]
     capsys.readouterr()
-    assert run(parse([*words, "--methods", "knn3,nearest", "--json"])) == 0
+    assert run(parse([*words, *counts, "--methods", "knn3,nearest", "--json"])) == 0
     out, _ = capsys.readouterr()
     printed = json.loads(out)
-    assert printed["methods"]["knn3"] == first["methods"]["knn3"]
-    assert printed["methods"]["nearest"]["counts"] == [2, 4]
-    assert printed["methods"]["nearest"]["starts"] == [2, 2]
-    assert printed["failures"] == {}
-    assert (tmp_path / "results" / "plate" / "efficiency.png").read_bytes().startswith(b"\x89PNG")
+    assert printed["curves"]["plate"]["knn3"] == first["methods"]["knn3"]
+    assert printed["curves"]["plate"]["nearest"]["counts"] == [2, 4]
+    assert printed["curves"]["plate"]["nearest"]["starts"] == [2, 2]
+    assert printed["failures"] == []
+    assert (results / "plate" / "learning-curve.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(AvmsfError, match="choosing is"):
-        run(parse([*words[:2], "3", *words[4:], "--methods", "knn3"]))
-
-
-def test_one_of_several_objects_has_to_be_named(tmp_path: Path) -> None:
-    fill_plate(tmp_path / "set" / "a")
-    fill_plate(tmp_path / "set" / "b")
-    with pytest.raises(AvmsfError, match="holds 2 objects; name one with --object"):
-        run(parse([str(tmp_path / "set"), "--output", str(tmp_path / "results")]))
+        run(parse([*words, "--counts", "3", "4", "--methods", "knn3"]))
 
 
 def test_a_metric_that_is_not_drawn_is_refused_before_any_work(tmp_path: Path, capsys: Streams) -> None:
     with pytest.raises(SystemExit) as ended:
-        parse([str(tmp_path), "--metric", "l2"])
+        parse(["learning-curve", str(tmp_path), "--metric", "l2"])
     assert ended.value.code == 2
     assert "l1_log" in capsys.readouterr().err
 
@@ -135,7 +131,7 @@ def test_a_metric_that_is_not_drawn_is_refused_before_any_work(tmp_path: Path, c
 def test_the_papers_network_takes_part_and_a_known_wall_is_handed_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert "field-positions" in parse(["plate"]).methods
+    assert "field-positions" in protocol_named("learning-curve").methods
     asked: list[Evaluation] = []
 
     def stop(evaluation: Evaluation, *objects: object, **settings: object) -> None:
@@ -144,7 +140,16 @@ def test_the_papers_network_takes_part_and_a_known_wall_is_handed_on(
 
     monkeypatch.setattr("avmsf.cli.evaluate.run_objects", stop)
     capture = fill_plate(tmp_path / "plate")
-    words = [str(capture), "--counts", "2", "--output", str(tmp_path / "results"), "--body.wall", "0.004"]
+    words = [
+        "learning-curve",
+        str(capture),
+        "--counts",
+        "2",
+        "--output",
+        str(tmp_path / "results"),
+        "--body.wall",
+        "0.004",
+    ]
     assert run(parse(words)) == 130
     bodies = asked[0].bodies
     assert isinstance(bodies, ObjectBodies)

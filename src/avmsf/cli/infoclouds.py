@@ -1,12 +1,10 @@
-"""`avmsf view-cloud`: Gaussians or features as pictures, from all sides."""
+"""What `avmsf info` prints and draws of Gaussians and features."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import torch
-import tyro
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
@@ -14,7 +12,8 @@ from torch import Tensor
 
 from avmsf.bench.clouds import component_colours, draw_cloud, draw_features, save_turntable
 from avmsf.bench.pictures import save_picture
-from avmsf.cli.printing import print_text, say
+from avmsf.cli.options.info import Options
+from avmsf.cli.printing import console, say
 from avmsf.cli.scenes import features_words
 from avmsf.errors import SceneError
 from avmsf.scene.features import GEOMETRY, FeatureField
@@ -27,49 +26,41 @@ from avmsf.scene.symmetry import Symmetries
 _UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
-@dataclass(frozen=True)
-class Options:
-    """Draw Gaussians or features from all sides: colours, features, clusters, symmetries."""
-
-    file: tyro.conf.Positional[Path]
-    """Gaussians (.ply, as `avmsf splat` writes them) or features (.safetensors, as `avmsf lift` does)."""
-    output: Path
-    """Folder for the pictures: cloud.png or features.png, and turntable.gif, on which the cloud turns."""
-    cloud: Path | None = None
-    """Gaussians that the features lie on, to draw their colours beside the features."""
-    clusters: int = 64
-    """Regions to draw of features."""
-    up: Literal["x", "y", "z"] = "z"
-    """Axis that points to the sky."""
-
-
-def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return tyro.cli(Options, prog="avmsf view-cloud", args=words, config=(tyro.conf.FlagCreatePairsOff,))
-
-
-def run(options: Options) -> int:
-    """Draw."""
-    if options.file.suffix.lower() == ".ply":
-        _draw_cloud(options)
-    else:
-        _draw_features(options)
-    return 0
-
-
-def _draw_cloud(options: Options) -> None:
+def describe_cloud(options: Options) -> dict[str, Any]:
+    """Print what Gaussians are, draw them if asked, and return their values."""
     cloud = read_splats(options.file)
+    extent = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
+    screen = console(errors=options.json)
+    sides = " x ".join(f"{side:.3g}" for side in extent)
+    screen.print(f"{options.file}: {len(cloud)} Gaussians, {sides} m", soft_wrap=True)
+    if options.plots is not None:
+        _draw_cloud(cloud, options, options.plots)
+    return {"kind": "gaussians", "file": str(options.file), "count": len(cloud), "extent_metres": extent}
+
+
+def describe_features(options: Options) -> dict[str, Any]:
+    """Print what features are, draw them if asked, and return their values."""
+    features, report = load_features(options.file), read_report(options.file)
+    screen = console(errors=options.json)
+    count, dim = features.features.shape
+    screen.print(f"{options.file}: {dim} features of {features.encoder} on {count} points", soft_wrap=True)
+    if "encoder" in report:
+        screen.print(features_words(report), soft_wrap=True)
+    if options.plots is not None:
+        _draw_features(features, report, options, options.plots)
+    values = {"kind": "features", "file": str(options.file), "encoder": features.encoder, "points": count, "dim": dim}
+    return {**values, "report": report}
+
+
+def _draw_cloud(cloud: GaussianCloud, options: Options, folder: Path) -> None:
     colors = plain_colors(cloud)
     title = f"{options.file.name}: {len(cloud)} Gaussians"
-    _write(draw_cloud(cloud.centers, {"colour": colors}, title=title, up=_UP[options.up]), options.output / "cloud.png")
-    _turn(cloud.centers, colors, options)
+    _write(draw_cloud(cloud.centers, {"color": colors}, title=title, up=_UP[options.up]), folder / "cloud.png")
+    _turn(cloud.centers, colors, options.up, folder)
 
 
-def _draw_features(options: Options) -> None:
-    features, report = load_features(options.file), read_report(options.file)
+def _draw_features(features: FeatureField, report: dict[str, Any], options: Options, folder: Path) -> None:
     symmetries = Symmetries.from_dict(report["symmetries"]) if "symmetries" in report else None
-    if "encoder" in report:
-        print_text(features_words(report))
     shown = without_positions(features)
     figure = draw_features(
         shown,
@@ -79,8 +70,8 @@ def _draw_features(options: Options) -> None:
         symmetries=symmetries,
         up=_UP[options.up],
     )
-    _write(figure, options.output / "features.png")
-    _turn(features.points, component_colours(shown.features), options, symmetries=symmetries)
+    _write(figure, folder / "features.png")
+    _turn(features.points, component_colours(shown.features), options.up, folder, symmetries=symmetries)
 
 
 def _colors_of(path: Path, features: FeatureField) -> Float[Tensor, "points 3"]:
@@ -98,12 +89,13 @@ def _colors_of(path: Path, features: FeatureField) -> Float[Tensor, "points 3"]:
 def _turn(
     points: Float[Tensor, "points 3"],
     colors: Float[Tensor, "points 3"],
-    options: Options,
+    up: str,
+    folder: Path,
     *,
     symmetries: Symmetries | None = None,
 ) -> None:
-    path = options.output / "turntable.gif"
-    save_turntable(points, colors, path, symmetries=symmetries, up=_UP[options.up])
+    path = folder / "turntable.gif"
+    save_turntable(points, colors, path, symmetries=symmetries, up=_UP[up])
     say(f"wrote {path}")
 
 
@@ -113,12 +105,12 @@ def _write(picture: Figure, path: Path) -> None:
 
 
 def without_positions(features: FeatureField) -> FeatureField:
-    """Return the features alone, which positions beside them would outshine."""
+    """Return the features alone, which positions next to them would outweigh."""
     if not features.encoder.startswith(f"{GEOMETRY} and "):
         return features
     return replace(features, features=features.features[:, 3:])
 
 
 def plain_colors(cloud: GaussianCloud) -> Float[Tensor, "points 3"]:
-    """Return the Gaussians' colours as seen from nowhere in particular, 0 to 1."""
+    """Return the Gaussians' colours independent of the direction of view, 0 to 1."""
     return (0.5 + ZEROTH * cloud.harmonics[:, 0]).clamp(0, 1).detach()

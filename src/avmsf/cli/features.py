@@ -1,0 +1,51 @@
+"""`avmsf features`: features on an object's surface out of what a folder shows of it."""
+
+from avmsf.capture.together import expect_one_unit
+from avmsf.cli import INTERRUPTED
+from avmsf.cli.options.features import Options
+from avmsf.cli.printing import console, print_json, say
+from avmsf.cli.scenebar import SceneBar
+from avmsf.cli.scenes import features_words, settings_for, stage_line
+from avmsf.cli.writing import expect_writable
+from avmsf.files import copy_whole
+from avmsf.pipeline.config import SceneConfig
+from avmsf.pipeline.scene import SceneStages
+from avmsf.pipeline.stages import StageFolder
+from avmsf.scene.featurestore import read_report
+
+
+def run(options: Options) -> int:
+    """Make the features; return 130 where Ctrl-C stopped it."""
+    if options.output is not None:
+        expect_writable(options.output)
+    settings = settings_for(options)
+    expect_one_unit(options.folder, settings)
+    stages = StageFolder(options.kept)
+    try:
+        with SceneBar() as bar:
+            scene = SceneStages(
+                options.folder,
+                stages,
+                SceneConfig(options.views, options.splat, options.config),
+                settings=settings,
+                listener=bar.listener,
+                device=options.device,
+            )
+            scene.expect_any()
+            with stages.lock("avmsf features"):
+                features = scene.features
+                report = read_report(features.path)
+                if options.output is not None:
+                    copy_whole(features.path, options.output)
+    except KeyboardInterrupt:
+        say("avmsf features: interrupted; the same command goes on from where it was")
+        return INTERRUPTED
+    screen = console(errors=options.json)
+    screen.print(features_words(report), soft_wrap=True)
+    for name, kept in scene.made().items():
+        screen.print(stage_line(name, kept), soft_wrap=True)
+    if options.output is not None:
+        screen.print(f"wrote {options.output}", soft_wrap=True)
+    if options.json:
+        print_json({"features": str(options.output or features.path), **report})
+    return 0

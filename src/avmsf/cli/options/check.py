@@ -1,0 +1,30 @@
+"""Options of `avmsf check`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import tyro
+
+from avmsf.cli.options.common import CaptureFolder, Flag, Printing, SettingsFile, parse_options
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """Check the recordings of a capture: levels, noise, clipping, onsets, double hits and alignment.
+
+    Prints one row per recording and the problems below. The delay, in samples, aligns a recording with the others. The
+    exit code is 0 if the capture can be read, with or without warnings, and 2 if it cannot.
+    """
+
+    capture: tyro.conf.Positional[CaptureFolder]
+    """Folder with impacts.csv and the recordings that it names."""
+    settings: SettingsFile = None
+    """Use this capture.toml instead of the folder's own."""
+    write_settings: Flag = False
+    """Write the proposed settings, with the reasons, to the folder's capture.toml, and check with them. An existing
+    capture.toml is not changed."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return parse_options(Options, "check", words)

@@ -1,0 +1,37 @@
+"""Options of `avmsf dataset check`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli.options.common import REGISTRY, Existing, Printing, one_column
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """List the objects of a published dataset: what can be read, and what is missing.
+
+    Known are ObjectFolder Real (as published, or its compact copy), RealImpact, and folders of captures. Sounds are not
+    read. The exit code is 0 if at least one object can be read, and 2 otherwise.
+    """
+
+    dataset: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATASET"), Existing("a dataset's folder")]]
+    """Folder of the dataset."""
+    contact_data: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), Existing("ObjectFolder Real's contacts")] = (
+        None
+    )
+    """ObjectFolder Real's contacts: a folder of arrays, or one of SonicGauss's lists."""
+    table: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Existing("a table of objects")] = None
+    """A CSV or JSON list id, name, material of ObjectFolder Real's objects, numbered as published."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    with one_column():
+        options: Options = tyro.extras.subcommand_cli_from_dict(
+            {"check": Options}, prog="avmsf dataset", args=words, registry=REGISTRY
+        )
+    return options

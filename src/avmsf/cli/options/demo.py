@@ -1,0 +1,28 @@
+"""Options of `avmsf demo`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli.options.common import Common, parse_options
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Run a complete example: from photographs and recordings of a mug to its sound field, sounds and pictures.
+
+    A ceramic mug, made by `avmsf simulate example`: 48 photographs and 16 impacts. Gaussians are fitted to the
+    photographs, and the mug's shape is made from both. A field is fitted to 12 of the impacts, which also show how
+    thick the mug's wall is, and compared with the other 4.
+    """
+
+    folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FOLDER")]] = Path("demo")
+    """Folder for all results; an earlier demo in it is replaced."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return parse_options(Options, "demo", words)

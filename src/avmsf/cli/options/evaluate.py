@@ -1,0 +1,86 @@
+"""Options of `avmsf evaluate`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from avmsf.cli.options.common import Existing, Flag, OutputFolder, Printing, parse_options
+from avmsf.pipeline.config import BodyConfig, Geometry, LiftConfig
+from avmsf.scene.splatconfig import SplatConfig
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """Evaluate methods at held-out contacts, on all objects of a dataset.
+
+    Every value is kept as it is computed: repeat an interrupted command to continue it, and add methods or objects
+    later. The folder of results holds summary.json, report.md and report.html, which shows and plays sounds.
+    """
+
+    protocol: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="PROTOCOL")]]
+    """The experiment: farthest, leave-one-out, closest, shots, learning-curve, views, ablation, non-symmetric, localize
+    or grid."""
+    data: tyro.conf.Positional[
+        Annotated[Path, tyro.conf.arg(metavar="DATA"), Existing("a dataset, capture folders or one capture")]
+    ]
+    """Folder of a dataset, of capture folders, or of one capture."""
+    methods: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
+    """Methods, separated by commas or blanks; by default those of the protocol."""
+    objects: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
+    """Objects, likewise; by default those of the protocol."""
+    output: OutputFolder = None
+    """Folder of results; by default evaluation/DATASET/PROTOCOL in the current folder."""
+    cache: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Keep the objects' features here, which several evaluations of one dataset may share; by default in the folder of
+    results."""
+    counts: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = ()
+    """learning-curve: numbers of training contacts; by default 3, 4, 6, 8, 12, 16, ... as long as a quarter of the
+    contacts is held out."""
+    starts: int = 3
+    """learning-curve: number of first contacts, evenly spaced in the table, that the choices start from."""
+    metric: Literal["relative_stft", "l1", "l1_log", "envelope"] = "relative_stft"
+    """learning-curve: metric to draw."""
+    look: Literal["best", "mesh"] = "best"
+    """Source of the visual features. best: photographs if there are any, by Gaussians, otherwise the mesh. mesh: the
+    mesh, onto its own surface."""
+    splat: SplatConfig = field(default_factory=SplatConfig)
+    """How Gaussians are fitted."""
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    """How features are made. The methods `paper` use the paper's own settings and only the encoder given here: DINOv2
+    without `--lift.encoder`, which then has to be installed."""
+    workers: int = 1
+    """Number of objects computed at a time, each on one thread; more than one needs the extra `scale`."""
+    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    """Address of a ray cluster to compute on, or auto; its computers have to see data and results at the same paths."""
+    seed: int = 0
+    """Seed of all methods."""
+    geometry: Geometry = "mesh"
+    """Shape that finite elements use. mesh: the object's mesh. gaussians: the surface of Gaussians fitted to its views.
+    noisy: its mesh with vertices displaced by 2 % of its size."""
+    body: BodyConfig = field(default_factory=BodyConfig)
+    """Elastic bodies."""
+    amplitude_scale: Literal["full-scale", "raw"] = "full-scale"
+    """full-scale: an object's sounds times one factor that brings its loudest recording to a peak of one, so that
+    values of different objects can be averaged. raw: in the recordings' unit."""
+    no_cdpam: Flag = False
+    """Do not compute the metric CDPAM, which needs the extra `eval`."""
+    cdpam_contacts: int = 8
+    """Number of test contacts per case at which CDPAM is computed, evenly spaced; 0 for all."""
+    modes: int = 128
+    """Maximum number of modes."""
+    contact_data: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), Existing("ObjectFolder Real's contacts")] = (
+        None
+    )
+    """ObjectFolder Real's contacts, for its raw form."""
+    table: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Existing("a table of objects")] = None
+    """The published table of ObjectFolder Real's names and materials."""
+    figures: Flag = False
+    """Also draw figures/OBJECT.png: spectrograms of the recording and of all methods, 20 Hz to 20 kHz, first second."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return parse_options(Options, "evaluate", words)

@@ -1,0 +1,88 @@
+"""Options of `avmsf export`, and which of them each format uses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli.options.common import Existing, Flag, Printing, Unit, parse_options
+from avmsf.export.formats import Format, Precision
+from avmsf.modal.config import PulseShape
+
+_USED: dict[Format, tuple[str, ...]] = {
+    "web": ("object", "object_unit", "capture"),
+    "gltf": ("object", "object_unit", "capture"),
+    "faust": ("no_noise",),
+    "avmsf-demo": ("object", "variant", "precision"),
+    "wavs": ("forces", "contact_times", "pulse", "seconds"),
+    "uff": ("functions",),
+}
+"""Options that each format uses, in addition to those that all use."""
+_OF_SOME = {"rate"}.union(*_USED.values())
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """Write a field for other tools: web page, glTF, Faust, samplers, modal analysis.
+
+    web: a page on which the object can be struck, as a folder for any static host or as one .html file. gltf: a .glb
+    that any viewer shows, with the draft extension KHR_audio_rigid_bodies. faust: a .dsp with controls, or a .lib
+    without. avmsf-demo: the layout of the paper's own demo. wavs: sounds with a table and an SFZ instrument, for
+    samplers. uff: the universal file format, for modal analysis. What a format cannot hold is printed.
+    """
+
+    field: tyro.conf.Positional[
+        Annotated[Path, tyro.conf.arg(metavar="FIELD"), Existing("a field file, as avmsf fit writes it")]
+    ]
+    """Field file, as `avmsf fit` writes it; or a folder in the layout of the paper's demo."""
+    to: Format
+    """Format to write."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE|FOLDER")]
+    """A folder, or a file for gltf (.glb), faust (.dsp or .lib), uff (.uff) or a page in one file (.html)."""
+    object: Annotated[Path | None, tyro.conf.arg(metavar="MESH|PLY"), Existing("a mesh or Gaussians")] = None
+    """Mesh, or Gaussians as a .ply, to show; by default the capture's surface, or else the field's points."""
+    object_unit: Unit = "m"
+    """Unit of the coordinates of the object's mesh."""
+    capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder")] = None
+    """Capture folder: its surface is shown, and a page offers its recordings next to the model's sounds."""
+    points: int | None = None
+    """Maximum number of contacts, spread over the object; by default as many as the format's tools read easily."""
+    overwrite: Flag = False
+    """Replace files that no export wrote. Files of other names are not changed."""
+    forces: tuple[float, ...] = (1.0,)
+    """wavs: forces of the layers, from soft to hard, in newtons if the field knows forces, otherwise relative."""
+    contact_times: tuple[float, ...] = (0.0,)
+    """wavs: contact time of each layer's hammer in seconds; one for all, or one per force."""
+    seconds: float | None = None
+    """wavs: length of the sounds; by default that of the training sounds."""
+    pulse: PulseShape = "half-sine"
+    """wavs: how the force rises and falls over that time, as in `avmsf render`."""
+    no_noise: Flag = False
+    """faust: write the modes without the residual noise."""
+    functions: int = 16
+    """uff: number of points whose frequency response functions are written in addition to the mode shapes."""
+    variant: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """avmsf-demo: name of the sound among those of one object, to write ("original") or to read."""
+    precision: Precision = "float32"
+    """avmsf-demo: number format of the gains."""
+    rate: float | None = None
+    """Sample rate in Hz of a field in the demo's layout, which does not hold it."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return parse_options(Options, "export", words)
+
+
+def unused_options(options: Options) -> list[str]:
+    """Return a sentence for each given option that the format does not use."""
+    used = _USED[options.to] + (("variant", "rate") if options.field.is_dir() else ())
+    sentences = []
+    for each in fields(options):
+        if each.name in _OF_SOME and each.name not in used and getattr(options, each.name) != each.default:
+            others = ", ".join(name for name, known in _USED.items() if each.name in known) or "the demo's folders"
+            option = f"--{each.name.replace('_', '-')}"
+            sentences.append(f"{option} is not used by --to {options.to}, only by {others}")
+    return sentences

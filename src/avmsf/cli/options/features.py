@@ -1,0 +1,35 @@
+"""Options of `avmsf features`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli.options.common import parse_options
+from avmsf.cli.options.scenes import SceneOptions
+from avmsf.pipeline.config import LiftConfig, ViewsConfig
+from avmsf.scene.splatconfig import SplatConfig
+
+
+@dataclass(frozen=True)
+class Options(SceneOptions):
+    """Compute visual features on an object's surface, equal at points that are symmetric to each other.
+
+    Views and Gaussians are made first if the cache does not have them. `avmsf fit --features` reads the result.
+    """
+
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FEATURES.safetensors")] = None
+    """Copy the features to this file."""
+    views: ViewsConfig = field(default_factory=ViewsConfig)
+    """How views are made."""
+    splat: SplatConfig = field(default_factory=SplatConfig)
+    """How Gaussians are fitted."""
+    config: tyro.conf.OmitArgPrefixes[LiftConfig] = field(default_factory=LiftConfig)
+    """How features are made."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return parse_options(Options, "features", words)

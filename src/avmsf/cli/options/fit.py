@@ -1,0 +1,102 @@
+"""Options of `avmsf fit`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli.options.common import Existing, Printing, SettingsFile, parse_options
+from avmsf.field.config import FitConfig, GainModel
+from avmsf.modal.config import ExtractionMethod
+from avmsf.pipeline.config import PRESETS, BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """Fit a sound field to a capture and write it to one file.
+
+    Without recordings, a mesh and --material give an approximate field. Repeat an interrupted command to continue it:
+    its state is kept next to the output, and the result is the same.
+    """
+
+    capture: tyro.conf.Positional[
+        Annotated[Path, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder, with impacts.csv")]
+    ]
+    """Folder with impacts.csv and the recordings that it names; with --material, a folder with a mesh, or a mesh."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FIELD.safetensors")]
+    """File to write the field to."""
+    settings: SettingsFile = None
+    """Use this capture.toml instead of the folder's own."""
+    material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Compute an approximate field of an object without recordings from its mesh and its material: ceramic, glass,
+    wood, plastic, iron, polycarbonate or steel."""
+    train_fraction: float | None = None
+    """Fit to all recordings at this fraction of the contacts, spread as far apart as possible, and compute the error
+    at the others. Contacts closer than 1 % of the extent of all count as one."""
+    train_count: int | None = None
+    """Fit to all recordings at this number of contacts, likewise."""
+    start: int = 0
+    """Row of impacts.csv, counted from 0, whose contact this choice starts from."""
+    features: Annotated[
+        Path | None, tyro.conf.arg(metavar="FEATURES.safetensors"), Existing("features, as avmsf features writes them")
+    ] = None
+    """Features written by `avmsf features`, in the frame of the contacts; by default positions on the surface."""
+    gain_model: GainModel = "auto"
+    """How gains vary over the object. auto: a Gaussian process over all kernel families, weighted by evidence; the
+    elastic family needs a mesh. network: the paper's attention network on the features. The others: a Gaussian process
+    over one family, for study; symmetry needs a mesh, visual needs --features."""
+    body: BodyConfig = field(default_factory=BodyConfig)
+    """Elastic bodies."""
+    extraction: ExtractionMethod = "high-resolution"
+    """How modes are extracted; see `avmsf modes --help`."""
+    modes: int = 128
+    """Maximum number of modes."""
+    time_zero: TimeZero | None = None
+    """Start of the sounds: onset, or peak (paper); by default as capture.toml says."""
+    device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
+    """Device for training end to end, its spectral loss and the network; by default the GPU if there is one. Mode
+    extraction, clustering, finite elements and the Gaussian process run on the CPU."""
+    preset: Preset = "default"
+    """Defaults of all settings. default: takes seconds to minutes. paper: everything as published, the middle of each
+    published list; takes hours. `--preset paper --help` shows its values. `avmsf reconstruct` also uses its features;
+    here they are those of --features."""
+    config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)
+    """How the field is fitted."""
+
+    @property
+    def pipeline(self) -> PipelineConfig:
+        """All settings as one; those of views and features are the features' file's own."""
+        scene, start = SceneConfig(), self.time_zero
+        return PipelineConfig(
+            self.gain_model, self.body, scene, self.config, self.extraction, self.modes, start, self.device
+        )
+
+
+@dataclass(frozen=True)
+class PaperOptions(Options):
+    """The same with the defaults of the preset `paper`."""
+
+    gain_model: GainModel = PRESETS["paper"].gain_model
+    extraction: ExtractionMethod = PRESETS["paper"].method
+    time_zero: TimeZero | None = PRESETS["paper"].time_zero
+    preset: Preset = "paper"
+    config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=lambda: PRESETS["paper"].fit)
+
+
+@dataclass(frozen=True)
+class _Preset:
+    preset: Preset = "default"
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell, with the preset's settings as defaults."""
+    kind = {"default": Options, "paper": PaperOptions}[preset_of(words)]
+    return parse_options(kind, "fit", words, description=Options.__doc__)
+
+
+def preset_of(words: Sequence[str]) -> Preset:
+    """Return the preset that the words name; it is read first, since it decides the defaults of all others."""
+    chosen, _ = tyro.cli(_Preset, args=words, add_help=False, return_unknown_args=True)
+    return chosen.preset

@@ -1,0 +1,40 @@
+"""Options of `avmsf info`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from avmsf.cli.options.common import Existing, Printing, SettingsFile, parse_options
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """Describe a field, Gaussians or features, and draw them with --plots."""
+
+    file: tyro.conf.Positional[
+        Annotated[Path, tyro.conf.arg(metavar="FILE"), Existing("a field, Gaussians or features")]
+    ]
+    """A field (.safetensors, of `avmsf fit`), Gaussians (.ply, of `avmsf splat`) or features (.safetensors, of
+    `avmsf features`)."""
+    capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder")] = None
+    """Field: compare it with a capture's recordings that it was not fitted to, or with all if there are none."""
+    settings: SettingsFile = None
+    """Field: use this capture.toml instead of the capture's own."""
+    plots: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Draw pictures to this folder. Field: modes.png, gains.png; doubt.png and spectrum.png if the gains have a
+    posterior; surface.png, with cross-sections, if they have a body; spectrograms.png with --capture. Gaussians:
+    cloud.png and turntable.gif. Features: features.png and turntable.gif."""
+    cloud: Annotated[Path | None, tyro.conf.arg(metavar="CLOUD.ply"), Existing("Gaussians, as a .ply file")] = None
+    """Features: also draw the colors of the Gaussians that the features lie on."""
+    clusters: int = 64
+    """Features: number of regions to draw."""
+    up: Literal["x", "y", "z"] = "z"
+    """Gaussians and features: axis that points up."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return parse_options(Options, "info", words)

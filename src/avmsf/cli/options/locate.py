@@ -1,0 +1,46 @@
+"""Options of `avmsf locate`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli.options.common import Existing, FieldFile, Flag, OutputFolder, Printing, SettingsFile, parse_options
+
+_Recording = Annotated[Path, Existing("a recording")]
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """Find where on the object the impact of a recording was, with a heat map and the uncertainty.
+
+    Each recording holds one impact, of any force and polarity; with --several, any number of them.
+    """
+
+    field: tyro.conf.Positional[FieldFile]
+    """Field file, as `avmsf fit` writes it."""
+    recordings: tyro.conf.Positional[Annotated[tuple[_Recording, ...], tyro.conf.arg(metavar="RECORDING.wav ...")]]
+    """Recordings of impacts on the same object: wav, flac or another format that libsndfile reads."""
+    capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder")] = None
+    """Read the recordings by this folder's capture.toml; by default as those of the fit were read."""
+    settings: SettingsFile = None
+    """Read the recordings by this capture.toml."""
+    several: Flag = False
+    """The recordings hold several impacts each; locate every one of them."""
+    force: float | None = None
+    """Peak force of every impact in newtons: it distinguishes contacts that differ only in loudness. For a field whose
+    recordings were not divided by their forces: relative to an average recorded impact."""
+    probability: float = 0.9
+    """Probability that the contact lies within the region that is reported."""
+    true_contact: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    """True contact of every impact, in meters: its distance is printed, and the heat maps mark it red, the found one
+    blue."""
+    output: OutputFolder = None
+    """Folder for a heat map and a colored point cloud of every impact, NAME.png and NAME.ply."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return parse_options(Options, "locate", words)

@@ -1,0 +1,95 @@
+"""Options of `avmsf reconstruct`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli.options.common import parse_options
+from avmsf.cli.options.fit import preset_of
+from avmsf.cli.options.scenes import SceneOptions, with_seed
+from avmsf.field.config import FitConfig, GainModel
+from avmsf.modal.config import ExtractionMethod
+from avmsf.pipeline.config import (
+    PRESETS,
+    BodyConfig,
+    LiftConfig,
+    PipelineConfig,
+    Preset,
+    SceneConfig,
+    TimeZero,
+    ViewsConfig,
+)
+from avmsf.scene.splatconfig import SplatConfig
+
+
+@dataclass(frozen=True)
+class Options(SceneOptions):
+    """Make a field from a capture folder with pictures or a mesh: Gaussians, features, modes, gains.
+
+    FOLDER also holds impacts.csv and the recordings that it names. The output of each stage is kept in the cache, only
+    what changed is computed again, and repeating an interrupted command continues it.
+    """
+
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FIELD.safetensors")] = None
+    """Copy the field to this file."""
+    material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Compute an approximate field without recordings from shape and material; see `avmsf fit --help`."""
+    train_fraction: float | None = None
+    """Fit to all recordings at this fraction of the contacts, spread as far apart as possible, and compute the error
+    at the others. Contacts closer than 1 % of the extent of all count as one."""
+    train_count: int | None = None
+    """Fit to all recordings at this number of contacts, likewise."""
+    start: int = 0
+    """Row of impacts.csv, counted from 0, whose contact this choice starts from."""
+    extraction: ExtractionMethod = "high-resolution"
+    """How modes are extracted; see `avmsf modes --help`."""
+    modes: int = 128
+    """Maximum number of modes."""
+    time_zero: TimeZero | None = None
+    """Start of the sounds: onset, or peak (paper); by default as capture.toml says."""
+    seed: int | None = None
+    """Seed of all stages; by default each stage's own."""
+    gain_model: GainModel = "auto"
+    """How gains vary over the object; see `avmsf fit --help`."""
+    body: BodyConfig = field(default_factory=BodyConfig)
+    """Elastic bodies."""
+    views: ViewsConfig = field(default_factory=ViewsConfig)
+    """How views are made."""
+    splat: SplatConfig = field(default_factory=SplatConfig)
+    """How Gaussians are fitted."""
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    """How features are made."""
+    preset: Preset = "default"
+    """Defaults of all settings, from views to the fit; see `avmsf fit --help`. `--preset paper --help` shows its
+    values."""
+    fit: FitConfig = field(default_factory=FitConfig)
+    """How the field is fitted."""
+
+    @property
+    def pipeline(self) -> PipelineConfig:
+        """All settings as one."""
+        scene = with_seed(SceneConfig(self.views, self.splat, self.lift), self.seed)
+        fit = self.fit if self.seed is None else replace(self.fit, seed=self.seed)
+        start = self.time_zero
+        return PipelineConfig(self.gain_model, self.body, scene, fit, self.extraction, self.modes, start, self.device)
+
+
+@dataclass(frozen=True)
+class PaperOptions(Options):
+    """The same with the defaults of the preset `paper`."""
+
+    gain_model: GainModel = PRESETS["paper"].gain_model
+    extraction: ExtractionMethod = PRESETS["paper"].method
+    lift: LiftConfig = field(default_factory=lambda: PRESETS["paper"].scene.lift)
+    time_zero: TimeZero | None = PRESETS["paper"].time_zero
+    preset: Preset = "paper"
+    fit: FitConfig = field(default_factory=lambda: PRESETS["paper"].fit)
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell, with the preset's settings as defaults."""
+    kind = {"default": Options, "paper": PaperOptions}[preset_of(words)]
+    return parse_options(kind, "reconstruct", words, description=Options.__doc__)

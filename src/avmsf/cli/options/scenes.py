@@ -1,0 +1,37 @@
+"""Options of the verbs that start from photographs, a video, a mesh or Gaussians."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli.options.common import Existing, Printing, SettingsFile
+from avmsf.pipeline.config import CACHE, SceneConfig
+
+
+@dataclass(frozen=True)
+class SceneOptions(Printing):
+    """What is read, and where the outputs of the stages are kept."""
+
+    folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FOLDER"), Existing("a folder")]]
+    """Folder with photographs (transforms.json, a COLMAP model, or only images/), a video, a mesh or Gaussians."""
+    cache: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Keep the output of each stage here, by default in FOLDER/.avmsf, so that it is computed only once."""
+    settings: SettingsFile = None
+    """Use this capture.toml instead of the folder's own."""
+    device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
+    """Device for Gaussians (with gsplat), DINOv2 and training; by default the GPU if there is one."""
+
+    @property
+    def kept(self) -> Path:
+        """The folder that keeps the stages' outputs."""
+        return self.folder / CACHE if self.cache is None else self.cache
+
+
+def with_seed(config: SceneConfig, seed: int | None) -> SceneConfig:
+    """Return the settings with one seed for all stages; unchanged for None."""
+    if seed is None:
+        return config
+    parts = {name: replace(getattr(config, name), seed=seed) for name in ("views", "splat", "lift")}
+    return replace(config, **parts)

@@ -1,0 +1,52 @@
+"""Options of `avmsf simulate`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli.options.common import Flag, InputError, Printing, parse_options
+from avmsf.simulate.example import EXAMPLE
+from avmsf.simulate.recipe import ObjectRecipe
+from avmsf.simulate.sim20 import SET, sim20_recipe
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """Simulate objects, their recordings and pictures, as capture folders with ground truth.
+
+    `avmsf simulate sim-20 --output FOLDER` makes the benchmark set, one folder per object; complete objects are kept,
+    so repeat an interrupted command to continue it. A single object, of the set by its name or any other by --kind or
+    --mesh, is written to FOLDER itself.
+    """
+
+    what: tyro.conf.Positional[Annotated[str | None, tyro.conf.arg(metavar="NAME")]] = None
+    """sim-20 for the benchmark set, the name of one of its objects, or example for the object of `avmsf demo`; nothing
+    for an object of your own."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
+    """Folder to make."""
+    list: Flag = False
+    """List the set's objects, the shapes and the materials, and make nothing."""
+    cache: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Keep elastic modes here. They take most of the time: other hammers, noises and views are then quick."""
+    recipe: Annotated[ObjectRecipe, tyro.conf.arg(name="")] = field(default_factory=ObjectRecipe)
+    """The object, its impacts, recordings and pictures; for an object of the set, what differs from it."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    options = parse_options(Options, "simulate", words, default=Options())
+    if (mesh := options.recipe.mesh) is not None and not mesh.is_file():
+        raise InputError(mesh, "a mesh: obj, ply, glb or stl")
+    # A second time from the named object's recipe: what is asked for may be a default, and not that object's.
+    recipe = None if options.list else _recipe_of(options.what)
+    return options if recipe is None else parse_options(Options, "simulate", words, default=Options(recipe=recipe))
+
+
+def _recipe_of(what: str | None) -> ObjectRecipe | None:
+    """Return the named object's recipe; None for the whole set and for an object of the user's own."""
+    if what in (None, SET):
+        return None
+    return EXAMPLE if what == "example" else sim20_recipe(what)

@@ -1,0 +1,33 @@
+"""Options of `avmsf splat`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli.options.common import parse_options
+from avmsf.cli.options.scenes import SceneOptions
+from avmsf.pipeline.config import ViewsConfig
+from avmsf.scene.splatconfig import SplatConfig
+
+
+@dataclass(frozen=True)
+class Options(SceneOptions):
+    """Fit 3D Gaussians to photographs, a video or a mesh, as a .ply file that any 3DGS viewer opens.
+
+    Views and Gaussians are kept in the cache. Repeat an interrupted command to continue it.
+    """
+
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="CLOUD.ply")] = None
+    """Copy the Gaussians to this file."""
+    views: ViewsConfig = field(default_factory=ViewsConfig)
+    """How views are made."""
+    config: tyro.conf.OmitArgPrefixes[SplatConfig] = field(default_factory=SplatConfig)
+    """How Gaussians are fitted."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return parse_options(Options, "splat", words)

@@ -1,0 +1,50 @@
+"""Options of `avmsf studio`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli.options.common import Common, Existing, Flag, parse_options
+
+
+@dataclass(frozen=True)
+class Options(Common):
+    """Open a page in the browser to strike an object and hear it, locate impacts, edit fields and record captures.
+
+    A field is played, searched and edited; a capture folder, a folder of images or a mesh is recorded and
+    reconstructed. The page is served only to this computer, at an address that holds a secret; Ctrl-C ends it.
+    """
+
+    target: tyro.conf.Positional[
+        Annotated[
+            Path | None,
+            tyro.conf.arg(metavar="FIELD|FOLDER|MESH"),
+            Existing("a field, a capture folder, a folder of images or a mesh"),
+        ]
+    ] = None
+    """A field file, a capture folder, a folder that shows the object, or a mesh. A mesh is copied to a folder of its
+    name next to it, which becomes the capture; but surface.obj, .ply, .glb or .stl, and Gaussians called splats.ply or
+    point_cloud.ply, open the folder that holds them as the capture. --capture names another folder for either."""
+    object: Annotated[Path | None, tyro.conf.arg(metavar="MESH|PLY"), Existing("a mesh or Gaussians")] = None
+    """Mesh, in meters, or Gaussians to show; by default what the capture folder holds."""
+    capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE")] = None
+    """Capture folder of a field, whose recordings are shown and added to; for a mesh, the folder to make."""
+    port: int | None = None
+    """Port to serve at; 0 for any free one. By default 8634, for which a browser remembers that the page may record, or
+    any free one if that is taken."""
+    no_browser: Flag = False
+    """Do not open the browser."""
+    model: Annotated[str | None, tyro.conf.arg(metavar="FOLDER|NAME")] = None
+    """Stable Audio pipeline for edits by text: a folder, or its name on the hub; needs the extra `text`."""
+    modes: int = 128
+    """Maximum number of modes of a reconstruction."""
+    fetch_modules: Flag = False
+    """First download the page's libraries with npm, so that it works without a network from then on."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return parse_options(Options, "studio", words)

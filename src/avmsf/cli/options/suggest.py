@@ -1,0 +1,38 @@
+"""Options of `avmsf suggest`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli.options.common import Existing, FieldFile, Flag, OutputFolder, Printing, SettingsFile, parse_options
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """Suggest where to record next: the contacts that reduce the expected error of the field most.
+
+    Each suggestion assumes that those before it are recorded, so keep this order. Record them, fit again with all
+    recordings, and repeat. Needs a field whose gains have a posterior, as all but `--gain-model network` have.
+    """
+
+    field: tyro.conf.Positional[FieldFile]
+    """Field file, as `avmsf fit` writes it."""
+    count: int = 5
+    """Number of contacts."""
+    candidates: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder")] = None
+    """Suggest among the contacts of this capture. By default: all of the surface that a straight hammer of 10 mm
+    reaches from outside, at most 45 degrees from perpendicular."""
+    unseen: Flag = False
+    """Suggest on all of the body's surface, also where no photograph shows it, such as the side that it stood on."""
+    settings: SettingsFile = None
+    """Use this capture.toml instead of the candidates' own."""
+    output: OutputFolder = None
+    """Folder for suggested.csv, the list of contacts, and suggested.png, the contacts on the object."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return parse_options(Options, "suggest", words)

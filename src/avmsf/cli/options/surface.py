@@ -1,0 +1,40 @@
+"""Options of `avmsf surface`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from avmsf.cli.options.common import parse_options
+from avmsf.cli.options.scenes import SceneOptions
+from avmsf.pipeline.config import ViewsConfig
+from avmsf.scene.splatconfig import SplatConfig
+
+
+@dataclass(frozen=True)
+class Options(SceneOptions):
+    """Write an object's surface as a mesh: the folder's own, or one reconstructed from its views.
+
+    In meters and in the frame of the folder. Views show both sides of a wall if both were seen, and cavities as deep as
+    they were seen. `avmsf reconstruct` uses this surface as one of the bodies that may vibrate; the others have walls
+    of several thicknesses below its outer side, since views do not show how thick a wall is. Views and Gaussians are
+    made first if the cache does not have them.
+    """
+
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="SURFACE.ply")] = None
+    """Write the surface to this file, which ends in .ply, .obj or .glb; the cache always holds surface.ply."""
+    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE.png")] = None
+    """Draw the surface and two cross-sections to this file, which ends in .png, .pdf or .svg."""
+    seed: int | None = None
+    """Seed of all stages; by default each stage's own."""
+    views: ViewsConfig = field(default_factory=ViewsConfig)
+    """How views are made."""
+    splat: SplatConfig = field(default_factory=SplatConfig)
+    """How Gaussians are fitted."""
+
+
+def parse(words: Sequence[str]) -> Options:
+    """Return the options that the words spell."""
+    return parse_options(Options, "surface", words)

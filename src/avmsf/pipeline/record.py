@@ -1,0 +1,37 @@
+"""What a pipeline's configuration means for captures, modes and the fields that it makes."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from typing import Any
+
+from avmsf.capture.settings import CaptureSettings
+from avmsf.field.soundfield import SoundField
+from avmsf.modal.extraction.finders import ModeFinder, finder_named
+from avmsf.pipeline.config import PipelineConfig
+
+RECORD = "pipeline"
+"""What a field's report calls the configuration that made it."""
+
+
+def finder_of(config: PipelineConfig) -> ModeFinder:
+    """Return what finds the modes."""
+    return finder_named(config.method, config.modes)
+
+
+def capture_settings_of(config: PipelineConfig, settings: CaptureSettings) -> CaptureSettings:
+    """Return a capture's settings with the configuration's start of sounds."""
+    return settings if config.time_zero is None else replace(settings, time_zero=config.time_zero)
+
+
+def with_record(made: SoundField, config: PipelineConfig, features: Mapping[str, Any]) -> SoundField:
+    """Return a field whose report has the configuration that made it, but for the fit's own, which it has anyway.
+
+    `features` is the report of the features' file: it names the encoder that was taken and how the features were made,
+    which decide where `config.scene` does not, as for a file from elsewhere. Empty where there is none.
+    """
+    values = asdict(config)
+    del values["fit"]
+    values["scene"] = features.get("scene")
+    values["encoder"] = features.get("encoder")
+    report = {**made.origin.report, RECORD: values}
+    return replace(made, origin=replace(made.origin, report=report))
