@@ -417,3 +417,17 @@ def test_show_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
     assert "field of plate" in out
     assert (told["pipeline"]["method"], told["pipeline"]["fit"]["seed"]) == ("high-resolution", 0)
     assert "extraction high-resolution" in out
+
+
+def test_what_is_rendered_is_listed_as_json_and_nothing_else_is_on_the_standard_output(
+    field: Path, tmp_path: Path, capsys: Streams
+) -> None:
+    assert main(["render", str(field), *AT, "-o", str(tmp_path / "a.wav"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["files"] == [str(tmp_path / "a.wav")]
+
+
+def test_a_quiet_verb_prints_no_progress(capture: Path, capsys: Streams) -> None:
+    assert main(["modes", str(capture), "--modes", "4", "--quiet"]) == 0
+    out, err = capsys.readouterr()
+    assert "frequency Hz" in out
+    assert err == ""

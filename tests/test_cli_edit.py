@@ -215,7 +215,7 @@ def test_edits_are_shown_by_what_they_did(field: Path, capsys: Streams) -> None:
     edited(field, *words, "--mode-db", "850", "-inf", "--mode-db", "2300", "6", "--mode-decay", "1300", "4")
     assert main(["info", str(field.with_name("new.safetensors"))]) == 0
     lines = [line.strip() for line in capsys.readouterr().out.splitlines() if "edited" in line]
-    law = "law displacement, modes damped too much to ring: "
+    law = "law displacement, modes overdamped: "
     assert lines == [
         f"edited     recast, from ceramic to wood with alpha changed, size 2, {law}2",
         "edited     retune, pitch 10, decay 1 to 4 by mode, gains_db 0 to 6 by mode, 1 muted, "

@@ -234,9 +234,9 @@ def test_what_cannot_be_done_is_said_in_one_line(place: Place, tmp_path: Path, c
     (tmp_path / "file").write_text("")
     wrong = {
         (place.field,): "expected one recording or more",
-        (place.field, str(tmp_path / "nowhere.wav")): "there is no such file",
+        (place.field, str(tmp_path / "nowhere.wav")): "expected a recording",
         (place.field, str(tmp_path)): "is a folder; expected one sound file in it",
-        (place.field, hit, "--probability", "1.5"): "--probability is 1.5; expected a value between 0 and 1",
+        (place.field, hit, "--probability", "1.5"): "--probability is 1.5; expected a probability between 0 and 1",
         (place.field, hit, "--output", str(tmp_path / "file")): "is a file",
         (place.field, hit, "--capture", str(tmp_path / "nowhere")): "expected a capture folder",
         (hit, hit): "a file of another kind",

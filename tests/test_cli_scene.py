@@ -72,7 +72,7 @@ def test_pictures_and_blows_become_a_field_on_gaussians(kept: Path) -> None:
     made = describe(field)["pipeline"]
     assert (made["method"], made["gain_model"]) == ("high-resolution", "network")
     assert made["encoder"] in features.encoder
-    assert (made["scene"]["splat"]["steps"], made["scene"]["features"]["encoder"]) == (60, "descriptors")
+    assert (made["scene"]["splat"]["steps"], made["scene"]["lift"]["encoder"]) == (60, "descriptors")
     assert made["fit"] == asdict(field.origin.config)
     # The slab's box, widened by the reach of Gaussians that its pictures of 48 pixels leave unsure: a pixel is 9 mm.
     a, b, c = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
@@ -189,7 +189,7 @@ def test_clouds_and_features_are_drawn(
     monkeypatch.setattr(infoclouds, "save_turntable", partial(save_turntable, frames=3))
     assert main(["info", str(kept / "cloud.ply"), "--plots", str(tmp_path / "a")]) == 0
     words = ["info", str(kept / "features.safetensors"), "--cloud", str(kept / "cloud.ply"), "--clusters", "8"]
-    assert main([*words, "--output", str(tmp_path / "b")]) == 0
+    assert main([*words, "--plots", str(tmp_path / "b")]) == 0
     out, _ = capsys.readouterr()
     assert "features: descriptors" in out
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["cloud.png", "turntable.gif"]

@@ -17,6 +17,7 @@ from avmsf.capture.datasets import (
     open_dataset,
 )
 from avmsf.cli import dataset as verb
+from avmsf.cli.options import dataset as options
 from avmsf.errors import DatasetError
 from capture_folder import fill
 from dataset_folders import write_compact, write_contacts, write_mesh, write_raw, write_realimpact
@@ -176,11 +177,11 @@ def test_a_collection_s_check_reads_no_sound(tmp_path: Path, monkeypatch: pytest
 
 def test_the_verb_prints_what_is_there(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_mesh(place / "raw/mesh_16k/2.obj")
-    assert verb.run(verb.parse(["check", str(place / "raw/of")])) == 0
+    assert verb.run(options.parse(["check", str(place / "raw/of")])) == 0
     out = capsys.readouterr().out
     assert "1 of 1 objects can be read, with 2 recordings" in out
     assert "missing: objects 11 to 20" in out
-    assert verb.run(verb.parse(["check", str(place / "impact/RI"), "--json"])) == 0
+    assert verb.run(options.parse(["check", str(place / "impact/RI"), "--json"])) == 0
     streams = capsys.readouterr()
     assert '"identifier": "22_Cup"' in streams.out
     assert "missing: 49 of 50 objects" in streams.err
@@ -188,7 +189,7 @@ def test_the_verb_prints_what_is_there(place: Path, capsys: pytest.CaptureFixtur
 
 def test_the_verb_ends_with_2_where_nothing_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_raw(tmp_path / "of", {"2": ("0", "1")}, contacts=False)
-    assert verb.run(verb.parse(["check", str(tmp_path / "of")])) == 2
+    assert verb.run(options.parse(["check", str(tmp_path / "of")])) == 2
     streams = capsys.readouterr()
     assert "missing: contact coordinates" in streams.out
     assert "no object of" in streams.err

@@ -16,6 +16,7 @@ from avmsf.capture.surface import Surface
 from avmsf.capture.texturedmesh import TexturedMesh, read_textured_mesh
 from avmsf.capture.views.read import read_views
 from avmsf.cli import simulate
+from avmsf.cli.options import simulate as options
 from avmsf.errors import SimulationError
 from avmsf.simulate.recipe import Imperfections, ObjectRecipe, key_of
 from avmsf.simulate.sim20 import sim20_recipe
@@ -375,27 +376,27 @@ def test_the_command_makes_an_object_of_a_mesh_and_keeps_it(
 ) -> None:
     words = ["--mesh", str(recipe.mesh), "--thickness", "0.006", "--detail", "0.2", "--material", "glass"]
     words += ["--contacts", "4", "--seconds", "1", "--views", "0", "--modes", "6", "--output", str(tmp_path / "mine")]
-    assert simulate.run(simulate.parse(words)) == 0
+    assert simulate.run(options.parse(words)) == 0
     assert "mine: done (1 of 1" in capsys.readouterr().err
     assert len(read_capture(tmp_path / "mine").impacts) == 4
-    assert simulate.run(simulate.parse(words)) == 0
+    assert simulate.run(options.parse(words)) == 0
     assert "mine: kept (1 of 1" in capsys.readouterr().err
     with pytest.raises(SimulationError, match=r"simulated with other settings \(seed\)"):
-        simulate.run(simulate.parse([*words, "--seed", "3"]))
+        simulate.run(options.parse([*words, "--seed", "3"]))
 
 
 def test_the_command_lists_and_knows_what_it_does_not_know(capsys: pytest.CaptureFixture[str]) -> None:
-    assert simulate.run(simulate.parse(["--list"])) == 0
+    assert simulate.run(options.parse(["--list"])) == 0
     assert "mug-ceramic" in capsys.readouterr().out
     with pytest.raises(SimulationError, match=r"no object called 'mug-ceramics'; it has .*mug-ceramic"):
-        simulate.run(simulate.parse(["mug-ceramics", "--output", "nowhere"]))
+        simulate.run(options.parse(["mug-ceramics", "--output", "nowhere"]))
     with pytest.raises(SimulationError, match="expected --output FOLDER"):
-        simulate.run(simulate.parse(["sim-20"]))
+        simulate.run(options.parse(["sim-20"]))
 
 
 def test_what_is_asked_of_a_named_object_holds_though_it_is_the_usual() -> None:
     # The example has 16 contacts at 44,100 Hz where a recipe usually has 40 at 48,000.
-    recipe = simulate.parse(["example", "--contacts", "40"]).recipe
+    recipe = options.parse(["example", "--contacts", "40"]).recipe
     assert (recipe.contacts, recipe.sample_rate, recipe.kind) == (40, 44100, "mug")
-    recipe = simulate.parse(["mug-plastic", "--material", "ceramic"]).recipe
+    recipe = options.parse(["mug-plastic", "--material", "ceramic"]).recipe
     assert recipe == replace(sim20_recipe("mug-plastic"), material="ceramic")

@@ -12,7 +12,7 @@ from avmsf.cli.demofolder import RECORD, replaced_whole
 from avmsf.errors import AvmsfError, DatasetError, EvaluationError, ExportError
 from avmsf.export.packedarrays import read_manifest
 from avmsf.export.written import MANIFEST, write_folder
-from avmsf.pipeline.reconstruct import CACHE
+from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.stages import StageFolder
 from avmsf.studio.strikefiles import JOURNAL, StrikeFiles
 

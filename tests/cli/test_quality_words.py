@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from avmsf.cli import suggest
+from avmsf.cli.options import suggest
 from avmsf.cli.scores import quality_words
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.residual import Residual

@@ -30,9 +30,8 @@ def test_a_mesh_is_written_as_it_is_in_metres(kind: str, tmp_path: Path) -> None
     folder.mkdir()
     write_surface_file(folder)
     (folder / "capture.toml").write_text('surface_unit = "mm"')
-    for name, words in ((f"a.{kind}", []), ("b", ["--format", kind])):
-        assert main(["surface", str(folder), "--output", str(tmp_path / name), *words]) == 0
-    (tmp_path / "b").rename(tmp_path / f"b.{kind}")
+    for option, name in (("--output", "a"), ("-o", "b")):
+        assert main(["surface", str(folder), option, str(tmp_path / f"{name}.{kind}")]) == 0
     for name in "ab":
         written, given = read_surface(tmp_path / f"{name}.{kind}"), slab()
         assert torch.allclose(written.vertices, given.vertices / 1000, atol=1e-8)
@@ -93,6 +92,6 @@ def test_the_picture_is_written_beside_the_surface_and_with_a_field(tmp_path: Pa
     contacts = bar_contacts(6)
     for name, made in (("with", elastic_field), ("without", positional_field)):
         save(sound_field(made(contacts, drawn_gains(contacts, seed=1))), tmp_path / f"{name}.safetensors")
-        assert main(["info", str(tmp_path / f"{name}.safetensors"), "--output", str(tmp_path / name)]) == 0
+        assert main(["info", str(tmp_path / f"{name}.safetensors"), "--plots", str(tmp_path / name)]) == 0
     assert (tmp_path / "with" / "surface.png").is_file()
     assert not (tmp_path / "without" / "surface.png").exists()

@@ -13,7 +13,8 @@ from avmsf.cli.fit import summary
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.store import load
 from avmsf.geometry.closest import ClosestPoints
-from avmsf.pipeline.reconstruct import CACHE, SURFACE
+from avmsf.pipeline.config import CACHE
+from avmsf.pipeline.reconstruct import SURFACE
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
 from plate_capture import TINY, fill_plate
 from small_scene import SMALL_SPLAT, slab_views

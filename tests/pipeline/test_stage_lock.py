@@ -11,8 +11,8 @@ import trimesh
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import main
 from avmsf.errors import FolderInUseError
-from avmsf.pipeline.config import PipelineConfig
-from avmsf.pipeline.reconstruct import CACHE, reconstruct
+from avmsf.pipeline.config import CACHE, PipelineConfig
+from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.scene import Listener
 from avmsf.pipeline.stages import StageFolder
 from plate_capture import fill_plate

@@ -9,7 +9,8 @@ import torch
 import trimesh
 
 from avmsf.field.store import save
-from avmsf.pipeline.reconstruct import CACHE, FIELD, SURFACE
+from avmsf.pipeline.config import CACHE
+from avmsf.pipeline.reconstruct import FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
 from avmsf.scene.ply import write_splats
 from avmsf.scene.start import StartPoints, starting_cloud

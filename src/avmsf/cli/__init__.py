@@ -19,7 +19,6 @@ import avmsf
 from avmsf._utils.memory import NO_MEMORY, lacks_memory
 from avmsf._utils.text import printable
 from avmsf.cli.heartbeat import beating, verbosity
-from avmsf.cli.options.common import check_inputs
 from avmsf.errors import AvmsfError, AvmsfWarning
 
 VERBS = {
@@ -76,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             # Options import nothing that computes: help and mistakes are answered before torch is loaded for seconds.
             options = import_module(f"avmsf.cli.options.{words[0]}").parse(words[1:])
-            check_inputs(options)
+            options.check_inputs()
             verbosity.quiet, verbosity.verbose = options.quiet, options.verbose
             with _loading(quiet=options.quiet):
                 verb = import_module(f"avmsf.cli.{words[0]}")

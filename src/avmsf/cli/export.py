@@ -9,7 +9,7 @@ import torch
 from avmsf.capture.folder import read_capture, settings_of
 from avmsf.capture.surface import find_surface_file
 from avmsf.cli.options.export import Options, unused_options
-from avmsf.cli.printing import figure, print_text, say
+from avmsf.cli.printing import figure, print_result, say
 from avmsf.cli.render import METRES
 from avmsf.errors import ExportError
 from avmsf.export.faust import fitted, write_faust
@@ -65,7 +65,16 @@ def run(options: Options) -> int:
         )
     largest = max(written.sizes, key=lambda path: written.sizes[path])
     files = f"{len(written.sizes)} files, the largest {largest.name}" if len(written.sizes) > 1 else "one file"
-    print_text(f"wrote {options.output}: {options.to}, {written.size / 1e6:.3g} MB, {files}")
+    text = f"wrote {options.output}: {options.to}, {written.size / 1e6:.3g} MB, {files}"
+    values = {
+        "output": str(options.output),
+        "format": options.to,
+        "bytes": written.size,
+        "error": written.error,
+        "files": {str(path): size for path, size in written.sizes.items()},
+        "notes": list(written.remarks),
+    }
+    print_result(text, values, json=options.json)
     return 0
 
 

@@ -93,6 +93,13 @@ def print_json(value: Mapping[str, Any]) -> None:
     print_text(json_text(value))
 
 
+def print_result(text: str, values: Mapping[str, Any], *, json: bool) -> None:
+    """Print a verb's result: as text, or as JSON with the text on the standard error."""
+    console(errors=json).print(text, soft_wrap=True)
+    if json:
+        print_json(values)
+
+
 def json_text(value: Mapping[str, Any]) -> str:
     """Return valid JSON: what is not a finite number becomes null, which NaN is not."""
     return json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False)

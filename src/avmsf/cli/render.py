@@ -12,7 +12,7 @@ from avmsf.capture.audio import MAX_SAMPLES
 from avmsf.cli.contacts import Contacts, contacts_at, read_contacts, refuse_far
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.render import Options
-from avmsf.cli.printing import print_text, say
+from avmsf.cli.printing import print_result, say
 from avmsf.cli.writing import Level, OutputError, expect_writable, write_sound
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
@@ -68,9 +68,10 @@ def run(options: Options) -> int:
     for path, sound in zip(paths, sounds, strict=True):
         write_sound(path, sound, sample_rate=field.sample_rate, coding=options.coding)
     wrote = paths[0] if len(paths) == 1 else f"{len(paths)} sounds to {options.output}"
-    print_text(
-        f"wrote {wrote}: {sounds.shape[1] / field.sample_rate:.3g} s at {field.sample_rate:g} Hz, {options.coding}"
-    )
+    seconds = sounds.shape[1] / field.sample_rate
+    text = f"wrote {wrote}: {seconds:.3g} s at {field.sample_rate:g} Hz, {options.coding}"
+    values = {"files": list(map(str, paths)), "sample_rate": field.sample_rate, "seconds": seconds, "peak": peak}
+    print_result(text, values, json=options.json)
     return 0
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.options.simulate import Options
-from avmsf.cli.printing import console, print_text, say, table
+from avmsf.cli.printing import console, print_json, print_result, say, table
 from avmsf.errors import SimulationError
 from avmsf.simulate.material import MATERIALS
 from avmsf.simulate.recipe import ObjectRecipe
@@ -18,7 +18,9 @@ from avmsf.simulate.simulationset import SetProgress, simulate_set
 def run(options: Options) -> int:
     """Simulate; return 130 where Ctrl-C stopped it."""
     if options.list:
-        _list()
+        _list(errors=options.json)
+        if options.json:
+            print_json({"objects": list(SIM20), "shapes": list(KINDS), "materials": list(MATERIALS)})
         return 0
     if options.output is None:
         raise SimulationError("expected --output FOLDER, where to put what is simulated; --list shows what there is")
@@ -33,7 +35,9 @@ def run(options: Options) -> int:
     except KeyboardInterrupt:
         say("avmsf simulate: interrupted; the same command goes on from where it was")
         return INTERRUPTED
-    print_text(f"wrote {options.output}" if len(recipes) == 1 else f"wrote {len(recipes)} objects to {options.output}")
+    text = f"wrote {options.output}" if len(recipes) == 1 else f"wrote {len(recipes)} objects to {options.output}"
+    values = {"output": str(options.output), "objects": [str(folder / name) for name in recipes]}
+    print_result(text, values, json=options.json)
     return 0
 
 
@@ -53,12 +57,12 @@ def _chosen(options: Options, output: Path) -> tuple[dict[str, ObjectRecipe], Pa
     return {place.name: options.recipe}, place.parent
 
 
-def _list() -> None:
-    screen = console(errors=False)
+def _list(*, errors: bool) -> None:
+    screen = console(errors=errors)
     rows = [
         (name, recipe.kind, recipe.material, str(recipe.seed), "yes" if name not in NON_SYMMETRIC else "no")
         for name, recipe in SIM20.items()
     ]
     screen.print(table(SET, ("object", "shape", "material", "seed", "symmetric by turns"), rows, words=3))
-    print_text(f"shapes for --kind: {', '.join(KINDS)}")
-    print_text(f"materials: {', '.join(MATERIALS)}")
+    screen.print(f"shapes for --kind: {', '.join(KINDS)}")
+    screen.print(f"materials: {', '.join(MATERIALS)}")

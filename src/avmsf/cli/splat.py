@@ -3,7 +3,7 @@
 from avmsf.capture.together import expect_one_unit
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.splat import Options
-from avmsf.cli.printing import print_text, say
+from avmsf.cli.printing import next_command, print_result, say
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import settings_for, stage_line
 from avmsf.cli.writing import expect_writable
@@ -40,9 +40,10 @@ def run(options: Options) -> int:
     except KeyboardInterrupt:
         say("avmsf splat: interrupted; the same command goes on from where it was")
         return INTERRUPTED
-    print_text(f"{gaussians} Gaussians")
-    for name, kept in scene.made().items():
-        print_text(stage_line(name, kept))
+    lines = [f"{gaussians} Gaussians", *(stage_line(name, kept) for name, kept in scene.made().items())]
     if options.output is not None:
-        print_text(f"wrote {options.output}")
+        lines.append(f"wrote {options.output}")
+    path = options.output or cloud.path
+    print_result("\n".join(lines), {"cloud": str(path), "gaussians": gaussians}, json=options.json)
+    next_command("avmsf info", path, "--plots plots")
     return 0

@@ -12,7 +12,7 @@ from avmsf.capture.together import expect_one_unit
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.scenes import with_seed
 from avmsf.cli.options.surface import Options
-from avmsf.cli.printing import print_text, say
+from avmsf.cli.printing import print_result, say
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import settings_for, stage_line
 from avmsf.cli.writing import OutputError, expect_writable
@@ -54,14 +54,13 @@ def run(options: Options) -> int:
     except KeyboardInterrupt:
         say("avmsf surface: interrupted; the same command goes on from where it was")
         return INTERRUPTED
-    print_text(surface_words(surface))
-    for name, made in {**scene.made(), "surface": kept}.items():
-        print_text(stage_line(name, made))
+    lines = [surface_words(surface)]
+    lines += [stage_line(name, made) for name, made in {**scene.made(), "surface": kept}.items()]
     if options.picture is not None:
         save_picture(draw_surface(surface, title=f"{options.folder.resolve().name}: surface"), options.picture)
-    for path in (options.output, options.picture):
-        if path is not None:
-            print_text(f"wrote {path}")
+    lines += [f"wrote {path}" for path in (options.output, options.picture) if path is not None]
+    values = {"surface": str(options.output or kept.path), "triangles": len(surface.faces)}
+    print_result("\n".join(lines), values, json=options.json)
     return 0
 
 

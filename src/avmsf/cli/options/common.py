@@ -54,6 +54,18 @@ class Common:
     verbose: Flag = False
     """Print each step of the work as it begins."""
 
+    def check_inputs(self) -> None:
+        """Raise `InputError` for the first input that does not exist."""
+        hints = get_type_hints(type(self), include_extras=True)
+        for each in fields(self):
+            expected = _expected(hints[each.name])
+            value = getattr(self, each.name)
+            if expected is None or value is None:
+                continue
+            for path in value if isinstance(value, tuple) else (value,):
+                if not path.exists():
+                    raise InputError(path, expected)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Printing(Common):
@@ -85,19 +97,6 @@ def one_column() -> Iterator[None]:
         del os.environ["COLUMNS"]
         if before is not None:
             os.environ["COLUMNS"] = before
-
-
-def check_inputs(options: object) -> None:
-    """Raise `InputError` for the first input that does not exist."""
-    hints = get_type_hints(type(options), include_extras=True)
-    for each in fields(options):  # type: ignore[arg-type]
-        expected = _expected(hints[each.name])
-        value = getattr(options, each.name)
-        if expected is None or value is None:
-            continue
-        for path in value if isinstance(value, tuple) else (value,):
-            if not path.exists():
-                raise InputError(path, expected)
 
 
 def _expected(hint: Any) -> str | None:

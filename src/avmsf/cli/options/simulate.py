@@ -34,12 +34,16 @@ class Options(Printing):
     recipe: Annotated[ObjectRecipe, tyro.conf.arg(name="")] = field(default_factory=ObjectRecipe)
     """The object, its impacts, recordings and pictures; for an object of the set, what differs from it."""
 
+    def check_inputs(self) -> None:
+        """Raise `InputError` also for a mesh that does not exist."""
+        super().check_inputs()
+        if (mesh := self.recipe.mesh) is not None and not mesh.is_file():
+            raise InputError(mesh, "a mesh: obj, ply, glb or stl")
+
 
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell."""
     options = parse_options(Options, "simulate", words, default=Options())
-    if (mesh := options.recipe.mesh) is not None and not mesh.is_file():
-        raise InputError(mesh, "a mesh: obj, ply, glb or stl")
     # A second time from the named object's recipe: what is asked for may be a default, and not that object's.
     recipe = None if options.list else _recipe_of(options.what)
     return options if recipe is None else parse_options(Options, "simulate", words, default=Options(recipe=recipe))
