@@ -45,9 +45,9 @@ KNOWN = (*FAMILIES, Visual.kind)
 errors between 0.4 % smaller and 1.7 % larger without a body, and changed nothing with one."""
 _UPDATED = 64
 """Contacts that a body is updated from, at most."""
-_PREDICTS = 1.0
+_PREDICTS = 1.4
 """Nats per mode that a free body has to add, below which supports are tried. A plate clamped at an edge and taken for
-free adds .5, a free one 2.3; mugs add 1.2 (held at the base) and 1.6, an aircraft .8 to 1.3."""
+free adds .5, a free one 2.3; mugs add 1.1 (held at the base) and 1.5, an aircraft .8 to 1.3."""
 _PLACES = 500
 """Points of the surface where the contacts that contradict the others may have been."""
 

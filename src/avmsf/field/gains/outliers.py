@@ -34,7 +34,7 @@ from functools import cached_property
 
 import torch
 from jaxtyping import Complex128, Float, Float64, Int
-from scipy.special import stdtrit
+from scipy.stats import wilcoxon
 from torch import Tensor
 
 from avmsf.capture.places import places_of
@@ -64,7 +64,7 @@ _REFUTED = -1.5
 _EXPLAINED = 0.4
 """Part of the others' mean ratio that a contact has to reach at another place."""
 _CHANCE = 0.0228
-"""Probability that errors fall as much by chance: that of two standard errors, if there are many contacts."""
+"""Probability that errors fall as much by chance: that of two standard errors of a normal distribution."""
 _TINY = torch.finfo(torch.float64).tiny
 
 Fit = Callable[[Int[Tensor, " rows"], tuple[float, ...]], MixtureGains]
@@ -297,9 +297,10 @@ def predicts_better(
 ) -> bool:
     """Return whether gains are surely predicted better, from leave-one-place-out predictions at the same contacts.
 
-    The errors over measured and predicted gains, each mode by its energy, have to fall more than by chance: Student's
-    t of the paired differences, with Bonferroni's correction where `new` is the best of several candidates. Over the
-    measured ones alone, a contact near a support would outweigh all others.
+    The errors over measured and predicted gains, each mode by its energy, have to fall more than by chance: Wilcoxon's
+    signed-rank test of the paired differences, with Bonferroni's correction where `new` is the best of several
+    candidates. Over the measured ones alone, a contact near a support would outweigh all others, as it would in a test
+    of the mean.
     """
 
     def energy(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, " contacts"]:
@@ -307,9 +308,8 @@ def predicts_better(
 
     power = energy(measured.values)
     less, more = ((energy(each - measured.values) / (power + energy(each))).sqrt() for each in (new, old))
-    fall = (more - less)[power > 0]
-    least = float(stdtrit(max(1, len(fall) - 1), 1 - _CHANCE / candidates))
-    return float(fall.mean()) > least * float(fall.std()) / len(fall) ** 0.5
+    fall = (more - less)[power > 0].numpy()
+    return bool(fall.any()) and float(wilcoxon(fall, alternative="greater").pvalue) < _CHANCE / candidates
 
 
 def _search(fit: Fit, sites: Sites, measured: MeasuredGains) -> _Search:
