@@ -24,7 +24,7 @@ from avmsf.field.uncertainty import parts_of, std_of
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import Residual
-from avmsf.modal.synthesis import synthesise_phased
+from avmsf.modal.synthesis import synthesize_phased
 from avmsf.pipeline.bodies import candidate_bodies, roughened
 from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
@@ -229,7 +229,7 @@ class _Lifted:
         median = (mean + deviation * drawn).norm(dim=3).median(dim=0).values
         lifted = mean * (median / mean.norm(dim=2).clamp_min(1e-30)).sqrt()[..., None]
         bank, length = self.field.bank, samples or self.field.samples
-        made = synthesise_phased(
+        made = synthesize_phased(
             lifted[..., 0].float(), bank.frequency, bank.damping, self.field.phase, samples=length,
             sample_rate=self.sample_rate, quadrature=lifted[..., 1].float(),
         )  # fmt: skip

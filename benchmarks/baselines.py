@@ -33,7 +33,7 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_modes
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.scene.gaussians import GaussianCloud
@@ -197,7 +197,7 @@ def _clips(family: BodyFamily, thickness: float | None, material: Material) -> t
     frequency = family.at(thickness).modes(material).frequency
     frequency = frequency[frequency < 0.4 * RATE]
     damping = 0.5 * (material.alpha + material.beta * (2.0 * math.pi * frequency).square())
-    sounds = synthesise(
+    sounds = synthesize(
         torch.ones(2, len(frequency)), frequency, damping, samples=round(SECONDS * RATE), sample_rate=RATE
     )
     return Impacts(torch.zeros(2, 3), sounds, RATE, ("1.wav", "2.wav")), DampingCurve.of(ModalBank(frequency, damping))

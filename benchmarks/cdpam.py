@@ -49,7 +49,7 @@ def measure_cdpam(options: Options) -> Report:
     conventions = (
         f"cdpam: seconds to embed a clip of {seconds:g} s at {SAMPLE_RATE:g} Hz, median of {repeats}, {os.cpu_count()} "
         f"processors and {torch.get_num_threads()} threads; processor_seconds: the same summed over threads. "
-        "layers_seconds: the sixteen layers as torch's convolutions, batch normalisations and rectifiers, in turn with "
+        "layers_seconds: the sixteen layers as torch's convolutions, batch normalizations and rectifiers, in turn with "
         "ours. arranging_seconds: once a process.",
         f"errors: largest relative error of distances between four clips of {short:g} s, from the same layers in "
         "float64; benchmark and authors are the two scalings, layers_ those of the layers in float32.",

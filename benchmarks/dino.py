@@ -18,7 +18,7 @@ from avmsf.capture.cameras import View
 from avmsf.capture.views import find_foreground, read_views
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.photographs import Photograph
-from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
+from avmsf.scene.rasterizer import Rasterizer, choose_rasterizer
 from avmsf.scene.splat import SplatProgress, splat
 from avmsf.scene.splatconfig import SplatConfig
 from avmsf.scene.ssim import psnr, ssim
@@ -53,12 +53,12 @@ def hold_out(views: Sequence[View]) -> tuple[list[View], list[View]]:
     return [view for row, view in enumerate(ordered) if row % EVERY], ordered[::EVERY]
 
 
-def judge(cloud: GaussianCloud, views: Sequence[View], *, rasteriser: Rasteriser) -> dict[str, float]:
+def judge(cloud: GaussianCloud, views: Sequence[View], *, rasterizer: Rasterizer) -> dict[str, float]:
     """Return mean PSNR over the image and inside the mask, dB, and mean SSIM, against the photographs as they are."""
     sums = {"psnr": 0.0, "psnr_mask": 0.0, "ssim": 0.0}
     for view in views:
         # Black: what lies behind the dinosaur in every photograph, and no parameter fitted to those held out.
-        image = rasteriser(cloud.detach(), view.camera, background=torch.zeros(3)).color
+        image = rasterizer(cloud.detach(), view.camera, background=torch.zeros(3)).color
         assert view.mask is not None
         sums["psnr"] += psnr(image, view.color)
         sums["psnr_mask"] += psnr(image, view.color, inside=view.mask > 127)
@@ -70,7 +70,7 @@ def _fit(*, quick_look: bool) -> dict[str, Any]:
     views = list(read_views(shared_data() / "dino"))
     if quick_look:
         views = [_small(view) for view in views]
-    config, rasteriser = QUICK if quick_look else CONFIG, choose_rasteriser("cpu")
+    config, rasterizer = QUICK if quick_look else CONFIG, choose_rasterizer("cpu")
     bare, _ = hold_out(views)
     began = time.perf_counter()
     # Of the photographs to fit alone; the masks that held-out ones are judged in come from all, and serve nothing else.
@@ -80,7 +80,7 @@ def _fit(*, quick_look: bool) -> dict[str, Any]:
     size = f"{train[0].camera.width} x {train[0].camera.height}"
     began = time.perf_counter()
     # A few steps on small images compile all that is compiled at first use, and loads it later.
-    splat([_small(view) for view in train], replace(QUICK, steps=10, densify_every=5), rasteriser=rasteriser)
+    splat([_small(view) for view in train], replace(QUICK, steps=10, densify_every=5), rasterizer=rasterizer)
     compiling = time.perf_counter() - began
     curve: list[dict[str, float]] = []
     judging = 0.0
@@ -94,16 +94,16 @@ def _fit(*, quick_look: bool) -> dict[str, Any]:
                     "seconds": paused - began - judging,
                     "step": progress.step,
                     "gaussians": progress.gaussians,
-                    **judge(progress.cloud, held, rasteriser=rasteriser),
+                    **judge(progress.cloud, held, rasterizer=rasterizer),
                 }
             )
             tell(f"dino: step {progress.step} of {config.steps}, {curve[-1]['psnr']:.2f} dB")
             judging += time.perf_counter() - paused
 
     began = time.perf_counter()
-    cloud = splat(train, config, rasteriser=rasteriser, progress=look)
+    cloud = splat(train, config, rasterizer=rasterizer, progress=look)
     seconds = time.perf_counter() - began - judging
-    figures = judge(cloud, held, rasteriser=rasteriser)
+    figures = judge(cloud, held, rasterizer=rasterizer)
     symmetries = find_symmetries(cloud.centers, seed=0, missing=0.1)
     figures |= {"seconds": masking + seconds, "gigabytes": peak_gigabytes(), "gaussians": float(len(cloud))}
     return {

@@ -37,7 +37,7 @@ CONVENTIONS = (
     f"of its own, .7 to 1.4 times); {' and '.join(STRANGERS)}, which are in no cluster, are edited towards 16 "
     "recordings of the other of the two in the new material. Modes are the finite elements' own, Poisson's ratio .27 "
     "throughout; those within 60 dB of the loudest are compared.",
-    "umap: distance to the centre of the target's cluster in a UMAP of the sets of frequencies, as in the paper. "
+    "umap: distance to the center of the target's cluster in a UMAP of the sets of frequencies, as in the paper. "
     "umap_rings: the same of frequencies and dampings. octaves: the plain distance of the vectors. told_apart: part of "
     "the labelled objects whose nearest other is of the same material; chance would come to .11.",
     "spectral: relative STFT error from the nearest clip of the reference at equal level, mean over 8 contacts.",

@@ -19,7 +19,7 @@ from avmsf.bench.editing import EditScore, judge, write_scores
 from avmsf.bench.editingobjects import REALIMPACT_26, SHAPES, STRANGERS, KnownObject, recorded_objects
 from avmsf.bench.editmethods import GENERATED, EditMethod, Recast, towards_reference, towards_words
 from avmsf.bench.edittasks import RECORDED_TRANSITIONS, SEVEN_TRANSITIONS, EditTask, prompted_tasks
-from avmsf.capture.datasets.recognise import open_dataset
+from avmsf.capture.datasets.recognize import open_dataset
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.tasks.config import SteerConfig
 from avmsf.tasks.reference import Reference
@@ -205,7 +205,7 @@ def _report(
                 figures |= {f"{cast.name}.{name}_{method.name}": value for name, value in values.items()}
     conventions = (
         f"{cast.what}; led towards {'two prompts' if words else 'recordings of an object'} of the target material; "
-        f"seed {seed}. umap: distance to the centre of the target's cluster by frequencies, as in the paper; "
+        f"seed {seed}. umap: distance to the center of the target's cluster by frequencies, as in the paper; "
         "umap_rings: with dampings; clap: mean cosine of sounds and prompt; spectral: relative STFT error from the "
         "nearest clip of the reference. edits: those with a score; a generated sound may hold no mode.",
         *cast.remarks,

@@ -22,7 +22,7 @@ from benchmarks.report import Options, Report, Table, tell
 from benchmarks.step import peak_gigabytes
 
 _LEISSA = np.array([13.489, 19.789, 24.432, 35.024, 35.024, 61.526])
-"""Angular frequencies of a free square plate times side^2 sqrt(mass a square metre / rigidity), Poisson's ratio .3."""
+"""Angular frequencies of a free square plate times side^2 sqrt(mass a square meter / rigidity), Poisson's ratio .3."""
 
 
 def measure_fem(options: Options) -> Report:
@@ -76,12 +76,12 @@ def plate_error() -> float:
 
 
 def timoshenko(length: float, side: float, material: Material, number: int) -> float:
-    """Return a free bar's bending frequency in hertz, `side` metres in the plane of bending, the lowest number 0.
+    """Return a free bar's bending frequency in hertz, `side` meters in the plane of bending, the lowest number 0.
 
     Exact for Timoshenko's beam with Cowper's shear coefficient: deflection, slope, moment and shear force are carried
     from end to end by a matrix exponential, which at a natural frequency takes both forces from zero to zero.
     """
-    # For a bar one metre wide, which cancels.
+    # For a bar one meter wide, which cancels.
     inertia = side**3 / 12
     shear = 10 * (1 + material.poisson) / (12 + 11 * material.poisson)
     rigidity = shear * material.young / (2 * (1 + material.poisson)) * side

@@ -26,7 +26,7 @@ from avmsf.geometry import ObjectShape
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import Residual
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.pipeline.bodies import roughened
 from avmsf.pipeline.cloudshape import shape_of_cloud
 from avmsf.scene.features import FeatureField
@@ -239,7 +239,7 @@ def _large_case(elastic: ElasticModes, contacts: int, modes: int) -> GainCase:
 def _modal_error(field: SoundField, test: Impacts, truth: Truth) -> float:
     """Return the error of the field's modes against the true ones, both without noise."""
     true = truth_from_first_sample(truth_at(truth, test.names), test)
-    clean = synthesise(
+    clean = synthesize(
         true.gains.float(),
         true.frequency,
         true.damping,

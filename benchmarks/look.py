@@ -30,7 +30,7 @@ def slab(plate: Plate, *, thickness: float = 0.02) -> Surface:
 
 
 def speckled(surface: Surface, *, seed: int) -> TexturedMesh:
-    """Return a surface with blotches of colour on it, laid on from above and from the sides as on a printed box."""
+    """Return a surface with blotches of color on it, laid on from above and from the sides as on a printed box."""
     generator = torch.Generator().manual_seed(seed)
     corners = surface.vertices[surface.faces]
     low, high = surface.vertices.amin(0), surface.vertices.amax(0)
@@ -70,7 +70,7 @@ SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {
     "box": lambda: trimesh.creation.box((0.2, 0.13, 0.07)),
     "hexagonal prism": lambda: trimesh.creation.cylinder(0.06, 0.12, sections=6),
 }
-"""Shapes with a continuous axis, three mirror planes, and a six-fold axis; metres."""
+"""Shapes with a continuous axis, three mirror planes, and a six-fold axis; meters."""
 
 
 def shape(name: str) -> Surface:
@@ -83,7 +83,7 @@ def _surface(mesh: trimesh.Trimesh) -> Surface:
 
 
 def _blotches(generator: torch.Generator) -> UInt8[Tensor, "256 256 3"]:
-    """Return noise of two sizes, smooth and fine, in strong colours."""
+    """Return noise of two sizes, smooth and fine, in strong colors."""
     image = torch.zeros(1, 3, 256, 256)
     for cells, weight in ((6, 1.0), (32, 0.6)):
         noise = torch.rand(1, 3, cells, cells, generator=generator) - 0.5

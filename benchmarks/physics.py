@@ -34,7 +34,7 @@ from benchmarks.step import peak_gigabytes
 
 COSTED = "skillet-iron"
 COSTED_SIZE, COSTED_MODES = 0.5, 170
-"""Metres, and elastic modes to simulate: so its 8 recordings hold 128 modes and more, of which 128 are kept."""
+"""Meters, and elastic modes to simulate: so its 8 recordings hold 128 modes and more, of which 128 are kept."""
 COVERED = ("mug-ceramic", "bowl-glass", "bracket-steel", "pot-steel", "dish-ceramic", "spoon-wood")
 COMPARED = 8
 """Lowest frequencies of nominal bodies and true ones."""

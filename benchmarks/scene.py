@@ -1,4 +1,4 @@
-"""From photographs to features: Gaussians of real photographs, the rasteriser, symmetries, and the way to a field."""
+"""From photographs to features: Gaussians of real photographs, the rasterizer, symmetries, and the way to a field."""
 
 import tempfile
 import time
@@ -23,7 +23,7 @@ from avmsf.scene.splatconfig import SplatConfig
 from benchmarks.dino import measure_dino
 from benchmarks.look import SHAPES, finish, lift_pictures, pictures, shape, slab, speckled
 from benchmarks.material import STRUCK
-from benchmarks.rasteriser import measure_rasteriser
+from benchmarks.rasterizer import measure_rasterizer
 from benchmarks.report import Options, Report, Table, tell
 from benchmarks.symmetry import measure_symmetry
 
@@ -63,7 +63,7 @@ def _consistency(options: Options) -> Report:
         tell(f"{name}: {before:.3f} before, {after:.3f} after")
     convention = (
         "consistency: root of the mean variance of descriptors over a point's symmetric places, in the features' own "
-        f"spread over the object; {count} pictures of {size} x {size} of grey shapes under one light."
+        f"spread over the object; {count} pictures of {size} x {size} of gray shapes under one light."
     )
     table = Table("spread of features over orbits", ("shape", "axes", "planes", "before", "after"), rows)
     return Report((convention,), (table,), figures)
@@ -109,7 +109,7 @@ def _pipeline(options: Options) -> Report:
 
 PARTS: dict[str, Callable[[Options], Report]] = {
     "dino": measure_dino,
-    "rasteriser": measure_rasteriser,
+    "rasterizer": measure_rasterizer,
     "symmetry": _symmetry,
     "consistency": _consistency,
     "pipeline": _pipeline,

@@ -25,7 +25,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.residual import Residual, shape_noise
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import sample_contacts
 from benchmarks.material import IMPULSE, REPOSITORY
@@ -82,7 +82,7 @@ def full_setting(seconds: float) -> tuple[Impacts, FeatureField, Extraction]:
     bank = ModalBank(frequency, 5.0 + 1e-3 * frequency)
     gains = torch.randn(_CONTACTS, _MODES, generator=generator)
     residual = Residual(torch.full((513,), 0.03))
-    sounds = synthesise(gains, bank.frequency, bank.damping, samples=samples, sample_rate=_RATE)
+    sounds = synthesize(gains, bank.frequency, bank.damping, samples=samples, sample_rate=_RATE)
     sounds += shape_noise(residual.magnitude, contacts=_CONTACTS, samples=samples, generator=generator)
     names = tuple(f"{row:02d}" for row in range(_CONTACTS))
     impacts = Impacts(contacts, sounds, _RATE, names)

@@ -22,7 +22,7 @@ from avmsf.geometry import ObjectShape, object_surface
 from avmsf.geometry.closest import ClosestPoints
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats, write_splats
-from avmsf.scene.rasteriser import choose_rasteriser
+from avmsf.scene.rasterizer import choose_rasterizer
 from avmsf.scene.splat import splat
 from avmsf.scene.splatconfig import SplatConfig
 from avmsf.scene.visibility import depth_of_cloud
@@ -149,7 +149,7 @@ def _truth(surface: Surface) -> _Truth:
 
 
 def _scores(views: Sequence[View], cloud: GaussianCloud, truth: _Truth) -> _Scores:
-    render, depths = depth_of_cloud(cloud, choose_rasteriser(cloud.centers.device)), {}
+    render, depths = depth_of_cloud(cloud, choose_rasterizer(cloud.centers.device)), {}
     for view in views:
         depths[id(view.camera)] = render(view.camera)
     start = time.process_time()

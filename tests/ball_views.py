@@ -1,4 +1,4 @@
-"""Photographs of a ball, ray by ray in closed form: a scene whose surface and colours are known everywhere."""
+"""Photographs of a ball, ray by ray in closed form: a scene whose surface and colors are known everywhere."""
 
 import math
 
@@ -8,13 +8,13 @@ from torch import Tensor
 from avmsf.capture.cameras import Camera, View
 
 RADIUS = 0.05
-"""Metres."""
+"""Meters."""
 MIDDLE = (0.01, -0.02, 0.03)
 """Off the origin, so that nothing works by being there."""
 
 
 def ball_color(normals: Tensor) -> Tensor:
-    """Return smooth colours, from .2 to .8, of points with these unit normals."""
+    """Return smooth colors, from .2 to .8, of points with these unit normals."""
     return 0.5 + 0.3 * torch.sin(normals * torch.tensor([4.0, 5.0, 6.0], dtype=normals.dtype) + 1.0)
 
 
@@ -33,7 +33,7 @@ def ball_cameras(count: int, *, size: int = 64, aim: tuple[float, float, float] 
 
 
 def ball_view(camera: Camera, *, name: str = "ball", background: float = 0.0, masked: bool = True) -> View:
-    """Return what a camera sees of the ball before a grey background; 3 x 3 rays a pixel, so that the rim is soft."""
+    """Return what a camera sees of the ball before a gray background; 3 x 3 rays a pixel, so that the rim is soft."""
     fine = camera.resized(3 * camera.width, 3 * camera.height)
     rays, middle = fine.rays(), torch.tensor(MIDDLE, dtype=torch.float64)
     offset = camera.position - middle

@@ -11,7 +11,7 @@ from avmsf.capture.texturedmesh import TexturedMesh
 from plate_capture import PLATE
 
 THICKNESS = 0.02
-"""Of the slab, metres; its upper side is the plate that is struck, at z = 0."""
+"""Of the slab, meters; its upper side is the plate that is struck, at z = 0."""
 SMALL_SPLAT = ("--splat.steps", "60", "--splat.start-points", "800")
 
 
@@ -25,7 +25,7 @@ def slab() -> Surface:
 
 
 def painted_slab() -> TexturedMesh:
-    """Return the slab with a colour that changes from corner to corner."""
+    """Return the slab with a color that changes from corner to corner."""
     surface = slab()
     paint = torch.rand(8, 3, generator=torch.Generator().manual_seed(1))
     return TexturedMesh.build(surface.vertices, surface.faces, colors=paint[surface.faces])

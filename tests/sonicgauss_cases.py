@@ -3,7 +3,7 @@
 import torch
 
 from avmsf.capture.impacts import Impacts
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.scene.gaussians import GaussianCloud
 
 SECONDS = 0.5
@@ -27,5 +27,5 @@ def impacts(count: int = 6, *, level: float = 1.0, seed: int = 0) -> Impacts:
     frequency = torch.tensor([700.0, 1900.0, 4100.0], dtype=torch.float64) * (1.0 + 0.1 * seed)
     gains = torch.cos(40.0 * contacts) * level
     noise = 1e-3 * level * torch.randn(count, round(SECONDS * 24000), generator=generator)
-    sounds = synthesise(gains.float(), frequency, 8.0 + 1e-3 * frequency, samples=noise.shape[1], sample_rate=24_000.0)
+    sounds = synthesize(gains.float(), frequency, 8.0 + 1e-3 * frequency, samples=noise.shape[1], sample_rate=24_000.0)
     return Impacts(contacts, sounds + noise, 24_000.0, tuple(f"{row}.wav" for row in range(count)))

@@ -21,7 +21,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.scene.points import farthest_points
 from avmsf.simulate.plate import Plate, PlateModes, plate_modes, sample_contacts, strike
 
@@ -141,7 +141,7 @@ def test_only_the_floor_with_cosines_follows_a_turned_phase():
     assert sines > 5 * both
     # The best sines are not what is left of the best sines and cosines without the cosines.
     gains, _ = fit_gains(late.sounds, bank, sample_rate=late.sample_rate)
-    without = synthesise(gains, bank.frequency, bank.damping, samples=4410, sample_rate=22050.0)
+    without = synthesize(gains, bank.frequency, bank.damping, samples=4410, sample_rate=22050.0)
     best = float((sine_floor(late, bank) - late.sounds).square().sum())
     assert best < 0.999 * float((without - late.sounds).square().sum())
 

@@ -98,7 +98,7 @@ BROKEN = [
     {"settings": "second = 1"},
     {"settings": "seconds = 0.001"},
     {"settings": 'surface = "no.obj"'},
-    {"settings": 'normalise = "peak"'},
+    {"settings": 'normalize = "peak"'},
     {"settings": "force_channel = 2"},
 ]
 

@@ -164,7 +164,7 @@ def test_a_scene_keeps_each_part_where_it_lies(tmp_path: Path) -> None:
     for place in (0.0, 2.0):
         scene.add_geometry(trimesh.creation.box(), transform=trimesh.transformations.translation_matrix([place, 0, 0]))
     scene.export(tmp_path / "two.glb")
-    surface = read_surface(tmp_path / "two.glb", metres=0.1)
+    surface = read_surface(tmp_path / "two.glb", meters=0.1)
     assert surface.faces.shape == (24, 3)
     assert surface.faces.max() == len(surface.vertices) - 1
     assert [surface.vertices[:, 0].min(), surface.vertices[:, 0].max()] == pytest.approx([-0.05, 0.25], rel=1e-6)

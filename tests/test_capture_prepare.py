@@ -1,4 +1,4 @@
-"""Alignment and normalisation: what comes out does not depend on when, how hard or with which wiring one struck."""
+"""Alignment and normalization: what comes out does not depend on when, how hard or with which wiring one struck."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -47,7 +47,7 @@ def error_in_band(found: NDArray, truth: NDArray, *, below: float) -> float:
     return float(np.linalg.norm(difference) / np.linalg.norm(true))
 
 
-def test_peak_normalisation_takes_the_blow_s_strength_out() -> None:
+def test_peak_normalization_takes_the_blow_s_strength_out() -> None:
     soft, hard = (prepare(recording(*struck(newtons)[1:]), HAMMER) for newtons in (2.0, 50.0))
     assert (soft.newtons, hard.newtons) == pytest.approx((2.0, 50.0), rel=1e-12)
     assert np.allclose(soft.sound, hard.sound, rtol=0, atol=1e-12)
@@ -68,10 +68,10 @@ def test_forces_of_the_table_serve_where_there_is_no_channel(tmp_path: Path) -> 
     # Float32 files of powers of two times one sound divide exactly.
     assert torch.equal(impacts.sounds[0], impacts.sounds[1])
     assert torch.equal(impacts.sounds[0], impacts.sounds[2])
-    raw = read_capture(folder, CaptureSettings(seconds=0.3, normalise="none")).impacts
+    raw = read_capture(folder, CaptureSettings(seconds=0.3, normalize="none")).impacts
     assert raw.forces is None
     assert torch.equal(raw.sounds[2], 8 * impacts.sounds[2])
-    done = read_capture(folder, CaptureSettings(seconds=0.3, normalise="done")).impacts
+    done = read_capture(folder, CaptureSettings(seconds=0.3, normalize="done")).impacts
     assert done.forces is not None
     assert torch.equal(done.sounds, raw.sounds)
 
@@ -83,7 +83,7 @@ def test_a_table_s_force_overrules_the_channel_s_scale() -> None:
 
 
 def test_the_force_channel_sets_time_zero_even_where_the_sound_comes_late() -> None:
-    # Sound needs 3 ms through a metre of air; that delay belongs to the response.
+    # Sound needs 3 ms through a meter of air; that delay belongs to the response.
     _, force, sound = struck(5.0)
     late = np.concatenate([np.zeros(24), sound])[: len(sound)]
     near, far = (prepare(recording(force, heard), HAMMER) for heard in (sound, late))
@@ -103,7 +103,7 @@ def test_without_alignment_nothing_moves() -> None:
 @pytest.mark.parametrize("wiring", [1, -1])
 def test_deconvolution_returns_the_response_to_one_newton_for_one_sample(newtons: float, wiring: int) -> None:
     impulse, force, sound = struck(newtons)
-    settings = replace(HAMMER, normalise="deconvolve", regularisation=1e-12)
+    settings = replace(HAMMER, normalize="deconvolve", regularization=1e-12)
     found = prepare(recording(wiring * force, sound), settings)
     assert found.newtons == pytest.approx(newtons, rel=1e-12)
     # Of the last samples the recording holds only the answer to the beginning of the push.
@@ -113,19 +113,19 @@ def test_deconvolution_returns_the_response_to_one_newton_for_one_sample(newtons
     assert error_in_band(found.sound, impulse, below=1100) < 2e-4
 
 
-def test_deconvolution_stays_close_in_noise_and_regularisation_holds_it_down() -> None:
+def test_deconvolution_stays_close_in_noise_and_regularization_holds_it_down() -> None:
     impulse, force, sound = struck(5.0, noise=1e-3)
-    settings = replace(HAMMER, normalise="deconvolve")
+    settings = replace(HAMMER, normalize="deconvolve")
     found = prepare(recording(force, sound), settings).sound
     # Noise is 60 dB under the peaks of both channels.
     assert error_in_band(found, impulse, below=1000) < 0.02
-    # Over all frequencies, the pulse's zeros among them: .10, where division without regularisation gives .59. Ten
+    # Over all frequencies, the pulse's zeros among them: .10, where division without regularization gives .59. Ten
     # times less or a hundred times more are both worse than the default.
     whole = [
         error_in_band(
-            prepare(recording(force, sound), replace(settings, regularisation=value)).sound, impulse, below=4e3
+            prepare(recording(force, sound), replace(settings, regularization=value)).sound, impulse, below=4e3
         )
-        for value in (1e-12, 1e-5, settings.regularisation, 1e-2)
+        for value in (1e-12, 1e-5, settings.regularization, 1e-2)
     ]
     assert whole[2] == min(whole) < 0.12
     assert whole[0] > 0.5
@@ -135,15 +135,15 @@ def test_only_the_push_itself_is_divided_by() -> None:
     # An amplifier's drift to 5 % of the peak after the blow, over the rest of the record.
     _, force, sound = struck(5.0)
     _, drifting, _ = struck(5.0, drift=0.05)
-    settings = replace(HAMMER, normalise="deconvolve")
+    settings = replace(HAMMER, normalize="deconvolve")
     clean, found = (prepare(recording(channel, sound), settings).sound for channel in (force, drifting))
     assert np.array_equal(clean, found)
 
 
-def test_normalisations_that_lack_their_force_say_so(tmp_path: Path) -> None:
+def test_normalizations_that_lack_their_force_say_so(tmp_path: Path) -> None:
     folder = fill(tmp_path)
     with pytest.raises(CaptureError, match=r"needs a force: give force_newtons in impacts.csv, or a force_channel"):
-        read_capture(folder, CaptureSettings(normalise="peak"))
+        read_capture(folder, CaptureSettings(normalize="peak"))
     with pytest.raises(CaptureError, match="its one channel is the force channel"):
         read_capture(folder, CaptureSettings(force_channel=1))
     silent = np.stack([np.zeros(4000), ring()], axis=1)
@@ -201,7 +201,7 @@ def test_the_aircraft_s_blows_deconvolved_are_its_measured_impulse_responses(sha
     assert np.quantile(correlations, 0.1) > 0.99
 
     # Divided by the peak alone the pulse stays in the sound, and with it the delay of its flank.
-    peak = read_capture(shared / "aircraft", replace(struck_settings, normalise="peak")).impacts
+    peak = read_capture(shared / "aircraft", replace(struck_settings, normalize="peak")).impacts
     assert agreement(spectra(peak.sounds, 512, decay=0.13), truth)[0] > 0.4
 
 

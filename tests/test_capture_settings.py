@@ -22,21 +22,21 @@ def test_every_key_is_optional_and_the_paper_keeps_three_seconds(tmp_path: Path)
 def test_keys_are_read_and_whole_numbers_serve_as_numbers(tmp_path: Path) -> None:
     settings = read(tmp_path, 'unit = "mm"\nseconds = 2\nforce_channel = 1\nresponse_channel = 2\nalign = false\n')
     assert settings == CaptureSettings(unit="mm", seconds=2.0, force_channel=1, response_channel=2, align=False)
-    assert settings.metres == 1e-3
+    assert settings.meters == 1e-3
 
 
-@pytest.mark.parametrize(("unit", "metres"), [("m", 1), ("cm", 0.01), ("mm", 0.001), ("in", 0.0254), ("ft", 0.3048)])
-def test_units_are_the_international_ones(unit: str, metres: float) -> None:
-    assert CaptureSettings(unit=unit).metres == metres
-    assert CaptureSettings(unit="m", surface_unit=unit).surface_metres == metres
-    assert CaptureSettings(unit=unit).surface_metres == metres
+@pytest.mark.parametrize(("unit", "meters"), [("m", 1), ("cm", 0.01), ("mm", 0.001), ("in", 0.0254), ("ft", 0.3048)])
+def test_units_are_the_international_ones(unit: str, meters: float) -> None:
+    assert CaptureSettings(unit=unit).meters == meters
+    assert CaptureSettings(unit="m", surface_unit=unit).surface_meters == meters
+    assert CaptureSettings(unit=unit).surface_meters == meters
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("second = 2.0", "unknown key 'second' .did you mean seconds"),
-        ("colour = 2.0", "unknown key 'colour'; expected some of name, unit"),
+        ("color = 2.0", "unknown key 'color'; expected some of name, unit"),
         ('seconds = "3"', "seconds is '3'; expected a number"),
         ("seconds = true", "seconds is True; expected a number"),
         ("response_channel = 1.5", "response_channel is 1.5; expected a whole number"),
@@ -46,14 +46,14 @@ def test_units_are_the_international_ones(unit: str, metres: float) -> None:
         ("seconds = 0", "seconds is 0.0; expected a number above 0"),
         ("seconds = nan", "seconds is nan; expected a number above 0"),
         ("playback_speed = -1", "playback_speed is -1.0; expected a number above 0"),
-        ("regularisation = 0.0", "regularisation is 0.0; expected a number above 0"),
+        ("regularization = 0.0", "regularization is 0.0; expected a number above 0"),
         ("force_scale = 0", "force_scale is 0.0; expected newtons"),
         ('unit = "km"', "unit is 'km'; expected one of m, cm, mm, in, ft"),
         ('surface_unit = "yd"', "surface_unit is 'yd'"),
         ("force_channel = 0", "force_channel is 0; channels count from 1"),
         ("force_channel = 2\nresponse_channel = 2", "are both 2"),
-        ('normalise = "rms"', "normalise is 'rms'; expected one of auto, peak, deconvolve, none, done"),
-        ('normalise = "deconvolve"', "say which force_channel"),
+        ('normalize = "rms"', "normalize is 'rms'; expected one of auto, peak, deconvolve, none, done"),
+        ('normalize = "deconvolve"', "say which force_channel"),
         ("seconds = ", "not a TOML file"),
     ],
 )

@@ -16,7 +16,7 @@ from capture_folder import HEADER, ROWS, fill
 CONTACTS = torch.tensor([[0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]], dtype=torch.float64)
 
 
-def test_rows_keep_their_order_and_contacts_are_metres(tmp_path: Path) -> None:
+def test_rows_keep_their_order_and_contacts_are_meters(tmp_path: Path) -> None:
     capture = read_capture(fill(tmp_path / "bowl", rows=(ROWS[2], ROWS[0], ROWS[1])))
     assert capture.name == "bowl"
     assert capture.impacts.names == ("c.wav", "a.wav", "b.wav")
@@ -149,7 +149,7 @@ def test_contacts_far_outside_the_surface_are_refused(tmp_path: Path) -> None:
         read_capture(folder)
 
 
-def test_a_surface_in_millimetres_beside_contacts_in_metres_is_refused_with_its_unit(tmp_path: Path) -> None:
+def test_a_surface_in_millimeters_beside_contacts_in_meters_is_refused_with_its_unit(tmp_path: Path) -> None:
     folder = fill(tmp_path)
     trimesh.creation.box((200, 400, 600)).export(folder / "surface.ply")
     with pytest.raises(CaptureError, match=r'is the surface.s unit mm\? If so, write surface_unit = "mm"'):

@@ -50,7 +50,7 @@ WRONG = {
     f"render not-ours.safetensors {AT} --output s": "a file of another kind",
     "render field.safetensors --output s": "expected contacts either by --position",
     f"render field.safetensors {AT} --contact-table no-z.csv --output s": "expected contacts either by --position",
-    "render field.safetensors --position 50 60 0 --output s": "say so with --unit",
+    "render field.safetensors --position 50 60 0 --output s": "--unit says",
     "render field.safetensors --position nan 0 0 --output s": "expected finite numbers",
     f"render field.safetensors {AT} {AT} --output two.wav": "is one file and there are 2 contacts",
     f"render field.safetensors {AT} --output words.csv": "words.csv is a file",

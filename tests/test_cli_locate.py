@@ -21,7 +21,7 @@ from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.tasks.locator import Locator
 from made_fields import BANK, positional
 
@@ -45,7 +45,7 @@ class Place:
     def blow(self, row: int, *, before: float = 0.1, bank: ModalBank = BANK, rate: int = RATE) -> Tensor:
         """Return a blow in faint noise, with some quiet before it."""
         gains = self.gains[row][None].to(torch.complex128)
-        sound = synthesise(
+        sound = synthesize(
             gains.real,
             bank.frequency,
             bank.damping,
@@ -100,7 +100,7 @@ def test_a_surer_region_is_larger(place: Place, capsys: Streams) -> None:
     shares = []
     for level in ("0.5", "0.999"):
         printed, _ = located([place.field, hit, "--probability", level], capsys)
-        shares.append((printed["blows"][0]["region"]["share"], printed["blows"][0]["region"]["radius_metres"]))
+        shares.append((printed["blows"][0]["region"]["share"], printed["blows"][0]["region"]["radius_meters"]))
     assert shares[0][0] < shares[1][0]
     assert shares[0][1] < shares[1][1]
 

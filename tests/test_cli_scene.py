@@ -171,7 +171,7 @@ def test_gaussians_made_elsewhere_are_looked_at_from_all_sides(kept: Path, tmp_p
     out, _ = capsys.readouterr()
     assert "features: descriptors" in out
     features = load_features(folder / ".avmsf" / "features.safetensors")
-    # A reader in metres changes nothing: the same Gaussians, written once more.
+    # A reader in meters changes nothing: the same Gaussians, written once more.
     assert torch.equal(features.points, read_splats(kept / "cloud.ply").centers)
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from avmsf.bench.clouds import component_colours, draw_cloud, draw_features, label_colours, save_turntable
+from avmsf.bench.clouds import component_colors, draw_cloud, draw_features, label_colors, save_turntable
 from avmsf.bench.sides import ALL_SIDES, view_from
 from avmsf.errors import EvaluationError
 from avmsf.scene.features import FeatureField
@@ -25,12 +25,12 @@ FOUND = Symmetries(
 )
 
 
-def test_a_sheet_has_a_row_for_each_set_of_colours_and_a_column_for_each_side():
+def test_a_sheet_has_a_row_for_each_set_of_colors_and_a_column_for_each_side():
     field = FeatureField(POINTS, torch.randn(300, 8, generator=GENERATOR), "test")
     figure = draw_features(
         field,
         title="a box",
-        colours=torch.rand(300, 3),
+        colors=torch.rand(300, 3),
         clusters=5,
         symmetries=FOUND,
         sides=((0.0, 25.0), (90.0, 25.0)),
@@ -38,7 +38,7 @@ def test_a_sheet_has_a_row_for_each_set_of_colours_and_a_column_for_each_side():
     titles = [axes.get_title() for axes in figure.axes]
     assert titles == [
         f"{name}, {azimuth}° round, 25° up"
-        for name in ("colour", "features", "5 clusters", "symmetries")
+        for name in ("color", "features", "5 clusters", "symmetries")
         for azimuth in (0, 90)
     ]
     assert all(len(axes.collections[0].get_offsets()) == 300 for axes in figure.axes)
@@ -77,8 +77,8 @@ def test_no_direction_is_out_of_sight_from_all_sides():
 
 def test_what_points_up_is_up_and_nearer_points_come_last():
     points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.5, 0.0, 0.0]])
-    colours = torch.eye(3)
-    axes = draw_cloud(points, {"colour": colours}, title="", sides=((90.0, 25.0),), up=(0.0, 1.0, 0.0)).axes[0]
+    colors = torch.eye(3)
+    axes = draw_cloud(points, {"color": colors}, title="", sides=((90.0, 25.0),), up=(0.0, 1.0, 0.0)).axes[0]
     drawn = axes.collections[0]
     place = {
         int(np.argmax(face[:3])): spot for face, spot in zip(drawn.get_facecolors(), drawn.get_offsets(), strict=True)
@@ -90,21 +90,21 @@ def test_what_points_up_is_up_and_nearer_points_come_last():
     assert order == [0, 1, 2]
 
 
-def test_colours_follow_the_principal_components():
+def test_colors_follow_the_principal_components():
     value = torch.linspace(-1, 1, 101)
     features = torch.stack([3 * value, torch.cos(20 * value), torch.zeros(101)], dim=1)
-    colours = component_colours(features)
-    assert bool((colours[:, 0].diff() >= 0).all())
-    assert float(colours.min()) == 0.0
-    assert float(colours.max()) == 1.0
-    # Two components fill two colours; the third stays grey.
-    assert bool((colours[:, 2] == 0.5).all())
-    assert bool((component_colours(torch.ones(9, 4)) == 0.5).all())
+    colors = component_colors(features)
+    assert bool((colors[:, 0].diff() >= 0).all())
+    assert float(colors.min()) == 0.0
+    assert float(colors.max()) == 1.0
+    # Two components fill two colors; the third stays gray.
+    assert bool((colors[:, 2] == 0.5).all())
+    assert bool((component_colors(torch.ones(9, 4)) == 0.5).all())
 
 
-def test_labels_have_colours_of_their_own():
-    colours = label_colours(torch.arange(64))
-    assert len(torch.unique((255 * colours).round(), dim=0)) == 64
+def test_labels_have_colors_of_their_own():
+    colors = label_colors(torch.arange(64))
+    assert len(torch.unique((255 * colors).round(), dim=0)) == 64
 
 
 def test_a_turntable_turns(tmp_path: Path):
@@ -121,9 +121,9 @@ def test_a_turntable_turns(tmp_path: Path):
 
 
 def test_what_cannot_be_drawn_is_refused(tmp_path: Path):
-    with pytest.raises(EvaluationError, match="0 sets of colours"):
+    with pytest.raises(EvaluationError, match="0 sets of colors"):
         draw_cloud(POINTS, {}, title="")
     with pytest.raises(EvaluationError, match=r"named \.gif"):
         save_turntable(POINTS, POINTS, tmp_path / "turn.png")
     with pytest.raises(EvaluationError, match="three numbers that points up"):
-        draw_cloud(POINTS, {"colour": POINTS}, title="", up=(0.0, 0.0, 0.0))
+        draw_cloud(POINTS, {"color": POINTS}, title="", up=(0.0, 0.0, 0.0))

@@ -28,20 +28,20 @@ def groups(parameters: list[nn.Parameter]) -> list[Group]:
 def test_steps_are_those_of_torch() -> None:
     ours, theirs = made(), made()
     descent = AdamW(groups(ours))
-    optimiser = torch.optim.AdamW(
+    optimizer = torch.optim.AdamW(
         [
             {"params": theirs[:1], "weight_decay": 0.3, "rate": 0.1},
             {"params": theirs[1:], "weight_decay": 0.0, "rate": 0.02},
         ]
     )
     for step in range(20):
-        for group in optimiser.param_groups:
+        for group in optimizer.param_groups:
             group["lr"] = group["rate"] / (1 + step)
-        for each, parameters in ((descent.zero_grad, ours), (optimiser.zero_grad, theirs)):
+        for each, parameters in ((descent.zero_grad, ours), (optimizer.zero_grad, theirs)):
             each()
             loss(parameters, step).backward()
         descent.step(1 / (1 + step))
-        optimiser.step()
+        optimizer.step()
     for one, other in zip(ours, theirs, strict=True):
         assert torch.equal(one, other)
 

@@ -1,4 +1,4 @@
-"""The embedded encoder: it knows colours and textures, not which way up or how large an image is."""
+"""The embedded encoder: it knows colors and textures, not which way up or how large an image is."""
 
 import math
 import time
@@ -13,7 +13,7 @@ NAMES = ("L", "a", "b", "gradient", "first", "second", "third", "fourth", "large
 
 
 def picture(size: int = 256, *, angle: float = 0.0) -> torch.Tensor:
-    """Smooth coloured waves of 12 to 60 pixels (at 256), turned about the image's middle by `angle`, radians."""
+    """Smooth colored waves of 12 to 60 pixels (at 256), turned about the image's middle by `angle`, radians."""
     place = (torch.arange(size, dtype=torch.float64) + 0.5) / size - 0.5
     down, across = torch.meshgrid(place, place, indexing="ij")
     x = math.cos(angle) * across + math.sin(angle) * down
@@ -94,7 +94,7 @@ def test_descriptors_tell_what_they_are_made_to_tell():
         ENCODER.describe(checks)[:, 64, 64],
     )
     flat, lined, crossed = (dict(zip(NAMES, each[6:18].tolist(), strict=True)) for each in first)
-    # Nothing varies on a plain grey: no gradient, no orientation, no spread, no curvature.
+    # Nothing varies on a plain gray: no gradient, no orientation, no spread, no curvature.
     assert all(abs(value) < 1e-2 for value in flat.values())
     # Stripes have one orientation (both signs of it: no first coefficient), checks two at right angles: no second.
     assert lined["second"] > 5

@@ -40,7 +40,7 @@ from avmsf.capture.datasets.realimpact import SELF_INTERSECTING
 from avmsf.capture.folder import Capture
 from avmsf.errors import AvmsfWarning, EditError, EvaluationError
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
 from avmsf.simulate.material import GLASS, MATERIALS, STEEL, WOOD
@@ -109,7 +109,7 @@ def test_a_shape_remade_is_one_solved_anew():
 
 def test_an_objects_sounds_are_its_modes():
     known = struck("glass")
-    rendered = synthesise(
+    rendered = synthesize(
         known.modes.gains.double(),
         known.modes.bank.frequency,
         known.modes.bank.damping,
@@ -462,7 +462,7 @@ def test_scores_are_kept_with_their_embedding(space, tmp_path):
     record = json.loads((tmp_path / "scores.json").read_text(encoding="utf-8"))
     assert record["scores"][0]["umap"] == scores[0].umap
     assert record["scores"][0]["seed"] == 4
-    assert record["spaces"]["flat"]["umap"] == {"neighbours": 8, "least_distance": 0.1, "seed": 0}
+    assert record["spaces"]["flat"]["umap"] == {"neighbors": 8, "least_distance": 0.1, "seed": 0}
 
 
 def test_the_benchmark_has_the_keys_that_are_asked_for(monkeypatch, tmp_path, capsys):

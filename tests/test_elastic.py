@@ -171,7 +171,7 @@ def test_modes_are_those_of_the_whole_spectrum(bracket, modes):
     np.testing.assert_allclose(modes.frequency.numpy(), expected, rtol=1e-9)
 
 
-def test_shapes_are_mass_normalised_and_free_of_rigid_motion(bracket):
+def test_shapes_are_mass_normalized_and_free_of_rigid_motion(bracket):
     mesh, forces, weights = matrices(bracket, STEEL)
     rigid = rigid_motions(mesh.nodes, weights)
     found = lowest_vibrations(forces, weights, rigid, count=10, shift=1e4, supported=False)

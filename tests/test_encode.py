@@ -37,7 +37,7 @@ def test_the_background_has_no_say_and_the_inside_stays():
     assert torch.equal(filled[core], color[core])
 
 
-def test_one_colour_is_carried_on_unchanged():
+def test_one_color_is_carried_on_unchanged():
     coverage = disc()
     color = torch.where(coverage[..., None] > 0, torch.tensor([0.2, 0.5, 0.7]), torch.tensor([0.9, 0.0, 0.1]))
     # Weighted means in float32.

@@ -18,7 +18,7 @@ from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
-from avmsf.modal.synthesis import synthesise_phased
+from avmsf.modal.synthesis import synthesize_phased
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import plate_modes
 from plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
@@ -141,7 +141,7 @@ def test_modes_that_start_late_keep_their_phase_unless_sines_are_asked_for(phase
     impacts = plate_impacts()
     modes = plate_extraction(impacts)
     turn = torch.full((len(modes.bank),), 1.2, dtype=torch.float64)
-    late = synthesise_phased(
+    late = synthesize_phased(
         modes.gains, modes.bank.frequency, modes.bank.damping, turn, samples=impacts.sounds.shape[1], sample_rate=RATE
     )
     amplitudes = {"gains": modes.gains * math.cos(1.2), "quadrature": modes.gains * math.sin(1.2)}

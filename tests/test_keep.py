@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from avmsf.errors import SceneError
-from avmsf.scene.cpu import NumbaRasteriser
+from avmsf.scene.cpu import NumbaRasterizer
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.keep import blended_weight, keep_object, masks_agree
 from avmsf.scene.start import StartPoints, starting_cloud
@@ -59,11 +59,11 @@ def test_without_masks_what_floats_alone_goes() -> None:
     assert torch.equal(kept.centers, ball.centers)
 
 
-def test_the_hidden_inside_goes_with_a_rasteriser() -> None:
+def test_the_hidden_inside_goes_with_a_rasterizer() -> None:
     shell, core = _ball(opacity=0.95), _ball(0.4 * RADIUS)
     views = ball_views(24)
     assert len(keep_object(shell.join(core), views)) == 2 * COUNT
-    kept = keep_object(shell.join(core), views, rasteriser=NumbaRasteriser())
+    kept = keep_object(shell.join(core), views, rasterizer=NumbaRasterizer())
     radii = (kept.centers - torch.tensor(MIDDLE)).norm(dim=1)
     assert float((radii < 0.5 * RADIUS).float().mean()) < 0.02
     assert int((radii > 0.9 * RADIUS).sum()) > 0.97 * COUNT
@@ -71,8 +71,8 @@ def test_the_hidden_inside_goes_with_a_rasteriser() -> None:
 
 def test_weights_of_a_view_sum_to_its_coverage() -> None:
     ball, view = _ball(opacity=0.7), ball_views(1)[0]
-    weights = blended_weight(ball, [view], rasteriser=NumbaRasteriser())
-    alpha = NumbaRasteriser()(ball, view.camera, background=torch.zeros(3)).alpha
+    weights = blended_weight(ball, [view], rasterizer=NumbaRasterizer())
+    alpha = NumbaRasterizer()(ball, view.camera, background=torch.zeros(3)).alpha
     # Sums of 800 shares and of 4096 pixels in float32.
     assert float(weights.sum()) == pytest.approx(float(alpha.sum()), rel=1e-4)
 

@@ -14,7 +14,7 @@ LOWEST = MIDDLE - 0.5 * (CELLS - 1) * SPACING
 
 
 def places() -> np.ndarray:
-    """Return where the grid's values lie, metres."""
+    """Return where the grid's values lie, meters."""
     rows = np.stack(np.meshgrid(*[np.arange(CELLS)] * 3, indexing="ij"), axis=-1)
     return LOWEST + SPACING * rows
 
@@ -31,7 +31,7 @@ def mesh_of(surface: Surface) -> trimesh.Trimesh:
 
 
 def off(surface: Surface) -> np.ndarray:
-    """Return how far the vertices lie off the ball, metres."""
+    """Return how far the vertices lie off the ball, meters."""
     return np.abs(np.linalg.norm(surface.vertices.numpy() - MIDDLE, axis=1) - RADIUS)
 
 

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from avmsf.capture.cameras import Camera, View
 from avmsf.capture.surface import Surface
 from avmsf.errors import SceneError
-from avmsf.scene.cpu import NumbaRasteriser
+from avmsf.scene.cpu import NumbaRasterizer
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.lift import by_presence, by_visibility, lift, lift_points, supported
-from avmsf.scene.rasteriser import Rendering
+from avmsf.scene.rasterizer import Rendering
 from avmsf.scene.visibility import depth_of_cloud, depth_of_surface, depth_reach, look
 
 RADIUS, DISTANCE, FOCAL, WIDTH, HEIGHT = 0.1, 0.5, 500.0, 240, 220
@@ -116,7 +116,7 @@ def test_every_point_is_told_its_own_place():
     assert int(known.sum()) > 400
     error = (lifted.features.features - points)[known].norm(dim=1)
     # Cells of h = 4 mm: bilinear interpolation errs by h^2 / 8 times the second derivative along both axes of the
-    # image, at most 1 / (R cos^3) of depth a metre at 60 degrees: .3 mm each. Half a cell off would be 2 mm off.
+    # image, at most 1 / (R cos^3) of depth a meter at 60 degrees: .3 mm each. Half a cell off would be 2 mm off.
     assert float(error.max()) < 6e-4
     assert float(error.median()) < 1e-4
 
@@ -124,18 +124,18 @@ def test_every_point_is_told_its_own_place():
 def test_gaussians_are_told_their_own_places():
     points = sphere_points()
 
-    def rasteriser(cloud, camera, *, background):
+    def rasterizer(cloud, camera, *, background):
         depth = sphere_depth(camera).float()
         color, screen, radii = torch.zeros(HEIGHT, WIDTH, 3), torch.zeros(len(cloud), 2), torch.ones(len(cloud))
         return Rendering(color, (depth > 0).float(), depth, screen, radii)
 
     views = [view_of(camera) for camera in AROUND]
-    lifted = lift(sphere_cloud(points), views, painted_sphere(AROUND), rasteriser=rasteriser)
+    lifted = lift(sphere_cloud(points), views, painted_sphere(AROUND), rasterizer=rasterizer)
     known = lifted.seen > 0
     # Steep views are heard, too: their cells span four times as much.
     assert float((lifted.features.features - points)[known].norm(dim=1).median()) < 5e-4
     assert lifted.features.encoder == "painted"
-    # What the views say of one point differs by tenths of millimetres, between points by ten centimetres.
+    # What the views say of one point differs by tenths of millimeters, between points by ten centimeters.
     assert lifted.agreement > 0.999
 
 
@@ -156,12 +156,12 @@ def test_rendered_gaussians_hide_what_lies_behind_them():
     sight = look(
         cloud.centers,
         view_of(camera),
-        depth_of_cloud(cloud, NumbaRasteriser())(camera),
+        depth_of_cloud(cloud, NumbaRasterizer())(camera),
         reach=depth_reach(cloud, camera),
     )
     towards = camera.position - points
     cosine = (points / RADIUS * towards / towards.norm(dim=1, keepdim=True)).sum(1)
-    # Gaussians of 4 mm: the shell is some millimetres thick and its rim uncertain by as much.
+    # Gaussians of 4 mm: the shell is some millimeters thick and its rim uncertain by as much.
     assert not bool(sight.seen[cosine < -0.2].any())
     assert float(sight.seen[cosine > 0.6].double().mean()) > 0.95
 
@@ -253,16 +253,16 @@ def test_a_gaussians_reach_is_its_deviation_along_the_view():
 
 
 def test_a_surfaces_depth_is_along_the_axis():
-    # A wide plate across the axis, half a metre away: every pixel sees the same depth, however long its ray.
+    # A wide plate across the axis, half a meter away: every pixel sees the same depth, however long its ray.
     corners = torch.tensor([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]])
     plate = Surface(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]))
     camera = camera_at([0, 0, 1])
     depth = depth_of_surface(plate)(camera)
-    # Embree works in float32: a micrometre in half a metre.
+    # Embree works in float32: a micrometer in half a meter.
     torch.testing.assert_close(depth, torch.full_like(depth, DISTANCE), rtol=0, atol=2e-6)
     smaller = Surface(0.001 * corners, plate.faces)
     partly = depth_of_surface(smaller)(camera)
-    # 18 mm at half a metre are 18 pixels of 500 a metre's metre.
+    # 18 mm at half a meter are 18 pixels of 500 a meter's meter.
     assert int((partly > 0).sum()) == pytest.approx(18 * 18, abs=2 * 18)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.residual import Residual
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.tasks.listening import WINDOW, Blow, Listener
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.retune import retune
@@ -39,7 +39,7 @@ def locator() -> Locator:
 def stream(*, noise: float = 1e-3) -> Tensor:
     """Return all blows, each ringing on beneath the following ones, in noise."""
     gains = locator().gains[list(STRUCK)].to(torch.complex128) * torch.tensor(FORCES, dtype=torch.float64)[:, None]
-    sounds = synthesise(gains.real, BANK.frequency, BANK.damping, samples=4000, sample_rate=RATE, quadrature=gains.imag)
+    sounds = synthesize(gains.real, BANK.frequency, BANK.damping, samples=4000, sample_rate=RATE, quadrature=gains.imag)
     total = torch.zeros(BEGINS[-1] + 4000, dtype=torch.float64)
     for begin, sound in zip(BEGINS, sounds, strict=True):
         total[begin : begin + 4000] += sound
@@ -162,7 +162,7 @@ def test_ringing_is_followed_and_fitted_exactly() -> None:
     size = torch.ones(len(BANK))
     modes = Ringing.of(BANK, size, sample_rate=RATE, hop=20, window=480)
     amplitudes = torch.complex(*torch.randn(2, len(BANK), generator=torch.Generator().manual_seed(0)).double())
-    sound = synthesise(
+    sound = synthesize(
         amplitudes.real[None],
         BANK.frequency,
         BANK.damping,

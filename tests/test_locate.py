@@ -16,7 +16,7 @@ from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual
-from avmsf.modal.synthesis import synthesise_phased
+from avmsf.modal.synthesis import synthesize_phased
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locate import DOUBTFUL, STRANGE, UNLIKE, judged, locate
@@ -158,7 +158,7 @@ def test_phase_and_quadrature_are_what_the_field_renders():
     field = field_of(TrueGains(plate_surface_points(PLATE, 600).float(), turned=True), phase=0.7)
     points = field.gain_field.points
     known = field.known(points[123:124])
-    sound = synthesise_phased(
+    sound = synthesize_phased(
         known.mean, bank().frequency, bank().damping, field.phase, samples=7200, sample_rate=RATE,
         quadrature=known.quadrature,
     )[0]  # fmt: skip
@@ -172,7 +172,7 @@ def test_dampings_that_vary_are_accounted_for():
     field = field_of(TrueGains(plate_surface_points(PLATE, 600).float(), factor=2.0))
     points = field.gain_field.points
     known = field.known(points[123:124])
-    sound = synthesise_phased(
+    sound = synthesize_phased(
         known.mean, bank().frequency, bank().damping * known.damping, field.phase, samples=7200, sample_rate=RATE
     )[0]
     corrected = Locator.of(field)
@@ -298,7 +298,7 @@ def with_the_modes_of_no_place(seed):
     drawn = torch.randn(len(bank()), 2, dtype=torch.float64, generator=generator)
     values = torch.view_as_complex(drawn) / gains.abs().square().mean(0).sqrt()
     phase = torch.zeros(len(bank()), dtype=torch.float64)
-    sounds = synthesise_phased(
+    sounds = synthesize_phased(
         values.real[None], bank().frequency, bank().damping, phase, samples=7200, sample_rate=RATE,
         quadrature=values.imag[None],
     )  # fmt: skip

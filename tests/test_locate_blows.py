@@ -89,14 +89,14 @@ def test_a_channel_that_is_silent_is_refused_as_such(locator):
 
 def test_settings_count_as_for_one_blow(locator):
     sound, contacts = overlapping([0.1, 0.3], [1.0, 0.8], seed=36)
-    settings = CaptureSettings(response_channel=2, force_channel=1, normalise="deconvolve")
+    settings = CaptureSettings(response_channel=2, force_channel=1, normalize="deconvolve")
     # Mono, as a telephone records it: the capture's channels are not asked for, and there is no pulse to divide out.
     mono = Recording("session.wav", sound.double().numpy()[None], RATE, "FLOAT")
     found = locate_blows(true_field(), mono, settings=settings, locator=locator)
     for (_, each), contact in zip(found, contacts, strict=True):
         assert missed(each, each.most_probable, contact) < 0.05
     both = Recording("session.wav", np.stack([0.1 * mono.channels[0][::-1], mono.channels[0]]), RATE, "FLOAT")
-    with pytest.raises(LocationError, match=r"session\.wav: normalise = .deconvolve. divides one push"):
+    with pytest.raises(LocationError, match=r"session\.wav: normalize = .deconvolve. divides one push"):
         locate_blows(true_field(), both, settings=settings, locator=locator)
-    plain = replace(settings, normalise="auto")
+    plain = replace(settings, normalize="auto")
     assert len(locate_blows(true_field(), both, settings=plain, locator=locator)) == 2

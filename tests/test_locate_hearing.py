@@ -67,7 +67,7 @@ def test_how_hard_a_blow_was_is_heard_where_its_push_was_recorded():
     push = np.zeros_like(one)
     push[1800:1809] = np.sin(np.pi * np.arange(1, 10) / 10)
     blow = scipy.signal.fftconvolve(one, push[1800:1809])[: len(one)]
-    settings = CaptureSettings(force_channel=1, response_channel=2, normalise="deconvolve")
+    settings = CaptureSettings(force_channel=1, response_channel=2, normalize="deconvolve")
     soft, hard = (
         hear(Recording("hit.wav", force * np.stack([push, blow]), RATE, "FLOAT"), true_field(), settings=settings)
         for force in (0.02, 0.4)
@@ -134,7 +134,7 @@ def test_channels_follow_the_capture_where_the_recording_has_them():
     torch.testing.assert_close(hear(two, like).sound, hear(two, true_field(), settings=settings).sound)
     alone = hear(Recording("hit.wav", one[None], RATE, "FLOAT"), true_field(), settings=settings)
     torch.testing.assert_close(alone.sound, hear(two, true_field(), settings=settings).sound)
-    hammered = CaptureSettings(force_channel=1, response_channel=2, highpass=30.0, normalise="deconvolve")
+    hammered = CaptureSettings(force_channel=1, response_channel=2, highpass=30.0, normalize="deconvolve")
     pushless = hear(Recording("hit.wav", one[None], RATE, "FLOAT"), true_field(), settings=hammered)
     torch.testing.assert_close(pushless.sound, alone.sound)
     with pytest.raises(LocationError, match="sample_rate says 8000 Hz"):

@@ -27,7 +27,7 @@ def plate_symmetries() -> Symmetries:
 
 
 def made(probability: list[float]) -> ContactMap:
-    """Return a map of points in a row, a centimetre apart."""
+    """Return a map of points in a row, a centimeter apart."""
     points = torch.zeros(len(probability), 3)
     points[:, 0] = 0.01 * torch.arange(len(probability))
     chances = torch.tensor(probability, dtype=torch.float64)

@@ -12,7 +12,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from avmsf.bench.contactpictures import contact_colours, draw_contact, write_contact_cloud
+from avmsf.bench.contactpictures import contact_colors, draw_contact, write_contact_cloud
 from avmsf.bench.locating import LocatingScores, judge_locating
 from avmsf.bench.locatingbaselines import NearestSpectrum, random_distance
 from avmsf.bench.locatingimages import Images, symmetries_of
@@ -22,7 +22,7 @@ from avmsf.errors import EvaluationError, LocationError
 from avmsf.evaluation.diffsound_locator import DiffSoundLocator
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.residual import Residual
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
 from avmsf.simulate.shapes.shape import Symmetry
 from avmsf.tasks.contactmap import ContactMap
@@ -122,7 +122,7 @@ def locator() -> Locator:
 @cache
 def strikes() -> Impacts:
     gains = locator().gains[list(STRUCK)].to(torch.complex128)
-    sounds = synthesise(
+    sounds = synthesize(
         gains.real, BANK.frequency, BANK.damping, samples=SAMPLES, sample_rate=RATE, quadrature=gains.imag
     )
     noise = torch.randn(sounds.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -290,22 +290,22 @@ def contact() -> ContactMap:
     return locator().locate(strikes().sounds[0])
 
 
-def test_colours_grow_with_probability() -> None:
+def test_colors_grow_with_probability() -> None:
     sharper = contact().probability ** 10
-    colours = contact_colours(replace(contact(), probability=sharper / sharper.sum()))
-    brightness = colours.sum(1)
+    colors = contact_colors(replace(contact(), probability=sharper / sharper.sum()))
+    brightness = colors.sum(1)
     assert int(brightness.argmax()) == contact().most_probable == STRUCK[0]
     order = torch.argsort(sharper)
     assert bool((brightness[order].diff() >= -1e-6).all())
     # Viridis begins with a dark purple.
-    assert colours[int(brightness.argmin())].tolist() == pytest.approx([0.267, 0.005, 0.329], abs=1e-3)
+    assert colors[int(brightness.argmin())].tolist() == pytest.approx([0.267, 0.005, 0.329], abs=1e-3)
 
 
 def test_a_cloud_holds_what_was_found(tmp_path: Path) -> None:
     write_contact_cloud(contact(), tmp_path / "blow.ply")
     read = trimesh.load(tmp_path / "blow.ply")
     assert np.allclose(read.vertices, contact().points.numpy())
-    assert np.array_equal(read.colors[:, :3], (255 * contact_colours(contact())).round().numpy().astype(np.uint8))
+    assert np.array_equal(read.colors[:, :3], (255 * contact_colors(contact())).round().numpy().astype(np.uint8))
     columns = read.metadata["_ply_raw"]["vertex"]["data"]
     assert np.allclose(columns["probability"], contact().probability.numpy())
     assert np.allclose(columns["cosine_distance"], contact().distance.numpy(), atol=1e-6)

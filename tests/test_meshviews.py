@@ -1,4 +1,4 @@
-"""Meshes read and rendered, against closed forms and against the files' own colours."""
+"""Meshes read and rendered, against closed forms and against the files' own colors."""
 
 import math
 import warnings
@@ -14,7 +14,7 @@ from PIL import Image
 from avmsf.capture import CaptureWarning, Surface
 from avmsf.capture.cameras import Camera
 from avmsf.capture.meshviews import FOCAL, UNLIT, Lighting, MeshTracer, orbit_cameras, render_views
-from avmsf.capture.texturedmesh import GREY, TexturedMesh, read_textured_mesh
+from avmsf.capture.texturedmesh import GRAY, TexturedMesh, read_textured_mesh
 from avmsf.errors import CaptureError
 
 RADIUS, DISTANCE = 0.1, 0.5
@@ -116,14 +116,14 @@ def test_textures_repeat() -> None:
     assert np.array_equal(view.image.numpy(), np.tile(texture, (4, 4, 1)))
 
 
-def test_colours_between_corners_are_their_mean() -> None:
+def test_colors_between_corners_are_their_mean() -> None:
     vertices = torch.tensor([[-0.3, -0.3, 0.0], [0.3, -0.3, 0.0], [0.0, 0.3, 0.0]])
     mesh = TexturedMesh.build(vertices, torch.tensor([[0, 1, 2]]), colors=torch.eye(3)[None])
     camera = facing(65)
     (view,) = render_views(mesh, [camera], lighting=UNLIT)
     pixels, _ = camera.project(vertices.mean(0, keepdim=True))
     across, down = pixels[0].long().tolist()
-    # A pixel is a 60th of the side: the colours change by 4 from one to the next.
+    # A pixel is a 60th of the side: the colors change by 4 from one to the next.
     assert np.allclose(view.image[down, across].numpy(), 85, atol=4)
 
 
@@ -153,7 +153,7 @@ def test_faces_are_as_bright_as_the_part_of_the_sky_that_they_see() -> None:
             )
             (view,) = render_views(mesh, [camera], lighting=light)
             slant = sign * light.direction[axis] / 3
-            expected = 255 * GREY * (0.2 + 0.7 * (1 + slant) / 2)
+            expected = 255 * GRAY * (0.2 + 0.7 * (1 + slant) / 2)
             assert np.allclose(view.image[16, 16].numpy(), expected, atol=0.51)
 
 
@@ -281,24 +281,24 @@ def box_arrays(side: float) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(box.vertices), np.asarray(box.faces)
 
 
-def test_vertex_and_face_colours_are_read(tmp_path: Path) -> None:
+def test_vertex_and_face_colors_are_read(tmp_path: Path) -> None:
     vertices, faces = box_arrays(0.2)
     painted = trimesh.Trimesh(vertices, faces, vertex_colors=np.tile([10, 200, 30, 255], (8, 1)), process=False)
     painted.export(tmp_path / "vertices.ply")
     assert np.allclose(read_textured_mesh(tmp_path / "vertices.ply").colors[..., 1], 200 / 255)
     own = np.arange(12)[:, None] * [20, 1, 0, 0] + [0, 0, 7, 255]
     trimesh.Trimesh(vertices, faces, face_colors=own, process=False).export(tmp_path / "faces.ply")
-    read = read_textured_mesh(tmp_path / "faces.ply", metres=0.01)
+    read = read_textured_mesh(tmp_path / "faces.ply", meters=0.01)
     assert np.allclose(read.colors[..., 0] * 255, 20 * np.arange(12)[:, None].repeat(3, axis=1), atol=1e-3)
     assert float(read.vertices.max()) == pytest.approx(1e-3)
 
 
 @pytest.mark.parametrize("kind", ["stl", "ply", "obj"])
-def test_without_colours_a_mesh_is_grey_and_says_so(tmp_path: Path, kind: str) -> None:
+def test_without_colors_a_mesh_is_gray_and_says_so(tmp_path: Path, kind: str) -> None:
     trimesh.Trimesh(*box_arrays(0.2), process=False).export(tmp_path / f"box.{kind}")
-    with pytest.warns(CaptureWarning, match=rf"box\.{kind}: has neither texture nor colours; it is taken as grey"):
+    with pytest.warns(CaptureWarning, match=rf"box\.{kind}: has neither texture nor colors; it is taken as gray"):
         read = read_textured_mesh(tmp_path / f"box.{kind}")
-    assert bool((read.colors == GREY).all())
+    assert bool((read.colors == GRAY).all())
     assert (len(read.vertices), len(read.faces)) == (8, 12)
 
 
@@ -313,18 +313,18 @@ def write_card(folder: Path, *, image: bytes | None, library: str = "map_Kd skin
 
 
 def test_a_missing_texture_file_is_named(tmp_path: Path) -> None:
-    with pytest.warns(CaptureWarning, match=r"card\.obj: its texture skin\.png is missing; .* grey"):
-        assert bool((read_textured_mesh(write_card(tmp_path, image=None)).colors == GREY).all())
+    with pytest.warns(CaptureWarning, match=r"card\.obj: its texture skin\.png is missing; .* gray"):
+        assert bool((read_textured_mesh(write_card(tmp_path, image=None)).colors == GRAY).all())
 
 
 def test_a_corrupt_texture_file_is_told(tmp_path: Path) -> None:
     Image.fromarray(noise(64)).save(tmp_path / "whole.png")
     cut = (tmp_path / "whole.png").read_bytes()[:3000]
-    with pytest.warns(CaptureWarning, match=r"card\.obj: its texture .* grey"):
-        assert bool((read_textured_mesh(write_card(tmp_path, image=cut)).colors == GREY).all())
+    with pytest.warns(CaptureWarning, match=r"card\.obj: its texture .* gray"):
+        assert bool((read_textured_mesh(write_card(tmp_path, image=cut)).colors == GRAY).all())
 
 
-def test_a_material_without_image_has_its_colour(tmp_path: Path) -> None:
+def test_a_material_without_image_has_its_color(tmp_path: Path) -> None:
     colors = read_textured_mesh(write_card(tmp_path, image=None, library="")).colors
     assert np.allclose(colors.numpy() * 255, [127, 63, 255], atol=1)
 

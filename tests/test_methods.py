@@ -29,7 +29,7 @@ from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.random_modes import random_modes
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
@@ -148,7 +148,7 @@ def test_one_or_two_shots_are_enough(name):
         assert sounds.shape == (COUNT, SAMPLES)
         assert bool(torch.isfinite(sounds).all())
         if name.startswith("knn"):
-            assert report_of(renderer) == {"neighbours": count}
+            assert report_of(renderer) == {"neighbors": count}
 
 
 @pytest.mark.parametrize("name", ["nearest", "knn3", "knn3-directions", "knn-gains", "knn-spectra", "spline-gains"])
@@ -170,17 +170,17 @@ def test_training_contacts_sound_as_recorded(name):
     assert float(difference.square().mean().sqrt() / train.sounds.square().mean().sqrt()) <= limit
 
 
-@pytest.mark.parametrize("name", ["knn-gains", "spline-gains", "field", "field-no-initialisation"])
+@pytest.mark.parametrize("name", ["knn-gains", "spline-gains", "field", "field-no-initialization"])
 def test_methods_with_modes_give_their_bank_and_gains(name):
     train, test = parts()
     renderer = made(name)
     gains = -renderer.complex_gains(test.contacts).imag
     assert gains.shape == (len(test), len(renderer.bank))
-    if name != "field-no-initialisation":
+    if name != "field-no-initialization":
         assert len(renderer.bank) == len(plate_extraction(train).bank)
     if name.endswith("gains"):
         sounds = replace(renderer, noise=False).render(test.contacts)
-        made_of = synthesise(gains, renderer.bank.frequency, renderer.bank.damping, samples=SAMPLES, sample_rate=RATE)
+        made_of = synthesize(gains, renderer.bank.frequency, renderer.bank.damping, samples=SAMPLES, sample_rate=RATE)
         # The plate's sounds are sines alone, and so are these.
         assert torch.allclose(sounds, made_of, rtol=0, atol=1e-6 * float(sounds.abs().max()))
 
@@ -218,7 +218,7 @@ def test_fields_read_what_their_names_say():
         return plate_features(200)
 
     task = replace(plate_task(train), features=features)
-    for name in ("field", "field-positions", "field-unaligned", "field-no-residual", "field-no-initialisation"):
+    for name in ("field", "field-positions", "field-unaligned", "field-no-residual", "field-no-initialization"):
         tiny(METHODS[name]).fit(task)
     assert asked == ["visual", "positions", "unaligned", "visual", "visual"]
 
@@ -236,7 +236,7 @@ def test_ablations_leave_out_what_their_names_say():
     assert torch.equal(made("field-warmup").bank.frequency, bank.frequency)
     assert not torch.equal(made("field").bank.frequency, bank.frequency)
     assert made("field-warmup").origin.config.steps == 0
-    free = made("field-no-initialisation")
+    free = made("field-no-initialization")
     config = free.origin.config
     assert (config.warmup_steps, config.steps) == (0, 10)
     assert len(free.bank) == len(bank)
@@ -244,7 +244,7 @@ def test_ablations_leave_out_what_their_names_say():
     assert made("field", seed=7).origin.config.seed == 7
 
 
-def test_without_initialisation_no_mode_of_the_recordings_leaks_in():
+def test_without_initialization_no_mode_of_the_recordings_leaks_in():
     """Other recordings of the same energy give the same start; and the fit begins as silent as that start says."""
     train, _ = parts()
     chance = torch.Generator().manual_seed(3)
@@ -260,8 +260,8 @@ def test_without_initialisation_no_mode_of_the_recordings_leaks_in():
     assert float(frequency.max()) < 3600
     assert bool((damping >= 1 / SECONDS).all())
     assert bool((damping <= math.pi * frequency / 10).all())
-    sounds = synthesise(start.gains, frequency, damping, samples=SAMPLES, sample_rate=RATE)
-    # Half of a damped sine's square is lost or won to its phase and its neighbours.
+    sounds = synthesize(start.gains, frequency, damping, samples=SAMPLES, sample_rate=RATE)
+    # Half of a damped sine's square is lost or won to its phase and its neighbors.
     assert float(sounds.square().mean() / train.sounds.square().mean()) == pytest.approx(1.0, abs=0.5)
     untrained = fit(
         train, plate_features(200), start, replace(TINY, warmup_steps=0, steps=1, learning_rate=1e-9), gains=Attention()
@@ -269,9 +269,9 @@ def test_without_initialisation_no_mode_of_the_recordings_leaks_in():
     assert torch.allclose(untrained.gain_field.gain_scale, start.gains[0])
 
 
-def test_frequencies_without_initialisation_are_free_to_move():
+def test_frequencies_without_initialization_are_free_to_move():
     train, _ = parts()
-    field = tiny(METHODS["field-no-initialisation"]).fit(plate_task(train))
+    field = tiny(METHODS["field-no-initialization"]).fit(plate_task(train))
     count = len(field.bank)
     start = random_modes(train, modes=count, bins=33, generator=torch.Generator().manual_seed(0))
     width = (start.bank.damping / (2 * math.pi)).clamp(min=1 / SECONDS)
@@ -355,7 +355,7 @@ def test_a_field_of_few_points_has_no_more_regions():
 
 def test_reports_say_what_was_used():
     assert report_of(made("white-noise")) == {}
-    assert report_of(made("knn3")) == {"neighbours": 3}
+    assert report_of(made("knn3")) == {"neighbors": 3}
     assert report_of(made("spline-gains")) == {
         "kernel": "thin plate",
         "directions": 2,

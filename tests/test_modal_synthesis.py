@@ -8,7 +8,7 @@ import scipy.signal
 import torch
 from torch import Tensor
 
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 
 RATE = 48000.0
 
@@ -37,7 +37,7 @@ def test_a_mode_is_the_impulse_response_of_a_two_pole_filter():
     filtered = scipy.signal.lfilter(
         [0.0, radius * math.sin(angle)], [1.0, -2 * radius * math.cos(angle), radius**2], impulse
     )
-    sound = synthesise(
+    sound = synthesize(
         torch.ones(1, 1, dtype=torch.float64),
         torch.tensor([frequency], dtype=torch.float64),
         torch.tensor([damping], dtype=torch.float64),
@@ -53,7 +53,7 @@ def test_a_mode_is_the_impulse_response_of_a_two_pole_filter():
 def test_blocks_make_the_plain_sum(dtype: torch.dtype, tolerance: float, samples: int):
     gains, frequency, damping, quadrature = draw()
     expected = plain_sum(gains, frequency, damping, quadrature, samples)
-    found = synthesise(
+    found = synthesize(
         gains.to(dtype),
         frequency,
         damping,
@@ -72,7 +72,7 @@ def test_gradients_are_those_of_finite_differences():
     inputs = [part.requires_grad_() for part in (gains, frequency / 20, damping, quadrature)]
 
     def sounds(gains: Tensor, frequency: Tensor, damping: Tensor, quadrature: Tensor) -> Tensor:
-        return synthesise(gains, frequency, damping, samples=514, sample_rate=RATE, quadrature=quadrature)
+        return synthesize(gains, frequency, damping, samples=514, sample_rate=RATE, quadrature=quadrature)
 
     assert torch.autograd.gradcheck(sounds, inputs, atol=1e-7)
     own = inputs[2].detach().expand(1, -1).clone().requires_grad_()
@@ -82,7 +82,7 @@ def test_gradients_are_those_of_finite_differences():
 def test_equal_dampings_given_a_contact_each_change_nothing():
     gains, frequency, damping, quadrature = draw()
     shared, own = (
-        synthesise(gains, frequency, rates, samples=2000, sample_rate=RATE, quadrature=quadrature)
+        synthesize(gains, frequency, rates, samples=2000, sample_rate=RATE, quadrature=quadrature)
         for rates in (damping, damping.expand(3, -1))
     )
     torch.testing.assert_close(own, shared, rtol=0, atol=1e-13)
@@ -91,7 +91,7 @@ def test_equal_dampings_given_a_contact_each_change_nothing():
 def test_each_contact_decays_at_its_own_damping():
     gains, frequency, damping, quadrature = draw()
     own = damping * torch.tensor([[1.0], [2.0], [5.0]], dtype=torch.float64)
-    together = synthesise(gains, frequency, own, samples=2000, sample_rate=RATE, quadrature=quadrature)
+    together = synthesize(gains, frequency, own, samples=2000, sample_rate=RATE, quadrature=quadrature)
     for row in range(3):
         alone = plain_sum(gains[row : row + 1], frequency, own[row], quadrature[row : row + 1], 2000)
         torch.testing.assert_close(together[row : row + 1], alone, rtol=0, atol=1e-11)
@@ -100,7 +100,7 @@ def test_each_contact_decays_at_its_own_damping():
 def test_quadrature_turns_the_phase():
     gains, frequency, damping, _ = draw()
     turn = 0.7
-    turned = synthesise(
+    turned = synthesize(
         gains * math.cos(turn),
         frequency,
         damping,
@@ -115,4 +115,4 @@ def test_quadrature_turns_the_phase():
 
 def test_no_mode_is_silence():
     empty = torch.zeros(0, dtype=torch.float64)
-    assert torch.equal(synthesise(torch.zeros(2, 0), empty, empty, samples=600, sample_rate=RATE), torch.zeros(2, 600))
+    assert torch.equal(synthesize(torch.zeros(2, 0), empty, empty, samples=600, sample_rate=RATE), torch.zeros(2, 600))

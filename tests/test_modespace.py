@@ -104,7 +104,7 @@ def test_an_objects_like_is_near_and_its_opposite_far(space):
     assert space.distance(space.place(wood), "wood") < 0.5 * space.distance(space.place(wood), "glass")
     assert space.distance(space.place(glass), "glass") < 0.5 * space.distance(space.place(glass), "wood")
     assert space.told_apart() == 1.0
-    # An edit that ends within its new material's cluster is about as far from the centre as the cluster's own.
+    # An edit that ends within its new material's cluster is about as far from the center as the cluster's own.
     assert space.distance(space.place(glass), "glass") < 3 * space.spread("glass")
 
 
@@ -140,7 +140,7 @@ def test_a_space_outlives_the_process_in_a_file(space, tmp_path):
     record = json.loads(path.read_text(encoding="utf-8"))
     assert {"umap-learn", "numba", "numpy"} <= set(record["versions"])
     assert record["umap"]["seed"] == 3
-    assert record["centres"]["wood"] == pytest.approx(np.mean(record["embedding"][:8], axis=0).tolist(), abs=1e-5)
+    assert record["centers"]["wood"] == pytest.approx(np.mean(record["embedding"][:8], axis=0).tolist(), abs=1e-5)
 
 
 @pytest.mark.slow

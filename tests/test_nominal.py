@@ -267,7 +267,7 @@ def test_the_memory_is_asked_for_what_is_computed_and_for_nothing_that_is_kept(
 
 
 @pytest.mark.parametrize(
-    ("walls", "words"), [(None, "state its wall in metres if it has one$"), ([0.2], "state another wall, or none$")]
+    ("walls", "words"), [(None, "state its wall in meters if it has one$"), ([0.2], "state another wall, or none$")]
 )
 def test_what_helps_depends_on_who_stated_the_wall(walls: list[float] | None, words: str):
     one = sheet()

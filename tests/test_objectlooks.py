@@ -20,7 +20,7 @@ from avmsf.scene.ply import read_splats
 from avmsf.scene.splatconfig import SplatConfig
 from small_scene import slab_views, write_surface_file
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*neither texture nor colours")
+pytestmark = pytest.mark.filterwarnings("ignore:.*neither texture nor colors")
 
 CONFIG = SceneConfig(
     views=ViewsConfig(rendered=24), lift=LiftConfig(encoder="descriptors", points=400, components=4, missing=0.0)

@@ -9,7 +9,7 @@ import torch
 from avmsf.bench.physical import ModalRenderer, judge_modes, match_modes
 from avmsf.errors import EvaluationError
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.truth import Truth
 
 CONTACTS = torch.arange(36, dtype=torch.float64).view(12, 3)
@@ -60,7 +60,7 @@ def test_weights_are_the_energies_of_the_sounds():
     rate, energies = 48000.0, []
     for mode in range(4):
         table = [values[:, mode : mode + 1] for values in (one.gains, one.quadrature)]
-        sounds = synthesise(
+        sounds = synthesize(
             table[0],
             one.frequency[mode : mode + 1],
             one.damping[mode : mode + 1],

@@ -31,7 +31,7 @@ def test_stems_stand_at_the_modes_as_high_as_their_levels_and_decay_times() -> N
     assert [text.get_text() for text in upper.texts] == ["1000", "200"]
 
 
-def test_gains_are_coloured_symmetrically_about_zero_strongest_modes_first_by_frequency() -> None:
+def test_gains_are_colored_symmetrically_about_zero_strongest_modes_first_by_frequency() -> None:
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(50, 3, generator=generator)
     gains = torch.randn(50, 3, generator=generator) * torch.tensor([1.0, 0.01, 3.0])

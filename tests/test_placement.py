@@ -40,7 +40,7 @@ def test_contacts_on_the_surface_pass() -> None:
     assert float(placement.distances.max()) < 0.01
 
 
-def test_distances_are_metres_to_the_nearest_point() -> None:
+def test_distances_are_meters_to_the_nearest_point() -> None:
     cloud = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 2]])
     placement = judge_placement(torch.tensor([[1.0, 0.3, 0.4], [0, 2, 0.25]]), cloud)
     assert placement.distances.tolist() == pytest.approx([0.5, 0.25])
@@ -70,7 +70,7 @@ def test_every_ratio_of_units_is_found_whichever_of_the_two_it_befell(factor: fl
     assert placement.mistake.unit_only
 
 
-def test_a_surface_in_millimetres_is_told_even_if_all_contacts_lie_near_one_of_its_corners() -> None:
+def test_a_surface_in_millimeters_is_told_even_if_all_contacts_lie_near_one_of_its_corners() -> None:
     cloud = 1000 * (CLOUD - CLOUD[0])
     placement = judge_placement(CONTACTS - CLOUD[0], cloud)
     assert not placement.off

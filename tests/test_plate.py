@@ -40,7 +40,7 @@ def test_frequencies_are_naviers():
     assert modes.numbers.tolist() == [[m, n] for _, m, n in heard]
 
 
-def test_a_square_metre_of_steel_sounds_where_the_handbook_has_it():
+def test_a_square_meter_of_steel_sounds_where_the_handbook_has_it():
     # Leissa: omega a^2 sqrt(rho / D) is 19.739 for the first mode of a simply supported square plate, 2 pi^2.
     plate = undamped(length=1.0, width=1.0, thickness=0.01, young=2e11, density=7850.0, poisson=0.3)
     modes = plate_modes(plate, torch.tensor([[0.4, 0.3, 0.0]]), highest=100.0)

@@ -22,7 +22,7 @@ from avmsf.bench.published import PUBLISHED, published_ratios
 from avmsf.bench.report import write_page, write_summary
 from avmsf.bench.reporttables import WARNING, Grid, Section, figure, sections
 from avmsf.bench.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, natural
-from avmsf.bench.summary import Mean, object_figures, summarise
+from avmsf.bench.summary import Mean, object_figures, summarize
 from avmsf.bench.titles import TITLES
 from avmsf.errors import EvaluationError
 from plate_set import fill_plates
@@ -56,7 +56,7 @@ THREE = (
 
 
 def test_means_are_over_contacts_then_over_objects() -> None:
-    summary = summarise(THREE, IDENTITY)
+    summary = summarize(THREE, IDENTITY)
     assert summary["methods"] == {"knn3": {"l1": 4.0}, "paper": {"l1": 8.5}}
     # Of 2, 4 and 6 the standard deviation is 2; of 1 and 16, 7.5 sqrt 2.
     assert summary["standard_errors"]["knn3"]["l1"] == pytest.approx(2 / math.sqrt(3))
@@ -66,7 +66,7 @@ def test_means_are_over_contacts_then_over_objects() -> None:
 
 
 def test_differences_and_ratios_are_paired() -> None:
-    summary = summarise(THREE, IDENTITY)
+    summary = summarize(THREE, IDENTITY)
     # Objects 1 and 2: 1 - 2 and 16 - 4; 1 / 2 and 16 / 4, whose geometric mean is sqrt 2; means 8.5 and 3.
     assert summary["difference_to_knn3"]["paper"]["l1"] == pytest.approx({"mean": 5.5, "standard_error": 6.5})
     assert summary["ratio_to_knn3"]["paper"]["l1"] == pytest.approx(math.sqrt(2))
@@ -75,10 +75,10 @@ def test_differences_and_ratios_are_paired() -> None:
 
 
 def test_a_perfect_method_has_ratio_zero_and_a_perfect_baseline_no_ratio() -> None:
-    summary = summarise((record("1", {"knn3": (2.0, 2.0), "paper": (0.0, 0.0)}),), IDENTITY)
+    summary = summarize((record("1", {"knn3": (2.0, 2.0), "paper": (0.0, 0.0)}),), IDENTITY)
     assert summary["ratio_to_knn3"]["paper"] == {"l1": 0.0}
     assert summary["standard_errors"]["paper"] == {"l1": None}
-    summary = summarise((record("1", {"knn3": (0.0, 0.0), "paper": (1.0, 1.0)}),), IDENTITY)
+    summary = summarize((record("1", {"knn3": (0.0, 0.0), "paper": (1.0, 1.0)}),), IDENTITY)
     assert summary["ratio_to_knn3"] == {}
 
 
@@ -96,13 +96,13 @@ def test_parts_of_one_experiment_are_pooled_and_one_that_failed_spoils_all() -> 
 def test_figures_of_which_more_is_better_have_no_ratio() -> None:
     cases = (CaseRecord("a", "a", ("t",), ("u",)),)
     outcomes = tuple(Outcome("a", method, {}, {"mac": 0.5}) for method in ("knn3", "paper"))
-    summary = summarise((ObjectRecord("1", cases=cases, outcomes=outcomes),), IDENTITY)
+    summary = summarize((ObjectRecord("1", cases=cases, outcomes=outcomes),), IDENTITY)
     assert summary["methods"]["paper"] == {"mac": 0.5}
     assert summary["ratio_to_knn3"] == {"knn3": {}, "paper": {}}
 
 
 def test_groups_of_objects_have_their_own_means() -> None:
-    summary = summarise(THREE, IDENTITY, subsets={"odd": frozenset({"1"}), "none": frozenset({"7"})})
+    summary = summarize(THREE, IDENTITY, subsets={"odd": frozenset({"1"}), "none": frozenset({"7"})})
     assert summary["subsets"] == {"odd": {"objects": 1, "methods": {"knn3": {"l1": 2.0}, "paper": {"l1": 1.0}}}}
 
 

@@ -10,7 +10,7 @@ from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.residual import Residual
-from avmsf.tasks.retune import brightness_centre, retune
+from avmsf.tasks.retune import brightness_center, retune
 from made_fields import BANK, FIELDS, places
 
 PLACES = places(7, seed=8)
@@ -56,19 +56,19 @@ def test_pitch_moves_frequencies_and_decay_the_ring_times(name):
     assert (told["edit"], told["pitch"], told["decay"]) == ("retune", 1.2, factors.tolist())
 
 
-def test_brightness_is_decibels_an_octave_about_the_centre():
+def test_brightness_is_decibels_an_octave_about_the_center():
     before = field()
-    centre = brightness_centre(before)
+    center = brightness_center(before)
     # Gains over the whole object, by hand.
     known = before.known(before.gain_field.points)
     power = (known.mean.double() ** 2 + known.quadrature.double() ** 2).mean(0)
     by_hand = float((power * BANK.frequency.log()).sum() / power.sum())
-    assert math.log(centre) == pytest.approx(by_hand, rel=1e-6)
+    assert math.log(center) == pytest.approx(by_hand, rel=1e-6)
     louder = change_db(before, retune(before, brightness_db=6.0))
-    torch.testing.assert_close(louder, 6.0 * torch.log2(BANK.frequency / centre), rtol=0, atol=1e-5)
+    torch.testing.assert_close(louder, 6.0 * torch.log2(BANK.frequency / center), rtol=0, atol=1e-5)
     # Heard where the modes come to lie.
     high = retune(before, brightness_db=6.0, pitch=[1.0, 1.0, 1.0, 1.0, 2.0])
-    step = change_db(before, high) - 6.0 * torch.log2(high.bank.frequency / brightness_centre(before, high.bank))
+    step = change_db(before, high) - 6.0 * torch.log2(high.bank.frequency / brightness_center(before, high.bank))
     assert float(step.abs().max()) < 1e-5
 
 

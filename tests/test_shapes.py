@@ -50,7 +50,7 @@ def mirror(normal: np.ndarray) -> np.ndarray:
 
 
 def misfit(places: np.ndarray, motion: np.ndarray, *, every: int = 1) -> float:
-    """Largest distance of a moved vertex, of one in `every`, from the vertices, metres."""
+    """Largest distance of a moved vertex, of one in `every`, from the vertices, meters."""
     return float(cKDTree(places).query(places[::every] @ motion.T)[0].max())
 
 
@@ -81,7 +81,7 @@ def test_tetrahedra_fill_the_body_once(kind: str) -> None:
     sides = cells[:, SIDES].reshape(-1, 3)
     _, which, counts = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
     assert counts.max() == 2
-    # Two neighbours see the triangle between them from its two sides: none of them lies over the other.
+    # Two neighbors see the triangle between them from its two sides: none of them lies over the other.
     ranks = np.argsort(sides, axis=1)
     turned = np.where(np.linalg.det(np.eye(3)[ranks]) > 0, 1, -1)
     balance = np.bincount(which.ravel(), weights=turned)
@@ -136,7 +136,7 @@ def test_shapes_have_no_symmetries_but_those_they_claim(kind: str) -> None:
     assert every == (symmetry.axis is not None and symmetry.order is None)
     assert some == (symmetry.order is not None)
     assert symmetry.none == (not (every or some or planes))
-    # A millimetre is far beyond the distance between neighbours that a symmetry leaves, and within what an eye sees.
+    # A millimeter is far beyond the distance between neighbors that a symmetry leaves, and within what an eye sees.
     if not every:
         for step in range(2, 13):
             angle = 2.0 * math.pi / step
@@ -202,7 +202,7 @@ def test_a_seed_gives_the_same_individual_and_another_seed_another() -> None:
     for kind in ("bell", "blob", "bracket", "mug"):
         one, same, other = make_shape(kind, seed=1), made(kind, 1), made(kind, 7)
         assert torch.equal(one.surface.vertices, same.surface.vertices)
-        assert torch.equal(one.colours, same.colours)
+        assert torch.equal(one.colors, same.colors)
         assert torch.equal(one.solid.cells, same.solid.cells)
         extents = [np.ptp(vertices(each), axis=0) for each in (one, other)]
         assert np.abs(extents[0] - extents[1]).max() > 1e-3
@@ -224,25 +224,25 @@ def test_sizes_and_walls_are_those_asked_for() -> None:
     )
 
 
-def test_colours_tell_places_apart_and_do_not_always_follow_the_symmetry() -> None:
+def test_colors_tell_places_apart_and_do_not_always_follow_the_symmetry() -> None:
     for kind in KINDS:
-        colours = made(kind).colours
-        assert colours.shape == made(kind).surface.vertices.shape
-        assert float(colours.min()) >= 0.0
-        assert float(colours.max()) <= 1.0
-        assert float(colours.std(dim=0).max()) > 0.01
+        colors = made(kind).colors
+        assert colors.shape == made(kind).surface.vertices.shape
+        assert float(colors.min()) >= 0.0
+        assert float(colors.max()) <= 1.0
+        assert float(colors.std(dim=0).max()) > 0.01
     unlike = []
     for seed in range(8):
         shape = make_shape("pot", seed=seed)
         places = vertices(shape)
         counterpart = cKDTree(places).query(places @ turn(math.pi).T)[1]
-        unlike.append(float((shape.colours - shape.colours[counterpart]).norm(dim=1).mean()))
+        unlike.append(float((shape.colors - shape.colors[counterpart]).norm(dim=1).mean()))
     # Bands follow every turn, but for the unevenness of the glaze; spots and patches do not.
     assert min(unlike) < 0.1
     assert max(unlike) > 0.2
 
 
-def test_pictures_show_the_colours() -> None:
+def test_pictures_show_the_colors() -> None:
     shape = made("fluted")
     mesh = textured(shape)
     assert enclosed(mesh.vertices.double().numpy()[mesh.faces.numpy()]) == pytest.approx(shape.solid.volume, rel=1e-5)
@@ -250,8 +250,8 @@ def test_pictures_show_the_colours() -> None:
     assert view.coverage is not None
     seen = view.image[view.coverage == 1.0].double() / 255.0
     assert len(seen) > 200
-    # Each pixel is a mean of colours that are there.
-    nearest = torch.cdist(seen, shape.colours.double()).amin(dim=1)
+    # Each pixel is a mean of colors that are there.
+    nearest = torch.cdist(seen, shape.colors.double()).amin(dim=1)
     assert float(nearest.quantile(0.8)) < 0.05
 
 

@@ -33,7 +33,7 @@ def test_a_plate_varies_by_the_part_asked_for(part: float) -> None:
     assert thickness.std() / thickness.mean() == pytest.approx(part, rel=0.1)
     assert thickness.mean() == pytest.approx(before, rel=0.25 * part)
     assert varied.volume == pytest.approx(solid.volume, rel=0.25 * part)
-    # Smooth: neighbours differ by little.
+    # Smooth: neighbors differ by little.
     _, near = cKDTree(solid.points[below].numpy()).query(solid.points[below].numpy(), k=2)
     assert np.abs(thickness - thickness[near[:, 1]]).max() < 0.5 * part * before
 

@@ -30,7 +30,7 @@ UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 def sheet(path: Path, *, bend: float = 1.0) -> Path:
-    """Write a bent tile in four colours, open below; without a bend it is flat."""
+    """Write a bent tile in four colors, open below; without a bend it is flat."""
     across, along = np.meshgrid(np.linspace(-0.1, 0.1, 13), np.linspace(-0.07, 0.07, 9), indexing="ij")
     places = np.stack([across, along, bend * (0.6 * across**2 + 0.3 * across * along)], axis=-1).reshape(-1, 3)
     rows = np.arange(13 * 9).reshape(13, 9)
@@ -158,7 +158,7 @@ def test_a_hammer_reaches_neither_the_inside_of_a_cup_nor_what_looks_down() -> N
     side = outward[:, 2].abs() < 0.5
     assert float(across[side].min()) > 0.038
     assert 30 < int(side.sum()) < 60
-    # Far apart: sixty places on some 300 square centimetres.
+    # Far apart: sixty places on some 300 square centimeters.
     assert float(torch.pdist(strikes.places).min()) > 0.01
 
 
@@ -265,7 +265,7 @@ def test_the_same_recipe_gives_the_same_bytes(recipe: ObjectRecipe, tmp_path: Pa
     assert digests[0] == digests[1]
 
 
-def test_painted_and_pictured_meshes_are_read_back_in_their_colours(tmp_path: Path) -> None:
+def test_painted_and_pictured_meshes_are_read_back_in_their_colors(tmp_path: Path) -> None:
     corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.2]])
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
     colors = torch.tensor([[[1.0, 0, 0]] * 3, [[0, 0.2, 1.0]] * 3])

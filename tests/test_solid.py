@@ -200,7 +200,7 @@ def test_a_hollow_ball_has_two_surfaces():
         (lambda: Surface(torch.rand(9, 3), torch.zeros(0, 3).long()), {"thickness": 0.001}, "9 points and no triang"),
         (lambda: Surface(torch.zeros(3, 3), torch.tensor([[0, 1, 2]])), {"thickness": 0.001}, "has an area: the mesh"),
         (lambda: Surface(torch.rand(3, 3), torch.tensor([[0, 1, 7]])), {"thickness": 0.001}, "names vertex 7"),
-        (lambda: mixed(ball()), {"thickness": 0.001}, r"\d+% of the surface faces against its neighbours"),
+        (lambda: mixed(ball()), {"thickness": 0.001}, r"\d+% of the surface faces against its neighbors"),
     ],
 )
 def test_walls_that_cannot_be(make: Callable[[], Surface], settings, words):

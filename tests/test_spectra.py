@@ -15,7 +15,7 @@ def noise(rows: int, samples: int, seed: int = 0) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("samples", [1, 40, 200, 203])
-def test_frames_are_direct_sums_over_centred_windows(samples):
+def test_frames_are_direct_sums_over_centered_windows(samples):
     fft_size, hop = 64, 16
     sound = noise(1, samples)
     magnitudes = magnitude_stft(sound, fft_size=fft_size, hop=hop)
@@ -85,7 +85,7 @@ def test_htk_filters_peak_at_even_mels_and_sum_to_one():
     step = (high - low) / 21
     # A peak is on the bin next to its edge: within half of 3.9 Hz, at most 3 mel at the lowest filter.
     np.testing.assert_allclose(mel, low + step * np.arange(1, 21), atol=3.0)
-    # Neighbouring triangles of height one over common edges add up to one between the first and the last peak.
+    # Neighboring triangles of height one over common edges add up to one between the first and the last peak.
     between = (bins > bins[filters[0].argmax()] + 4) & (bins < bins[filters[-1].argmax()] - 4)
     np.testing.assert_allclose(filters.sum(dim=0).numpy()[between], 1.0, atol=1e-12)
     assert float(filters[:, bins < 100].abs().sum()) == 0.0

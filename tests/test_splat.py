@@ -9,7 +9,7 @@ import torch
 from avmsf.capture.cameras import View
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import SceneError
-from avmsf.scene.cpu import NumbaRasteriser
+from avmsf.scene.cpu import NumbaRasterizer
 from avmsf.scene.densify import rotation_matrices
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.photographs import choose_backdrop, prepare_photographs
@@ -25,7 +25,7 @@ NAMES = ("centers", "rotations", "log_scales", "logit_opacities", "harmonics")
 
 def _mean_psnr(cloud: GaussianCloud, views: list[View], *, background: float = 0.0) -> float:
     back = torch.full((3,), background)
-    images = [NumbaRasteriser()(cloud, view.camera, background=back).color for view in views]
+    images = [NumbaRasterizer()(cloud, view.camera, background=back).color for view in views]
     return sum(psnr(image, view.color) for image, view in zip(images, views, strict=True)) / len(views)
 
 
@@ -46,7 +46,7 @@ def test_held_out_views_of_a_ball_are_foretold_and_its_gaussians_lie_on_it() -> 
     views = ball_views(30)
     held, seen = views[::6], [view for place, view in enumerate(views) if place % 6]
     cloud = splat(seen, replace(QUICK, steps=200, start_points=800, gaussians=1500))
-    # A grey ball of the right outline has 17 dB; 0.5 / 255 of rounding would allow 59.
+    # A gray ball of the right outline has 17 dB; 0.5 / 255 of rounding would allow 59.
     assert _mean_psnr(cloud, held) > 30.0
     # A Gaussian's middle lies under what it shows by about its width, of a pixel or two; 3 pixels are 14 % here.
     assert float(_off_surface(cloud).median()) < 0.14
@@ -126,7 +126,7 @@ def test_photographs_without_masks_start_from_points() -> None:
         splat(views, QUICK)
 
 
-def test_before_random_colours_the_object_alone_is_fitted() -> None:
+def test_before_random_colors_the_object_alone_is_fitted() -> None:
     views = []
     for place, view in enumerate(ball_views(16)):
         # A background that is another in every view and every pixel, as behind an object that turns.
@@ -135,17 +135,17 @@ def test_before_random_colours_the_object_alone_is_fitted() -> None:
         image = torch.where(view.mask[..., None] > 127, view.image, noise)
         views.append(View(view.name, image, view.camera, view.mask))
     assert choose_backdrop(views, QUICK).color is None
-    # Without the loss on the mask, the colours alone must say what is the object.
+    # Without the loss on the mask, the colors alone must say what is the object.
     cloud = splat(views, replace(QUICK, steps=120, mask_weight=0.0))
     assert _mean_psnr(cloud, ball_views(16)) > 24.0
     inside = [(view.mask > 127, view) for view in views if view.mask is not None]
     for mask, view in inside[:3]:
-        alpha = NumbaRasteriser()(cloud, view.camera, background=torch.zeros(3)).alpha
+        alpha = NumbaRasterizer()(cloud, view.camera, background=torch.zeros(3)).alpha
         assert float(alpha[~mask].mean()) < 0.03
         assert float(alpha[mask].mean()) > 0.95
 
 
-def test_the_backdrop_is_the_plain_colour_around_the_object() -> None:
+def test_the_backdrop_is_the_plain_color_around_the_object() -> None:
     found = choose_backdrop(ball_views(4, background=0.6), SplatConfig()).color
     assert found is not None
     # 0.6 is 153 of 255.
@@ -188,8 +188,8 @@ def test_halved_photographs_are_means_that_the_halved_camera_sees() -> None:
     torch.testing.assert_close(full, small)
 
 
-def test_gaussians_start_as_wide_as_their_neighbours_are_far() -> None:
-    # On a cubic lattice the three nearest neighbours are one spacing away.
+def test_gaussians_start_as_wide_as_their_neighbors_are_far() -> None:
+    # On a cubic lattice the three nearest neighbors are one spacing away.
     axis = torch.arange(5.0) * 0.01
     points = torch.cartesian_prod(axis, axis, axis)
     cloud = starting_cloud(StartPoints(points, torch.full((125, 3), 0.25)), degree=1, scale=0.5, opacity=0.3)
@@ -202,19 +202,19 @@ def test_gaussians_start_as_wide_as_their_neighbours_are_far() -> None:
     discs = starting_cloud(start, degree=1, scale=0.5, opacity=0.3, flatness=0.2)
     torch.testing.assert_close(discs.log_scales.exp(), torch.tensor([[0.005, 0.005, 0.001]]).repeat(125, 1))
     torch.testing.assert_close(rotation_matrices(discs.rotations)[:, :, 2], normals)
-    # One of them alone, seen half a pixel off its middle both ways, has 5 mm at .3 m and the rasteriser's blur of .3
+    # One of them alone, seen half a pixel off its middle both ways, has 5 mm at .3 m and the rasterizer's blur of .3
     # square pixels for its variance.
     alone = replace(cloud.take(torch.tensor([62])), centers=torch.tensor([MIDDLE]))
-    shown = NumbaRasteriser()(alone, camera, background=torch.zeros(3)).color[32, 32]
+    shown = NumbaRasterizer()(alone, camera, background=torch.zeros(3)).color[32, 32]
     expected = 0.3 * 0.25 * math.exp(-0.25 / ((0.005 / 0.3 * 128) ** 2 + 0.3))
     torch.testing.assert_close(shown, torch.full((3,), expected), rtol=1e-3, atol=0)
 
 
-def test_points_take_the_colours_that_photographs_show_of_their_side() -> None:
+def test_points_take_the_colors_that_photographs_show_of_their_side() -> None:
     normals = _ball_points(2000)
     points = torch.tensor(MIDDLE) + RADIUS * normals
     found = photographed_colors(points, ball_views(24), spacing=2.0 * RADIUS / 2000**0.5)
-    # Depth cells and pixels of .3 / 128 m blur colours that change by 1.8 a radius at most.
+    # Depth cells and pixels of .3 / 128 m blur colors that change by 1.8 a radius at most.
     assert float((found - ball_color(normals)).abs().median()) < 0.05
     away = photographed_colors(torch.tensor([[9.0, 9.0, 9.0]]), ball_views(3), spacing=0.01)
     assert away.tolist() == [[0.5, 0.5, 0.5]]

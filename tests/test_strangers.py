@@ -74,10 +74,10 @@ def test_noise_is_no_part_of_a_sounds_energy(seconds):
     modes = Extractor.of(field.bank, sample_rate=RATE, samples=quiet.shape[1])
     for clear, noisy in zip(quiet, loud, strict=True):
         energy = float(clear.double().square().sum())
-        assert modes.extract(clear, colour=field.residual).energy == pytest.approx(energy, rel=1e-3)
+        assert modes.extract(clear, color=field.residual).energy == pytest.approx(energy, rel=1e-3)
         # The estimate rests on 5 frames in the shorter sounds, and scatters by a twelfth of the noise.
         noise = float(noisy.double().square().sum()) - energy
-        left = modes.extract(noisy, colour=field.residual).energy
+        left = modes.extract(noisy, color=field.residual).energy
         assert left == pytest.approx(energy, abs=0.25 * noise)
 
 
@@ -88,7 +88,7 @@ def test_a_sound_beneath_noise_is_no_less_than_its_modes() -> None:
     drowned = damped_blows("wood", length=0.2, heard_by="wood", noise_db=15.0)[:, : round(0.04 * RATE)]
     modes = Extractor.of(field.bank, sample_rate=RATE, samples=drowned.shape[1])
     for sound in drowned:
-        estimated = modes.extract(sound, colour=field.residual)
+        estimated = modes.extract(sound, color=field.residual)
         if 0.3 < estimated.energy / estimated.fitted < 0.6:
             found, judged = locator.locate(sound), judged + 1
             assert 0.0 < found.detuned < 1.0

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from avmsf.scene.neighbourhoods import read_neighbourhoods
+from avmsf.scene.neighborhoods import read_neighborhoods
 from avmsf.scene.symmetryalignment import Halves
 from avmsf.scene.symmetrycandidates import CoarseCloud, matching_pairs, mirrors_of_pairs, turns_of_pairs
 from avmsf.scene.symmetryfit import fit_motion
@@ -65,7 +65,7 @@ def test_a_hole_is_missing_and_a_part_on_one_side_is_wrong():
     points = egg()
     holed = halves(points[(points[:, 0] < 0.25)]).align(Motion(X, MIDDLE, None))
     # By area: the points are crowded towards the tips.
-    areas = read_neighbourhoods(points).spacing ** 2
+    areas = read_neighborhoods(points).spacing ** 2
     share = areas[points[:, 0] < -0.25].sum() / areas[points[:, 0] < 0.25].sum()
     assert holed.error < 0.2
     # What lies within two spacings of the hole's border counts to it: 2 x 2 pi .25 x .017 of the egg's area of .75.
@@ -102,13 +102,13 @@ def test_matching_pairs_propose_planes_and_axes_that_no_inertia_shows():
         for sign in (1, -1)
         for direction in random.normal(size=(int(60000 * radius**2), 3))
     ]
-    surface = read_neighbourhoods(np.array(points))
+    surface = read_neighborhoods(np.array(points))
     coarse = CoarseCloud.of(surface, surface.points[random.choice(len(points), 150, replace=False)])
     pairs = matching_pairs(surface, generator=random)
     planes = mirrors_of_pairs(surface, pairs, coarse=coarse, most=5)
     # The coarse picture is good to a fiftieth of the object, some degrees.
     assert min(sum(plane.apart(Motion(X, MIDDLE, None), MIDDLE)) for plane in planes) < 6.0
-    cloud = read_neighbourhoods(egg())
+    cloud = read_neighborhoods(egg())
     pairs = matching_pairs(cloud, generator=random)
     axes = turns_of_pairs(cloud, pairs, coarse=CoarseCloud.of(cloud, cloud.points[:150]), most=10)
     for true in (X, Y, Z):

@@ -63,9 +63,9 @@ def test_names_may_have_folders_and_blanks(tmp_path: Path, write: Callable[..., 
 
 
 @pytest.mark.parametrize("write", WRITERS)
-def test_points_and_colours(tmp_path: Path, write: Callable[..., None]) -> None:
+def test_points_and_colors(tmp_path: Path, write: Callable[..., None]) -> None:
     write(tmp_path / "sparse/0", ring(4), NAMES)
-    found = read_sparse_points(tmp_path, metres=2.0)
+    found = read_sparse_points(tmp_path, meters=2.0)
     assert found is not None
     points, colors = found
     assert torch.equal(points, torch.tensor([[1.0, -0.5, 4.0], [2.0, 4.0, 6.0]], dtype=torch.float64))

@@ -54,7 +54,7 @@ def seen(row: int) -> tuple[np.ndarray, np.ndarray]:
 def photographs(
     wall: tuple[float, float, float], paint: tuple[float, float, float], *, falloff: float = 0.0, noise: float = 1.5
 ) -> list[View]:
-    """The ring in a colour before a wall whose corners are darker by a share `falloff`."""
+    """The ring in a color before a wall whose corners are darker by a share `falloff`."""
     generator = np.random.default_rng(0)
     across, down = np.meshgrid(np.linspace(-1, 1, WIDTH), np.linspace(-1, 1, HEIGHT))
     lit = 1 - falloff * (across**2 + down**2) / 2
@@ -157,7 +157,7 @@ def test_what_touches_the_object_in_one_view_alone_is_dropped() -> None:
     assert mask[stand].mean() < 0.3
 
 
-def test_the_background_colour_is_taken_outside_the_masks_alone() -> None:
+def test_the_background_color_is_taken_outside_the_masks_alone() -> None:
     view = photographs((40.0, 80.0, 120.0), (220.0, 215.0, 205.0), noise=0.0)[0]
     image, mask = view.image.clone(), torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
     image[:] = torch.tensor([40, 80, 120], dtype=torch.uint8)
@@ -197,7 +197,7 @@ def test_a_busy_background_is_refused() -> None:
         find_foreground(busy)
 
 
-def test_cameras_that_do_not_fit_are_warned_of_and_colours_decide_alone() -> None:
+def test_cameras_that_do_not_fit_are_warned_of_and_colors_decide_alone() -> None:
     views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
     turned = []
     for row, view in enumerate(views):
@@ -227,6 +227,6 @@ def test_the_hull_of_true_outlines_holds_the_ring_and_not_its_hole() -> None:
     assert np.abs(inside.max(axis=0)[:2] - (RING + TUBE)).max() < 2 * hull.edge
     # The middle is seen through from above and below.
     assert np.hypot(inside[:, 0], inside[:, 1]).min() > (RING - TUBE) / 2
-    # A pixel at half a metre's distance is 3 mm: places that deep in the tube are inside for certain.
+    # A pixel at half a meter's distance is 3 mm: places that deep in the tube are inside for certain.
     deep = np.hypot(np.hypot(hull.centers[:, 0], hull.centers[:, 1]) - RING, hull.centers[:, 2]) < TUBE - 0.005
     assert hull.occupied(missing=0)[deep].mean() > 0.99

@@ -37,15 +37,15 @@ def test_channels_are_red_green_blue(tmp_path: Path, suffix: str, tolerance: int
     assert picture.mask is None
 
 
-def test_grey_and_sixteen_bits_show_the_same(tmp_path: Path) -> None:
-    grey = RAMP[..., 0]
-    cv2.imwrite(str(tmp_path / "8.png"), grey)
+def test_gray_and_sixteen_bits_show_the_same(tmp_path: Path) -> None:
+    gray = RAMP[..., 0]
+    cv2.imwrite(str(tmp_path / "8.png"), gray)
     # 257 is 65535 / 255; half a level more still rounds down.
-    cv2.imwrite(str(tmp_path / "16.png"), grey.astype(np.uint16) * 257 + 128)
+    cv2.imwrite(str(tmp_path / "16.png"), gray.astype(np.uint16) * 257 + 128)
     cv2.imwrite(str(tmp_path / "color.png"), RAMP[..., ::-1].astype(np.uint16) * 257 - 128)
     for name in ("8", "16"):
         color = read_picture(tmp_path / f"{name}.png").color
-        assert np.array_equal(color, np.repeat(grey[..., None], 3, axis=2))
+        assert np.array_equal(color, np.repeat(gray[..., None], 3, axis=2))
     assert np.array_equal(read_picture(tmp_path / "color.png").color, RAMP)
 
 
@@ -62,10 +62,10 @@ def test_alpha_is_the_mask_and_lays_the_object_before_black(tmp_path: Path) -> N
     assert np.abs(image[:, 20] - RAMP[:, 20] / 5).max() <= 0.5
 
 
-def test_grey_with_alpha_and_opaque_alpha(tmp_path: Path) -> None:
+def test_gray_with_alpha_and_opaque_alpha(tmp_path: Path) -> None:
     alpha = np.where(np.arange(WIDTH) < 9, 255, 0).astype(np.uint8) * np.ones((HEIGHT, 1), dtype=np.uint8)
-    Image.fromarray(np.dstack([RAMP[..., 0], alpha]), "LA").save(tmp_path / "grey.png")
-    picture = read_picture(tmp_path / "grey.png")
+    Image.fromarray(np.dstack([RAMP[..., 0], alpha]), "LA").save(tmp_path / "gray.png")
+    picture = read_picture(tmp_path / "gray.png")
     assert picture.mask is not None
     assert np.array_equal(picture.mask, alpha)
     assert np.array_equal(picture.color[:, :9, 1], RAMP[:, :9, 0])
@@ -73,7 +73,7 @@ def test_grey_with_alpha_and_opaque_alpha(tmp_path: Path) -> None:
     assert read_picture(tmp_path / "opaque.png").mask is None
 
 
-def test_masks_of_zeros_and_ones_colours_or_alpha(tmp_path: Path) -> None:
+def test_masks_of_zeros_and_ones_colors_or_alpha(tmp_path: Path) -> None:
     object_there = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
     object_there[5:9, 4:30] = 1
     red = np.dstack([object_there * 255, object_there * 0, object_there * 0])

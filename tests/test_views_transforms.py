@@ -37,9 +37,9 @@ def test_without_rotation_a_camera_looks_down_z_with_x_right_and_y_up(tmp_path: 
     assert torch.allclose(depth, torch.full((3,), 5.0, dtype=torch.float64))
 
 
-def test_metres_scale_positions_and_nothing_else(tmp_path: Path) -> None:
+def test_meters_scale_positions_and_nothing_else(tmp_path: Path) -> None:
     folder = facing_down_z(tmp_path)
-    plain, scaled = read_views(folder), read_views(folder, metres=0.01)
+    plain, scaled = read_views(folder), read_views(folder, meters=0.01)
     for one, other in zip(plain, scaled, strict=True):
         assert torch.allclose(other.camera.position, one.camera.position / 100, atol=1e-15)
         assert torch.equal(other.camera.world_to_camera[:3, :3], one.camera.world_to_camera[:3, :3])
@@ -127,7 +127,7 @@ def test_points_that_the_file_names(tmp_path: Path) -> None:
     header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
     header += "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
     (tmp_path / "sparse.ply").write_text(header + "1 2 3 255 0 7\n-1 0 0.5 1 2 3\n")
-    found = read_sparse_points(tmp_path, metres=0.1)
+    found = read_sparse_points(tmp_path, meters=0.1)
     assert found is not None
     points, colors = found
     assert torch.allclose(points, torch.tensor([[0.1, 0.2, 0.3], [-0.1, 0.0, 0.05]], dtype=torch.float64))
@@ -208,8 +208,8 @@ def test_numbers_that_the_caller_gives_are_checked(tmp_path: Path) -> None:
     write_transforms(tmp_path, frames(ring(3)))
     with pytest.raises(CaptureError, match="longest side in pixels, at least 1, found 0"):
         read_views(tmp_path, longest=0)
-    with pytest.raises(CaptureError, match="length of the cameras' unit in metres, found -1"):
-        read_views(tmp_path, metres=-1.0)
+    with pytest.raises(CaptureError, match="length of the cameras' unit in meters, found -1"):
+        read_views(tmp_path, meters=-1.0)
 
 
 def test_progress_counts_every_image(tmp_path: Path) -> None:

@@ -69,8 +69,8 @@ def write_capture_folder(folder: Path) -> None:
         rows.append(f"{number}.wav,{','.join(map(str, contact))},0,0,1,{number + 1}")
     (folder / "impacts.csv").write_text("\n".join([*rows, ""]))
     (folder / "capture.toml").write_text(
-        'name = "ball"\nunit = "m"\nseconds = 0.1\nplayback_speed = 1.0\nnormalise = "auto"\nhighpass = 20.0\n'
-        "align = true\nregularisation = 1e-4\nresponse_channel = 1\n"
+        'name = "ball"\nunit = "m"\nseconds = 0.1\nplayback_speed = 1.0\nnormalize = "auto"\nhighpass = 20.0\n'
+        "align = true\nregularization = 1e-4\nresponse_channel = 1\n"
     )
 
 

@@ -110,7 +110,7 @@ def test_forces_unrelated_to_the_loudness_are_not_divided_by(tmp_path: Path, rel
     gains = places * (forces if related else 10 ** (1 / 20 * generator.standard_normal(count))) / 30
     sounds = [gain * ring(0.3, before=0.05, seed=1, noise=1e-5) for gain in gains]
     folder = folder_of(tmp_path, sounds, forces, contacts)
-    assert found(folder) == ({} if related else {"normalise": "none"})
+    assert found(folder) == ({} if related else {"normalize": "none"})
 
 
 def test_few_recordings_do_not_show_that_forces_are_unrelated(tmp_path: Path) -> None:
@@ -174,11 +174,11 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     proposals = [
         Proposal("force_channel", 1, "Because\nof # it all. " * 30),
         Proposal("highpass", 20.0, "é"),
-        Proposal("normalise", "none", "so"),
+        Proposal("normalize", "none", "so"),
         Proposal("align", False, ""),
     ]
     path = write_settings(tmp_path, proposals)
-    expected = replace(CaptureSettings(), force_channel=1, highpass=20.0, normalise="none", align=False)
+    expected = replace(CaptureSettings(), force_channel=1, highpass=20.0, normalize="none", align=False)
     assert CaptureSettings.read(path) == expected
     assert path.read_text(encoding="utf-8") == settings_text(proposals)
 

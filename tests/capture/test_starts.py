@@ -104,7 +104,7 @@ def test_a_deconvolved_response_is_known_before_the_push_too() -> None:
     force[300:303] = 5 * push
     heard = fftconvolve(response, 5 * push)
     sound[300 - early : 300 - early + len(heard)] = heard
-    settings = CaptureSettings(force_channel=1, response_channel=2, normalise="deconvolve", regularisation=1e-9)
+    settings = CaptureSettings(force_channel=1, response_channel=2, normalize="deconvolve", regularization=1e-9)
     found = prepare(Recording("a.wav", np.stack([force, sound]), float(RATE), "FLOAT"), settings)
     # The window begins 16 samples and one width of the pulse (3) before it.
     assert len(found.before) == 19

@@ -23,7 +23,7 @@ VERBS = {
 
 
 def capture_in(folder: Path, unit: str) -> Path:
-    """Fill a folder with contacts in metres and a mesh in a unit that its settings do not name."""
+    """Fill a folder with contacts in meters and a mesh in a unit that its settings do not name."""
     fill_plate(folder, surface=False)
     write_surface_file(folder)
     lines = [line.split() for line in (folder / "surface.obj").read_text().splitlines()]

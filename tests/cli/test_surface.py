@@ -25,7 +25,7 @@ FIT = tuple(f"--fit.{word[2:]}" if word.startswith("--") else word for word in T
 
 
 @pytest.mark.parametrize("kind", ["ply", "obj", "glb"])
-def test_a_mesh_is_written_as_it_is_in_metres(kind: str, tmp_path: Path) -> None:
+def test_a_mesh_is_written_as_it_is_in_meters(kind: str, tmp_path: Path) -> None:
     folder = tmp_path / "slab"
     folder.mkdir()
     write_surface_file(folder)

@@ -18,7 +18,7 @@ from avmsf.cli.writing import OutputError
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.residual import Residual
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.tasks.locator import Locator
 from made_fields import BANK, positional
 
@@ -35,7 +35,7 @@ def hit(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str, torch.Tenso
     save(field, folder / "plate.safetensors")
     locator = Locator.of(field)
     gains = locator.gains[STRUCK][None].to(torch.complex128)
-    sound = synthesise(
+    sound = synthesize(
         gains.real, BANK.frequency, BANK.damping, samples=SAMPLES, sample_rate=float(RATE), quadrature=gains.imag
     )[0]
     noise = torch.randn(len(sound) + 800, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -59,7 +59,7 @@ def test_the_true_contact_is_red_at_its_place_and_the_found_one_blue(
     distance = float((points[STRUCK] - points[OTHER]).norm())
     diagonal = float((points.amax(0) - points.amin(0)).norm())
     assert blow["true_contact"] == pytest.approx(points[OTHER].tolist(), abs=1e-6)
-    assert blow["error_metres"] == pytest.approx(distance, abs=1e-6)
+    assert blow["error_meters"] == pytest.approx(distance, abs=1e-6)
     assert blow["rmed_posterior"] == pytest.approx(distance / diagonal, abs=1e-6)
     assert blow["rmed"] == pytest.approx(distance / diagonal, abs=1e-6)
     (figure,) = figures

@@ -26,7 +26,7 @@ from avmsf.fem.isotropic import isotropic_modes
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
 from avmsf.modal.spectra import magnitude_stft
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.block import block
 from avmsf.simulate.material import GLASS
 
@@ -49,7 +49,7 @@ def true_modes() -> tuple[torch.Tensor, torch.Tensor]:
 
 def struck(amplitudes: torch.Tensor, contacts: torch.Tensor | None = None) -> Impacts:
     frequency, damping = true_modes()
-    sounds = synthesise(amplitudes, frequency, damping, samples=SAMPLES, sample_rate=RATE)
+    sounds = synthesize(amplitudes, frequency, damping, samples=SAMPLES, sample_rate=RATE)
     places = torch.zeros(len(sounds), 3) if contacts is None else contacts
     return Impacts(places, sounds, RATE, tuple(f"{row}.wav" for row in range(len(sounds))))
 
@@ -148,7 +148,7 @@ def test_it_recovers_the_thickness_of_a_wall_that_lies_between_those_computed():
     thickness = 1.2 * walls.thickness[1]
     frequency = walls.at(thickness).modes(replace(GLASS, young=1.3 * GLASS.young, poisson=POISSON)).frequency
     damping = 8.0 + 2e-8 * (2.0 * math.pi * frequency).square()
-    sounds = synthesise(torch.ones(1, 8), frequency, damping, samples=SAMPLES, sample_rate=RATE)
+    sounds = synthesize(torch.ones(1, 8), frequency, damping, samples=SAMPLES, sample_rate=RATE)
     clips = clip_spectra(Impacts(torch.zeros(1, 3), sounds, RATE, ("1.wav",)))
     known = DampingCurve.of(ModalBank(frequency, damping))
     found = fit_material(
@@ -185,7 +185,7 @@ def test_weights_make_training_spectra_no_worse_and_find_the_strengths_of_modes(
 
     def misfit(renderer: DiffSound) -> float:
         atoms = torch.eye(12, dtype=torch.float64)
-        own = synthesise(atoms, renderer.bank.frequency, renderer.bank.damping, samples=SAMPLES, sample_rate=RATE)
+        own = synthesize(atoms, renderer.bank.frequency, renderer.bank.damping, samples=SAMPLES, sample_rate=RATE)
         parts = magnitude_stft(own, fft_size=2048, hop=512).flatten(1)
         recorded = magnitude_stft(simulated().sounds.double(), fft_size=2048, hop=512).flatten(1)
         return float((renderer.gains(CONTACTS).abs() @ parts - recorded).square().sum())

@@ -146,10 +146,10 @@ def test_a_surface_becomes_a_glb_of_the_same_triangles(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", ["obj", "ply", "stl", "glb"])
-def test_a_mesh_file_in_millimetres_is_shown_in_metres(tmp_path: Path, ending: str) -> None:
+def test_a_mesh_file_in_millimeters_is_shown_in_meters(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"ball.{ending}"
     trimesh.creation.icosphere(subdivisions=2, radius=100.0).export(path)
-    shown = read_object(path, ball_points(), metres=1e-3)
+    shown = read_object(path, ball_points(), meters=1e-3)
     (tmp_path / "shown.glb").write_bytes(shown.content)
     loaded = trimesh.load_mesh(tmp_path / "shown.glb", process=False)
     np.testing.assert_allclose(np.linalg.norm(loaded.vertices, axis=1), 0.1, rtol=1e-5)
@@ -157,7 +157,7 @@ def test_a_mesh_file_in_millimetres_is_shown_in_metres(tmp_path: Path, ending: s
         read_object(path, ball_points())
 
 
-def test_colours_of_a_mesh_are_kept(tmp_path: Path) -> None:
+def test_colors_of_a_mesh_are_kept(tmp_path: Path) -> None:
     mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
     mesh.visual.vertex_colors = np.r_["1", np.arange(42)[:, None] * [1, 2, 3], np.full((42, 1), 255)].astype(np.uint8)
     mesh.export(tmp_path / "ball.ply")

@@ -141,7 +141,7 @@ def test_viewers_show_the_mesh_or_the_points(tmp_path):
     np.testing.assert_allclose(cloud.vertices, field.points.numpy(), atol=1e-7)
 
 
-def test_a_texture_becomes_the_corners_colours():
+def test_a_texture_becomes_the_corners_colors():
     picture = torch.zeros(2, 2, 3, dtype=torch.uint8)
     picture[0, 0, 1] = 255  # the upper left is green, all else black
     mesh = TexturedMesh.build(
@@ -156,7 +156,7 @@ def test_a_texture_becomes_the_corners_colours():
     assert look.colors.sum() == 1.0
 
 
-def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colours(tmp_path, monkeypatch):
+def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colors(tmp_path, monkeypatch):
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.6)
     upper = ball.vertices[:, 2] > 0
     ball.visual.vertex_colors = np.where(upper[:, None], [255, 0, 0, 255], [0, 0, 255, 255]).astype(np.uint8)

@@ -218,7 +218,7 @@ def test_pictures_are_drawn_of_solids_and_of_sheets() -> None:
     points = bar_points()
     doubt = relative_gain_std(field, points)
     sheet = draw_doubt(points, doubt, title="bar", struck=contacts, suggested=contacts[:2])
-    assert len(sheet.axes) == 2  # the sheet and its colours
+    assert len(sheet.axes) == 2  # the sheet and its colors
     bent = points + torch.tensor([0.0, 0.0, 1.0]) * points[:, :1].square()
     solid = draw_doubt(bent, doubt, title="bent", suggested=contacts[:3])
     assert len(solid.axes) == 7

@@ -16,7 +16,7 @@ WALL = 0.003
 
 
 def cup(inner: float, height: float) -> trimesh.Trimesh:
-    """Return a round cup that is open above, with this inner radius, metres."""
+    """Return a round cup that is open above, with this inner radius, meters."""
     outer = inner + WALL
     profile = [(0, 0), (outer, 0), (outer, height), (inner, height), (inner, WALL), (0, WALL)]
     mesh = trimesh.creation.revolve(np.array(profile), sections=64)

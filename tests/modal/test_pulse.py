@@ -8,7 +8,7 @@ import torch
 from scipy.integrate import quad
 
 from avmsf.modal.pulse import ForcePulse
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 
 RATE = 8000.0
 SHAPES = ("half-sine", "hertz")
@@ -61,7 +61,7 @@ def test_a_half_sine_takes_from_a_mode_what_its_spectrum_says():
     frequency = torch.tensor([200.0, 900.0, 1500.0], dtype=torch.float64)
     still = torch.full((3,), 1e-6, dtype=torch.float64)
     gains = torch.eye(3, dtype=torch.float64)
-    sounds = synthesise(gains, frequency, still, samples=20_000, sample_rate=rate)
+    sounds = synthesize(gains, frequency, still, samples=20_000, sample_rate=rate)
     softened = ForcePulse(contact).soften(sounds, sample_rate=rate)
     passed = softened[:, 1000:].abs().amax(1)
     product = frequency * contact

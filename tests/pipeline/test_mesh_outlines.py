@@ -64,7 +64,7 @@ def test_a_mesh_of_another_size_or_place_is_told(surface: Surface) -> None:
 
 @pytest.mark.parametrize("unit", ["mm", "cm", "in"])
 def test_cameras_in_another_unit_are_refused_with_it(unit: str) -> None:
-    """A mesh and contacts in metres, cameras in another unit that the settings do not name; and the other way round."""
+    """A mesh and contacts in meters, cameras in another unit that the settings do not name; and the other way round."""
     with pytest.raises(CaptureError) as caught:
         judge_outlines(scaled(METRES[unit]), VIEWS, CaptureSettings())
     assert f'views_unit = "{unit}"' in str(caught.value)

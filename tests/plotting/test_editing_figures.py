@@ -62,7 +62,7 @@ def test_scores_hold_the_places_and_the_clap_score_of_every_preview(
     assert before.clap_curve == ()
     assert before.places["pitches"] == pytest.approx(space.place(struck("ceramic").bank), abs=1e-6)
     for each in scores:
-        apart = np.asarray(each.places["pitches"]) - space.centre("glass")
+        apart = np.asarray(each.places["pitches"]) - space.center("glass")
         assert each.umap["pitches"] == pytest.approx(float(np.linalg.norm(apart)))
     # Of the object as it was, wherever it is loudest.
     known = struck("ceramic").sound_field

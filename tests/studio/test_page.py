@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.page
 
 SPACING = SIDES[0] / 30
-"""Between neighbouring contacts, metres."""
+"""Between neighboring contacts, meters."""
 LIVE_CAPTURE = {"revision": 1, "undo": False, "abilities": ["capture", "reconstruct"], "mode": "capture", "job": None}
 
 
 def last_place(page: "Page") -> torch.Tensor:
-    """Return where the last blow fell, metres."""
+    """Return where the last blow fell, meters."""
     return torch.tensor(page.evaluate("avmsf.studio.view.placeOf(avmsf.studio.last.row)"))
 
 
@@ -89,17 +89,15 @@ def test_keys_turn_and_strike_what_is_in_the_middle(plain: "Page") -> None:
 def expect_painted(page: "Page", kind: str) -> None:
     page.click("#tab-modes")
     page.click("tr[data-mode='2']")
-    painted = page.evaluate(
-        "(({ values, colours }) => ({ values: [...values], colours: [...colours] }))(avmsf.painted())"
-    )
+    painted = page.evaluate("(({ values, colors }) => ({ values: [...values], colors: [...colors] }))(avmsf.painted())")
     values, shape = torch.tensor(painted["values"]), plate_shapes(plate_table().points)[:, 2]
     sign = torch.sign(values @ shape)
     torch.testing.assert_close(values * sign, shape, atol=1e-6, rtol=0)
-    colours = torch.tensor(painted["colours"]).reshape(-1, 3)
+    colors = torch.tensor(painted["colors"]).reshape(-1, 3)
     # One end of the scale is red, the other blue; and the picture has them where the shape is greatest.
     high, low = int(values.argmax()), int(values.argmin())
-    assert colours[high, 0] > 1.5 * colours[high, 2]
-    assert colours[low, 2] > 1.5 * colours[low, 0]
+    assert colors[high, 0] > 1.5 * colors[high, 2]
+    assert colors[low, 2] > 1.5 * colors[low, 0]
     page.wait_for_timeout(900 if kind == "gaussians" else 150)
     corner = torch.tensor([0.112, 0.072, 0.01])
     for turn in (1.0, -1.0):
@@ -117,8 +115,8 @@ def pixel(page: "Page", x: float, y: float) -> tuple[float, float]:
     from PIL import Image
 
     shot = page.screenshot(clip={"x": x - 2, "y": y - 2, "width": 4, "height": 4})
-    colours = np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), dtype=float).mean(axis=(0, 1))
-    return float(colours[0]), float(colours[2])
+    colors = np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), dtype=float).mean(axis=(0, 1))
+    return float(colors[0]), float(colors[2])
 
 
 def test_the_table_tells_pitch_decay_and_level_at_the_contact(plain: "Page") -> None:
@@ -152,7 +150,7 @@ def test_a_dropped_recording_is_located_and_painted(visit: Open) -> None:
         "row": 77,
         "probability": packed(probability),
         "distance": packed(1 - probability),
-        "region": {"level": 0.9, "radius_metres": 0.012, "share": 0.031},
+        "region": {"level": 0.9, "radius_meters": 0.012, "share": 0.031},
         "explained": 0.97,
         "ambiguous": True,
         "counterparts": [{"place": table.points[300].tolist(), "probability": 0.2, "words": "mirrored"}],
@@ -509,7 +507,7 @@ def test_all_fits_on_a_telephone(visit: Open) -> None:
 
 def test_what_was_found_goes_when_another_recording_is_looked_for(visit: Open) -> None:
     probability = torch.exp(-torch.arange(plate_table().points.shape[0]) / 50.0)
-    region = {"level": 0.9, "radius_metres": 0.012, "share": 0.031}
+    region = {"level": 0.9, "radius_meters": 0.012, "share": 0.031}
     found = {"place": [0.0, 0.0, 0.01], "row": 5, "probability": packed(probability), "region": region}
     silence = {"error": "the recording: expected a blow, found noise alone: record it again"}
     answers = [({"blows": [found]}, 200), (silence, 422), ({"blows": [found]}, 200)]

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.page
 
 SPACING = SIDES[0] / 30
-"""Between neighbouring contacts, metres."""
+"""Between neighboring contacts, meters."""
 FOLDER = "/captures/plate"
 LIVE_CAPTURE = {"revision": 1, "undo": False, "abilities": ["capture", "reconstruct"], "mode": "capture", "job": None}
 HERE, THERE = (0.04, 0.04, 0.01), (-0.04, 0.0, 0.01)
@@ -294,7 +294,7 @@ def test_a_place_found_on_another_field_is_not_painted_and_searches_do_not_meet(
         held.append(route)
 
     def found(row: int, revision: int) -> dict[str, Any]:
-        region = {"level": 0.9, "radius_metres": 0.01, "share": 0.1}
+        region = {"level": 0.9, "radius_meters": 0.01, "share": 0.1}
         place = page.evaluate(f"avmsf.studio.view.placeOf({row})")
         return {"blows": [{"place": place, "row": row, "probability": "", "region": region}], "revision": revision}
 

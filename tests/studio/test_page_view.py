@@ -335,13 +335,13 @@ INKED = """(name) => {
   };
   const { width, height } = canvas;
   const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
-  const close = (place, colour, alpha) =>
-    data[4 * place + 3] > alpha && colour.every((value, at) => Math.abs(value - data[4 * place + at]) < 24);
+  const close = (place, color, alpha) =>
+    data[4 * place + 3] > alpha && color.every((value, at) => Math.abs(value - data[4 * place + at]) < 24);
   const columns = (token, alpha) => {
-    const colour = ink(token);
+    const color = ink(token);
     const highest = new Array(width).fill(null);
     for (let place = 0; place < width * height; place++)
-      if (highest[place % width] === null && close(place, colour, alpha))
+      if (highest[place % width] === null && close(place, color, alpha))
         highest[place % width] = Math.floor(place / width) / height;
     return highest;
   };
@@ -479,7 +479,7 @@ def test_a_recording_is_drawn_from_its_beginning_beside_the_model_of_its_own_con
     page.click(recording)
     beside = lines()
     page.evaluate("avmsf.strike(100)")
-    # Two of the chart's 124 pixels: how a line's end is coloured depends on the time since the blow.
+    # Two of the chart's 124 pixels: how a line's end is colored depends on the time since the blow.
     np.testing.assert_allclose(beside, lines(), atol=2.1 / 124, rtol=0)
     # In the middle of the plate most modes have a node.
     assert (elsewhere - beside > 0.3).sum() >= 2

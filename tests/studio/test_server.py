@@ -491,8 +491,8 @@ def test_a_mesh_called_as_a_captures_own_opens_the_folder_that_it_lies_in(
     with pytest.raises(SystemExit):
         main(["studio", "--help"])
     told = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "a folder of its name beside it becomes the capture and gets a copy" in told
-    for name in ("surface.obj", *MESHES, *SPLATS):
+    assert "a folder of its name next to it, which becomes the capture" in told
+    for name in ("surface.obj", *SPLATS):
         assert name in told
     assert "open the folder that they lie in as the capture" in told
 
@@ -669,7 +669,7 @@ def test_the_command_says_what_it_needs(capsys: pytest.CaptureFixture[str], monk
     assert main(["studio"]) == 2
     assert "expected a field, a capture folder" in capsys.readouterr().err
     assert main(["studio", "nothing.safetensors"]) == 2
-    assert "found nothing: check the path" in capsys.readouterr().err
+    assert "nothing.safetensors: expected a field, a capture folder" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "avmsf.studio.server", None)
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     del sys.modules["avmsf.studio.server"]

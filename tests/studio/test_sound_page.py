@@ -14,7 +14,7 @@ from avmsf.export.bundle import make_bundle, write_bundle
 from avmsf.export.sampledfield import SampledField
 from avmsf.export.webpage import single_file
 from avmsf.modal.pulse import ForcePulse
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from struck_table import RATE, struck_table
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def test_modes_are_the_same_at_any_sample_rate(page: "Page", table: SampledField
         rate,
     )
     kept = table.frequency < rate / 2
-    expected = synthesise(
+    expected = synthesize(
         table.sine[4:5, kept],
         table.frequency[kept],
         table.damping_at(torch.tensor([4]))[:, kept],

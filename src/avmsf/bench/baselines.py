@@ -19,7 +19,7 @@ from avmsf.errors import EvaluationError
 from avmsf.field.gains.family import Sites, nearest_sites
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains, fit_sine_gains
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.scene.points import nearest_points
 
 
@@ -90,7 +90,7 @@ class MeanWaveform:
     """Whether directions count as well as contacts."""
 
     def __post_init__(self) -> None:
-        _expect_neighbours(self.train, self.count)
+        _expect_neighbors(self.train, self.count)
 
     @property
     def sample_rate(self) -> float:
@@ -120,7 +120,7 @@ class MeanGains(ModalBaseline):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _expect_neighbours(self.train, self.count)
+        _expect_neighbors(self.train, self.count)
 
     def amplitudes_at(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts two_modes"]:
         """Return the mean of the nearest training contacts' gains in phase, then in quadrature."""
@@ -164,7 +164,7 @@ def _render(
     gains: Float[Tensor, "contacts modes"],
     quadrature: Float[Tensor, "contacts modes"] | None,
 ) -> Float[Tensor, "contacts samples"]:
-    return synthesise(
+    return synthesize(
         gains,
         bank.frequency,
         bank.damping,
@@ -174,7 +174,7 @@ def _render(
     )
 
 
-def _expect_neighbours(train: Impacts, count: int) -> None:
+def _expect_neighbors(train: Impacts, count: int) -> None:
     if not 1 <= count <= len(train):
         raise EvaluationError(
             f"the mean of {count} nearest impacts was asked of {len(train)} training impacts; ask for 1 to {len(train)}"

@@ -199,7 +199,7 @@ class Places:
     """
 
     contacts: Float64[Tensor, "places 3"]
-    """Contact of the first recording at each, metres."""
+    """Contact of the first recording at each, meters."""
     rows: tuple[tuple[int, ...], ...]
     """The recordings at each."""
 

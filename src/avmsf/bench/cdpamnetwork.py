@@ -13,7 +13,7 @@ FEATURES = 256 + 64 + 16 + 4
 """Numbers in which two sounds are compared: those of all layers of the distance."""
 _TAPS = 15
 _NORM_FLOOR = 1e-5
-"""What batch normalisation adds to a variance."""
+"""What batch normalization adds to a variance."""
 _LEAK, _HEAD_LEAK = 0.1, 0.01
 """Slopes of the rectifiers below zero, in the encoder and in the distance."""
 _SILENCE = 1024
@@ -59,7 +59,7 @@ class Silence:
 
 @dataclass(frozen=True, eq=False)
 class CdpamNetwork:
-    """The encoder with its batch normalisation folded in, and the layers of the distance.
+    """The encoder with its batch normalization folded in, and the layers of the distance.
 
     Sixteen convolutions, each followed by a leaky rectifier; every fourth keeps every second sample and has twice as
     many channels. Of the mean over time the first half, the authors' acoustic part, is scaled to length one. The
@@ -145,7 +145,7 @@ def _channels(layer: int) -> int:
 def _fold(
     weights: CdpamWeights, layer: int
 ) -> tuple[Float64[Tensor, "outputs inputs taps"], Float64[Tensor, " outputs"]]:
-    """Return a convolution's weights and bias, batch normalisation included."""
+    """Return a convolution's weights and bias, batch normalization included."""
     outputs, inputs = _channels(layer), 1 if layer == 0 else _channels(layer - 1)
     kernel = weights.take(f"base_encoder.encoder.{layer}.weight", outputs, inputs, _TAPS)
     bias = weights.take(f"base_encoder.encoder.{layer}.bias", outputs)

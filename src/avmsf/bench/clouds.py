@@ -1,4 +1,4 @@
-"""Pictures of a cloud from all sides: its colours, features, clusters and symmetries, as a sheet or a turntable."""
+"""Pictures of a cloud from all sides: its colors, features, clusters and symmetries, as a sheet or a turntable."""
 
 import io
 import math
@@ -22,7 +22,7 @@ from avmsf.scene.features import FeatureField
 from avmsf.scene.points import cluster
 from avmsf.scene.symmetry import Symmetries
 
-_GREY = 0.62
+_GRAY = 0.62
 _INCHES, _TURNTABLE_INCHES = 3.0, 4.0
 _MARGIN = 1.12
 _WIDTH = 1.9
@@ -34,25 +34,25 @@ _AXIS, _PLANE = "#c8502d", "#1f3b5c"
 
 def draw_cloud(
     points: Float[Tensor, "points 3"],
-    colours: Mapping[str, Float[Tensor, "points 3"]],
+    colors: Mapping[str, Float[Tensor, "points 3"]],
     *,
     title: str,
     symmetries: Symmetries | None = None,
     sides: Sequence[Side] = AROUND,
     up: Sequence[float] = UP,
 ) -> Figure:
-    """Draw a cloud from each side in a column, once for every named set of colours (0 to 1) in a row.
+    """Draw a cloud from each side in a column, once for every named set of colors (0 to 1) in a row.
 
     Symmetries get a row of their own: axes as lines with their order, mirror planes as outlines. `up` is the direction
     that points to the sky. Raises EvaluationError where there is nothing to draw.
     """
-    rows = dict(colours)
+    rows = dict(colors)
     if symmetries is not None:
-        rows["symmetries"] = torch.full((len(points), 3), _GREY)
+        rows["symmetries"] = torch.full((len(points), 3), _GRAY)
     if not rows or not sides or not len(points):
         raise EvaluationError(
-            f"expected points, colours or symmetries, and sides to draw, found {len(points)} points, {len(rows)} "
-            f"sets of colours and {len(sides)} sides"
+            f"expected points, colors or symmetries, and sides to draw, found {len(points)} points, {len(rows)} "
+            f"sets of colors and {len(sides)} sides"
         )
     figure = Figure(figsize=(_INCHES * len(sides), _INCHES * len(rows) + 0.5), layout="constrained")
     grid = figure.subplots(len(rows), len(sides), squeeze=False)
@@ -72,7 +72,7 @@ def draw_features(
     features: FeatureField,
     *,
     title: str,
-    colours: Float[Tensor, "points 3"] | None = None,
+    colors: Float[Tensor, "points 3"] | None = None,
     clusters: int | None = None,
     symmetries: Symmetries | None = None,
     sides: Sequence[Side] = AROUND,
@@ -80,35 +80,35 @@ def draw_features(
 ) -> Figure:
     """Draw what is known of an object's points, as `draw_cloud` does.
 
-    Rows: the points in their own colours if given, their features' first three principal components as red, green and
+    Rows: the points in their own colors if given, their features' first three principal components as red, green and
     blue, `clusters` k-means groups if asked for, and the symmetries if given.
     """
-    rows = {} if colours is None else {"colour": colours}
-    rows["features"] = component_colours(features.features)
+    rows = {} if colors is None else {"color": colors}
+    rows["features"] = component_colors(features.features)
     if clusters is not None:
-        rows[f"{clusters} clusters"] = label_colours(cluster(features.points, clusters).labels)
+        rows[f"{clusters} clusters"] = label_colors(cluster(features.points, clusters).labels)
     return draw_cloud(features.points, rows, title=title, symmetries=symmetries, sides=sides, up=up)
 
 
-def component_colours(features: Float[Tensor, "points dim"]) -> Float[Tensor, "points 3"]:
+def component_colors(features: Float[Tensor, "points dim"]) -> Float[Tensor, "points 3"]:
     """Return the first three principal components as red, green and blue, from the 2nd to the 98th percentile.
 
-    Each component's largest weight is positive. What features do not fill, of fewer than three, stays grey.
+    Each component's largest weight is positive. What features do not fill, of fewer than three, stays gray.
     """
-    centred = (features - features.mean(0)).double()
-    _, sizes, directions = torch.linalg.svd(centred, full_matrices=False)
-    colours = torch.full((len(features), 3), 0.5)
+    centered = (features - features.mean(0)).double()
+    _, sizes, directions = torch.linalg.svd(centered, full_matrices=False)
+    colors = torch.full((len(features), 3), 0.5)
     for column, (size, direction) in enumerate(zip(sizes[:3].tolist(), directions, strict=False)):
         if size < 1e-6 * max(1.0, float(sizes[0])) or size == 0.0:
             break
-        value = centred @ (direction * torch.sign(direction[direction.abs().argmax()]))
+        value = centered @ (direction * torch.sign(direction[direction.abs().argmax()]))
         low, high = np.quantile(value.numpy(), [0.02, 0.98])
-        colours[:, column] = ((value - low) / max(high - low, 1e-12)).clamp(0.0, 1.0).float()
-    return colours
+        colors[:, column] = ((value - low) / max(high - low, 1e-12)).clamp(0.0, 1.0).float()
+    return colors
 
 
-def label_colours(labels: Int[Tensor, " points"]) -> Float[Tensor, "points 3"]:
-    """Return a colour for each label; labels that follow one another get hues far apart."""
+def label_colors(labels: Int[Tensor, " points"]) -> Float[Tensor, "points 3"]:
+    """Return a color for each label; labels that follow one another get hues far apart."""
     number = labels.numpy()
     hue = (number * 0.618034) % 1.0
     saturation = 0.55 + 0.4 * ((number * 0.37) % 1.0)
@@ -118,7 +118,7 @@ def label_colours(labels: Int[Tensor, " points"]) -> Float[Tensor, "points 3"]:
 
 def save_turntable(
     points: Float[Tensor, "points 3"],
-    colours: Float[Tensor, "points 3"],
+    colors: Float[Tensor, "points 3"],
     path: Path,
     *,
     symmetries: Symmetries | None = None,
@@ -133,7 +133,7 @@ def save_turntable(
         figure = Figure(figsize=(_TURNTABLE_INCHES, _TURNTABLE_INCHES), dpi=100)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         view = view_from((360.0 * frame / frames, ABOVE), up)
-        _scatter(axes, points, colours, view, inches=_TURNTABLE_INCHES)
+        _scatter(axes, points, colors, view, inches=_TURNTABLE_INCHES)
         if symmetries is not None:
             _draw_symmetries(axes, points, symmetries, view)
         still = io.BytesIO()
@@ -154,7 +154,7 @@ def _middle(points: Float[Tensor, "points 3"]) -> tuple[Float[np.ndarray, " 3"],
 def _scatter(
     axes: Axes,
     points: Float[Tensor, "points 3"],
-    colours: Float[Tensor, "points 3"],
+    colors: Float[Tensor, "points 3"],
     view: Float[np.ndarray, "3 3"],
     *,
     inches: float,
@@ -164,7 +164,7 @@ def _scatter(
     order = np.argsort(seen[:, 2])
     # What is farther is darker: flat dots alone show no depth.
     shade = 0.72 + 0.28 * (seen[:, 2:] / max(radius, 1e-30) + 1) / 2
-    shown = np.clip(colours.numpy() * shade, 0.0, 1.0)
+    shown = np.clip(colors.numpy() * shade, 0.0, 1.0)
     # Dots so wide that near ones hide far ones: about twice as wide as they lie apart.
     dot = 72 * inches * _WIDTH / math.sqrt(max(len(seen), _FEW))
     axes.scatter(seen[order, 0], seen[order, 1], c=shown[order], s=dot**2, linewidths=0, rasterized=True)

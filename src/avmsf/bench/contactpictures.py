@@ -1,4 +1,4 @@
-"""Where a blow may have fallen, as a picture of the object from all sides and as a point cloud in colours."""
+"""Where a blow may have fallen, as a picture of the object from all sides and as a point cloud in colors."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +19,7 @@ from avmsf.files import write_whole
 from avmsf.tasks.contactmap import ContactMap
 
 _DECADES = 3.0
-"""Powers of ten below the likeliest that colours tell apart."""
+"""Powers of ten below the likeliest that colors tell apart."""
 _HEAT = "viridis"
 """Its purple, green and yellow leave red and blue, the paper's colors of the true and the found contact, for marks."""
 _FOUND, _OTHER, _TRUTH = (0.20, 0.45, 1.00), (0.95, 0.95, 0.95), (1.00, 0.05, 0.05)
@@ -42,7 +42,7 @@ def draw_contact(
     The likeliest place is marked blue, `others` that sound alike white, and the `truth` red where it is known.
     """
     points = contact.points
-    # The likeliest point and its neighbourhood must not fall between those that are drawn.
+    # The likeliest point and its neighborhood must not fall between those that are drawn.
     rows = torch.arange(0, len(points), max(1, len(points) // _DRAWN))
     rows = torch.unique(torch.cat([rows, torch.topk(contact.probability, min(64, len(points))).indices]))
     marks: list[tuple[Tensor, tuple[float, float, float]]] = [] if others is None else [(o, _OTHER) for o in others]
@@ -50,7 +50,7 @@ def draw_contact(
     if truth is not None:
         marks.append((truth, _TRUTH))
     likely, alike = (
-        _marked(points, colours, marks)[rows] for colours in (contact_colours(contact), _distance_colours(contact))
+        _marked(points, colors, marks)[rows] for colors in (contact_colors(contact), _distance_colors(contact))
     )
     figure = draw_cloud(
         points[rows], {"probability": likely, "cosine distance": alike}, title=_title(title, marks), sides=sides
@@ -67,8 +67,8 @@ def draw_contact(
     return figure
 
 
-def contact_colours(contact: ContactMap) -> Float[Tensor, "points 3"]:
-    """Return colours, 0 to 1, dark purple for a thousandth of the greatest probability and less, up to yellow."""
+def contact_colors(contact: ContactMap) -> Float[Tensor, "points 3"]:
+    """Return colors, 0 to 1, dark purple for a thousandth of the greatest probability and less, up to yellow."""
     likely = contact.probability.double()
     share = likely / likely.max().clamp_min(torch.finfo(torch.float64).tiny)
     level = 1.0 + torch.log10(share.clamp_min(10.0**-_DECADES)) / _DECADES
@@ -76,9 +76,9 @@ def contact_colours(contact: ContactMap) -> Float[Tensor, "points 3"]:
 
 
 def write_contact_cloud(contact: ContactMap, path: Path) -> None:
-    """Write the object's points with their colours as a binary `.ply` that any viewer of point clouds opens.
+    """Write the object's points with their colors as a binary `.ply` that any viewer of point clouds opens.
 
-    The vertices have the floats `probability` (they sum to one) and `cosine_distance` beside place and colour. Raises
+    The vertices have the floats `probability` (they sum to one) and `cosine_distance` beside place and color. Raises
     EvaluationError where it cannot be written.
     """
     kinds = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
@@ -86,7 +86,7 @@ def write_contact_cloud(contact: ContactMap, path: Path) -> None:
     table = np.zeros(len(contact.points), dtype=kinds)
     columns: Mapping[str, Tensor] = {
         **dict(zip("xyz", contact.points.double().T, strict=True)),
-        **dict(zip(("red", "green", "blue"), (255.0 * contact_colours(contact)).round().T, strict=True)),
+        **dict(zip(("red", "green", "blue"), (255.0 * contact_colors(contact)).round().T, strict=True)),
         "probability": contact.probability,
         "cosine_distance": contact.distance,
     }
@@ -99,7 +99,7 @@ def write_contact_cloud(contact: ContactMap, path: Path) -> None:
     write_whole(path, lambda place: place.write_bytes(content), raising=EvaluationError)
 
 
-def _distance_colours(contact: ContactMap) -> Float[Tensor, "points 3"]:
+def _distance_colors(contact: ContactMap) -> Float[Tensor, "points 3"]:
     low, high = _span(contact)
     return _heat(1.0 - (contact.distance.double() - low) / (high - low))
 
@@ -115,22 +115,22 @@ def _heat(level: Float[Tensor, " points"]) -> Float[Tensor, "points 3"]:
 
 def _marked(
     points: Float[Tensor, "points 3"],
-    colours: Float[Tensor, "points 3"],
+    colors: Float[Tensor, "points 3"],
     marks: Sequence[tuple[Tensor, tuple[float, float, float]]],
 ) -> Float[Tensor, "points 3"]:
-    """Return the colours with those of the points about each mark replaced by the mark's."""
-    painted = colours.clone()
+    """Return the colors with those of the points about each mark replaced by the mark's."""
+    painted = colors.clone()
     diagonal = float((points.amax(0) - points.amin(0)).norm())
-    for place, colour in marks:
+    for place, color in marks:
         apart = (points.double() - place.double()).norm(dim=1)
         near = (apart <= max(_MARK * diagonal, float(apart.min()))).nonzero().flatten()
         ring = near[apart[near] >= 0.5 * _MARK * diagonal]
         # A ring leaves the heat in its middle visible; where points are sparse, the nearest one alone is painted.
-        painted[ring if len(ring) >= 6 else near] = torch.tensor(colour)
+        painted[ring if len(ring) >= 6 else near] = torch.tensor(color)
     return painted
 
 
 def _title(title: str, marks: Sequence[tuple[Tensor, tuple[float, float, float]]]) -> str:
-    used = {colour for _, colour in marks}
+    used = {color for _, color in marks}
     named = ((_FOUND, "blue: likeliest"), (_OTHER, "white: sounds alike"), (_TRUTH, "red: true contact"))
-    return "\n".join([title, ", ".join(words for colour, words in named if colour in used)])
+    return "\n".join([title, ", ".join(words for color, words in named if color in used)])

@@ -32,7 +32,7 @@ def draw_doubt(
     suggested: Float[Tensor, "suggested 3"] | None = None,
     directions: Float[Tensor, "suggested 3"] | None = None,
 ) -> Figure:
-    """Draw doubt (of `relative_gain_std`, 0 is certainty) on an object's points (object frame, metres), from six sides.
+    """Draw doubt (of `relative_gain_std`, 0 is certainty) on an object's points (object frame, meters), from six sides.
 
     `struck` contacts are marked by crosses, `suggested` ones by their numbers, each where it can be seen: no point is
     in front of it, and the blow, whose `directions` may be given, goes away from the eye, so that the two sides of a

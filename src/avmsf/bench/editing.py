@@ -37,7 +37,7 @@ class EditScore:
     prompt: str | None
     seed: int
     umap: Mapping[str, float]
-    """Distance to the centre of the target's cluster, by the names of the spaces; in UMAP's units."""
+    """Distance to the center of the target's cluster, by the names of the spaces; in UMAP's units."""
     octaves: Mapping[str, float]
     """The same without UMAP, in octaves."""
     spectral: float | None

@@ -70,7 +70,7 @@ _MODES = 40
 _CONTACTS, _POINTS = 16, 400
 """Struck to be recorded, and all that an edit may strike."""
 _MICROPHONE = (0.45, -0.35, 0.4)
-"""From the middle of the object, metres."""
+"""From the middle of the object, meters."""
 _SMALLEST, _LARGEST = 0.7, 1.4
 """Factors on the size that a shape is drawn in."""
 _FAINTEST_DB = -60.0
@@ -89,7 +89,7 @@ class KnownObject:
     recipe: GainRecipe = field(default_factory=MixtureEstimator)
     """How its field spreads the gains."""
     points: Float[Tensor, "points 3"] | None = None
-    """Of its surface, metres; the contacts alone where nothing else is known."""
+    """Of its surface, meters; the contacts alone where nothing else is known."""
 
     @property
     def bank(self) -> ModalBank:

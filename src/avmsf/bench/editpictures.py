@@ -58,16 +58,16 @@ def draw_edit(before: HeardModes, after: HeardModes, *, sample_rate: float, titl
     drawn = [("before", before, _INK), ("after", after, _ACCENT)]
     tops = [each.level_db(loudest).max().item() for _, each, _ in drawn if bool((each.size > 0).any())]
     top = max([0.0, *tops])
-    for name, modes, colour in drawn:
+    for name, modes, color in drawn:
         heard = (modes.size > 0).numpy()
         frequency, t60 = modes.frequency.numpy(), modes.t60.numpy()
         level = np.maximum(modes.level_db(loudest).numpy()[heard], top - _RANGE_DB)
-        levels.vlines(frequency[heard], top - _RANGE_DB, level, colors=colour, linewidths=1.2, alpha=0.7)
-        levels.plot(frequency[heard], level, "o", color=colour, markersize=4, label=name)
-        rings.plot(frequency[heard], t60[heard], "o", color=colour, markersize=4, alpha=0.8)
-        rings.plot(frequency[~heard], t60[~heard], "o", color=colour, markersize=4, mfc="none")
+        levels.vlines(frequency[heard], top - _RANGE_DB, level, colors=color, linewidths=1.2, alpha=0.7)
+        levels.plot(frequency[heard], level, "o", color=color, markersize=4, label=name)
+        rings.plot(frequency[heard], t60[heard], "o", color=color, markersize=4, alpha=0.8)
+        rings.plot(frequency[~heard], t60[~heard], "o", color=color, markersize=4, mfc="none")
     for one, other in zip(_places(before), _places(after), strict=True):
-        rings.plot([one[0], other[0]], [one[1], other[1]], color="grey", linewidth=0.5, alpha=0.5, zorder=0)
+        rings.plot([one[0], other[0]], [one[1], other[1]], color="gray", linewidth=0.5, alpha=0.5, zorder=0)
     _count(counts, drawn)
     levels.set_ylim(top - _RANGE_DB, top + 6.0)
     levels.set_ylabel("level (dB re strongest before)")
@@ -127,10 +127,10 @@ def _count(axes: Axes, drawn: list[tuple[str, HeardModes, str]]) -> None:
     if not len(both):
         return
     edges = np.arange(np.floor(both.min()), np.ceil(both.max()) + 1.5)
-    for (_, _, colour), places in zip(drawn, octaves, strict=True):
-        axes.stairs(np.histogram(places, edges)[0], 2.0 ** (edges / _BANDS), color=colour, fill=True, alpha=0.35)
+    for (_, _, color), places in zip(drawn, octaves, strict=True):
+        axes.stairs(np.histogram(places, edges)[0], 2.0 ** (edges / _BANDS), color=color, fill=True, alpha=0.35)
 
 
 def _shade(axes: Axes, start: float, highest: float) -> None:
     if highest >= start:
-        axes.axvspan(start, 1.1 * highest, color="grey", alpha=0.2, linewidth=0)
+        axes.axvspan(start, 1.1 * highest, color="gray", alpha=0.2, linewidth=0)

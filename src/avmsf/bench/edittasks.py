@@ -54,7 +54,7 @@ SIMULATED_TRANSITIONS = (Transition("ceramic", "wood"), Transition("glass", "ste
 """Those that are measured towards recordings with several seeds."""
 _RING = ("ceramic", "wood", "glass", "steel", "plastic", "iron", "polycarbonate")
 SEVEN_TRANSITIONS = tuple(Transition(*pair) for pair in zip(_RING, (*_RING[1:], _RING[0]), strict=True))
-"""Every one of the seven simulated materials is left once and reached once, by a neighbour that it contrasts with."""
+"""Every one of the seven simulated materials is left once and reached once, by a neighbor that it contrasts with."""
 
 
 @dataclass(frozen=True, eq=False)

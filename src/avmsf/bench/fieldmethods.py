@@ -57,7 +57,7 @@ class MixtureField:
 
 @dataclass(frozen=True)
 class UninformedField:
-    """A field without modal initialisation (the paper's row "w/o init"): no extracted modes and no warm-up.
+    """A field without modal initialization (the paper's row "w/o init"): no extracted modes and no warm-up.
 
     It starts from `random_modes`, with as many modes and bands of noise as the extraction has, and is trained end to
     end for as many steps as the recipe takes in all. Corrections have `correction_rate`, for here they are no

@@ -80,7 +80,7 @@ class Heard:
 def draw_spectrogram(heard: Heard, *, loudest: float | None, width: int = 240, height: int = 120) -> str:
     """Return the address of a picture of a sound: time to the right, frequency upwards on a logarithmic scale.
 
-    Colours span 80 dB below `loudest`, the largest magnitude of the recording it is compared with; None is its own.
+    Colors span 80 dB below `loudest`, the largest magnitude of the recording it is compared with; None is its own.
     """
     levels = _levels(heard, width, height)
     top = float(levels.max()) if loudest is None else loudest
@@ -108,8 +108,8 @@ def _levels(heard: Heard, width: int, height: int) -> Float64[Tensor, "height wi
 
 def _png(shades: UInt8[np.ndarray, "height width"]) -> str:
     picture = Image.fromarray(shades).convert("P")
-    colours = (colormaps["magma"](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
-    picture.putpalette(colours.tobytes())
+    colors = (colormaps["magma"](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
+    picture.putpalette(colors.tobytes())
     memory = io.BytesIO()
     picture.save(memory, format="PNG", optimize=True)
     return f"data:image/png;base64,{base64.b64encode(memory.getvalue()).decode()}"

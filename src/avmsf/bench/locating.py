@@ -54,7 +54,7 @@ class StrikeRow:
     recording: str
     method: str
     place: tuple[float, float, float] | None
-    """Where it was located, metres; None where the error is that of a random point."""
+    """Where it was located, meters; None where the error is that of a random point."""
     truth: tuple[float, float, float]
     rmed: float
     rmed_modulo: float
@@ -79,9 +79,9 @@ class LocatingScores:
     rows: tuple[StrikeRow, ...]
     """By recording, then in the order of the methods."""
     diagonal: float
-    """Of the box around the object's points, metres."""
+    """Of the box around the object's points, meters."""
     scale: float
-    """Size that contact errors are relative to in the ObjectFolder benchmark, metres; the diagonal unless told."""
+    """Size that contact errors are relative to in the ObjectFolder benchmark, meters; the diagonal unless told."""
     level: float
     """Probability of the regions."""
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -131,8 +131,8 @@ def judge_locating(
 ) -> LocatingScores:
     """Locate every strike of `test` by every method and compare.
 
-    `images` are those of the object's symmetries; `truth` is where the blows fell, metres, where that is known better
-    than by the recordings' table; `diffsound` is needed for the method of this name; `scale`, metres, is what contact
+    `images` are those of the object's symmetries; `truth` is where the blows fell, meters, where that is known better
+    than by the recordings' table; `diffsound` is needed for the method of this name; `scale`, meters, is what contact
     errors are relative to, the diagonal unless told.
     Raises EvaluationError for unknown methods, sounds at another rate than the field's, and objects without a size.
     """

@@ -34,7 +34,7 @@ class NearestSpectrum:
         return int(torch.where(self.train.sounds.any(dim=1), alike, -torch.inf).argmax())
 
     def place(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " 3"]:
-        """Return where that recording was struck, metres."""
+        """Return where that recording was struck, meters."""
         return self.train.contacts[self.row(sound)].double()
 
     @cached_property
@@ -55,8 +55,8 @@ class NearestSpectrum:
         if not float(power.max()) > 0.0:
             return torch.zeros_like(power)
         level = torch.log(power.clamp_min(_FLOOR * float(power.max())))
-        centred = level - level.mean()
-        return centred / centred.norm().clamp_min(torch.finfo(torch.float64).tiny)
+        centered = level - level.mean()
+        return centered / centered.norm().clamp_min(torch.finfo(torch.float64).tiny)
 
 
 def random_distance(points: Float[Tensor, "points 3"], right: Float[Tensor, "images 3"]) -> float:

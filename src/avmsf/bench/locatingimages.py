@@ -26,7 +26,7 @@ class Images:
     """All motions that follow from some symmetries, those about axes of any angle apart."""
 
     motions: Float64[Tensor, "motions 4 4"]
-    """Affine maps of the object frame, metres; standing still is the first."""
+    """Affine maps of the object frame, meters; standing still is the first."""
     continuous: tuple[RotationalSymmetry, ...]
     """Axes of any angle: one of them, or two that make a ball."""
 
@@ -50,7 +50,7 @@ class Images:
         return cls(torch.eye(4, dtype=torch.float64)[None], ())
 
     def at(self, place: Float[Tensor, " 3"]) -> Float64[Tensor, "images 3"]:
-        """Return the images of a place (object frame, metres), itself the first; the place itself may be repeated."""
+        """Return the images of a place (object frame, meters), itself the first; the place itself may be repeated."""
         there = place.detach().double().cpu()
         images = self.motions[:, :3, :3] @ there + self.motions[:, :3, 3]
         if not self.continuous:

@@ -26,7 +26,7 @@ from avmsf.field.config import PAPER
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.finders import ShortTime
 
-NEIGHBOURS = 3
+NEIGHBORS = 3
 """Nearest strikes that are averaged (the paper's KNN), or all where there are fewer."""
 _RECORDED = "recorded:"
 
@@ -74,7 +74,7 @@ class RecordedMethod:
 
 
 def _count(task: Task) -> int:
-    return min(NEIGHBOURS, len(task.train))
+    return min(NEIGHBORS, len(task.train))
 
 
 def _white_noise(task: Task) -> WhiteNoise:
@@ -133,13 +133,13 @@ FIELDS = (
     FieldMethod("field-unaligned", look="unaligned"),
     # All steps end to end take long enough without two trials of dampings beforehand. The noise is
     # trained, as measuring it needs the modes.
-    UninformedField("field-no-initialisation", replace(QUICK, damping="shared", noise_rate=0.1)),
+    UninformedField("field-no-initialization", replace(QUICK, damping="shared", noise_rate=0.1)),
     FieldMethod("field-no-residual", replace(QUICK, residual=False)),
     # The warm-up moves no damping, so there is nothing to choose between.
     FieldMethod("field-warmup", replace(QUICK, steps=0, damping="shared")),
     FieldMethod("paper", _PAPER, "paper", ShortTime()),
     FieldMethod("paper-positions", _PAPER, "paper-positions", ShortTime()),
-    UninformedField("paper-no-initialisation", _PAPER, look="paper", finder=ShortTime()),
+    UninformedField("paper-no-initialization", _PAPER, look="paper", finder=ShortTime()),
     FieldMethod("paper-unaligned", _PAPER, "paper-unaligned", ShortTime()),
     FieldMethod("paper-no-residual", replace(_PAPER, residual=False), "paper", ShortTime()),
     FieldMethod("paper-per-contact", replace(PAPER, damping="per-contact"), "paper", ShortTime()),
@@ -191,5 +191,5 @@ def report_of(renderer: Renderer) -> dict[str, Any]:
     if isinstance(renderer, SplineGains | DiffSound):
         return renderer.report
     if isinstance(renderer, MeanGains | MeanSpectra | MeanWaveform):
-        return {"neighbours": renderer.count}
+        return {"neighbors": renderer.count}
     return {}

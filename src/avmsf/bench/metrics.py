@@ -103,7 +103,7 @@ def default_fft_sizes(sample_rate: float) -> tuple[int, ...]:
 def relative_stft_error(predicted: Sounds, truth: Sounds, *, fft_sizes: Sequence[int]) -> PerContact:
     """Return the sums of absolute differences of STFT magnitudes, over the truth's sum, mean over FFT sizes.
 
-    Hann windows, hop a quarter of the FFT size, frames centred, silence beyond the ends. The truth's sum is the mean
+    Hann windows, hop a quarter of the FFT size, frames centered, silence beyond the ends. The truth's sum is the mean
     over all contacts given, so that the mean of the result is the ratio of the sums over all contacts: loud blows weigh
     more than faint ones, as they do to the ear. Raises EvaluationError where the truth is silence throughout.
     """

@@ -14,7 +14,7 @@ from avmsf.field.recipes import orientation_signs
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import shape_noise
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class ModalBaseline(ABC):
         """Return the modes' sound at each contact, and the noise beside it where there is any."""
         gains, quadrature = self.amplitudes_at(contacts).chunk(2, dim=1)
         samples = self.train.sounds.shape[1]
-        sounds = synthesise(
+        sounds = synthesize(
             gains,
             self.bank.frequency,
             self.bank.damping,

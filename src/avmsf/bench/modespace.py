@@ -41,7 +41,7 @@ _TOLERANCE = 1e-3
 class UmapSettings:
     """How UMAP arranges the objects; everything else as umap-learn has it."""
 
-    neighbours: int = 8
+    neighbors: int = 8
     """Objects that each one's place is decided by; one less than all where these are fewer."""
     least_distance: float = 0.1
     """How close points may come: `min_dist`."""
@@ -119,21 +119,21 @@ class MaterialSpace:
             _quieten()
             return np.asarray(self._umap.transform(vector[None]))[0]
 
-    def centre(self, material: str) -> Float[np.ndarray, " 2"]:
+    def center(self, material: str) -> Float[np.ndarray, " 2"]:
         """Return the mean of the points of a material. Raises EvaluationError with the materials there are."""
         return self.embedding[self._rows(material)].mean(axis=0)
 
     def distance(self, place: Float[np.ndarray, " 2"], material: str) -> float:
-        """Return how far a place is from a material's centre, in UMAP's units."""
-        return float(np.linalg.norm(place - self.centre(material)))
+        """Return how far a place is from a material's center, in UMAP's units."""
+        return float(np.linalg.norm(place - self.center(material)))
 
     def plain_distance(self, bank: ModalBank, material: str) -> float:
         """Return how far a set of modes is from the mean of a material's vectors, octaves, without any UMAP."""
-        centre = self.vectors[self._rows(material)].mean(axis=0)
-        return float(np.linalg.norm(self.features.vector(bank) - centre))
+        center = self.vectors[self._rows(material)].mean(axis=0)
+        return float(np.linalg.norm(self.features.vector(bank) - center))
 
     def spread(self, material: str) -> float:
-        """Return the mean distance of a material's own points from their centre, in UMAP's units."""
+        """Return the mean distance of a material's own points from their center, in UMAP's units."""
         own = self.embedding[self._rows(material)]
         return float(np.linalg.norm(own - own.mean(axis=0), axis=1).mean())
 
@@ -160,7 +160,7 @@ class MaterialSpace:
             "names": list(self.names),
             "vectors": self.vectors.tolist(),
             "embedding": embedding.tolist(),
-            "centres": {material: self.centre(material).tolist() for material in self.known},
+            "centers": {material: self.center(material).tolist() for material in self.known},
         }
 
     def save(self, path: str | Path) -> None:
@@ -217,7 +217,7 @@ class MaterialSpace:
         umap = _import_umap()
         model = umap.UMAP(
             n_components=2,
-            n_neighbors=min(self.settings.neighbours, len(self.vectors) - 1),
+            n_neighbors=min(self.settings.neighbors, len(self.vectors) - 1),
             min_dist=self.settings.least_distance,
             random_state=self.settings.seed,
             transform_seed=self.settings.seed,

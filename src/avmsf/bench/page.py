@@ -154,7 +154,7 @@ def _listening(records: Sequence[ObjectRecord], folder: Path) -> str:
     words = (
         "Each contact was not trained on. The recording comes first; all sounds of a contact are turned up alike, but "
         "for those that would clip, which are turned down to full scale. Pictures show time to the right and frequency "
-        "upwards on a logarithmic scale; colours span 80 dB below the recording's loudest point."
+        "upwards on a logarithmic scale; colors span 80 dB below the recording's loudest point."
     )
     blocks = "".join(f"<h3>{escape(title)}</h3>{''.join(each)}" for title, each in found.items())
     return f'<section id="listen"><h2>Look and listen</h2><p>{escape(words)}</p>{blocks}</section>'

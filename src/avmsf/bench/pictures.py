@@ -52,7 +52,7 @@ def draw_modes(bank: ModalBank, level_db: Float[Tensor, " modes"], *, title: str
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     frequency, level = bank.frequency.numpy(), level_db.numpy()
     bottom = 10.0 * math.floor(float(level.min()) / 10) - 5.0
-    _stems(upper, frequency, level, bottom=bottom, colour=_INK)
+    _stems(upper, frequency, level, bottom=bottom, color=_INK)
     upper.set_ylim(bottom, float(level.max()) + 0.12 * (float(level.max()) - bottom))
     upper.set_ylabel("level (dB re strongest)")
     for row in _apart(frequency, level, most=8):
@@ -60,7 +60,7 @@ def draw_modes(bank: ModalBank, level_db: Float[Tensor, " modes"], *, title: str
         upper.annotate(
             f"{frequency[row]:.4g}", place, xytext=(0, 5), textcoords="offset points", ha="center", fontsize=8
         )
-    _stems(lower, frequency, math.log(1000) / bank.damping.numpy(), bottom=0.0, colour=_ACCENT)
+    _stems(lower, frequency, math.log(1000) / bank.damping.numpy(), bottom=0.0, color=_ACCENT)
     lower.set_ylim(bottom=0.0)
     lower.set_ylabel("decay by 60 dB (s)")
     lower.set_xlabel("frequency (Hz)")
@@ -80,7 +80,7 @@ def draw_gains(
     contacts: Float[Tensor, "contacts 3"] | None = None,
     most: int = 6,
 ) -> Figure:
-    """Draw the strongest modes' signed gains on the object's points (object frame), each on its own colour scale.
+    """Draw the strongest modes' signed gains on the object's points (object frame), each on its own color scale.
 
     `contacts` are marked by crosses. An object that is flat along an axis is drawn in its plane.
     """
@@ -95,17 +95,17 @@ def draw_gains(
     marks = None if contacts is None else contacts.double().numpy()
     for number, mode in enumerate(sorted(strongest.tolist(), key=lambda mode: float(frequency[mode]))):
         values = gains[:, mode].numpy()
-        colours = {"c": values, "cmap": "RdBu_r", "vmin": -np.abs(values).max(), "vmax": np.abs(values).max()}
+        colors = {"c": values, "cmap": "RdBu_r", "vmin": -np.abs(values).max(), "vmax": np.abs(values).max()}
         place = (rows, columns, number + 1)
         if len(wide) == 2:
-            axes, drawn = _scatter_in_plane(figure, place, places, marks, wide, colours)
+            axes, drawn = _scatter_in_plane(figure, place, places, marks, wide, colors)
         else:
-            axes, drawn = _scatter_in_space(figure, place, places, marks, colours)
+            axes, drawn = _scatter_in_space(figure, place, places, marks, colors)
         axes.set_title(f"{float(frequency[mode]):.4g} Hz", fontsize=11)
         figure.colorbar(
             drawn, ax=axes, shrink=0.8 if len(wide) == 2 else 0.6, pad=0.02 if len(wide) == 2 else 0.16
         ).ax.tick_params(labelsize=8)
-    figure.suptitle(f"{title}\n(colour: signed gain, in the unit of the recordings)", fontsize=12)
+    figure.suptitle(f"{title}\n(color: signed gain, in the unit of the recordings)", fontsize=12)
     return figure
 
 
@@ -169,8 +169,8 @@ def draw_scores(scores: Mapping[str, Scores], *, metric: str = "relative_stft", 
     axes = figure.subplots()
     heights = [means[method] for method in order]
     spread = [0.0 if math.isnan(errors[method]) else errors[method] for method in order]
-    colours = [_ACCENT if method == "field" else _INK for method in order]
-    axes.barh(order, heights, xerr=spread, color=colours, alpha=0.85, capsize=3)
+    colors = [_ACCENT if method == "field" else _INK for method in order]
+    axes.barh(order, heights, xerr=spread, color=colors, alpha=0.85, capsize=3)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.set_xlim(0.5 * min(heights), 2 * max(heights))
@@ -189,10 +189,10 @@ def draw_scores(scores: Mapping[str, Scores], *, metric: str = "relative_stft", 
     return figure
 
 
-def _stems(axes: Axes, places: np.ndarray, heights: np.ndarray, *, bottom: float, colour: str) -> None:
+def _stems(axes: Axes, places: np.ndarray, heights: np.ndarray, *, bottom: float, color: str) -> None:
     marks, lines, base = axes.stem(places, heights, bottom=bottom)
-    marks.set(color=colour, markersize=4)
-    lines.set(color=colour, linewidth=1)
+    marks.set(color=color, markersize=4)
+    lines.set(color=color, linewidth=1)
     base.set_visible(False)
 
 
@@ -211,13 +211,13 @@ def _scatter_in_plane(
     points: np.ndarray,
     marks: np.ndarray | None,
     wide: Sequence[int],
-    colours: dict[str, Any],
+    colors: dict[str, Any],
 ) -> tuple[Any, Any]:
     axes = figure.add_subplot(*place)
     across, along = (points[:, axis] for axis in wide)
     # Dots about twice as wide as their distance, if they fill the picture's 3 inches, so that they close to a surface.
     size = 216 * 2.2 / np.sqrt(len(points) * np.ptp(across) / np.ptp(along))
-    drawn = axes.scatter(across, along, s=size**2, marker="s", linewidths=0, rasterized=True, **colours)
+    drawn = axes.scatter(across, along, s=size**2, marker="s", linewidths=0, rasterized=True, **colors)
     if marks is not None:
         axes.plot(marks[:, wide[0]], marks[:, wide[1]], "kx", markersize=5)
     axes.set_aspect("equal")
@@ -227,10 +227,10 @@ def _scatter_in_plane(
 
 
 def _scatter_in_space(
-    figure: Figure, place: tuple[int, int, int], points: np.ndarray, marks: np.ndarray | None, colours: dict
+    figure: Figure, place: tuple[int, int, int], points: np.ndarray, marks: np.ndarray | None, colors: dict
 ) -> tuple[Any, Any]:
     axes = figure.add_subplot(*place, projection="3d")
-    drawn = axes.scatter(points[:, 0], points[:, 1], points[:, 2], s=4, linewidths=0, rasterized=True, **colours)
+    drawn = axes.scatter(points[:, 0], points[:, 1], points[:, 2], s=4, linewidths=0, rasterized=True, **colors)
     if marks is not None:
         axes.scatter(marks[:, 0], marks[:, 1], marks[:, 2], c="black", marker="x", s=20, depthshade=False)
     axes.set_box_aspect(np.maximum(np.ptp(points, axis=0), 0.15 * np.ptp(points, axis=0).max()), zoom=1.3)

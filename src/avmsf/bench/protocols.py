@@ -38,7 +38,7 @@ _CURVES = (
 )
 """Methods that take part, where no others are asked for: those that need no pictures of the object. All but
 the network, `field-positions`, take seconds for each figure."""
-_ABLATED = ("field-positions", "field-no-initialisation", "field-unaligned", "field-no-residual")
+_ABLATED = ("field-positions", "field-no-initialization", "field-unaligned", "field-no-residual")
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ PROTOCOLS = {
         ),
         EvaluationProtocol(
             "ablation",
-            "Leave out one part of the field at a time: looks, initialisation, alignment, residual.",
+            "Leave out one part of the field at a time: looks, initialization, alignment, residual.",
             Farthest(),
             (BASELINE, "field", *_ABLATED),
             subset="ablation",

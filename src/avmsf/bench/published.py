@@ -69,7 +69,7 @@ PUBLISHED = (
         (
             _row("AV-MSF", "paper", 0.019, 0.927, 0.015, 2.00e-4),
             _row("without visual", "paper-positions", 0.028, 1.148, 0.015, 4.20e-4),
-            _row("without initialisation", "paper-no-initialisation", 0.045, 1.077, 0.026, 2.97e-4),
+            _row("without initialization", "paper-no-initialization", 0.045, 1.077, 0.026, 2.97e-4),
             _row("without alignment", "paper-unaligned", 0.019, 1.002, 0.016, 2.62e-4),
             _row("without residual", "paper-no-residual", 0.031, 5.764, 0.026, 3.22e-4),
         ),

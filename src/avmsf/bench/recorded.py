@@ -24,7 +24,7 @@ class Recorded:
     folder: Path
     """Holds the object's files."""
     contacts: Float[Tensor, "contacts 3"]
-    """Contacts of the object's recordings, metres."""
+    """Contacts of the object's recordings, meters."""
     names: tuple[str, ...]
     """The recordings' names, row for row."""
     sample_rate: float
@@ -60,7 +60,7 @@ class Recorded:
         return torch.stack(sounds) if sounds else torch.zeros(0, self.samples)
 
     def _find(self, contact: Float[Tensor, "3"]) -> Path:
-        # Contacts that went through float32 are still the same places; a micrometre is far below any two's distance.
+        # Contacts that went through float32 are still the same places; a micrometer is far below any two's distance.
         rows = torch.nonzero((self.contacts.double() - contact.double()).norm(dim=1) < 1e-6).flatten().tolist()
         if not rows:
             place = ", ".join(f"{value:g}" for value in contact.tolist())

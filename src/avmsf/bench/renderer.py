@@ -21,7 +21,7 @@ class Renderer(Protocol):
     def render(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Float[Tensor, "contacts samples"]:
-        """Return the sound of a blow at each contact (object frame, metres), in the unit of the training sounds.
+        """Return the sound of a blow at each contact (object frame, meters), in the unit of the training sounds.
 
         `directions`, unit vectors along which the hammer moves, are for those to heed who know of directions.
         """

@@ -12,7 +12,7 @@ from avmsf.bench.page import heard_contacts, page
 from avmsf.bench.pictures import save_picture
 from avmsf.bench.reporttables import Section, sections
 from avmsf.bench.results import ObjectRecord, ResultsFolder, write_json
-from avmsf.bench.summary import summarise, times_of
+from avmsf.bench.summary import summarize, times_of
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
 from avmsf.plotting.spectrograms import draw_method_spectrograms
@@ -28,7 +28,7 @@ _RECORDED = "recorded"
 def write_summary(results: ResultsFolder, *, subsets: Mapping[str, frozenset[str]]) -> dict[str, Any]:
     """Write `summary.json`, `times.json` and `report.md` of what the folder holds by now, and return the summary."""
     records, identity = results.records(), results.identity()
-    summary = summarise(records, identity, subsets=subsets)
+    summary = summarize(records, identity, subsets=subsets)
     write_json(results.path / SUMMARY, summary)
     write_json(results.path / TIMES, times_of(records))
     _write_text(results.path / TABLES, markdown(sections(records, identity, subsets=subsets)))

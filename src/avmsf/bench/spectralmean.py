@@ -49,13 +49,13 @@ class MeanSpectra:
         sounds = [self._mean(self.train.sounds[each]) for each in rows]
         return torch.stack(sounds) if sounds else self.train.sounds[:0]
 
-    def _mean(self, sounds: Float[Tensor, "neighbours samples"]) -> Float[Tensor, " samples"]:
+    def _mean(self, sounds: Float[Tensor, "neighbors samples"]) -> Float[Tensor, " samples"]:
         spectra = self._transform(sounds)
         mixed = torch.polar(spectra.abs().mean(dim=0), spectra[0].angle())
         size = self._size
         return torch.istft(mixed, size, size // 4, window=self._window(sounds), center=True, length=sounds.shape[1])
 
-    def _transform(self, sounds: Float[Tensor, "neighbours samples"]) -> Complex[Tensor, "neighbours bins frames"]:
+    def _transform(self, sounds: Float[Tensor, "neighbors samples"]) -> Complex[Tensor, "neighbors bins frames"]:
         size = self._size
         return torch.stft(
             sounds,
@@ -71,5 +71,5 @@ class MeanSpectra:
     def _size(self) -> int:
         return 4 * max(1, round(scaled_fft_size(self.fft_size, sample_rate=self.sample_rate) / 4))
 
-    def _window(self, sounds: Float[Tensor, "neighbours samples"]) -> Float[Tensor, " size"]:
+    def _window(self, sounds: Float[Tensor, "neighbors samples"]) -> Float[Tensor, " size"]:
         return torch.hann_window(self._size, dtype=sounds.dtype, device=sounds.device)

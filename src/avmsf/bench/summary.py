@@ -108,7 +108,7 @@ def ratios_of_means(table: Table) -> dict[str, dict[str, float]]:
     }
 
 
-def summarise(
+def summarize(
     records: Sequence[ObjectRecord], identity: Mapping[str, Any], *, subsets: Mapping[str, frozenset[str]] | None = None
 ) -> dict[str, Any]:
     """Return all figures as plain values, of which the same records always give the same.

@@ -17,7 +17,7 @@ _MILLIMETERS = 1000.0
 
 
 def draw_surface(surface: Surface, *, title: str) -> Figure:
-    """Draw a surface of triangles (object frame, metres), and its cuts through the middle of its box, in millimeters.
+    """Draw a surface of triangles (object frame, meters), and its cuts through the middle of its box, in millimeters.
 
     One cut is along x and z, one along y and z: walls and cavities of what stands upright show in both. Raises
     EvaluationError for a surface without triangles.

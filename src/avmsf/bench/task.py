@@ -44,7 +44,7 @@ class Task:
     train: Impacts
     """The blows to learn from."""
     contacts: Float[Tensor, "contacts 3"]
-    """Contacts of all the object's blows, training and test alike, metres."""
+    """Contacts of all the object's blows, training and test alike, meters."""
     names: tuple[str, ...]
     """Names of their recordings, row for row."""
     seed: int

@@ -19,7 +19,7 @@ class Camera:
     """
 
     world_to_camera: Float[Tensor, "4 4"]
-    """Rigid transform of the object frame, metres, into the camera's; float64."""
+    """Rigid transform of the object frame, meters, into the camera's; float64."""
     focal: tuple[float, float]
     """Focal lengths along x and y, pixels."""
     principal: tuple[float, float]
@@ -66,7 +66,7 @@ class Camera:
 
     @cached_property
     def position(self) -> Float[Tensor, " 3"]:
-        """The camera's place in the object frame, metres."""
+        """The camera's place in the object frame, meters."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
     @cached_property
@@ -78,7 +78,7 @@ class Camera:
         )
 
     def project(self, points: Float[Tensor, "points 3"]) -> tuple[Float[Tensor, "points 2"], Float[Tensor, " points"]]:
-        """Return the points' places in the image, pixels, and their depths along the optical axis, metres; float64.
+        """Return the points' places in the image, pixels, and their depths along the optical axis, meters; float64.
 
         A point at or behind the camera has no place: its pixels are NaN.
         """

@@ -194,7 +194,7 @@ def _write_files(capture: Capture, folder: Path, *, onsets_within: float | None)
         f'name = "{name}"\n'
         f"seconds = {seconds!r}\n"
         f"playback_speed = {speed!r}\n"
-        f'normalise = "{"none" if impacts.forces is None else "done"}"\n'
+        f'normalize = "{"none" if impacts.forces is None else "done"}"\n'
         + ("align = false\n" if onsets_within is None else ""),
         encoding="utf-8",
     )

@@ -29,7 +29,7 @@ class Impacts:
     """Blows on one object, one row a blow, all at one sample rate and of one length."""
 
     contacts: Float[Tensor, "contacts 3"]
-    """Contact points in the object frame, metres; read in float64, so that equal distances stay equal."""
+    """Contact points in the object frame, meters; read in float64, so that equal distances stay equal."""
     sounds: Float[Tensor, "contacts samples"]
     """Response to each blow, starting at its onset; per newton where the forces are known, else as recorded."""
     sample_rate: float

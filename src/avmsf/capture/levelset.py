@@ -24,7 +24,7 @@ def enclose(
 ) -> Surface:
     """Return the closed surface around all that is above `level` on a grid, triangles counter-clockwise from outside.
 
-    `lowest` is the place of the first value and `spacing` the distance between two, metres; the values at the grid's
+    `lowest` is the place of the first value and `spacing` the distance between two, meters; the values at the grid's
     edge must be below the level. Parts much smaller than the largest are left out. With `faces` the surface is made
     coarser until it has at most so many triangles, twice or four times as many where fewer would pinch it open. Raises
     CaptureError where nothing or everything is above the level.

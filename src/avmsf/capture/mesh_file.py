@@ -31,7 +31,7 @@ MAX_CORNERS = 1_000
 """Corners of one polygon. Modeling programs write caps of at most some hundreds; a polygon of more is cut into
 triangles without area."""
 MAX_COORDINATE = 1e9
-"""Largest coordinate, in the file's unit: a kilometre in micrometres. Its cube is an ordinary number in float32."""
+"""Largest coordinate, in the file's unit: a kilometer in micrometers. Its cube is an ordinary number in float32."""
 MAX_TEXTURE_PIXELS = 3 * 8192**2
 """Pixels of all textures: three pictures of 8192 x 8192, the largest that graphics cards of all makes take. 0.6 GB."""
 _MAX_VALUES = 12 * MAX_FACES

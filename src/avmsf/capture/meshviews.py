@@ -31,8 +31,8 @@ class Lighting:
     """Light on a matte surface: some from everywhere, some from a sky, a half sphere of even brightness.
 
     A face that leans by an angle t from the middle of the sky sees (1 + cos t) / 2 of it, so that no side of an object
-    is dark. The light stays with the object, so that a place has one colour in all views. Both are factors of the
-    surface's colour as displayed.
+    is dark. The light stays with the object, so that a place has one color in all views. Both are factors of the
+    surface's color as displayed.
     """
 
     ambient: float = 0.4
@@ -46,7 +46,7 @@ class Lighting:
 
 MATTE = Lighting()
 UNLIT = Lighting(ambient=1.0, sky=0.0)
-"""The surface's own colours (albedo)."""
+"""The surface's own colors (albedo)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Sight:
     faces: Int[Tensor, "height width"]
     """Row of the mesh's faces; -1 where there is none."""
     depth: Float[Tensor, "height width"]
-    """Metres along the optical axis; infinite where there is no face."""
+    """Meters along the optical axis; infinite where there is no face."""
     normals: Float[Tensor, "height width 3"]
     """Smooth unit normals in the object frame, turned towards the camera; zero where there is no face."""
 
@@ -75,7 +75,7 @@ class MeshTracer:
         self.coordinates = mesh.coordinates.numpy()
         self.materials = mesh.materials.numpy()
         self.atlas = TextureAtlas([texture.numpy() for texture in mesh.textures])
-        self.texels = self._texels_per_metre()
+        self.texels = self._texels_per_meter()
         self.scene = EmbreeScene()
         placed = ((vertices - self.middle) / self.size).astype(np.float32)
         TriangleMesh(self.scene, placed, self.faces.astype(np.int32))
@@ -173,9 +173,9 @@ class MeshTracer:
         return normals * -np.where(towards == 0, 1, towards) / np.maximum(length, 1e-30)
 
     def _colors(self, hits: "_Hits", camera: Camera, lighting: Lighting) -> np.ndarray:
-        """Return the colour of each hit, 0 to 1."""
+        """Return the color of each hit, 0 to 1."""
         places = np.einsum("nca,nc->na", self.coordinates[hits.faces], hits.weights)
-        # Size of a ray's neighbourhood on a face that looks at the camera; one that leans shows more.
+        # Size of a ray's neighborhood on a face that looks at the camera; one that leans shows more.
         spans = hits.depth / min(camera.focal) * self.texels[hits.faces]
         colors = self.atlas.look_up(places, self.materials[hits.faces], spans=spans)
         colors *= np.einsum("nca,nc->na", self.colors[hits.faces], hits.weights)
@@ -186,8 +186,8 @@ class MeshTracer:
             colors *= lighting.ambient
         return colors
 
-    def _texels_per_metre(self) -> np.ndarray:
-        """Return how many texels lie side by side on a metre of each face, [faces]."""
+    def _texels_per_meter(self) -> np.ndarray:
+        """Return how many texels lie side by side on a meter of each face, [faces]."""
         corners = self.vertices[self.faces]
         doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         pixels = self.coordinates * self.atlas.sizes[self.materials][:, None]
@@ -207,7 +207,7 @@ class _Hits:
     """How much of each of the face's corners, [hits, 3]."""
     directions: np.ndarray
     depth: np.ndarray
-    """Metres along the optical axis."""
+    """Meters along the optical axis."""
 
 
 def render_views(
@@ -258,7 +258,7 @@ def orbit_cameras(
     """Return cameras on circles around an object that all look at the middle of its bounding box.
 
     As the defaults stand, the 72 views of ObjectFolder's scans: three elevations, degrees, of 24 azimuths each, square
-    images of `size` pixels that span 60 degrees. `distance` counts object units. A unit is `unit` metres, or, where
+    images of `size` pixels that span 60 degrees. `distance` counts object units. A unit is `unit` meters, or, where
     that is not given, such that the bounding box reaches `RADIUS` units from its middle to its corners: the sphere
     around the object then spans 87 % of the image. Raises CaptureError for an object without extent, and for an
     elevation straight along `up`.

@@ -48,9 +48,9 @@ class Mistake:
     axes: Float[Tensor, "3 3"]
     """A permutation with signs; float64."""
     shift: Float[Tensor, " 3"]
-    """Metres; float64."""
+    """Meters; float64."""
     distance: float = 0.0
-    """Metres within which nine of ten contacts lie off the surface once it is undone."""
+    """Meters within which nine of ten contacts lie off the surface once it is undone."""
 
     def undo(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts 3"]:
         """Return where the contacts were meant, float64."""
@@ -67,7 +67,7 @@ class Mistake:
             ratio = self.factor if self.factor > 1 else 1 / self.factor
             steps.append(f"{'multiplied' if self.factor > 1 else 'divided'} by {ratio:.4g}")
             size, whose = (self.factor, "their unit") if self.factor < 1 else (1 / self.factor, "the surface's unit")
-            named = [name for metres, name in UNITS.items() if abs(size / metres - 1) < 1e-6]
+            named = [name for meters, name in UNITS.items() if abs(size / meters - 1) < 1e-6]
             questions.append(f"is {whose} {named[0]}?" if named else "do they and the surface count one unit?")
         if not torch.equal(self.axes, torch.eye(3, dtype=torch.float64)):
             steps.append(f"with (x, y, z) taken as {_written(self.axes)}")
@@ -85,13 +85,13 @@ class Placement:
     """How contacts lie to a surface."""
 
     distances: Float[Tensor, " contacts"]
-    """From each contact to the surface's nearest point, metres, float64."""
+    """From each contact to the surface's nearest point, meters, float64."""
     diagonal: float
-    """Of the object's bounding box, metres."""
+    """Of the object's bounding box, meters."""
     spread: float
-    """Diagonal of the contacts' bounding box, metres."""
+    """Diagonal of the contacts' bounding box, meters."""
     tolerance: float
-    """Metres up to which a contact counts as on the surface: `TOLERANCE`, or more where the points are sparse."""
+    """Meters up to which a contact counts as on the surface: `TOLERANCE`, or more where the points are sparse."""
     mistake: Mistake | None = None
     """What would explain contacts off the surface; None where they lie on it, or nothing simple explains them."""
 
@@ -193,7 +193,7 @@ def expect_placed(
 ) -> None:
     """Raise FitError where contacts are not on a surface, with the transform that would bring them onto it.
 
-    `points` are all over the surface, as `surface_points` has them; both in metres. Contacts are not on it where a
+    `points` are all over the surface, as `surface_points` has them; both in meters. Contacts are not on it where a
     mistake made with all of them explains that, of unit, axes or origin, and where half of them lie farther off than
     `Placement.tolerance`: rough surfaces, glue and single wrong rows pass. `names` are for the message.
     """
@@ -203,7 +203,7 @@ def expect_placed(
     if placement.mistake is None:
         advice = "; bring both into one frame, or take a gain model without elastic mode shapes"
     elif placement.mistake.unit_only:
-        advice = " State each one's unit, as unit and surface_unit in capture.toml do, or give both in metres"
+        advice = " State each one's unit, as unit and surface_unit in capture.toml do, or give both in meters"
     else:
         advice = " Undo this in one of the two, or take a gain model without elastic mode shapes"
     raise FitError(f"elastic mode shapes need contacts on their surface, and {placement.describe(names)}{advice}")
@@ -310,7 +310,7 @@ def _ratio(value: float) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
 
 
-def _length(metres: float) -> str:
-    if metres < 0.01:
-        return f"{metres * 1e3:.2g} mm"
-    return f"{metres:.3g} m"
+def _length(meters: float) -> str:
+    if meters < 0.01:
+        return f"{meters * 1e3:.2g} mm"
+    return f"{meters:.3g} m"

@@ -40,11 +40,11 @@ class Prepared:
 
 
 def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float | None = None) -> Prepared:
-    """Align and normalise one recording as the settings say; `newtons` is the peak force that the table gives.
+    """Align and normalize one recording as the settings say; `newtons` is the peak force that the table gives.
 
     The result keeps everything after the onset; how much of it a capture keeps depends on all its recordings.
     Raises `CaptureError` for rates outside 100 Hz to 192 kHz, silence, peaks outside `MIN_PEAK` to `MAX_PEAK`, and
-    normalisations that lack their force.
+    normalizations that lack their force.
     """
     refuse_rate(recording.sample_rate * settings.playback_speed, recording.name)
     sound = recording.response(settings.response_channel, force_channel=settings.force_channel)
@@ -61,15 +61,15 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
             newtons = abs(pulse.height * settings.force_scale)
     elif settings.align:
         onset = find_onset(sound, sample_rate=recording.sample_rate)
-    manner = settings.normalise
+    manner = settings.normalize
     if manner == "auto":
         manner = "none" if newtons is None else "peak"
     if manner == "peak" and newtons is None:
         raise CaptureError(
-            f'{recording.name}: normalise = "peak" needs a force: give force_newtons in impacts.csv, or a force_channel'
+            f'{recording.name}: normalize = "peak" needs a force: give force_newtons in impacts.csv, or a force_channel'
         )
     if manner == "deconvolve" and pulse is not None:
-        before, kept = deconvolve(sound, force, pulse=pulse, regularisation=settings.regularisation)
+        before, kept = deconvolve(sound, force, pulse=pulse, regularization=settings.regularization)
     else:
         before, kept = np.split(sound, [onset if settings.align else 0])
     if settings.from_peaks:
@@ -149,12 +149,12 @@ def deconvolve(
     force: Float64[np.ndarray, " frames"],
     *,
     pulse: Pulse,
-    regularisation: float,
+    regularization: float,
 ) -> tuple[Float64[np.ndarray, " lead"], Float64[np.ndarray, " samples"]]:
     """Return the response to a force of one sample's length and of the recorded pulse's height, before and from it on.
 
     With F and X the spectra of force and sound from just before the blow on, zero-padded so that nothing wraps
-    round, and e the regularisation, the response has the spectrum
+    round, and e the regularization, the response has the spectrum
 
         H = X conj(F) / (|F|^2 + e max |F|^2),
 
@@ -171,7 +171,7 @@ def deconvolve(
     size = next_fast_len(len(later) + len(isolated), real=True)
     push, heard = rfft(isolated / pulse.height, size), rfft(later, size)
     power = np.abs(push) ** 2
-    whole = irfft(heard * push.conj() / (power + regularisation * power.max()), size)
+    whole = irfft(heard * push.conj() / (power + regularization * power.max()), size)
     # What the last samples hold of the response is the part of the push that came before its peak.
     # The zeros keep negative times, of which there are at most the window's length, apart from these.
     return whole[size - (pulse.start - begin) :], whole[: len(sound) - pulse.peak]

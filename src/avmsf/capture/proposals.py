@@ -165,7 +165,7 @@ def channel_figures(recording: Recording) -> Float64[np.ndarray, "2 channels"]:
 
 
 class Evidence:
-    """What the recordings of a folder show about `normalise`, `highpass` and `align`, added one after the other."""
+    """What the recordings of a folder show about `normalize`, `highpass` and `align`, added one after the other."""
 
     def __init__(self, settings: CaptureSettings) -> None:
         self.settings = settings
@@ -205,17 +205,17 @@ class Evidence:
         """Return what all recordings together show."""
         if len(self._rates) != 1 or len(self._starts) < 2:
             return []
-        found = (self._normalise(), self._highpass(), self._align())
+        found = (self._normalize(), self._highpass(), self._align())
         return [each for each in found if each is not None]
 
-    def _normalise(self) -> Proposal | None:
+    def _normalize(self) -> Proposal | None:
         """Propose "none" where dividing by the force makes levels differ more, significantly.
 
         With b the slope of the level over the force, both in dB, the division leaves less variance where b > .5 and
         more where b < .5. Levels are compared within repeated impacts where these suffice, else over all contacts,
         whose own differences are then the noise of the regression.
         """
-        if self.settings.normalise != "auto" or len(self._struck) != len(self._starts):
+        if self.settings.normalize != "auto" or len(self._struck) != len(self._starts):
             return None
         force, level = np.array([(decibels(push), decibels(peak)) for _, push, peak in self._struck]).T
         places = [(*(round(value, 6) for value in each.contact), each.direction) for each, _, _ in self._struck]
@@ -233,7 +233,7 @@ class Evidence:
         if slope - error * float(stdtrit(freedom, SIGNIFICANCE)) >= 0.5:
             return None
         return Proposal(
-            "normalise",
+            "normalize",
             "none",
             f"The forces do not go with the loudness: 10 dB more force made the recordings {10 * slope:+.1f} dB louder "
             f"(standard error {10 * error:.1f} dB), so that dividing by them would make levels differ more.",

@@ -15,7 +15,7 @@ from avmsf.errors import CaptureError
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 USUAL_SECONDS = 3.0
 TIME_ZEROS = ("onset", "peak")
-NORMALISATIONS = ("auto", "peak", "deconvolve", "none", "done")
+NORMALIZATIONS = ("auto", "peak", "deconvolve", "none", "done")
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class CaptureSettings:
     playback_speed: float = 1.0
     """The capture's sample rate is the files' rate times this; nothing is resampled. Above 1, slow vibrations sound
     as a smaller object would."""
-    normalise: str = "auto"
+    normalize: str = "auto"
     """peak: divide by the peak force. deconvolve: divide the spectrum by the force's. none: leave as recorded. done:
     the files are divided already, by the force_newtons that the table keeps, where it has them. auto: peak where a
     force is known by channel or column, else none."""
-    regularisation: float = 1e-4
+    regularization: float = 1e-4
     """For deconvolve: the power, relative to the greatest of the force's spectrum, below which the force counts as
     absent. Larger is quieter and duller."""
     highpass: float = 0.0
@@ -69,7 +69,7 @@ class CaptureSettings:
         for key in ("unit", "surface_unit", "views_unit"):
             if getattr(self, key) not in (*METRES, *((None,) if key == "surface_unit" else ())):
                 raise CaptureError(f"{key} is {getattr(self, key)!r}; expected one of {', '.join(METRES)}")
-        for key in ("seconds", "playback_speed", "regularisation"):
+        for key in ("seconds", "playback_speed", "regularization"):
             value = getattr(self, key)
             if value is not None and not (value > 0 and math.isfinite(value)):
                 raise CaptureError(f"{key} is {value!r}; expected a number above 0")
@@ -85,10 +85,10 @@ class CaptureSettings:
             raise CaptureError(f"force_channel and response_channel are both {self.force_channel}")
         if self.time_zero not in TIME_ZEROS:
             raise CaptureError(f"time_zero is {self.time_zero!r}; expected one of {', '.join(TIME_ZEROS)}")
-        if self.normalise not in NORMALISATIONS:
-            raise CaptureError(f"normalise is {self.normalise!r}; expected one of {', '.join(NORMALISATIONS)}")
-        if self.normalise == "deconvolve" and self.force_channel is None:
-            raise CaptureError('normalise = "deconvolve" needs the hammer\'s pulse: say which force_channel holds it')
+        if self.normalize not in NORMALIZATIONS:
+            raise CaptureError(f"normalize is {self.normalize!r}; expected one of {', '.join(NORMALIZATIONS)}")
+        if self.normalize == "deconvolve" and self.force_channel is None:
+            raise CaptureError('normalize = "deconvolve" needs the hammer\'s pulse: say which force_channel holds it')
 
     def kept_seconds(self, rate: float) -> float:
         """Return how many seconds are kept from the onset of files of this sample rate, Hz.
@@ -104,18 +104,18 @@ class CaptureSettings:
         return self.align and self.time_zero == "peak"
 
     @property
-    def metres(self) -> float:
-        """Metres in one unit of the contacts' coordinates."""
+    def meters(self) -> float:
+        """Meters in one unit of the contacts' coordinates."""
         return METRES[self.unit]
 
     @property
-    def surface_metres(self) -> float:
-        """Metres in one unit of the surface's coordinates."""
+    def surface_meters(self) -> float:
+        """Meters in one unit of the surface's coordinates."""
         return METRES[self.surface_unit or self.unit]
 
     @property
-    def views_metres(self) -> float:
-        """Metres in one unit of the cameras' positions."""
+    def views_meters(self) -> float:
+        """Meters in one unit of the cameras' positions."""
         return METRES[self.views_unit]
 
     @classmethod

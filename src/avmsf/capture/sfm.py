@@ -281,7 +281,7 @@ def _refuse_few(models: Sequence[dict[str, Any]], everything: Sequence[str], *, 
     apart = f"; they fall into {len(models)} groups that could not be joined" if len(models) > 1 else ""
     raise CaptureError(
         f"{images}: only {len(registered)} of {len(everything)} photographs got a camera{apart}; without one: "
-        f"{_some(lacking)}: photograph the object sharply from closer neighbouring places (10 to 15 degrees apart), "
+        f"{_some(lacking)}: photograph the object sharply from closer neighboring places (10 to 15 degrees apart), "
         "with a patterned, unmoved ground in view"
     )
 

@@ -25,7 +25,7 @@ class Surface:
     """Triangles, or points alone."""
 
     vertices: Float[Tensor, "points 3"]
-    """Object frame, metres."""
+    """Object frame, meters."""
     faces: Int[Tensor, "faces 3"]
     """Rows of `vertices` at the corners of each triangle; no rows for a point cloud."""
 
@@ -48,9 +48,9 @@ class Surface:
         return cls(places, corners)
 
     @classmethod
-    def read(cls, path: str | Path, *, metres: float = 1.0) -> "Surface":
+    def read(cls, path: str | Path, *, meters: float = 1.0) -> "Surface":
         """Read a mesh or a point cloud, see `read_surface`. Raises CaptureError for a file without points."""
-        return read_surface(path, metres=metres)
+        return read_surface(path, meters=meters)
 
     def write(self, path: str | Path) -> None:
         """Write a binary PLY file in meters."""
@@ -61,8 +61,8 @@ class Surface:
         return f"Surface({len(self.vertices)} vertices, {len(self.faces)} triangles, {size} m)"
 
 
-def read_surface(path: str | Path, *, metres: float = 1.0) -> Surface:
-    """Read a mesh or a point cloud whose coordinates count `metres` each; vertices keep the file's order.
+def read_surface(path: str | Path, *, meters: float = 1.0) -> Surface:
+    """Read a mesh or a point cloud whose coordinates count `meters` each; vertices keep the file's order.
 
     A scene of several parts becomes one surface. `CaptureError` as `load_mesh`, and where it holds no points.
     """
@@ -76,7 +76,7 @@ def read_surface(path: str | Path, *, metres: float = 1.0) -> Surface:
     joined = np.concatenate(vertices)
     if not len(joined):
         raise CaptureError(f"{path}: holds no points: export the surface again")
-    return Surface(torch.from_numpy((joined * metres).astype(np.float32)), torch.from_numpy(np.concatenate(faces)))
+    return Surface(torch.from_numpy((joined * meters).astype(np.float32)), torch.from_numpy(np.concatenate(faces)))
 
 
 def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
@@ -92,11 +92,11 @@ def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
 def find_surface(folder: Path, settings: CaptureSettings) -> Surface | None:
     """Read what `find_surface_file` finds; None where it finds nothing."""
     path = find_surface_file(folder, settings)
-    return None if path is None else read_surface(path, metres=settings.surface_metres)
+    return None if path is None else read_surface(path, meters=settings.surface_meters)
 
 
 def write_surface(surface: Surface, path: Path, *, kind: SurfaceKind = "ply") -> None:
-    """Write a surface in metres: as a binary PLY, which holds float32 coordinates to the last bit, as OBJ or as GLB."""
+    """Write a surface in meters: as a binary PLY, which holds float32 coordinates to the last bit, as OBJ or as GLB."""
     vertices, faces = surface.vertices.numpy(), surface.faces.numpy()
     cloud = not len(faces)
     shape = trimesh.PointCloud(vertices) if cloud else trimesh.Trimesh(vertices, faces, process=False)  # type: ignore[no-untyped-call]

@@ -21,7 +21,7 @@ MAX_ROWS = 10_000
 MIN_FORCE_NEWTONS, MAX_FORCE_NEWTONS = 1e-6, 1e6
 """Peak forces that a row may give: from a grain of dust to the largest impact hammers (2e4 N) and beyond."""
 FARTHEST = 100.0
-"""Metres from the origin beyond which a contact cannot be meant."""
+"""Meters from the origin beyond which a contact cannot be meant."""
 HOW_TO_WRITE = (
     f"{TABLE} has the header line file,x,y,z (and if known nx,ny,nz,force_newtons) and one row a recording, "
     "for example: 001.wav,0.12,0.05,0.30. Without recordings, avmsf fit --material NAME guesses a field from the shape"
@@ -48,7 +48,7 @@ class Strike:
     """Path of the wav file inside the capture folder, with forward slashes."""
     line: int
     contact: tuple[float, float, float]
-    """Metres."""
+    """Meters."""
     direction: tuple[float, float, float] | None
     """Unit vector."""
     newtons: float | None
@@ -104,12 +104,12 @@ def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
 
 
 def understand(row: Row, settings: CaptureSettings) -> Strike:
-    """Turn one row into a contact in metres, a unit direction and a force; `CaptureError` names the line and value."""
+    """Turn one row into a contact in meters, a unit direction and a force; `CaptureError` names the line and value."""
     where = f"{TABLE} line {row.line}"
     written = [_number(row, name) for name in ("x", "y", "z")]
-    contact = [value * settings.metres for value in written]
+    contact = [value * settings.meters for value in written]
     farthest = max(written, key=abs)
-    if abs(farthest) * settings.metres > FARTHEST:
+    if abs(farthest) * settings.meters > FARTHEST:
         raise CaptureError(
             f"{where}: the contact ({', '.join(row.cells[name] for name in ('x', 'y', 'z'))}) lies "
             f"{math.hypot(*contact):.4g} m away (unit = {settings.unit!r}): {fitting_units(abs(farthest))}"
@@ -145,7 +145,7 @@ def fitting_units(written: float) -> str:
     fitting = [(unit, written * size) for unit, size in METRES.items() if 0.01 <= written * size <= 5]
     if not fitting:
         return "no unit would make that an object one can strike: mend the row"
-    choices = " or ".join(f'unit = "{unit}" ({metres:.3g} m)' for unit, metres in fitting)
+    choices = " or ".join(f'unit = "{unit}" ({meters:.3g} m)' for unit, meters in fitting)
     return f"write in capture.toml what the numbers count: {choices}"
 
 

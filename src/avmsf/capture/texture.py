@@ -1,4 +1,4 @@
-"""Colours looked up in texture images, smaller copies of which serve where a pixel spans many texels."""
+"""Colors looked up in texture images, smaller copies of which serve where a pixel spans many texels."""
 
 from collections.abc import Sequence
 
@@ -21,7 +21,7 @@ class TextureAtlas:
         *,
         spans: Float[np.ndarray, " samples"],
     ) -> Float[np.ndarray, "samples 3"]:
-        """Return the colours, 0 to 1, at places u (right) and v (up), by bilinear interpolation between texels.
+        """Return the colors, 0 to 1, at places u (right) and v (up), by bilinear interpolation between texels.
 
         `spans` says how many texels of the full image lie side by side under a sample; the copy is read in which that
         is between one and two.

@@ -1,4 +1,4 @@
-"""A triangle mesh with its colours, as scanners and modelling programs write it: obj, ply, glb or stl."""
+"""A triangle mesh with its colors, as scanners and modelling programs write it: obj, ply, glb or stl."""
 
 import math
 import re
@@ -20,8 +20,8 @@ from avmsf.capture.surface import Surface
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
 
-GREY = 0.7
-"""Brightness of what has no colour, 0 to 1."""
+GRAY = 0.7
+"""Brightness of what has no color, 0 to 1."""
 CREASE = 40.0
 """Degrees between a face and the mean of the faces around one of its corners, beyond which the corner is sharp.
 
@@ -31,13 +31,13 @@ A box's corner leans 55 degrees from each of its three sides, an edge at a right
 
 @dataclass(frozen=True, eq=False)
 class TexturedMesh:
-    """Triangles with smooth normals and the colours of their surface, all given at the corners of each face.
+    """Triangles with smooth normals and the colors of their surface, all given at the corners of each face.
 
-    The colour of a place is that of its texture times that of the mesh; what has no texture has a white one.
+    The color of a place is that of its texture times that of the mesh; what has no texture has a white one.
     """
 
     vertices: Float[Tensor, "points 3"]
-    """Object frame, metres; no two in one place."""
+    """Object frame, meters; no two in one place."""
     faces: Int[Tensor, "faces 3"]
     """Rows of `vertices` at the corners of each triangle."""
     normals: Float[Tensor, "faces 3 3"]
@@ -64,7 +64,7 @@ class TexturedMesh:
     ) -> "TexturedMesh":
         """Return the mesh with vertices in one place made one, unused ones left out, and its normals computed.
 
-        Without colours and textures the mesh is plain grey; texture coordinates without materials belong to the first
+        Without colors and textures the mesh is plain gray; texture coordinates without materials belong to the first
         texture. Raises CaptureError for coordinates that are not numbers, for faces that name vertices which are not
         there, and for a mesh without a face that has an area.
         """
@@ -73,7 +73,7 @@ class TexturedMesh:
         welded = rows.reshape(-1, 3)
         textured = bool(textures)
         if colors is None:
-            colors = torch.full((len(faces), 3, 3), 1.0 if textured else GREY)
+            colors = torch.full((len(faces), 3, 3), 1.0 if textured else GRAY)
         return cls(
             vertices=torch.from_numpy(used).float(),
             faces=torch.from_numpy(welded),
@@ -86,7 +86,7 @@ class TexturedMesh:
 
     @classmethod
     def plain(cls, surface: Surface) -> "TexturedMesh":
-        """Return a surface's triangles in grey; raises CaptureError as `build`, also for points without triangles."""
+        """Return a surface's triangles in gray; raises CaptureError as `build`, also for points without triangles."""
         return cls.build(surface.vertices, surface.faces)
 
     @cached_property
@@ -95,12 +95,12 @@ class TexturedMesh:
         return Surface(self.vertices, self.faces)
 
 
-def read_textured_mesh(path: str | Path, *, metres: float = 1.0) -> TexturedMesh:
-    """Read a mesh whose coordinates count `metres` each, with its textures, vertex colours or face colours.
+def read_textured_mesh(path: str | Path, *, meters: float = 1.0) -> TexturedMesh:
+    """Read a mesh whose coordinates count `meters` each, with its textures, vertex colors or face colors.
 
-    Parts of a scene become one mesh. Colours are taken as they are written and opaque, whatever the file says of
-    light and transparency. Normals in the file are not used. What has no colour at all, or whose texture file is
-    missing or corrupt, is grey, and a `CaptureWarning` says so. Raises CaptureError as `load_mesh`, and where the
+    Parts of a scene become one mesh. Colors are taken as they are written and opaque, whatever the file says of
+    light and transparency. Normals in the file are not used. What has no color at all, or whose texture file is
+    missing or corrupt, is gray, and a `CaptureWarning` says so. Raises CaptureError as `load_mesh`, and where the
     file holds no triangles.
     """
     path = Path(path)
@@ -114,7 +114,7 @@ def read_textured_mesh(path: str | Path, *, metres: float = 1.0) -> TexturedMesh
     painted = [_paint(part, lacking) for part in parts]
     remarks = list(dict.fromkeys(paint.remark for paint in painted if paint.remark))
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    vertices = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts]) * metres
+    vertices = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts]) * meters
     faces = np.concatenate([np.asarray(part.faces, dtype=np.int64) + start for part, start in zip(parts, offsets)])  # noqa: B905
     counts = [len(part.faces) for part in parts]
     try:
@@ -154,7 +154,7 @@ def corner_normals(vertices: Float[np.ndarray, "points 3"], faces: Int[np.ndarra
 
 @dataclass(frozen=True, eq=False)
 class _Paint:
-    """The colours of one part."""
+    """The colors of one part."""
 
     colors: np.ndarray
     coordinates: np.ndarray
@@ -172,9 +172,9 @@ def _paint(part: trimesh.Trimesh, lacking: dict[str, str]) -> _Paint:
     if visual.kind == "face":
         own = np.asarray(visual.face_colors)[:, None, :3] / 255.0
         return _Paint(np.repeat(own, 3, axis=1), nowhere, white)
-    grey = np.full((len(faces), 3, 3), GREY)
+    gray = np.full((len(faces), 3, 3), GRAY)
     if visual.kind != "texture":
-        return _Paint(grey, nowhere, white, "has neither texture nor colours; it is taken as grey")
+        return _Paint(gray, nowhere, white, "has neither texture nor colors; it is taken as gray")
     material = visual.material
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     factor = getattr(material, "baseColorFactor", None)
@@ -182,17 +182,17 @@ def _paint(part: trimesh.Trimesh, lacking: dict[str, str]) -> _Paint:
         try:
             texture = np.array(image.convert("RGB"))
         except (OSError, SyntaxError, ValueError) as error:  # what Pillow raises for images that are cut or corrupt
-            return _Paint(grey, nowhere, white, f"its texture cannot be read and is taken as grey: {error}")
+            return _Paint(gray, nowhere, white, f"its texture cannot be read and is taken as gray: {error}")
         coordinates = np.nan_to_num(np.asarray(visual.uv, dtype=np.float64)[faces])
         tint = np.asarray([255.0] * 3 if factor is None else factor, dtype=np.float64)[:3] / 255.0
-        return _Paint(np.broadcast_to(tint, grey.shape).copy(), coordinates, texture)
+        return _Paint(np.broadcast_to(tint, gray.shape).copy(), coordinates, texture)
     name = str(getattr(material, "name", ""))
     if name in lacking:
-        return _Paint(grey, nowhere, white, f"its texture {lacking[name]} is missing; what it covers is taken as grey")
+        return _Paint(gray, nowhere, white, f"its texture {lacking[name]} is missing; what it covers is taken as gray")
     if factor is None and "kd" not in getattr(material, "kwargs", {}):
-        return _Paint(grey, nowhere, white, "has neither texture nor colours; it is taken as grey")
+        return _Paint(gray, nowhere, white, "has neither texture nor colors; it is taken as gray")
     tint = np.asarray(material.main_color, dtype=np.float64)[:3] / 255.0
-    return _Paint(np.broadcast_to(tint, grey.shape).copy(), nowhere, white)
+    return _Paint(np.broadcast_to(tint, gray.shape).copy(), nowhere, white)
 
 
 def _missing_images(path: Path) -> dict[str, str]:

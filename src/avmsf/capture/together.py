@@ -18,9 +18,9 @@ from avmsf.errors import CaptureError
 from avmsf.wording import counted
 
 WIDEST = 10.0
-"""Metres across beyond which contacts are more likely in another unit."""
+"""Meters across beyond which contacts are more likely in another unit."""
 NARROWEST = 1e-3
-"""Metres across below which they are."""
+"""Meters across below which they are."""
 USUAL_RANGE_DB = 80.0
 """Level between a recording and the median beyond which its scale is in doubt: a contact near the nodes of most modes
 takes 40 dB, a soft blow 30."""
@@ -121,12 +121,12 @@ def judge_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list
     if across > WIDEST:
         remarks.append(
             f"{TABLE}: the contacts lie {across:.3g} m apart (unit = {settings.unit!r}); if that is not so, "
-            f"{fitting_units(across / settings.metres)}"
+            f"{fitting_units(across / settings.meters)}"
         )
     elif 0 < across < NARROWEST:
         remarks.append(
             f"{TABLE}: all contacts lie within {across * 1e3:.2g} mm (unit = {settings.unit!r}); if that is not so, "
-            f"{fitting_units(across / settings.metres)}"
+            f"{fitting_units(across / settings.meters)}"
         )
     return remarks
 
@@ -176,10 +176,10 @@ def _mending(mistake: Mistake | None, settings: CaptureSettings) -> str:
     if mistake is None or not mistake.unit_only:
         return ""
 
-    def named(metres: float) -> list[str]:
-        return [unit for unit, length in METRES.items() if abs(length / metres - 1) < 1e-6]
+    def named(meters: float) -> list[str]:
+        return [unit for unit, length in METRES.items() if abs(length / meters - 1) < 1e-6]
 
-    contacts, shape = named(settings.metres * mistake.factor), named(settings.surface_metres / mistake.factor)
+    contacts, shape = named(settings.meters * mistake.factor), named(settings.surface_meters / mistake.factor)
     if contacts and (mistake.factor < 1 or not shape):
         shape_unit = settings.surface_unit or settings.unit
         return f' If so, write unit = "{contacts[0]}" and surface_unit = "{shape_unit}" in capture.toml'

@@ -90,13 +90,13 @@ def sharpness(frame: np.ndarray) -> float:
 
     The picture is [height, width, 3] in 8 bits, blue first.
     """
-    grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-    height, width = grey.shape
+    gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+    height, width = gray.shape
     if max(height, width) > JUDGED:
         factor = JUDGED / max(height, width)
         smaller = (max(1, round(width * factor)), max(1, round(height * factor)))
-        grey = cv2.resize(grey, smaller, interpolation=cv2.INTER_AREA)
-    return float(cv2.Laplacian(grey, cv2.CV_32F).var())
+        gray = cv2.resize(gray, smaller, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(gray, cv2.CV_32F).var())
 
 
 def _pick(

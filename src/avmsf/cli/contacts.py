@@ -24,7 +24,7 @@ class Contacts:
     """Where to strike, and what to call each sound."""
 
     places: Float64[Tensor, "contacts 3"]
-    """Object frame, metres."""
+    """Object frame, meters."""
     names: tuple[str, ...]
     """Paths of wav files in the output folder."""
     directions: Float64[Tensor, "contacts 3"] | None = None
@@ -34,18 +34,18 @@ class Contacts:
 def contacts_at(
     places: Sequence[tuple[float, float, float]],
     *,
-    metres: float,
+    meters: float,
     directions: Sequence[tuple[float, float, float]] = (),
 ) -> Contacts:
-    """Number the contacts that the command line gives, whose coordinates count `metres` each."""
+    """Number the contacts that the command line gives, whose coordinates count `meters` each."""
     return Contacts(
-        torch.tensor(places, dtype=torch.float64).reshape(-1, 3) * metres,
+        torch.tensor(places, dtype=torch.float64).reshape(-1, 3) * meters,
         tuple(f"{number:03d}.wav" for number in range(1, len(places) + 1)),
         torch.tensor(directions, dtype=torch.float64) if directions else None,
     )
 
 
-def read_contacts(path: Path, *, metres: float) -> Contacts:
+def read_contacts(path: Path, *, meters: float) -> Contacts:
     """Read a table with the columns x, y, z and perhaps file, nx, ny and nz, such as a capture's impacts.csv.
 
     Other columns are ignored. Sounds are called as the column `file` says, else by number. Raises `CaptureError` with
@@ -70,7 +70,7 @@ def read_contacts(path: Path, *, metres: float) -> Contacts:
         raise CaptureError(f"{path}: more than one row is to become {repeated}; each needs a name of its own")
     directions = torch.tensor(normals, dtype=torch.float64)
     known = directions if bool(directions.any()) else None
-    return Contacts(torch.tensor(places, dtype=torch.float64) * metres, tuple(names), known)
+    return Contacts(torch.tensor(places, dtype=torch.float64) * meters, tuple(names), known)
 
 
 def refuse_far(contacts: Contacts, field: SoundField) -> None:

@@ -174,7 +174,7 @@ def _expect(options: Options, asked: _Edit) -> None:
 def _contact(field: SoundField, at: tuple[float, float, float] | None) -> Float[Tensor, " 3"]:
     """Return the place that is listened to: the one that is asked for, or among some the loudest."""
     if at is not None:
-        chosen = contacts_at([at], metres=1.0)
+        chosen = contacts_at([at], meters=1.0)
         refuse_far(chosen, field)
         return chosen.places[0].double()
     points = field.gain_field.points

@@ -114,28 +114,28 @@ def _sampled(field: SoundField | SampledField, options: Options) -> SampledField
 
 
 def _object(options: Options) -> tuple[Path | None, float]:
-    """Return the file that shows the object, and what its coordinates count in metres."""
+    """Return the file that shows the object, and what its coordinates count in meters."""
     if options.object is not None or options.capture is None:
         return options.object, METRES[options.object_unit]
     settings = settings_of(options.capture)
-    return find_surface_file(options.capture, settings), settings.surface_metres
+    return find_surface_file(options.capture, settings), settings.surface_meters
 
 
-def _gaussians(path: Path | None, metres: float, field: SampledField) -> GaussianCloud | None:
-    """Return the file's Gaussians, which are in metres; None for a mesh, whose coordinates count `metres`."""
+def _gaussians(path: Path | None, meters: float, field: SampledField) -> GaussianCloud | None:
+    """Return the file's Gaussians, which are in meters; None for a mesh, whose coordinates count `meters`."""
     if path is None or path.suffix.lower() != ".ply" or (path.is_file() and not holds_gaussians(path)):
         return None
-    read_object(path, field.points, metres=metres)
+    read_object(path, field.points, meters=meters)
     return read_splats(path)
 
 
 def _web(field: SoundField | SampledField, options: Options) -> Written:
-    source, metres = _object(options)
+    source, meters = _object(options)
     return write_webpage(
         field,
         options.output,
         object=source,
-        metres=metres,
+        meters=meters,
         strikes=None if options.capture is None else read_capture(options.capture).impacts,
         limit=options.points or POINTS["web"],
         force=options.overwrite,
@@ -144,15 +144,15 @@ def _web(field: SoundField | SampledField, options: Options) -> Written:
 
 def _gltf(field: SoundField | SampledField, options: Options) -> Written:
     sampled = _sampled(field, options)
-    source, metres = _object(options)
-    cloud = _gaussians(source, metres, sampled)
+    source, meters = _object(options)
+    cloud = _gaussians(source, meters, sampled)
     if cloud is not None and source is not None:
         beside, content = options.output.with_suffix(".gaussians.ply"), source.read_bytes()
         expect_free(beside, content, force=options.overwrite)
         written = write_gltf(sampled, options.output, look=Look.of_gaussians(cloud, sampled), force=options.overwrite)
         copied = write_file(beside, content, force=options.overwrite)
         return replace(written, sizes={**written.sizes, **copied})
-    shown, remarks = (None, ()) if source is None else read_look(source, sampled, metres=metres)
+    shown, remarks = (None, ()) if source is None else read_look(source, sampled, meters=meters)
     written = write_gltf(sampled, options.output, look=shown, force=options.overwrite)
     return replace(written, remarks=remarks + written.remarks)
 

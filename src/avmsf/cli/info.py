@@ -102,7 +102,7 @@ def describe(field: SoundField) -> dict[str, Any]:
         "seconds": field.samples / field.sample_rate,
         "mode_count": len(field.bank),
         "points": len(points),
-        "extent_metres": (points.amax(0) - points.amin(0)).tolist(),
+        "extent_meters": (points.amax(0) - points.amin(0)).tolist(),
         "gain_field": {"kind": field.gain_field.kind, **field.gain_field.record()},
         "residual_rms": noise,
         "per_newton": field.origin.per_newton,
@@ -185,7 +185,7 @@ def _gains_words(gains: dict[str, Any]) -> str:
 
 
 def _words(values: dict[str, Any], quality: list[str]) -> str:
-    extent = " x ".join(f"{side:.3g}" for side in values["extent_metres"])
+    extent = " x ".join(f"{side:.3g}" for side in values["extent_meters"])
     report = values["report"]
     lines = [
         f"field of {values['capture'] or 'an unnamed capture'}",

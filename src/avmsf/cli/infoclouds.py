@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.bench.clouds import component_colours, draw_cloud, draw_features, save_turntable
+from avmsf.bench.clouds import component_colors, draw_cloud, draw_features, save_turntable
 from avmsf.bench.pictures import save_picture
 from avmsf.cli.options.info import Options
 from avmsf.cli.printing import console, say
@@ -35,7 +35,7 @@ def describe_cloud(options: Options) -> dict[str, Any]:
     screen.print(f"{options.file}: {len(cloud)} Gaussians, {sides} m", soft_wrap=True)
     if options.plots is not None:
         _draw_cloud(cloud, options, options.plots)
-    return {"kind": "gaussians", "file": str(options.file), "count": len(cloud), "extent_metres": extent}
+    return {"kind": "gaussians", "file": str(options.file), "count": len(cloud), "extent_meters": extent}
 
 
 def describe_features(options: Options) -> dict[str, Any]:
@@ -65,17 +65,17 @@ def _draw_features(features: FeatureField, report: dict[str, Any], options: Opti
     figure = draw_features(
         shown,
         title=f"{options.file.name}: {features.encoder} on {len(features.points)} points",
-        colours=None if options.cloud is None else _colors_of(options.cloud, features),
+        colors=None if options.cloud is None else _colors_of(options.cloud, features),
         clusters=min(options.clusters, len(features.points)),
         symmetries=symmetries,
         up=_UP[options.up],
     )
     _write(figure, folder / "features.png")
-    _turn(features.points, component_colours(shown.features), options.up, folder, symmetries=symmetries)
+    _turn(features.points, component_colors(shown.features), options.up, folder, symmetries=symmetries)
 
 
 def _colors_of(path: Path, features: FeatureField) -> Float[Tensor, "points 3"]:
-    """Return the colours of the Gaussians that the features lie on."""
+    """Return the colors of the Gaussians that the features lie on."""
     cloud = read_splats(path)
     apart, rows = cKDTree(cloud.centers.numpy()).query(features.points.numpy())
     if apart.any():
@@ -112,5 +112,5 @@ def without_positions(features: FeatureField) -> FeatureField:
 
 
 def plain_colors(cloud: GaussianCloud) -> Float[Tensor, "points 3"]:
-    """Return the Gaussians' colours independent of the direction of view, 0 to 1."""
+    """Return the Gaussians' colors independent of the direction of view, 0 to 1."""
     return (0.5 + ZEROTH * cloud.harmonics[:, 0]).clamp(0, 1).detach()

@@ -152,7 +152,7 @@ def _error(contact: ContactMap, truth: Float64[Tensor, " 3"]) -> dict[str, Any]:
     places = (contact.points[int(contact.distance.argmin())], contact.position)
     cosine, likely = (float((place.double() - truth).norm()) for place in places)
     relative = {"rmed": cosine / diagonal, "rmed_posterior": likely / diagonal}
-    return {"true_contact": truth.tolist(), "error_metres": likely, **relative}
+    return {"true_contact": truth.tolist(), "error_meters": likely, **relative}
 
 
 def _describe(name: str, seconds: float | None, contact: ContactMap, known: _Known, level: float) -> dict[str, Any]:
@@ -170,11 +170,11 @@ def _words(values: dict[str, Any]) -> str:
     where = ", ".join(f"{value + 0.0:.4f}" for value in values["place"])
     lines = [
         f"{values['recording']}{when}: struck at ({where}) m; {100 * region['level']:g} % within "
-        f"{figure(1000 * region['radius_metres'], 2)} mm, {figure(100 * region['share'], 2)} % of the surface; the "
+        f"{figure(1000 * region['radius_meters'], 2)} mm, {figure(100 * region['share'], 2)} % of the surface; the "
         f"field explains {100 * values['explained']:.0f} % of the sound"
     ]
     if "rmed" in values:
-        error, share = 1000 * values["error_metres"], 100 * values["rmed_posterior"]
+        error, share = 1000 * values["error_meters"], 100 * values["rmed_posterior"]
         lines.append(f"  {error:.1f} mm from the true contact ({share:.1f} % of the diagonal)")
     if values["ambiguous"]:
         lines.append("  ambiguous: several places sound about the same")

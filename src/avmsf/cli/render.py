@@ -26,16 +26,16 @@ METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 
 def run(options: Options) -> int:
     """Render and write."""
-    metres = METRES[options.unit]
+    meters = METRES[options.unit]
     if bool(options.position) == (options.contact_table is not None):
         raise OutputError("expected contacts either by --position X Y Z, once or more, or by --contact-table TABLE.csv")
     if options.direction and len(options.direction) != len(options.position):
         raise OutputError(
             f"expected one --direction for each --position, got {len(options.direction)} for {len(options.position)}"
         )
-    contacts = contacts_at(options.position, metres=metres, directions=options.direction)
+    contacts = contacts_at(options.position, meters=meters, directions=options.direction)
     if options.contact_table is not None:
-        contacts = read_contacts(options.contact_table, metres=metres)
+        contacts = read_contacts(options.contact_table, meters=meters)
     paths = _paths(options.output, contacts)
     for name in ("force", "level_db"):
         if not math.isfinite(getattr(options, name)):

@@ -39,7 +39,7 @@ from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import Residual, low_fluctuation_noise
 from avmsf.modal.spectra import magnitude_stft
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.elastic import ElasticModes
 
 __all__ = ["MODES", "DiffSound", "DiffSoundConfig", "fit_diffsound"]
@@ -87,7 +87,7 @@ class DiffSound:
     ) -> Float[Tensor, "contacts samples"]:
         """Return the sound of an impact at each contact, in the unit of the training sounds."""
         gains = self.gains(contacts, directions=directions).float()
-        sounds = synthesise(
+        sounds = synthesize(
             gains, self.bank.frequency, self.bank.damping, samples=self.samples, sample_rate=self.sample_rate
         )
         return sounds + low_fluctuation_noise(self.residual.magnitude, samples=self.samples).to(sounds)
@@ -168,7 +168,7 @@ def _weights(
     Compared are the magnitudes of spectra with the sum of the modes' own: phases of modes whose frequencies are not
     exact mean nothing. Raises EvaluationError where all recordings are silent, or no mode moves at their contacts.
     """
-    atoms = synthesise(
+    atoms = synthesize(
         torch.eye(len(bank), dtype=torch.float64), bank.frequency, bank.damping, samples=train.sounds.shape[1],
         sample_rate=train.sample_rate,
     )  # fmt: skip

@@ -26,7 +26,7 @@ from avmsf.evaluation.spectral_losses import ClipSpectra
 from avmsf.fem.family import BodyFamily
 from avmsf.fem.isotropic import IsotropicModes
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.material import MATERIALS, Material, material_named
 
@@ -170,7 +170,7 @@ def predicted_sound(
     if not bool(inside.any()):
         raise EvaluationError(f"expected modes from {BAND[0]:g} to {BAND[1]:g} Hz, got none")
     ones = torch.ones(1, int(inside.sum()))
-    sound = synthesise(ones, heard[inside], damping[inside], samples=SAMPLES, sample_rate=RATE)[0]
+    sound = synthesize(ones, heard[inside], damping[inside], samples=SAMPLES, sample_rate=RATE)[0]
     return sound / sound.detach().abs().max(), heard[inside]
 
 

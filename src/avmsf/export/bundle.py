@@ -46,7 +46,7 @@ def make_bundle(
     field: SoundField | SampledField,
     *,
     object: Path | Surface | None = None,
-    metres: float = 1.0,
+    meters: float = 1.0,
     surface: Path | None = None,
     strikes: Impacts | None = None,
     limit: int = MOST_POINTS,
@@ -55,7 +55,7 @@ def make_bundle(
 ) -> Bundle:
     """Return a field's bundle, at no more than `limit` contacts.
 
-    `object` is shown for it: a mesh whose coordinates count `metres` each, Gaussians, or the contacts alone. The mesh
+    `object` is shown for it: a mesh whose coordinates count `meters` each, Gaussians, or the contacts alone. The mesh
     `surface`, in meters, is what the reader can show instead, as the one that was made of Gaussians. `strikes` are
     measured ones to compare with, `live` what a server behind the page offers. Raises `ExportError`, for a field
     without a mode too unless it may be `mute`, as an object's that is to be struck first.
@@ -69,7 +69,7 @@ def make_bundle(
         remarks = (f"{len(sampled):,} of the field's {count:,} contacts are kept, spread evenly",)
     if len(sampled.frequency) == 0 and not mute:
         raise ExportError("expected a mode that can be heard, found none below half the sample rate: nothing to strike")
-    shown = read_object(object, sampled.points, metres=metres)
+    shown = read_object(object, sampled.points, meters=meters)
     content, tensors = _packed(_tensors(sampled))
     files = {"field.bin": content}
     if shown.name is not None:
@@ -88,7 +88,7 @@ def write_bundle(
     folder: str | Path,
     *,
     object: Path | Surface | None = None,
-    metres: float = 1.0,
+    meters: float = 1.0,
     surface: Path | None = None,
     strikes: Impacts | None = None,
     limit: int = MOST_POINTS,
@@ -101,7 +101,7 @@ def write_bundle(
     A bundle that is there is replaced. Raises `ExportError` for another folder that is not empty, unless with `force`.
     """
     bundle = make_bundle(
-        field, object=object, metres=metres, surface=surface, strikes=strikes, limit=limit, live=live, mute=mute
+        field, object=object, meters=meters, surface=surface, strikes=strikes, limit=limit, live=live, mute=mute
     )
     sizes = write_folder(
         Path(folder), lambda place: write_files(bundle.files, place), dict(bundle.manifest), force=force

@@ -8,11 +8,11 @@ from avmsf.export.sampledfield import SampledField
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.start import ZEROTH
 
-_GREY = 0.7
+_GRAY = 0.7
 
 
 def discs(field: SampledField) -> GaussianCloud:
-    """Return a flat grey Gaussian at each point, along the surface, as wide as the points lie apart."""
+    """Return a flat gray Gaussian at each point, along the surface, as wide as the points lie apart."""
     places = field.points.double().numpy()
     if len(places) > 1:
         apart = np.median(cKDTree(places).query(places, k=min(4, len(places)))[0][:, 1:], axis=1)
@@ -30,5 +30,5 @@ def discs(field: SampledField) -> GaussianCloud:
         torch.nn.functional.normalize(turned, dim=1),
         scales.log(),
         torch.full((len(field),), 3.0),
-        torch.full((len(field), 1, 3), (_GREY - 0.5) / ZEROTH),
+        torch.full((len(field), 1, 3), (_GRAY - 0.5) / ZEROTH),
     )

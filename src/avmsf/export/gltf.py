@@ -30,7 +30,7 @@ EXTENSION = "KHR_audio_rigid_bodies"
 _FLOAT, _UNSIGNED = 5126, 5125
 _POINTS, _TRIANGLES = 0, 4
 _VERTICES, _INDICES = 34962, 34963
-_GREY = 0.7
+_GRAY = 0.7
 
 
 def write_gltf(sampled: SampledField, path: str | Path, *, look: Look | None = None, force: bool = False) -> Written:
@@ -108,7 +108,7 @@ def _document(
         primitive["attributes"]["COLOR_0"] = buffer.add(_linear(look.colors).numpy(), target=_VERTICES)
     if len(look.faces):
         primitive["indices"] = buffer.add(look.faces.reshape(-1).numpy(), target=_INDICES)
-    shade = 1.0 if look.colors is not None else float(_linear(torch.tensor(_GREY)))
+    shade = 1.0 if look.colors is not None else float(_linear(torch.tensor(_GRAY)))
     surface = {"baseColorFactor": [shade] * 3 + [1.0], "metallicFactor": 0.0, "roughnessFactor": 0.6}
     document = {
         "asset": {"version": "2.0", "generator": generator()},
@@ -166,5 +166,5 @@ def _remarks(sampled: SampledField) -> tuple[str, ...]:
 
 
 def _linear(colors: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
-    """Return colours as light, as glTF holds vertex colours, of colours as displayed (IEC 61966-2-1)."""
+    """Return colors as light, as glTF holds vertex colors, of colors as displayed (IEC 61966-2-1)."""
     return torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)

@@ -1,4 +1,4 @@
-"""What a viewer shows of an object beside its modes: triangles with colours, Gaussians' centers, or points."""
+"""What a viewer shows of an object beside its modes: triangles with colors, Gaussians' centers, or points."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,16 +19,16 @@ from avmsf.scene.start import ZEROTH
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What a viewer shows: triangles with colours, or the field's points."""
+    """What a viewer shows: triangles with colors, or the field's points."""
 
     vertices: Float[Tensor, "vertices 3"]
-    """Object frame, metres."""
+    """Object frame, meters."""
     faces: Int[Tensor, "faces 3"]
     """Rows of `vertices`; none for points."""
     normals: Float[Tensor, "vertices 3"]
     """Unit vectors out of the object."""
     colors: Float[Tensor, "vertices 3"] | None = None
-    """Red, green, blue as displayed (sRGB), 0 to 1; None for grey."""
+    """Red, green, blue as displayed (sRGB), 0 to 1; None for gray."""
 
     @classmethod
     def of_points(cls, sampled: SampledField) -> "Look":
@@ -37,9 +37,9 @@ class Look:
 
     @classmethod
     def of_mesh(cls, mesh: TexturedMesh) -> "Look":
-        """Return a mesh, whose corners keep their own normals and colours where these differ between faces.
+        """Return a mesh, whose corners keep their own normals and colors where these differ between faces.
 
-        Textures become colours of the corners.
+        Textures become colors of the corners.
         """
         corners = torch.cat([mesh.vertices[mesh.faces], mesh.normals, _corner_colors(mesh)], dim=2).reshape(-1, 9)
         table, rows = np.unique(corners.numpy(), axis=0, return_inverse=True)
@@ -48,20 +48,20 @@ class Look:
 
     @classmethod
     def of_gaussians(cls, cloud: GaussianCloud, sampled: SampledField) -> "Look":
-        """Return the centers of Gaussians in their colours."""
+        """Return the centers of Gaussians in their colors."""
         colors = (0.5 + ZEROTH * cloud.harmonics[:, 0]).clamp(0.0, 1.0)
         normals = sampled.normals[sampled.nearest(cloud.centers)]
         return cls(cloud.centers, torch.zeros(0, 3, dtype=torch.int64), normals, colors)
 
 
-def read_look(path: Path, sampled: SampledField, *, metres: float = 1.0) -> tuple[Look, tuple[str, ...]]:
-    """Read a mesh whose coordinates count `metres` each, and what differs from the file, a sentence each.
+def read_look(path: Path, sampled: SampledField, *, meters: float = 1.0) -> tuple[Look, tuple[str, ...]]:
+    """Read a mesh whose coordinates count `meters` each, and what differs from the file, a sentence each.
 
     Meshes of more than `MOST_FACES` triangles are reduced. Raises `ExportError` for one that is huge, or plainly not in
     the field's unit, and `CaptureError` for a file that is no mesh.
     """
     expect_readable(path)
-    mesh = read_textured_mesh(path, metres=metres)
+    mesh = read_textured_mesh(path, meters=meters)
     expect_alike(mesh.vertices.double().numpy(), sampled.points, str(path))
     faces = len(mesh.faces)
     if faces <= MOST_FACES:
@@ -79,7 +79,7 @@ def read_look(path: Path, sampled: SampledField, *, metres: float = 1.0) -> tupl
 
 
 def _corner_colors(mesh: TexturedMesh) -> Float[Tensor, "faces 3 3"]:
-    """Return each corner's colour times that of its texture there."""
+    """Return each corner's color times that of its texture there."""
     colors = mesh.colors.clone()
     for number, texture in enumerate(mesh.textures):
         chosen = mesh.materials == number

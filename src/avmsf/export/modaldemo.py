@@ -44,7 +44,7 @@ class Demo:
     field: SampledField
     """The sound, at the Gaussians' centers."""
     scales: Float[Tensor, "points 3"]
-    """Standard deviations of the Gaussians along their own axes, metres."""
+    """Standard deviations of the Gaussians along their own axes, meters."""
     rotations: Float[Tensor, "points 4"]
     """Their quaternions w, x, y, z."""
     opacities: Float[Tensor, " points"]

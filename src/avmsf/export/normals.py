@@ -8,9 +8,9 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.scene.neighbourhoods import read_neighbourhoods
+from avmsf.scene.neighborhoods import read_neighborhoods
 
-_NEIGHBOURS = 12
+_NEIGHBORS = 12
 """Points that a side is handed on to."""
 _VIEWS = 128
 """Directions from which a part's outermost points are looked at."""
@@ -19,16 +19,16 @@ _VIEWS = 128
 def outward_normals(points: Float[Tensor, "points 3"]) -> Float32[Tensor, "points 3"]:
     """Return unit normals of the surface that points lie on, out of the object.
 
-    Planes through neighbours have no side. One side is handed on along the tree of neighbours that bends least (after
+    Planes through neighbors have no side. One side is handed on along the tree of neighbors that bends least (after
     Hoppe et al. 1992), and each part of the surface is turned such that its outermost points, seen from all around,
     face outwards. A few points have no surface: theirs point away from their middle.
     """
     places = points.detach().double().cpu().numpy()
-    if len(places) <= _NEIGHBOURS:
+    if len(places) <= _NEIGHBORS:
         return torch.from_numpy(_away(places)).float()
-    normals = read_neighbourhoods(places, count=_NEIGHBOURS).normals
-    _, rows = cKDTree(places).query(places, k=_NEIGHBOURS + 1)
-    tails, heads = np.repeat(np.arange(len(places)), _NEIGHBOURS), rows[:, 1:].reshape(-1)
+    normals = read_neighborhoods(places, count=_NEIGHBORS).normals
+    _, rows = cKDTree(places).query(places, k=_NEIGHBORS + 1)
+    tails, heads = np.repeat(np.arange(len(places)), _NEIGHBORS), rows[:, 1:].reshape(-1)
     # Where the normals agree an edge costs next to nothing, but more than the nothing that a sparse graph leaves out.
     bend = 1.0 - np.abs(np.einsum("nd,nd->n", normals[tails], normals[heads])) + 1e-9
     edges = (np.minimum(tails, heads), np.maximum(tails, heads))

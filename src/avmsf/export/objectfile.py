@@ -37,11 +37,11 @@ class ObjectFile:
 
 
 def read_object(
-    source: Path | Surface | None, points: Float[Tensor, "points 3"], *, metres: float = 1.0, most: int = MOST_FACES
+    source: Path | Surface | None, points: Float[Tensor, "points 3"], *, meters: float = 1.0, most: int = MOST_FACES
 ) -> ObjectFile:
     """Return an object for a field at `points`: a mesh as `.glb`, Gaussians as they are, or None.
 
-    A file's coordinates count `metres` each; Gaussians are in metres. Meshes of more than `most` triangles are reduced.
+    A file's coordinates count `meters` each; Gaussians are in meters. Meshes of more than `most` triangles are reduced.
     Raises `ExportError` for a file that is missing, no mesh, huge, or plainly not in the field's unit.
     """
     if source is None:
@@ -54,7 +54,7 @@ def read_object(
         expect_alike(read_splats(source).centers.numpy(), points, str(source))
         return ObjectFile("gaussians", "object.ply", source.read_bytes())
     scene = load_mesh(source, raising=ExportError)
-    scene.apply_scale(metres)  # type: ignore[no-untyped-call]
+    scene.apply_scale(meters)  # type: ignore[no-untyped-call]
     return _shown(scene, points, str(source), most)
 
 
@@ -98,7 +98,7 @@ def _as_glb(scene: trimesh.Scene) -> bytes:
 
 
 def reduced(mesh: trimesh.Trimesh, share: float) -> trimesh.Trimesh:
-    """Return a mesh of such a share of the triangles, with vertex colours but no textures."""
+    """Return a mesh of such a share of the triangles, with vertex colors but no textures."""
     # Faces without shared corners cannot be merged, and many files have no others.
     merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     merged.merge_vertices(merge_tex=True, merge_norm=True)

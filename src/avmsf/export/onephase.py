@@ -6,7 +6,7 @@ from torch import Tensor
 
 from avmsf.export.sampledfield import SampledField
 from avmsf.modal.phase import common_phase
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 
 _JUDGED = 8
 """Points at which an export is compared with the field."""
@@ -44,7 +44,7 @@ def deviation(
     """Return by how much these modes without noise miss the field at most, over its loudest sample, at a few points."""
     rows = field.spread(_JUDGED)
     zero = torch.zeros(len(rows), len(field.frequency))
-    heard = synthesise(
+    heard = synthesize(
         zero if sine is None else sine[rows],
         field.frequency,
         damping if damping.ndim == 1 else damping[rows],

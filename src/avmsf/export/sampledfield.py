@@ -16,7 +16,7 @@ from avmsf.field.gains.model import MixtureGains
 from avmsf.field.scaledgains import ScaledGains
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.pulse import ForcePulse
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.scene.points import farthest_points, nearest_points
 
 _BATCH = 1024
@@ -36,7 +36,7 @@ class SampledField:
     """
 
     points: Float[Tensor, "points 3"]
-    """Where the gains are known, object frame, metres."""
+    """Where the gains are known, object frame, meters."""
     normals: Float32[Tensor, "points 3"]
     """Unit vectors out of the object there; a blow goes the other way."""
     frequency: Float64[Tensor, " modes"]
@@ -67,7 +67,7 @@ class SampledField:
         *,
         limit: int | None = None,
     ) -> "SampledField":
-        """Return the field at `points` (object frame, metres), or at its own; at most `limit` of them, spread evenly.
+        """Return the field at `points` (object frame, meters), or at its own; at most `limit` of them, spread evenly.
 
         `normals` point out of the object; where they are not given they are those that the field's physics holds, or
         else are judged from how the points lie. Raises `ExportError` for points that are none, or not finite.
@@ -125,7 +125,7 @@ class SampledField:
         return len(self.points)
 
     def nearest(self, places: Float[Tensor, "places 3"]) -> Int[Tensor, " places"]:
-        """Return the row of the point nearest to each place (object frame, metres)."""
+        """Return the row of the point nearest to each place (object frame, meters)."""
         return nearest_points(self.points, places)[:, 0]
 
     def spread(self, count: int) -> Int[Tensor, " chosen"]:
@@ -163,7 +163,7 @@ class SampledField:
         noise = torch.nn.functional.pad(self.noise, (0, max(0, length - self.samples)))[:length]
         parts = []
         for chosen in torch.split(rows, _RENDERED):
-            modes = synthesise(
+            modes = synthesize(
                 self.sine[chosen],
                 self.frequency,
                 self.damping if self.shared_damping else self.damping[chosen],

@@ -52,7 +52,7 @@ def write_webpage(
     output: str | Path,
     *,
     object: Path | Surface | None = None,
-    metres: float = 1.0,
+    meters: float = 1.0,
     surface: Path | None = None,
     strikes: Impacts | None = None,
     limit: int = MOST_POINTS,
@@ -64,7 +64,7 @@ def write_webpage(
     `force`.
     """
     output = Path(output)
-    bundle = make_bundle(field, object=object, metres=metres, surface=surface, strikes=strikes, limit=limit)
+    bundle = make_bundle(field, object=object, meters=meters, surface=surface, strikes=strikes, limit=limit)
     if output.suffix.lower() in PAGE_SUFFIXES:
         return Written(write_file(output, single_file(bundle).encode(), force=force), bundle.remarks)
     content = {**page_files(), **bundle.files}
@@ -103,7 +103,7 @@ def single_file(bundle: Bundle, page: Mapping[str, bytes] | None = None) -> str:
 
 
 def _bare(source: str) -> str:
-    """Return a module that asks the import map for its neighbours: data has no place that `./` could start from."""
+    """Return a module that asks the import map for its neighbors: data has no place that `./` could start from."""
     return _IMPORTED.sub(r"\1\2avmsf/\3\2", source)
 
 

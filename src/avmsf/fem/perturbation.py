@@ -44,9 +44,9 @@ class Elements:
     cells: Int[np.ndarray, "cells 10"]
     """Rows of nodes."""
     centers: Float64[np.ndarray, "cells 3"]
-    """Metres."""
+    """Meters."""
     volumes: Float64[np.ndarray, " cells"]
-    """Cubic metres."""
+    """Cubic meters."""
     slopes: Float64[np.ndarray, "cells points 10 3"]
     """Gradients of the shape functions at quadrature points of equal weight, 1/m."""
     reference_mass: Float64[np.ndarray, "10 10"]

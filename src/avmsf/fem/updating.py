@@ -74,7 +74,7 @@ def update(
     """Return the updated modes and the log evidence that they gain, or None where the nominal ones have the highest.
 
     `modes` have `perturbations`; `frequency` (Hz) and `values`, along each mode's common phase, are those measured for
-    impacts at `points` (metres) along `directions` (unit vectors); modes that are not `usable`, silent or doubled ones,
+    impacts at `points` (meters) along `directions` (unit vectors); modes that are not `usable`, silent or doubled ones,
     say nothing of the body. `match` weighs a body, known at least at the points, against the other families.
     """
     assert modes.perturbations is not None

@@ -58,7 +58,7 @@ class AttentionGains(TrainableGains):
         # Layers draw from torch's global generator as they are made, which is not ours to advance.
         with torch.random.fork_rng(devices=[]):
             self._build(features.features.shape[1], len(gain_scale))
-        self._initialise(generator)
+        self._initialize(generator)
 
     def _build(self, dim: int, modes: int) -> None:
         shape = self.shape
@@ -75,7 +75,7 @@ class AttentionGains(TrainableGains):
         self.to_gains = nn.Linear(sizes[-1], modes)
         self.to_dampings = nn.Linear(sizes[-1], modes) if shape.spatial_damping else None
 
-    def _initialise(self, generator: torch.Generator) -> None:
+    def _initialize(self, generator: torch.Generator) -> None:
         for layer in self.modules():
             if isinstance(layer, nn.Linear):
                 bound = 1 / math.sqrt(layer.in_features)

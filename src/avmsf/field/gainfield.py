@@ -41,11 +41,11 @@ class GainField(Protocol):
 
     @property
     def points(self) -> Float[Tensor, "points 3"]:
-        """Points of the object's surface, object frame, metres: where pictures and searches look."""
+        """Points of the object's surface, object frame, meters: where pictures and searches look."""
         ...
 
     def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
-        """Return the gains of impacts at contacts (object frame, metres).
+        """Return the gains of impacts at contacts (object frame, meters).
 
         `directions` are the unit vectors along which the hammer moves. Fields that know of directions take an impact
         straight into the surface where none are given; the others ignore them.

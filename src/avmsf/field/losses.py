@@ -51,12 +51,12 @@ def spectral_target(
 ) -> SpectralTarget:
     """Return the magnitudes of `sounds`, or of their first `samples`, at several resolutions (sizes in samples).
 
-    Hann windows, frames centred, silence beyond the ends, as in `avmsf.modal.spectra`. Raises ValueError for an odd
+    Hann windows, frames centered, silence beyond the ends, as in `avmsf.modal.spectra`. Raises ValueError for an odd
     FFT size.
     """
     odd = [size for size in fft_sizes if size % 2]
     if odd:
-        raise ValueError(f"expected even FFT sizes, found {odd[0]}: half a window lies before a frame's centre")
+        raise ValueError(f"expected even FFT sizes, found {odd[0]}: half a window lies before a frame's center")
     cut = sounds[:, :samples]
     windows = [torch.hann_window(size, dtype=cut.dtype, device=cut.device) for size in fft_sizes]
     tiny = torch.finfo(cut.dtype).tiny
@@ -148,7 +148,7 @@ def _overlap_add(
 
 
 def _padded(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Float[Tensor, "contacts padded"]:
-    """Return the sounds between half windows of silence: frames are centred on the samples 0, hop, 2 hop, ..."""
+    """Return the sounds between half windows of silence: frames are centered on the samples 0, hop, 2 hop, ..."""
     return torch.nn.functional.pad(sounds, (fft_size // 2, fft_size // 2))
 
 

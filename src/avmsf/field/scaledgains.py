@@ -50,7 +50,7 @@ class ScaledGains:
 
     @property
     def points(self) -> Float32[Tensor, "points 3"]:
-        """Points of the object's surface, object frame, metres."""
+        """Points of the object's surface, object frame, meters."""
         return (self.field.points.double() * self.length).float()
 
     @property

@@ -23,7 +23,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.pulse import ForcePulse
 from avmsf.modal.residual import Residual, low_fluctuation_noise, shape_noise
-from avmsf.modal.synthesis import synthesise_phased
+from avmsf.modal.synthesis import synthesize_phased
 
 if TYPE_CHECKING:
     from avmsf.field.config import GainModel
@@ -248,7 +248,7 @@ class SoundField:
         return impacts if self.alignment is None else self.alignment.apply(impacts)
 
     def gains(self, contacts: ArrayLike, *, directions: ArrayLike | None = None) -> Float[Tensor, "contacts modes"]:
-        """Return the signed amplitudes at the contacts (object frame, metres), in the unit of the training sounds.
+        """Return the signed amplitudes at the contacts (object frame, meters), in the unit of the training sounds.
 
         `directions`, unit vectors, are those of the impacts; without them they go straight into the surface.
         """
@@ -353,7 +353,7 @@ class SoundField:
         """Return the sounds of the audible modes with these gains, without noise."""
         damping = self.bank.damping if known.damping is None else self.bank.damping * known.damping
         rows = torch.nonzero(self.audible).flatten()
-        return synthesise_phased(
+        return synthesize_phased(
             known.mean[:, rows],
             self.bank.frequency[rows],
             damping[..., rows],

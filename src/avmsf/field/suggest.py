@@ -38,7 +38,7 @@ class Suggestions:
     __repr__ = short_repr
 
     contacts: Float64[Tensor, "contacts 3"]
-    """Object frame, metres."""
+    """Object frame, meters."""
     directions: Float64[Tensor, "contacts 3"] | None
     """Unit vectors along which to strike: as given, or the nearest to straight into the field's body that a hammer can
     take; without a body that of the nearest recording; None where the field knows nothing of directions."""
@@ -49,7 +49,7 @@ class Suggestions:
     after: tuple[float, ...]
     """Expected error of the whole field after each of the contacts and those before it."""
     points: Float64[Tensor, "points 3"]
-    """Points spread evenly over the surface, metres."""
+    """Points spread evenly over the surface, meters."""
     map_before: Float64[Tensor, " points"]
     """Expected error at these with what has been struck."""
     map_after: Float64[Tensor, " points"]
@@ -68,7 +68,7 @@ def suggest(
 ) -> Suggestions:
     """Return the `count` contacts that lower the expected error of the whole field most, each given those before it.
 
-    `candidates` are the places to choose from (metres, on the surface; contacts of the fit are passed over); without
+    `candidates` are the places to choose from (meters, on the surface; contacts of the fit are passed over); without
     them they are points spread over the surface that a hammer can strike from outside (`hammer_access`). `directions`
     are the unit vectors along which candidates can be struck, straight into the surface where not given. A field made
     of photographs has points where they show the object; with `unseen`, error and candidates are those of all of the
@@ -226,15 +226,15 @@ def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates:
 
 def _expect_on_surface(candidates: Float64[Tensor, "candidates 3"], surface: Float64[Tensor, "points 3"]) -> None:
     if not len(candidates):
-        raise FitError("candidates is empty: give places on the surface, in metres, or none at all")
+        raise FitError("candidates is empty: give places on the surface, in meters, or none at all")
     if not bool(torch.isfinite(candidates).all()):
         row = int(torch.nonzero(~torch.isfinite(candidates).all(1))[0])
-        raise FitError(f"candidate {row} is {candidates[row].tolist()}: expected finite coordinates in metres")
+        raise FitError(f"candidate {row} is {candidates[row].tolist()}: expected finite coordinates in meters")
     distance = torch.from_numpy(cKDTree(surface.numpy()).query(candidates.numpy())[0])
     worst = int(distance.argmax())
     if float(distance[worst]) > _OFF * float((surface.amax(0) - surface.amin(0)).norm()):
         raise FitError(
             f"candidate {worst} at {[round(each, 4) for each in candidates[worst].tolist()]} m is "
-            f"{float(distance[worst]):.2g} m from the object's surface: candidates lie on it, in metres, in the "
+            f"{float(distance[worst]):.2g} m from the object's surface: candidates lie on it, in meters, in the "
             "object's frame"
         )

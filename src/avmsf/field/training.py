@@ -17,7 +17,7 @@ from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import Residual, shape_noise
-from avmsf.modal.synthesis import synthesise_phased
+from avmsf.modal.synthesis import synthesize_phased
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class AdamW:
 
 
 class TrainingRun:
-    """Parameters on their way: a gain field, small corrections to the bank and residual, and their optimisers.
+    """Parameters on their way: a gain field, small corrections to the bank and residual, and their optimizers.
 
     The corrections are measured in what the recordings resolve: frequencies in their modes' widths, dampings and noise
     magnitudes as logarithms. So one learning rate serves all, and dampings and magnitudes stay positive. All tensors
@@ -167,7 +167,7 @@ class TrainingRun:
     def sounds(self, rows: Int[Tensor, " contacts"]) -> Float[Tensor, "contacts samples"]:
         """Return the sounds at points of the gain field, with a fresh draw of noise (paper, eq. 12)."""
         gains, bank = self.network.read(rows), self.bank
-        sounds = synthesise_phased(
+        sounds = synthesize_phased(
             gains.mean,
             bank.frequency,
             bank.damping if gains.damping is None else bank.damping * gains.damping,

@@ -17,7 +17,7 @@ from avmsf.field.gains.model import MixtureGains
 from avmsf.field.scaledgains import ScaledGains, fitted_gains
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.phase import turned_like
-from avmsf.modal.synthesis import synthesise_phased
+from avmsf.modal.synthesis import synthesize_phased
 
 LEVEL = 0.9
 """Default probability of credible intervals."""
@@ -99,7 +99,7 @@ def scale_of(field: SoundField) -> Float64[Tensor, " modes"]:
 
 
 def training_contacts(field: SoundField) -> Float64[Tensor, "contacts 3"]:
-    """Return the contacts that the gains were fitted to, metres, on the object as it is. Raises as `fitted_mixture`."""
+    """Return the contacts that the gains were fitted to, meters, on the object as it is. Raises as `fitted_mixture`."""
     fitted, gains = fitted_mixture(field), field.gain_field
     return gains.contacts.double() if isinstance(gains, ScaledGains) else fitted.contacts
 
@@ -127,7 +127,7 @@ def parts_of(
 
 
 def relative_gain_std(field: SoundField, points: Float[Tensor, "points 3"]) -> Float64[Tensor, " points"]:
-    """Return the standard deviation of the gains at points (metres) over their root mean square on the object.
+    """Return the standard deviation of the gains at points (meters) over their root mean square on the object.
 
     Both as energy over all modes: 0 is certainty; places that may be louder than the mean can have more than 1. Raises
     as `fitted_mixture`.
@@ -149,7 +149,7 @@ def spectrum_band(
 ) -> SpectrumBand:
     """Return the interval of probability `level` of each band of the spectrum of an impact's sound.
 
-    By drawing sounds: gains from their posterior, and the noise's mean energy added. `contact` in metres, `direction`
+    By drawing sounds: gains from their posterior, and the noise's mean energy added. `contact` in meters, `direction`
     as in `SoundField.render`, `seed` for the draws. Raises as `fitted_mixture`, and FitError for a level that is not
     between 0 and 1.
     """
@@ -212,7 +212,7 @@ def _spectra(field: SoundField, modes: Tensor) -> Tensor:
     """Return the spectrum of each mode by itself, [modes, 2, frequencies], of a gain of one in either part."""
     one = torch.eye(len(modes), dtype=torch.float64)
     sounds = [
-        synthesise_phased(
+        synthesize_phased(
             first, field.bank.frequency[modes], field.bank.damping[modes], field.phase[modes],
             samples=field.samples, sample_rate=field.sample_rate, quadrature=second,
         )

@@ -20,7 +20,7 @@ class Closest:
     weights: Float64[np.ndarray, "places 3"]
     """Barycentric coordinates in it, 0 to 1."""
     distances: Float64[np.ndarray, " places"]
-    """Metres."""
+    """Meters."""
 
 
 class ClosestPoints:

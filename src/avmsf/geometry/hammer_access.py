@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from avmsf.geometry.closest import ClosestPoints
 
 HAMMER_DIAMETER = 0.01
-"""Metres. A pencil has 7 mm, the head of the usual modal hammer (PCB 086C03) 16 mm and its tip 6 mm."""
+"""Meters. A pencil has 7 mm, the head of the usual modal hammer (PCB 086C03) 16 mm and its tip 6 mm."""
 MAX_TILT_DEGREES = 45.0
 """Angle between the hammer and the normal beyond which more of the force goes along the surface than into it."""
 MAX_DISTANCE = 0.02
@@ -51,7 +51,7 @@ class MeshAccess:
     def __call__(
         self, places: Float64[np.ndarray, "places 3"]
     ) -> tuple[Bool[np.ndarray, " places"], Float64[np.ndarray, "places 3"], Float64[np.ndarray, "places 3"]]:
-        """Return which places, metres, can be struck, the surface's nearest points, and the hammer's axis there.
+        """Return which places, meters, can be struck, the surface's nearest points, and the hammer's axis there.
 
         The axis is a unit vector away from the surface: of those that lie clear the one nearest to the normal.
         """
@@ -114,7 +114,7 @@ class PointAccess:
     def __call__(
         self, places: Float64[np.ndarray, "places 3"]
     ) -> tuple[Bool[np.ndarray, " places"], Float64[np.ndarray, "places 3"], None]:
-        """Return which places, metres, can be struck, the places, and no axes: a normal of a few points is rough."""
+        """Return which places, meters, can be struck, the places, and no axes: a normal of a few points is rough."""
         normals = self._normals(places)
         reached = np.zeros(len(places), dtype=bool)
         for side in (normals, -normals):

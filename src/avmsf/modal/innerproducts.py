@@ -144,7 +144,7 @@ def _project(
 ) -> tuple[Complex128[Tensor, "contacts modes"], Complex128[Tensor, "contacts modes"]]:
     """Return the sums over n of sound z^n and, if `weighted`, of n sound z^n (zero if not).
 
-    By blocks, as in `synthesise`: z^(mK + k) = z^(mK) z^k.
+    By blocks, as in `synthesize`: z^(mK + k) = z^(mK) z^k.
     """
     within = _powers(poles, _BLOCK)
     tables = [within.real, within.imag]

@@ -1,4 +1,4 @@
-"""What is heard beside the modes: noise of one colour, the same at every contact (paper, section 3.4)."""
+"""What is heard beside the modes: noise of one color, the same at every contact (paper, section 3.4)."""
 
 import math
 from dataclasses import dataclass

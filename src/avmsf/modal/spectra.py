@@ -1,6 +1,6 @@
 """Spectra of sounds as differentiable torch functions, one convention for losses, metrics and pictures.
 
-A spectrogram's window is the periodic Hann window of the FFT's own length. Its frames are centred on the samples 0,
+A spectrogram's window is the periodic Hann window of the FFT's own length. Its frames are centered on the samples 0,
 hop, 2 hop, ... with silence before the first and after the last sample, so that a sound of any length, shorter than the
 FFT too, has 1 + samples // hop frames and its onset is in the middle of the first. Nothing is scaled: a steady sine of
 amplitude A on a bin reads A fft_size / 4, and white noise of standard deviation s reads s sqrt(3 pi fft_size / 32) on

@@ -17,7 +17,7 @@ _BLOCK = 512
 fastest from about 256 on."""
 
 
-def synthesise(
+def synthesize(
     gains: Float[Tensor, "contacts modes"],
     frequency: Float64[Tensor, " modes"],
     damping: Float64[Tensor, "*contacts modes"],
@@ -46,7 +46,7 @@ def synthesise(
     return sounds.reshape(gains.shape[0], blocks * _BLOCK)[:, :samples]
 
 
-def synthesise_phased(
+def synthesize_phased(
     gains: Float[Tensor, "contacts modes"],
     frequency: Float64[Tensor, " modes"],
     damping: Float64[Tensor, "*contacts modes"],
@@ -56,7 +56,7 @@ def synthesise_phased(
     sample_rate: float,
     quadrature: Float[Tensor, "contacts modes"] | None = None,
 ) -> Float[Tensor, "contacts samples"]:
-    """Return the sum over modes of gains exp(-d t) sin(2 pi f t + phase), phases in radians; else as `synthesise`.
+    """Return the sum over modes of gains exp(-d t) sin(2 pi f t + phase), phases in radians; else as `synthesize`.
 
     The quadrature's cosines, too, are ahead by the phase.
     """
@@ -65,7 +65,7 @@ def synthesise_phased(
     sine, cosine = gains * along, gains * ahead
     if quadrature is not None:
         sine, cosine = sine - quadrature * ahead, cosine + quadrature * along
-    return synthesise(sine, frequency, damping, samples=samples, sample_rate=sample_rate, quadrature=cosine)
+    return synthesize(sine, frequency, damping, samples=samples, sample_rate=sample_rate, quadrature=cosine)
 
 
 def _decaying_sines(

@@ -11,7 +11,7 @@ from avmsf.capture.surface import Surface
 from avmsf.errors import SceneError
 from avmsf.geometry import ObjectShape, object_surface
 from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
+from avmsf.scene.rasterizer import Rasterizer, choose_rasterizer
 from avmsf.scene.visibility import depth_of_cloud
 
 _FEWEST = 100
@@ -32,10 +32,10 @@ def shape_of_cloud(cloud: GaussianCloud, views: Sequence[View] = (), *, cells: i
     `object_surface` does.
     """
     cloud = _visible(cloud)
-    rasteriser = choose_rasteriser(cloud.centers.device)
+    rasterizer = choose_rasterizer(cloud.centers.device)
     if not masks_suffice(views):
-        views = views_of_cloud(cloud, rasteriser, size=_SIZE)
-    return object_surface(views, depth_of_cloud(cloud, rasteriser), cells=cells)
+        views = views_of_cloud(cloud, rasterizer, size=_SIZE)
+    return object_surface(views, depth_of_cloud(cloud, rasterizer), cells=cells)
 
 
 def masks_suffice(views: Sequence[View]) -> bool:
@@ -43,13 +43,13 @@ def masks_suffice(views: Sequence[View]) -> bool:
     return sum(view.mask is not None and bool((view.mask > 127).any()) for view in views) >= _FEWEST_MASKS
 
 
-def views_of_cloud(cloud: GaussianCloud, rasteriser: Rasteriser, *, size: int) -> tuple[View, ...]:
+def views_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer, *, size: int) -> tuple[View, ...]:
     """Return the 72 pictures of `orbit_cameras` of Gaussians before white, `size` pixels wide, with masks."""
     box = Surface(cloud.centers.float(), torch.zeros(0, 3, dtype=torch.int64))
     views = []
     for number, camera in enumerate(orbit_cameras(box, size=size)):
         with torch.no_grad():
-            seen = rasteriser(cloud, camera, background=cloud.centers.new_ones(3))
+            seen = rasterizer(cloud, camera, background=cloud.centers.new_ones(3))
         image, mask = ((255 * each.clamp(0, 1)).round().to(torch.uint8) for each in (seen.color, seen.alpha))
         views.append(View(f"view_{number:03d}", image, camera, mask))
     return tuple(views)

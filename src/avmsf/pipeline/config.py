@@ -103,7 +103,7 @@ class BodyConfig:
     """How an object's shape becomes bodies that vibrate."""
 
     wall: float | None = None
-    """Thickness of the object's wall, metres, where it is known; 0 for a body that its surface encloses whole. By
+    """Thickness of the object's wall, meters, where it is known; 0 for a body that its surface encloses whole. By
     itself it tries several, and the recordings choose."""
     shapes: int = 80
     """Lowest elastic mode shapes that gains are made of, and on which stiffness and density are updated."""
@@ -116,7 +116,7 @@ class BodyConfig:
 
     def __post_init__(self) -> None:
         if self.wall is not None and not 0 <= self.wall < float("inf"):
-            raise SimulationError(f"wall = {self.wall}: expected metres, or 0 for a body without a cavity")
+            raise SimulationError(f"wall = {self.wall}: expected meters, or 0 for a body without a cavity")
         if self.shapes < 1:
             raise SimulationError(f"shapes = {self.shapes}: expected 1 or more")
 

@@ -18,7 +18,7 @@ from avmsf.scene.features import FeatureField
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.lift import Lifted, LiftProgress, by_presence, by_visibility, lift, lift_points, supported
 from avmsf.scene.points import sample_surface
-from avmsf.scene.rasteriser import Rasteriser
+from avmsf.scene.rasterizer import Rasterizer
 from avmsf.scene.reduction import reduce, resize, with_positions
 from avmsf.scene.refine import orbit_spread, refine
 from avmsf.scene.symmetry import Symmetries
@@ -72,7 +72,7 @@ def lift_to_cloud(
     encoder: Encoder,
     config: LiftConfig,
     *,
-    rasteriser: Rasteriser,
+    rasterizer: Rasterizer,
     progress: Callable[[LiftProgress], None] | None = None,
 ) -> Lifted:
     """Lift features onto the Gaussians that views see, as the settings say."""
@@ -81,7 +81,7 @@ def lift_to_cloud(
         cloud,
         views,
         encoder,
-        rasteriser=rasteriser,
+        rasterizer=rasterizer,
         weighting=weighting,
         inpainted=config.background == "inpainted",
         progress=progress,

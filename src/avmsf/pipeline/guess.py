@@ -111,7 +111,7 @@ def expect_no_recordings(folder: Path) -> None:
 def known_surface(place: Path, settings: CaptureSettings) -> Surface:
     """Return the surface of a mesh file, or of a folder without recordings. Raises FitError where there is none."""
     if not place.is_dir():
-        return read_surface(place, metres=settings.surface_metres)
+        return read_surface(place, meters=settings.surface_meters)
     expect_no_recordings(place)
     surface = find_surface(place, settings)
     if surface is None:

@@ -24,7 +24,7 @@ from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.keep import keep_object
 from avmsf.scene.lift import Lifted, LiftProgress
 from avmsf.scene.ply import read_splats, write_splats
-from avmsf.scene.rasteriser import choose_rasteriser
+from avmsf.scene.rasterizer import choose_rasterizer
 from avmsf.scene.splat import SplatProgress, splat
 from avmsf.scene.start import StartPoints
 
@@ -174,7 +174,7 @@ class SceneStages:
         if not bare:
             return None
         where = source.path if source.kind == "cameras" else self.stages.path("motion")
-        found = read_sparse_points(where, metres=self.settings.views_metres)
+        found = read_sparse_points(where, meters=self.settings.views_meters)
         if found is None:
             raise SceneError(
                 f"expected masks, or points of structure from motion, to start Gaussians from; {len(bare)} views "
@@ -185,40 +185,40 @@ class SceneStages:
     def _lift_to_cloud(self, views: Sequence[View], encoder: Encoder) -> Lifted:
         cloud = read_splats(self.cloud.path)
         self.listener.tell(f"lift: {encoder.name} of {len(views)} views onto {len(cloud)} Gaussians")
-        rasteriser = choose_rasteriser(cloud.centers.device)
+        rasterizer = choose_rasterizer(cloud.centers.device)
         return lift_to_cloud(
-            cloud, views, encoder, self.config.lift, rasteriser=rasteriser, progress=self.listener.lifting
+            cloud, views, encoder, self.config.lift, rasterizer=rasterizer, progress=self.listener.lifting
         )
 
     def _lift_to_mesh(self, views: Sequence[View], encoder: Encoder) -> Lifted:
-        surface = read_surface(self._source().path, metres=self.settings.surface_metres)
+        surface = read_surface(self._source().path, meters=self.settings.surface_meters)
         points = self.config.lift.points
         self.listener.tell(f"lift: {encoder.name} of {len(views)} views onto {points} points of the mesh")
         return lift_to_surface(surface, views, encoder, self.config.lift, progress=self.listener.lifting)
 
     def _keep_given(self, splats: Path) -> Kept:
-        """Keep the Gaussians of a file that came with the folder: in metres, and those on the object alone."""
+        """Keep the Gaussians of a file that came with the folder: in meters, and those on the object alone."""
         views = None if self.source is None else self.views
 
         def make(path: Path) -> None:
             self.listener.tell(f"splat: the Gaussians of {splats.name}, as they are")
-            cloud = scaled(read_splats(splats), self.settings.views_metres)
+            cloud = scaled(read_splats(splats), self.settings.views_meters)
             if views is not None:
-                cloud = keep_object(cloud, read_views(views.path), rasteriser=choose_rasteriser(cloud.centers.device))
+                cloud = keep_object(cloud, read_views(views.path), rasterizer=choose_rasterizer(cloud.centers.device))
             write_splats(cloud, path)
 
         recipe = {
             "given": digest_of(splats),
             "views": None if views is None else views.digest,
-            "metres": self.settings.views_metres,
+            "meters": self.settings.views_meters,
         }
         return self.stages.keep(CLOUD, recipe, make)
 
     def _keep_views_of_cloud(self) -> Kept:
         def make(path: Path) -> None:
             cloud = read_splats(self.cloud.path)
-            rasteriser = choose_rasteriser(cloud.centers.device)
-            replace_views(views_of_cloud(cloud, rasteriser, size=self.config.views.rendered), path)
+            rasterizer = choose_rasterizer(cloud.centers.device)
+            replace_views(views_of_cloud(cloud, rasterizer, size=self.config.views.rendered), path)
 
         recipe = {"cloud": self.cloud.digest, "rendered": self.config.views.rendered}
         return self.stages.keep("views", recipe, make)

@@ -110,7 +110,7 @@ def expect_contacts_in_outlines(
     if not fitting:
         return
     factor = max(fitting)
-    name = next((unit for unit, size in METRES.items() if abs(size / (factor * settings.metres) - 1) < 1e-6), None)
+    name = next((unit for unit, size in METRES.items() if abs(size / (factor * settings.meters) - 1) < 1e-6), None)
     mended = f'write unit = "{name}" in capture.toml' if name else "scale the contacts or the cameras"
     raise CaptureError(
         f"expected contacts on the object that the photographs show; most lie outside of its outlines, and inside when "
@@ -144,13 +144,13 @@ def _share_inside(contacts: Float[Tensor, "contacts 3"], views: Sequence[View]) 
 def _mending(factor: float, settings: CaptureSettings) -> str:
     """Return what to write in capture.toml where the mesh times a factor fits the cameras."""
 
-    def named(metres: float) -> str | None:
-        return next((unit for unit, length in METRES.items() if abs(length / metres - 1) < 1e-6), None)
+    def named(meters: float) -> str | None:
+        return next((unit for unit, length in METRES.items() if abs(length / meters - 1) < 1e-6), None)
 
-    views, contacts = named(settings.views_metres / factor), named(settings.metres * factor)
+    views, contacts = named(settings.views_meters / factor), named(settings.meters * factor)
     if views is not None:
         return f'write views_unit = "{views}" in capture.toml'
-    mesh = named(settings.surface_metres * factor)
+    mesh = named(settings.surface_meters * factor)
     if contacts is not None and mesh is not None:
         return f'write unit = "{contacts}" and surface_unit = "{mesh}" in capture.toml'
     return "scale the cameras or the mesh"

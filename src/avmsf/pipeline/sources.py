@@ -106,10 +106,10 @@ def keep_views(
             views = _rendered(source.path, config, settings=settings, tell=tell)
         else:
             folder = source.path if moved is None else moved.path
-            views = _photographed(folder, config, metres=settings.views_metres, tell=tell)
+            views = _photographed(folder, config, meters=settings.views_meters, tell=tell)
         replace_views(_spread(views, config.count), path)
 
-    lengths = {"views_metres": settings.views_metres, "surface_metres": settings.surface_metres}
+    lengths = {"views_meters": settings.views_meters, "surface_meters": settings.surface_meters}
     chosen = {name: value for name, value in asdict(config).items() if name in _matters(source.kind)}
     return stages.keep("views", {"kind": source.kind, **recipe, **lengths, **chosen}, make)
 
@@ -133,8 +133,8 @@ def _matters(kind: Kind) -> Sequence[str]:
     return ("rendered", "count") if kind == "mesh" else ("longest", "masks", "count")
 
 
-def _photographed(folder: Path, config: ViewsConfig, *, metres: float, tell: Tell) -> tuple[View, ...]:
-    views = read_views(folder, longest=config.longest, metres=metres)
+def _photographed(folder: Path, config: ViewsConfig, *, meters: float, tell: Tell) -> tuple[View, ...]:
+    views = read_views(folder, longest=config.longest, meters=meters)
     bare = sum(view.mask is None for view in views)
     if config.masks and bare:
         tell(f"views: {len(views)}, looking for the object in {bare} without a mask")
@@ -143,7 +143,7 @@ def _photographed(folder: Path, config: ViewsConfig, *, metres: float, tell: Tel
 
 
 def _rendered(path: Path, config: ViewsConfig, *, settings: CaptureSettings, tell: Tell) -> tuple[View, ...]:
-    mesh = read_textured_mesh(path, metres=settings.surface_metres)
+    mesh = read_textured_mesh(path, meters=settings.surface_meters)
     cameras = orbit_cameras(mesh.surface, size=config.rendered)
     tell(f"views: rendering {len(cameras)} of {path.name}")
     return render_views(mesh, cameras)

@@ -1,6 +1,6 @@
-"""From ellipses in the image to pixels: the second half of rasterising, with its gradient.
+"""From ellipses in the image to pixels: the second half of rasterizing, with its gradient.
 
-Every pixel takes the Gaussians of its tile from front to back. One that covers alpha of it gives alpha T of its colour
+Every pixel takes the Gaussians of its tile from front to back. One that covers alpha of it gives alpha T of its color
 and leaves T (1 - alpha) of what lies behind, until less than 1e-4 is left (3DGS). The gradient takes them from back to
 front, dividing T by 1 - alpha again, and writes one row for each pair of tile and Gaussian; these are summed at the end
 in an order that does not depend on the number of threads.
@@ -36,7 +36,7 @@ _TILE_WORK = 8
 
 
 class Blending(torch.autograd.Function):
-    """Colour, coverage and depth of every pixel from the Gaussians' ellipses."""
+    """Color, coverage and depth of every pixel from the Gaussians' ellipses."""
 
     @staticmethod
     def forward(
@@ -51,7 +51,7 @@ class Blending(torch.autograd.Function):
         background: Float32[Tensor, " 3"],
         size: tuple[int, int],
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return colour [height, width, 3], alpha and depth [height, width]; the rest as `Projection` gives it."""
+        """Return color [height, width, 3], alpha and depth [height, width]; the rest as `Projection` gives it."""
         width, height = size
         inputs = [each.detach().numpy() for each in (screen, remainders, ellipses, opacities, colors, depths)]
         paint = background.detach().contiguous().numpy()
@@ -87,7 +87,7 @@ class Blending(torch.autograd.Function):
 
 
 def _bounds(starts: Int64[np.ndarray, " edges"], lanes: int) -> Int64[np.ndarray, " bounds"]:
-    """Return where each lane's stretch of tiles begins, and the end: neighbours, for they share many Gaussians."""
+    """Return where each lane's stretch of tiles begins, and the end: neighbors, for they share many Gaussians."""
     work = starts + _TILE_WORK * np.arange(len(starts))
     bounds = np.searchsorted(work, np.linspace(0, work[-1], lanes + 1))
     bounds[-1] = len(starts) - 1

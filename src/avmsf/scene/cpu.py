@@ -1,4 +1,4 @@
-"""The rasteriser for processors: numba kernels over tiles of 8 x 8 pixels."""
+"""The rasterizer for processors: numba kernels over tiles of 8 x 8 pixels."""
 
 from dataclasses import fields
 
@@ -11,10 +11,10 @@ from avmsf.errors import SceneError
 from avmsf.scene.blending import Blending
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.projection import project
-from avmsf.scene.rasteriser import Rendering
+from avmsf.scene.rasterizer import Rendering
 
 
-class NumbaRasteriser:
+class NumbaRasterizer:
     """Renders clouds on the CPU in float32, with as many threads as numba is given (`NUMBA_NUM_THREADS`).
 
     The same cloud gives the same image and the same gradients to the last bit, whatever the number of threads. The
@@ -22,7 +22,7 @@ class NumbaRasteriser:
     """
 
     def __call__(self, cloud: GaussianCloud, camera: Camera, *, background: Float[Tensor, " 3"]) -> Rendering:
-        """Return what `camera` sees before a `background` colour.
+        """Return what `camera` sees before a `background` color.
 
         Raises SceneError for tensors that are not float32 on the CPU, and for Gaussians with numbers that are not
         finite or rotations without length.
@@ -43,7 +43,7 @@ def _expect_plain(cloud: GaussianCloud, background: Float[Tensor, " 3"]) -> None
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise SceneError(
                 f"expected float32 numbers on the CPU, found {name} in {str(tensor.dtype).removeprefix('torch.')} on "
-                f"{tensor.device}: convert it, or take the rasteriser that `choose_rasteriser` gives for that device"
+                f"{tensor.device}: convert it, or take the rasterizer that `choose_rasterizer` gives for that device"
             )
 
 

@@ -1,4 +1,4 @@
-"""The rasteriser for graphics cards: gsplat's kernels (extra `gpu`)."""
+"""The rasterizer for graphics cards: gsplat's kernels (extra `gpu`)."""
 
 import importlib
 from typing import Any
@@ -11,10 +11,10 @@ from avmsf.capture.cameras import Camera
 from avmsf.errors import SceneError
 from avmsf.scene.ellipses import NEAR
 from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.rasteriser import Rendering
+from avmsf.scene.rasterizer import Rendering
 
 
-class GsplatRasteriser:
+class GsplatRasterizer:
     """Renders clouds where they lie, on a CUDA device, by gsplat."""
 
     def __init__(self) -> None:
@@ -28,7 +28,7 @@ class GsplatRasteriser:
             ) from error
 
     def __call__(self, cloud: GaussianCloud, camera: Camera, *, background: Float[Tensor, " 3"]) -> Rendering:
-        """Return what `camera` sees before a `background` colour.
+        """Return what `camera` sees before a `background` color.
 
         Raises SceneError for a cloud or background that is not on a CUDA device.
         """
@@ -37,7 +37,7 @@ class GsplatRasteriser:
             if not _lies_on_card(tensor):
                 raise SceneError(
                     f"expected a {name} on a CUDA device, found it on {tensor.device}: move it there, or take the "
-                    "rasteriser that `choose_rasteriser` gives for that device"
+                    "rasterizer that `choose_rasterizer` gives for that device"
                 )
         painted, covered, found = self._gsplat.rasterization(
             means=centers,

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from avmsf.capture.cameras import Camera
 from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.rasteriser import Rendering
+from avmsf.scene.rasterizer import Rendering
 from avmsf.scene.splatconfig import SplatConfig
 
 _SHRINK = 1.6
@@ -28,7 +28,7 @@ class Density:
     """How strongly the photographs pulled at each Gaussian since the number last changed."""
 
     pull: Float[Tensor, " points"]
-    """Sum over views of the slope's length by the place in the image, in half images (gsplat's normalisation)."""
+    """Sum over views of the slope's length by the place in the image, in half images (gsplat's normalization)."""
     views: Float[Tensor, " points"]
     """Views that saw the Gaussian."""
 

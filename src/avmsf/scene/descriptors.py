@@ -1,4 +1,4 @@
-"""The embedded encoder: colour, gradient orientation and local shape at several scales, without any download.
+"""The embedded encoder: color, gradient orientation and local shape at several scales, without any download.
 
 All descriptors are the same whatever way up the camera was held. Where g is an image's gradient as a complex number
 and G a Gaussian, |G * (g^k / |g|^(k-1))| is the k-th Fourier coefficient, in magnitude, of a dense histogram of
@@ -32,9 +32,9 @@ _FAINT = np.float32(0.01)
 
 @dataclass(frozen=True)
 class ImageDescriptors:
-    """Hand-made descriptors of an image's neighbourhoods. They are no DINO features and do not say so.
+    """Hand-made descriptors of an image's neighborhoods. They are no DINO features and do not say so.
 
-    Colour and spread of colour in CIE Lab, orientation histograms' Fourier coefficients 0 to 4, principal curvatures
+    Color and spread of color in CIE Lab, orientation histograms' Fourier coefficients 0 to 4, principal curvatures
     of the brightness: 39 features with the default scales.
     """
 
@@ -43,7 +43,7 @@ class ImageDescriptors:
     stride: int = 2
     """Pixels that one cell of the map stands for."""
     color_scales: tuple[float, ...] = (2.0, 8.0, 32.0)
-    """Standard deviations of the Gaussians that colours are averaged over, pixels."""
+    """Standard deviations of the Gaussians that colors are averaged over, pixels."""
     texture_scales: tuple[float, ...] = (4.0, 8.0, 16.0)
     """Standard deviations of the soft cells in which orientations, curvatures and spreads are taken, pixels."""
 
@@ -68,7 +68,7 @@ class ImageDescriptors:
 
 
 def _spreads(lab: _Plane, scale: float) -> list[_Plane]:
-    """Return the standard deviation of each colour in a Gaussian window."""
+    """Return the standard deviation of each color in a Gaussian window."""
     variance = _smooth(lab**2, scale) - _smooth(lab, scale) ** 2
     return _channels(np.sqrt(np.maximum(variance, 0)) * _SPREAD_SIZES)
 

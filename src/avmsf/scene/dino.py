@@ -42,7 +42,7 @@ class DinoEncoder:
         """Wrap a transformers model on whatever device and in whatever precision it is.
 
         `longest`, pixels, is the resolution encoded, None for each image's own; `mean` and `deviation` are what the
-        model was trained to have colours normalised with.
+        model was trained to have colors normalized with.
         """
         if longest is not None and longest < 1:
             raise SceneError(f"longest = {longest}: expected the pixels of the longer side, such as 518")
@@ -183,7 +183,7 @@ def _load_model(folder: Path, device: torch.device, dtype: torch.dtype) -> nn.Mo
 
 
 def _constants(path: Path) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the mean and deviation of colours that a preprocessor's file asks for, ImageNet's without one."""
+    """Return the mean and deviation of colors that a preprocessor's file asks for, ImageNet's without one."""
     if not path.is_file():
         return IMAGENET_MEAN, IMAGENET_DEVIATION
     record = read_settings(path, raising=SceneError)

@@ -17,7 +17,7 @@ import numpy as np
 from avmsf.compiled import compiled
 
 NEAR = 0.01
-"""Gaussians with centers nearer than this to the camera's plane are not seen, metres (gsplat's default)."""
+"""Gaussians with centers nearer than this to the camera's plane are not seen, meters (gsplat's default)."""
 _WIDEST = 1e30
 """Ellipses with larger variances, square pixels, are dropped: float32 cannot hold what follows from them."""
 FAINTEST = 1.0 / 255.0
@@ -135,7 +135,7 @@ def project_points(
     radii,
     remainders,
 ):
-    """Write what `Projection.forward` returns into arrays of zeros, all but the colours, which are only checked.
+    """Write what `Projection.forward` returns into arrays of zeros, all but the colors, which are only checked.
 
     `scratch` [lanes, 16, 3] are float64 numbers to work with.
     """
@@ -193,7 +193,7 @@ def project_points_back(
     by_log_scales,
     by_logits,
 ):
-    """Write the derivatives by centers, rotations, sizes and opacities, without what the colours add to the centers.
+    """Write the derivatives by centers, rotations, sizes and opacities, without what the colors add to the centers.
 
     The arrays come as zeros, and stay so where the radius is zero. `scratch` is that of `project_points`.
     """

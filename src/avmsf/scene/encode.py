@@ -55,7 +55,7 @@ def unit_image(
 def continue_outside(
     color: Float[Tensor, "height width 3"], coverage: Float[Tensor, "height width"]
 ) -> Float[Tensor, "height width 3"]:
-    """Return the image with the object's colours carried on smoothly over what lies outside its mask.
+    """Return the image with the object's colors carried on smoothly over what lies outside its mask.
 
     Whatever an encoder then computes near the silhouette speaks of the object: the background, and the edge between
     the two, differ from view to view at one place of the surface. Pixels that the object covers in part go, too, and

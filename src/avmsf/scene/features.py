@@ -20,10 +20,10 @@ GEOMETRY = "geometry"
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Groups of neighbouring points, each with one descriptor (paper, eq. 7)."""
+    """Groups of neighboring points, each with one descriptor (paper, eq. 7)."""
 
     centers: Float[Tensor, "clusters 3"]
-    """Means of the groups' points, metres."""
+    """Means of the groups' points, meters."""
     descriptors: Float[Tensor, "clusters dim"]
     """Means of the groups' features."""
 
@@ -35,7 +35,7 @@ class FeatureField:
     __repr__ = short_repr
 
     points: Float[Tensor, "points 3"]
-    """Object frame, metres."""
+    """Object frame, meters."""
     features: Float[Tensor, "points dim"]
     """About unit size, so that no dimension drowns the others."""
     encoder: str
@@ -83,7 +83,7 @@ class FeatureField:
 
     @property
     def half_diagonal(self) -> float:
-        """Half the diagonal of the points' bounding box, metres: the object's size in formulas."""
+        """Half the diagonal of the points' bounding box, meters: the object's size in formulas."""
         return _half_diagonal(self.points)
 
     def digest(self) -> str:

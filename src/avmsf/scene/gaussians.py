@@ -1,4 +1,4 @@
-"""An object as 3D Gaussians: soft ellipsoids with an opacity and a colour that depends on the direction of view."""
+"""An object as 3D Gaussians: soft ellipsoids with an opacity and a color that depends on the direction of view."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ class GaussianCloud:
     __repr__ = short_repr
 
     centers: Float[Tensor, "points 3"]
-    """Metres."""
+    """Meters."""
     rotations: Float[Tensor, "points 4"]
-    """Quaternions w, x, y, z from each Gaussian's own axes to the object frame; normalised where they are used."""
+    """Quaternions w, x, y, z from each Gaussian's own axes to the object frame; normalized where they are used."""
     log_scales: Float[Tensor, "points 3"]
-    """Natural logarithms of the standard deviations along the own axes, metres."""
+    """Natural logarithms of the standard deviations along the own axes, meters."""
     logit_opacities: Float[Tensor, " points"]
     """Opacity at the center is the sigmoid of these."""
     harmonics: Float[Tensor, "points coefficients 3"]

@@ -1,7 +1,7 @@
 """Real spherical harmonics to degree 3 and their slopes, in the order and with the signs of 3D Gaussian Splatting.
 
 Each of the 16 functions is a polynomial in the coordinates of a unit direction (Sloan 2008, "Stupid Spherical
-Harmonics Tricks", with the Condon-Shortley sign on odd orders). A colour is one half more than their weighted sum.
+Harmonics Tricks", with the Condon-Shortley sign on odd orders). A color is one half more than their weighted sum.
 """
 
 import math
@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from avmsf.compiled import compiled
 
 _C0 = 0.28209479177387814
-"""sqrt(1 / 4 pi); the further constants normalise their polynomials to one over the sphere likewise."""
+"""sqrt(1 / 4 pi); the further constants normalize their polynomials to one over the sphere likewise."""
 _C1 = 0.4886025119029199
 _C2, _C2_ZONAL, _C2_SECTORAL = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
 _C3, _C3_PRODUCT, _C3_FLAT = 0.5900435899266435, 2.890611442640554, 0.4570457994644658
@@ -83,7 +83,7 @@ def _direction(center, position):
 @compiled(error_model="numpy")
 @no_type_check
 def shade(lane, lanes, centers, weights, radii, position, scratch, colors):
-    """Write the colours [points, 3] in which a camera at `position` sees Gaussians, all but those with radius zero.
+    """Write the colors [points, 3] in which a camera at `position` sees Gaussians, all but those with radius zero.
 
     `scratch` [lanes, 35] are float64 numbers to work with.
     """
@@ -102,7 +102,7 @@ def shade(lane, lanes, centers, weights, radii, position, scratch, colors):
 @compiled(error_model="numpy")
 @no_type_check
 def shade_back(lane, lanes, centers, weights, radii, position, by_colors, scratch, by_centers, by_weights):
-    """Add to `by_centers` [points, 3] what the colours' derivatives bring, and write those by the weights.
+    """Add to `by_centers` [points, 3] what the colors' derivatives bring, and write those by the weights.
 
     Gaussians with radius zero are left out. `scratch` is that of `shade`.
     """
@@ -117,7 +117,7 @@ def shade_back(lane, lanes, centers, weights, radii, position, by_colors, scratc
             color = 0.5
             for k in range(count):
                 color += basis[k] * float(weights[i, k, j])
-            # Where a colour is held at zero nothing moves it.
+            # Where a color is held at zero nothing moves it.
             by_color[j] = float(by_colors[i, j]) if color > 0.0 else 0.0
         for k in range(count):
             mixed[k] = 0.0

@@ -28,11 +28,11 @@ class Hull:
     """The surface of what the masks leave."""
 
     points: Float[Tensor, "points 3"]
-    """Middles of the voxels at the surface, metres."""
+    """Middles of the voxels at the surface, meters."""
     normals: Float[Tensor, "points 3"]
     """Unit normals, outwards, as well as voxels tell them."""
     spacing: float
-    """Edge of a voxel, metres."""
+    """Edge of a voxel, meters."""
 
 
 def visual_hull(views: Sequence[View], *, points: int, dissent: float = 0.05) -> Hull:

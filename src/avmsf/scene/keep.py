@@ -13,12 +13,12 @@ from torch import Tensor
 from avmsf.capture.cameras import View
 from avmsf.errors import SceneError
 from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.rasteriser import Rasteriser
+from avmsf.scene.rasterizer import Rasterizer
 from avmsf.scene.start import ZEROTH
 
-_NEIGHBOURS = 8
+_NEIGHBORS = 8
 _AFLOAT = 6.0
-"""Distance to the neighbours, in medians of that distance, beyond which a Gaussian belongs to nothing."""
+"""Distance to the neighbors, in medians of that distance, beyond which a Gaussian belongs to nothing."""
 _OVERSIZE = 0.15
 """Largest scale, in diagonals of the box around the middle 98 % of the centers."""
 _RIM = 2
@@ -29,7 +29,7 @@ def keep_object(
     cloud: GaussianCloud,
     views: Sequence[View],
     *,
-    rasteriser: Rasteriser | None = None,
+    rasterizer: Rasterizer | None = None,
     least_opacity: float = 0.1,
     dissent: float = 0.1,
     least_weight: float = 0.5,
@@ -37,8 +37,8 @@ def keep_object(
     """Return the Gaussians that lie on the object.
 
     Those go whose opacity is less than `least_opacity`; whose center is outside of the masks in more than `dissent` of
-    the views that have it in their image; whose scale is that of the object; whose neighbours are far away; and, with a
-    `rasteriser`, those that in no view colour as much as `least_weight` pixels in sum, because others hide them.
+    the views that have it in their image; whose scale is that of the object; whose neighbors are far away; and, with a
+    `rasterizer`, those that in no view color as much as `least_weight` pixels in sum, because others hide them.
     Raises `SceneError` where nothing remains.
     """
     cloud = cloud.detach()
@@ -46,8 +46,8 @@ def keep_object(
     rows = rows[masks_agree(cloud.centers[rows], views, dissent=dissent)]
     _expect_some(rows, cloud)
     rows = rows[_sized(cloud.take(rows))]
-    if rasteriser is not None:
-        rows = rows[blended_weight(cloud.take(rows), views, rasteriser=rasteriser) >= least_weight]
+    if rasterizer is not None:
+        rows = rows[blended_weight(cloud.take(rows), views, rasterizer=rasterizer) >= least_weight]
     _expect_some(rows, cloud)
     rows = rows[_close(cloud.centers[rows])]
     _expect_some(rows, cloud)
@@ -81,18 +81,18 @@ def masks_agree(
     return ((seen > 0) & (against <= dissent * seen)).to(device)
 
 
-def blended_weight(cloud: GaussianCloud, views: Sequence[View], *, rasteriser: Rasteriser) -> Float[Tensor, " points"]:
+def blended_weight(cloud: GaussianCloud, views: Sequence[View], *, rasterizer: Rasterizer) -> Float[Tensor, " points"]:
     """Return each Gaussian's largest share in an image: its blending weights summed over the pixels of a view.
 
-    Taken from the slope of a rendering by the Gaussians' own brightness, so that any rasteriser tells it.
+    Taken from the slope of a rendering by the Gaussians' own brightness, so that any rasterizer tells it.
     """
     largest = torch.zeros_like(cloud.logit_opacities)
     for view in views:
-        # Grey is far from black, at which colours are cut off and have no slope.
-        grey = torch.zeros_like(cloud.harmonics[:, :1], requires_grad=True)
-        plain = replace(cloud.detach(), harmonics=grey)
-        color = rasteriser(plain, view.camera, background=largest.new_zeros(3)).color
-        (slope,) = torch.autograd.grad(color[..., 0].sum(), grey)
+        # Gray is far from black, at which colors are cut off and have no slope.
+        gray = torch.zeros_like(cloud.harmonics[:, :1], requires_grad=True)
+        plain = replace(cloud.detach(), harmonics=gray)
+        color = rasterizer(plain, view.camera, background=largest.new_zeros(3)).color
+        (slope,) = torch.autograd.grad(color[..., 0].sum(), gray)
         largest = torch.maximum(largest, slope[:, 0, 0] / ZEROTH)
     return largest
 
@@ -105,7 +105,7 @@ def _sized(cloud: GaussianCloud) -> Bool[Tensor, " points"]:
 
 def _close(points: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
     places = points.double().cpu().numpy()
-    count = min(_NEIGHBOURS, len(places) - 1)
+    count = min(_NEIGHBORS, len(places) - 1)
     if count < 1:
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
     distance = cKDTree(places).query(places, k=np.arange(2, count + 2))[0].mean(1)

@@ -14,13 +14,13 @@ from avmsf.scene.encode import Encoder, continue_outside
 from avmsf.scene.features import FeatureField
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.points import nearest_points
-from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
+from avmsf.scene.rasterizer import Rasterizer, choose_rasterizer
 from avmsf.scene.visibility import DepthMap, Sight, depth_of_cloud, depth_reach, look
 
 _REACH = 1.0
 """Standard deviations by which a Gaussian may lie behind the depth that is seen and still be of that surface. Two let
 twice as many through thin walls; what one turns away is seen at a slant, and by other views better."""
-_NEIGHBOURS = 3
+_NEIGHBORS = 3
 """Seen points whose features an unseen one takes the mean of."""
 
 LEAST_SEEN = 0.05
@@ -51,7 +51,7 @@ class Lifted:
 
     features: FeatureField
     seen: Int[Tensor, " points"]
-    """Number of views that see each point; where it is 0 the feature is its neighbours'."""
+    """Number of views that see each point; where it is 0 the feature is its neighbors'."""
     past: Int[Tensor, " points"]
     """Number of these that see a surface behind the point."""
     agreement: float
@@ -108,7 +108,7 @@ def lift(
     views: Sequence[View],
     encoder: Encoder,
     *,
-    rasteriser: Rasteriser | None = None,
+    rasterizer: Rasterizer | None = None,
     weighting: Weighting = by_presence,
     inpainted: bool = True,
     progress: Callable[[LiftProgress], None] | None = None,
@@ -117,14 +117,14 @@ def lift(
 
     A view sees a Gaussian whose center lies inside its mask, where it has one, and no deeper than the depth that the
     cloud shows there plus the Gaussian's own standard deviation along the view and two pixels: a surface of Gaussians
-    is as thick as they are. The `rasteriser` is by default the one for the cloud's device. Raises as `lift_points`.
+    is as thick as they are. The `rasterizer` is by default the one for the cloud's device. Raises as `lift_points`.
     """
-    rasteriser = choose_rasteriser(cloud.centers.device) if rasteriser is None else rasteriser
+    rasterizer = choose_rasterizer(cloud.centers.device) if rasterizer is None else rasterizer
     return lift_points(
         cloud.centers,
         views,
         encoder,
-        depth_map=depth_of_cloud(cloud, rasteriser),
+        depth_map=depth_of_cloud(cloud, rasterizer),
         reach=lambda camera: _REACH * depth_reach(cloud, camera),
         weighting=weighting,
         inpainted=inpainted,
@@ -145,7 +145,7 @@ def lift_points(
 ) -> Lifted:
     """Give points of a surface, whose depth in a camera `depth_map` knows, the mean of the features in their views.
 
-    `reach` says how far behind that depth a point may lie, metres; without it, points lie on the surface. Images are
+    `reach` says how far behind that depth a point may lie, meters; without it, points lie on the surface. Images are
     `inpainted` outside their masks with the object's colors, or described as they are (paper). One view is
     described at a time. Raises SceneError where there is nothing to lift or where no view sees any point.
     """
@@ -186,12 +186,12 @@ class _Tally:
         self.squares += weights * found.double().square().sum(1)
 
     def result(self, points: Float[Tensor, "points 3"], encoder: str) -> Lifted:
-        """Return the means, with those of seen neighbours where there is none."""
+        """Return the means, with those of seen neighbors where there is none."""
         known = self.seen > 0
         if not bool(known.any()):
             raise SceneError(
                 f"no view sees any of the {len(points)} points: the cameras look elsewhere, or the points and the "
-                "cameras are in different frames or units (metres?), or the masks are empty: look at one view's points "
+                "cameras are in different frames or units (meters?), or the masks are empty: look at one view's points "
                 "in its image"
             )
         means = self.sums[known] / self.weights[known][:, None]
@@ -199,7 +199,7 @@ class _Tally:
         features[known] = means
         if not bool(known.all()):
             places = points.detach().cpu()
-            near = nearest_points(places[known], places[~known], count=min(_NEIGHBOURS, int(known.sum())))
+            near = nearest_points(places[known], places[~known], count=min(_NEIGHBORS, int(known.sum())))
             features[~known] = means[near].mean(1)
         field = FeatureField(points.detach().float(), features.to(points.device), encoder)
         return Lifted(field, self.seen.to(points.device), self.past.to(points.device), self._agreement())

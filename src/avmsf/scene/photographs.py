@@ -16,7 +16,7 @@ from avmsf.errors import SceneError
 from avmsf.scene.splatconfig import SplatConfig
 
 _PLAIN_STEP, _PLAIN_PART = 24, 0.9
-"""A background is plain where this part of its pixels lies within so many levels of 255 of the median colour."""
+"""A background is plain where this part of its pixels lies within so many levels of 255 of the median color."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +47,13 @@ class Backdrop:
     """What is behind the object in renderings."""
 
     color: Float[Tensor, " 3"] | None
-    """Red, green and blue, 0 to 1; None puts another colour behind every time, and the same into the photographs."""
+    """Red, green and blue, 0 to 1; None puts another color behind every time, and the same into the photographs."""
 
 
 def choose_backdrop(views: Sequence[View], config: SplatConfig) -> Backdrop:
-    """Return the colour that the config names, or the one found around the masks, or at the edges of the images.
+    """Return the color that the config names, or the one found around the masks, or at the edges of the images.
 
-    Raises `SceneError` for random colours without any mask.
+    Raises `SceneError` for random colors without any mask.
     """
     masked = any(view.mask is not None for view in views)
     if not isinstance(config.background, str):
@@ -62,7 +62,7 @@ def choose_backdrop(views: Sequence[View], config: SplatConfig) -> Backdrop:
         if not masked:
             raise SceneError(
                 "background = random takes masks, to know where the background is; no view has one: give masks or the "
-                "background's colour"
+                "background's color"
             )
         return Backdrop(None)
     pixels = np.concatenate([_outside(view) for view in views])
@@ -75,7 +75,7 @@ def choose_backdrop(views: Sequence[View], config: SplatConfig) -> Backdrop:
 
 
 def prepare_photographs(views: Sequence[View], backdrop: Backdrop, *, halvings: int) -> list[Photograph]:
-    """Return the views that can be compared: all, or before random colours those with a mask.
+    """Return the views that can be compared: all, or before random colors those with a mask.
 
     A mask without the object says nothing that is worth believing: its view is left out. `visual_hull` warns of it.
     """

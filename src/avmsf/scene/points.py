@@ -1,8 +1,8 @@
 """Points on an object: which to strike, which are near, which belong together, and points where none are known.
 
-All distances are Euclidean, in metres, taken in float64 whatever the points come in. Ties go to the point that comes
+All distances are Euclidean, in meters, taken in float64 whatever the points come in. Ties go to the point that comes
 first, and contacts on a regular grid are full of ties: read them in float64, for what was a tie as it was written
-in decimals is broken by the rounding of float32, and then another split or another neighbour comes out.
+in decimals is broken by the rounding of float32, and then another split or another neighbor comes out.
 """
 
 import math
@@ -25,7 +25,7 @@ class Clusters:
     """Groups of points that lie together, none of them empty."""
 
     centers: Float[Tensor, "clusters 3"]
-    """Mean of each group's points, metres."""
+    """Mean of each group's points, meters."""
     labels: Int[Tensor, " points"]
     """Which group each point belongs to: that of the nearest center."""
 
@@ -35,7 +35,7 @@ class SurfaceSamples:
     """Points drawn from a surface."""
 
     points: Float[Tensor, "points 3"]
-    """Metres."""
+    """Meters."""
     normals: Float[Tensor, "points 3"]
     """Unit normals of the faces that the points lie on, to the side from which a face runs counter-clockwise."""
 
@@ -95,7 +95,7 @@ def nearest_points(
     _expect_rows(points, count, 0)
     tree = cKDTree(points.detach().double().cpu().numpy())
     places = queries.detach().double().cpu().numpy()
-    # One neighbour more than asked for shows whether the last place is a tie, which the tree breaks as it likes.
+    # One neighbor more than asked for shows whether the last place is a tie, which the tree breaks as it likes.
     sought = min(count + 1, len(points))
     while True:
         distances, rows = tree.query(places, k=np.arange(1, sought + 1))

@@ -1,4 +1,4 @@
-"""From Gaussians in space to ellipses in the image: the first half of rasterising, with its gradient.
+"""From Gaussians in space to ellipses in the image: the first half of rasterizing, with its gradient.
 
 The conventions are gsplat's. `ellipses` and `harmonics` hold the kernels.
 """
@@ -22,7 +22,7 @@ _MARGIN = 0.3
 
 
 class Projection(torch.autograd.Function):
-    """Places, shapes, opacities, colours and depths of a cloud's Gaussians in one image, and their reach."""
+    """Places, shapes, opacities, colors and depths of a cloud's Gaussians in one image, and their reach."""
 
     @staticmethod
     def forward(
@@ -34,7 +34,7 @@ class Projection(torch.autograd.Function):
         weights: Float32[Tensor, "points coefficients 3"],
         camera: Camera,
     ) -> tuple[Tensor, ...]:
-        """Return screen [points, 2], ellipses [points, 3], opacities, colours [points, 3], depths, radii, remainders.
+        """Return screen [points, 2], ellipses [points, 3], opacities, colors [points, 3], depths, radii, remainders.
 
         An ellipse holds p, r and s of the triangular matrix that takes an offset (x, y) in pixels to standard
         deviations: (p x + r y, s y). Unseen Gaussians have radius 0, bad ones radius NaN. The remainders [points, 2]
@@ -82,19 +82,19 @@ def project(cloud: GaussianCloud, camera: Camera) -> tuple[Tensor, ...]:
 
 def _lens(camera: Camera) -> Float64[np.ndarray, "10"]:
     """Return focal lengths, principal point, size, and the tangents left, right, up and down where the slope ends."""
-    (across, down), (middle, centre) = camera.focal, camera.principal
+    (across, down), (middle, center) = camera.focal, camera.principal
     margins = _MARGIN * 0.5 * camera.width / across, _MARGIN * 0.5 * camera.height / down
     return np.array(
         [
             across,
             down,
             middle,
-            centre,
+            center,
             camera.width,
             camera.height,
             -middle / across - margins[0],
             (camera.width - middle) / across + margins[0],
-            -centre / down - margins[1],
-            (camera.height - centre) / down + margins[1],
+            -center / down - margins[1],
+            (camera.height - center) / down + margins[1],
         ]
     )

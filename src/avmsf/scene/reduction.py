@@ -48,7 +48,7 @@ def resize(features: FeatureField, size: float) -> FeatureField:
 def with_positions(features: FeatureField) -> FeatureField:
     """Return the features with the points' positions before them, as `FeatureField.from_points` has them.
 
-    Colour alone does not tell a bowl's left from its right; a gain field may need to. Positions are 1 long at most,
+    Color alone does not tell a bowl's left from its right; a gain field may need to. Positions are 1 long at most,
     and root mean square about .5: `resize` keeps features from drowning them.
     """
     positions = FeatureField.from_points(features.points).features

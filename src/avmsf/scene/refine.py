@@ -12,7 +12,7 @@ from torch import Tensor
 
 from avmsf.errors import SceneError
 from avmsf.scene.features import FeatureField
-from avmsf.scene.neighbourhoods import read_neighbourhoods
+from avmsf.scene.neighborhoods import read_neighborhoods
 from avmsf.scene.symmetry import Symmetries
 
 ITERATIONS = 3
@@ -108,7 +108,7 @@ def _orbits(
         return []
     places = points.detach().double().cpu()
     tree = cKDTree(places.numpy())
-    spacing = torch.from_numpy(read_neighbourhoods(places.numpy()).spacing)
+    spacing = torch.from_numpy(read_neighborhoods(places.numpy()).spacing)
     limit = reach * spacing if reach else torch.full_like(spacing, math.inf)
     orbits = []
     for rotation in symmetries.rotations:

@@ -16,7 +16,7 @@ from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.hull import visual_hull
 from avmsf.scene.keep import keep_object
 from avmsf.scene.photographs import choose_backdrop, prepare_photographs
-from avmsf.scene.rasteriser import Rasteriser, choose_rasteriser
+from avmsf.scene.rasterizer import Rasterizer, choose_rasterizer
 from avmsf.scene.splatcheckpoint import fingerprint
 from avmsf.scene.splatconfig import SplatConfig
 from avmsf.scene.splatrun import SplatRun
@@ -57,13 +57,13 @@ def splat(
     *,
     start: StartPoints | None = None,
     device: torch.device | str | None = None,
-    rasteriser: Rasteriser | None = None,
+    rasterizer: Rasterizer | None = None,
     progress: Callable[[SplatProgress], None] | None = None,
     checkpoint: str | Path | None = None,
 ) -> GaussianCloud:
     """Fit Gaussians to views and return those that lie on the object.
 
-    They start at the points of `start`, or on the visual hull of the views' masks. Without a `device` or `rasteriser`
+    They start at the points of `start`, or on the visual hull of the views' masks. Without a `device` or `rasterizer`
     they are fitted on a CUDA device where there is one and gsplat beside it, else on the CPU; they come back on the
     CPU. There the same views, config and start give the same Gaussians on the same machine.
 
@@ -72,8 +72,8 @@ def splat(
     `SceneError` for views or settings that nothing can be made of, and for a checkpoint that is not of these.
     """
     config = SplatConfig() if config is None else config
-    device = _device(device, rasteriser)
-    rasteriser = choose_rasteriser(device) if rasteriser is None else rasteriser
+    device = _device(device, rasterizer)
+    rasterizer = choose_rasterizer(device) if rasterizer is None else rasterizer
     began = time.monotonic()
     backdrop = choose_backdrop(views, config)
     photographs = prepare_photographs(views, backdrop, halvings=config.halvings)
@@ -84,7 +84,7 @@ def splat(
         opacity=config.start_opacity,
         flatness=config.start_flatness,
     )
-    run = SplatRun(cloud.to(device), photographs, backdrop, config, rasteriser=rasteriser)
+    run = SplatRun(cloud.to(device), photographs, backdrop, config, rasterizer=rasterizer)
     keeper = _Keeper(None if checkpoint is None else Path(checkpoint), fingerprint(views, cloud, config))
     keeper.resume(run)
     try:
@@ -101,7 +101,7 @@ def splat(
             keeper.save(run)
         raise
     keeper.save(run)
-    return keep_object(run.cloud, views, rasteriser=rasteriser).to("cpu")
+    return keep_object(run.cloud, views, rasterizer=rasterizer).to("cpu")
 
 
 class _Keeper:
@@ -141,8 +141,8 @@ def _hull_points(views: Sequence[View], config: SplatConfig) -> StartPoints:
     return StartPoints(hull.points, colors, hull.normals)
 
 
-def _device(device: torch.device | str | None, rasteriser: Rasteriser | None) -> torch.device:
+def _device(device: torch.device | str | None, rasterizer: Rasterizer | None) -> torch.device:
     if device is not None:
         return torch.device(device)
     usable = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
-    return torch.device("cuda" if usable and rasteriser is None else "cpu")
+    return torch.device("cuda" if usable and rasterizer is None else "cpu")

@@ -40,13 +40,13 @@ class SplatConfig:
     """Settings of a splatting. The defaults are what a short run on a processor does best with."""
 
     steps: int = 2000
-    """Steps of the optimiser, one view each; all schedules stretch with them."""
+    """Steps of the optimizer, one view each; all schedules stretch with them."""
     degree: Literal[0, 1, 2, 3] = 2
-    """Degree of the spherical harmonics: how a colour depends on the direction of view."""
+    """Degree of the spherical harmonics: how a color depends on the direction of view."""
     start_points: int = 15_000
     """Points on the visual hull that the Gaussians start at."""
     start_scale: float = 1.0
-    """First standard deviation of a Gaussian, in mean distances to its three nearest neighbours."""
+    """First standard deviation of a Gaussian, in mean distances to its three nearest neighbors."""
     start_opacity: float = 0.5
     """First opacity."""
     gaussians: int = 30_000
@@ -61,8 +61,8 @@ class SplatConfig:
     start_flatness: float = 0.3
     """First thickness of a Gaussian whose normal is known, in parts of its width."""
     background: tuple[float, float, float] | Literal["found", "random"] = "found"
-    """Red, green, blue behind the object, 0 to 1. `random` puts the masked object before another colour every step;
-    `found` takes the colour around the masks where it is plain, and `random` where it is not."""
+    """Red, green, blue behind the object, 0 to 1. `random` puts the masked object before another color every step;
+    `found` takes the color around the masks where it is plain, and `random` where it is not."""
     halvings: int = 2
     """How often the first images are halved."""
     coarse_until: float = 0.5

@@ -1,4 +1,4 @@
-"""One run of fitting Gaussians to photographs: parameters, optimiser, schedules and what one step does."""
+"""One run of fitting Gaussians to photographs: parameters, optimizer, schedules and what one step does."""
 
 import math
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ from avmsf.errors import SceneError
 from avmsf.scene.densify import Density
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.photographs import Backdrop, Photograph
-from avmsf.scene.rasteriser import Rasteriser, Rendering
+from avmsf.scene.rasterizer import Rasterizer, Rendering
 from avmsf.scene.splatconfig import SplatConfig
 from avmsf.scene.ssim import ssim
 
 GROUPS = ("centers", "rotations", "log_scales", "logit_opacities", "colors", "shades")
-"""Parameters with a rate of their own; colours are the harmonics of degree 0, shades those above."""
+"""Parameters with a rate of their own; colors are the harmonics of degree 0, shades those above."""
 _BETAS, _EPSILON = (0.9, 0.999), 1e-15
 """Adam's, as in 3DGS."""
 
@@ -42,9 +42,9 @@ class SplatRun:
         backdrop: Backdrop,
         config: SplatConfig,
         *,
-        rasteriser: Rasteriser,
+        rasterizer: Rasterizer,
     ) -> None:
-        self.photographs, self.backdrop, self.config, self.rasteriser = photographs, backdrop, config, rasteriser
+        self.photographs, self.backdrop, self.config, self.rasterizer = photographs, backdrop, config, rasterizer
         spread = cloud.centers.amax(0) - cloud.centers.amin(0)
         self.half_diagonal = 0.5 * float(spread.norm())
         self.parameters = {name: value.clone() for name, value in _named(cloud).items()}
@@ -71,7 +71,7 @@ class SplatRun:
         target = self._target(photograph, level)
         leaves = {name: value.detach().requires_grad_() for name, value in self.parameters.items()}
         cloud = self._cloud(leaves, self._degree())
-        rendering = self.rasteriser(cloud, photograph.cameras[level], background=target.background)
+        rendering = self.rasterizer(cloud, photograph.cameras[level], background=target.background)
         growing = self.step < self.config.densify_until * self.config.steps
         if growing:
             rendering.screen.retain_grad()
@@ -204,7 +204,7 @@ class SplatRun:
                 self._rebuild(torch.nonzero(~faint)[:, 0], None)
 
     def _rebuild(self, rows: Tensor, fresh: GaussianCloud | None) -> None:
-        """Keep the given rows, then add new Gaussians, about which the optimiser knows nothing yet."""
+        """Keep the given rows, then add new Gaussians, about which the optimizer knows nothing yet."""
         added = {} if fresh is None else _named(fresh)
         for name in GROUPS:
             more = added.get(name, self.parameters[name][:0])

@@ -1,4 +1,4 @@
-"""Where Gaussians start: points on or near the object, with colours, each a small soft ball."""
+"""Where Gaussians start: points on or near the object, with colors, each a small soft ball."""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from avmsf.errors import SceneError
 from avmsf.scene.gaussians import GaussianCloud
 
 ZEROTH = 0.28209479177387814
-"""The harmonic of degree 0, sqrt(1 / 4 pi): a colour is one half more than this times its coefficient."""
+"""The harmonic of degree 0, sqrt(1 / 4 pi): a color is one half more than this times its coefficient."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class StartPoints:
     """Points to start Gaussians at: of structure from motion, of a surface, of a visual hull."""
 
     points: Float[Tensor, "points 3"]
-    """Metres."""
+    """Meters."""
     colors: Float[Tensor, "points 3"]
     """Red, green, blue, 0 to 1."""
     normals: Float[Tensor, "points 3"] | None = None
@@ -40,7 +40,7 @@ class StartPoints:
 def starting_cloud(
     start: StartPoints, *, degree: int, scale: float, opacity: float, flatness: float = 1.0
 ) -> GaussianCloud:
-    """Return one Gaussian a point, `scale` mean distances to its 3 nearest neighbours wide (3DGS, section 5.1).
+    """Return one Gaussian a point, `scale` mean distances to its 3 nearest neighbors wide (3DGS, section 5.1).
 
     Round, or where normals are known a disc across the normal, `flatness` times as thick as wide. Where points
     coincide, the width is a thousandth of their bounding box's diagonal at least.
@@ -76,9 +76,9 @@ def _turns(normals: Float[Tensor, "points 3"]) -> Float[Tensor, "points 4"]:
 def photographed_colors(
     points: Float[Tensor, "points 3"], views: Sequence[View], *, spacing: float
 ) -> Float[Tensor, "points 3"]:
-    """Return the middle (median) of each point's colours in the views that see it, grey where none does.
+    """Return the middle (median) of each point's colors in the views that see it, gray where none does.
 
-    The points hide one another as balls of `spacing`, metres, would; what lies less than two of these behind the
+    The points hide one another as balls of `spacing`, meters, would; what lies less than two of these behind the
     foremost is seen as well. Where they stand out from the object, some views show what is beside it: hence no mean.
     """
     shown = np.full((len(views), len(points), 3), np.nan, dtype=np.float32)

@@ -19,7 +19,7 @@ class RotationalSymmetry:
     axis: Float[Tensor, " 3"]
     """Unit vector along the axis, of either sign."""
     point: Float[Tensor, " 3"]
-    """Where the axis passes the object's middle, metres."""
+    """Where the axis passes the object's middle, meters."""
     order: int | None
     """How many turns make a whole one, 2 or more; None where every angle is a symmetry. Then every plane that contains
     the axis mirrors the object too, and is not listed."""
@@ -59,7 +59,7 @@ class MirrorSymmetry:
     normal: Float[Tensor, " 3"]
     """Unit normal of the plane, of either sign."""
     point: Float[Tensor, " 3"]
-    """The point of the plane nearest to the object's middle, metres."""
+    """The point of the plane nearest to the object's middle, meters."""
     error: float
     """As for a rotation."""
     missing: float
@@ -81,7 +81,7 @@ class Symmetries:
     rotations: tuple[RotationalSymmetry, ...]
     mirrors: tuple[MirrorSymmetry, ...]
     spacing: float
-    """Distance between neighbouring points of the cloud that was judged, metres: the unit of the errors."""
+    """Distance between neighboring points of the cloud that was judged, meters: the unit of the errors."""
     tolerance: float
     """Errors up to this were accepted, in point spacings."""
     rejected: float

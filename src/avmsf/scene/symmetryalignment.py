@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from avmsf.scene.neighbourhoods import Neighbourhoods, read_neighbourhoods
+from avmsf.scene.neighborhoods import Neighborhoods, read_neighborhoods
 from avmsf.scene.symmetrymotion import Motion
 
 _REACH = 3.0
@@ -24,7 +24,7 @@ _STRAY = 1.0
 _CONTINUING = 0.45
 """Part of a stray piece's border that has to continue the surface beyond an open edge for the piece to fill a hole."""
 _OPEN = 0.22
-"""Length of `Neighbourhoods.openings` from which on a point lies at an edge of what was seen."""
+"""Length of `Neighborhoods.openings` from which on a point lies at an edge of what was seen."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Halves:
     """A cloud in two halves: points to be moved, drawn evenly by area, and a surface that they should meet."""
 
     queries: Float[np.ndarray, "queries 3"]
-    target: Neighbourhoods
+    target: Neighborhoods
     tree: cKDTree
     spacing: float
     """Median spacing of the target, or what stands for it, in the unit of the points: that of the errors."""
@@ -63,7 +63,7 @@ class Halves:
     ) -> "Halves":
         """Divide a cloud, and draw `count` queries from one half; errors are in spacings, kept within `bounds`."""
         order = generator.permutation(len(points))
-        moved, target = (read_neighbourhoods(points[order[part::2]]) for part in (0, 1))
+        moved, target = (read_neighborhoods(points[order[part::2]]) for part in (0, 1))
         areas = moved.spacing**2
         # Some points in a cloud lie alone: they would stand for much more than they show.
         areas = np.minimum(areas, 4 * np.median(areas))
@@ -96,7 +96,7 @@ class Halves:
 
 def _in_holes(
     moved: Float[np.ndarray, "queries 3"],
-    target: Neighbourhoods,
+    target: Neighborhoods,
     row: Int[np.ndarray, " queries"],
     stray: Bool[np.ndarray, " queries"],
 ) -> Bool[np.ndarray, " queries"]:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
 
-from avmsf.scene.neighbourhoods import Neighbourhoods, describe_neighbourhoods
+from avmsf.scene.neighborhoods import Neighborhoods, describe_neighborhoods
 from avmsf.scene.symmetrymotion import Motion
 
 _CELLS = 56
@@ -35,7 +35,7 @@ class CoarseCloud:
     width: float
 
     @classmethod
-    def of(cls, surface: Neighbourhoods, few: Float[np.ndarray, "few 3"], *, width: float = 0.03) -> "CoarseCloud":
+    def of(cls, surface: Neighborhoods, few: Float[np.ndarray, "few 3"], *, width: float = 0.03) -> "CoarseCloud":
         """Fill the grid; `few` are the points that will be moved."""
         lowest, highest = surface.points.min(0) - 0.1, surface.points.max(0) + 0.1
         cell = float((highest - lowest).max()) / _CELLS
@@ -73,12 +73,12 @@ class CoarseCloud:
         return self.score(linear, points - np.einsum("mij,mj->mi", linear, points))
 
 
-def principal_motions(surface: Neighbourhoods) -> list[Motion]:
+def principal_motions(surface: Neighborhoods) -> list[Motion]:
     """Return reflections and half turns along the principal axes of the surface, through its means and box's middle."""
     areas = np.minimum(surface.spacing**2, 4 * np.median(surface.spacing**2))
     mean = (areas[:, None] * surface.points).sum(0) / areas.sum()
-    centred = surface.points - mean
-    _, axes = np.linalg.eigh((areas[:, None] * centred).T @ centred)
+    centered = surface.points - mean
+    _, axes = np.linalg.eigh((areas[:, None] * centered).T @ centered)
     along = surface.points @ axes
     box = axes @ ((along.min(0) + along.max(0)) / 2)
     return [
@@ -89,7 +89,7 @@ def principal_motions(surface: Neighbourhoods) -> list[Motion]:
     ]
 
 
-def mirrors_of_pairs(surface: Neighbourhoods, pairs: Pairs, *, coarse: CoarseCloud, most: int) -> list[Motion]:
+def mirrors_of_pairs(surface: Neighborhoods, pairs: Pairs, *, coarse: CoarseCloud, most: int) -> list[Motion]:
     """Return reflections that matching points propose, the best on the coarse cloud first."""
     first, second = pairs
     points, normals = surface.points, surface.normals
@@ -105,7 +105,7 @@ def mirrors_of_pairs(surface: Neighbourhoods, pairs: Pairs, *, coarse: CoarseClo
     return distinct([Motion(direction[row], middle[row], None) for row in order], most=most)
 
 
-def turns_of_pairs(surface: Neighbourhoods, pairs: Pairs, *, coarse: CoarseCloud, most: int) -> list[Motion]:
+def turns_of_pairs(surface: Neighborhoods, pairs: Pairs, *, coarse: CoarseCloud, most: int) -> list[Motion]:
     """Return turns that matching points propose, the best on the coarse cloud first, about axes that differ."""
     first, second = pairs
     directions, places, angles = [], [], []
@@ -150,13 +150,13 @@ def distinct(motions: list[Motion], *, most: int) -> list[Motion]:
     return chosen
 
 
-def matching_pairs(surface: Neighbourhoods, *, generator: np.random.Generator) -> Pairs:
+def matching_pairs(surface: Neighborhoods, *, generator: np.random.Generator) -> Pairs:
     """Return rows of points that are far from one another and about which the surface is alike."""
     areas = np.minimum(surface.spacing**2, 4 * np.median(surface.spacing**2))
     shares = areas / areas.sum()
     rows = generator.choice(len(areas), min(_DESCRIBED, len(areas)), replace=False, p=shares)
     counted = generator.choice(len(areas), min(_COUNTED, len(areas)), replace=False)
-    described = describe_neighbourhoods(surface, rows, counted, diagonal=1.0)
+    described = describe_neighborhoods(surface, rows, counted, diagonal=1.0)
     squares = (described**2).sum(axis=1)
     unlike = squares[:, None] + squares - 2 * described @ described.T
     places = surface.points[rows]

@@ -30,7 +30,7 @@ class Group:
     """Motions that carry an object onto itself, and the characters of the group that they form."""
 
     motions: Float64[Tensor, "order 3 4"]
-    """A point x goes to A x + b, [A b] being the motion, A orthogonal, b in metres. The first one is the identity."""
+    """A point x goes to A x + b, [A b] being the motion, A orthogonal, b in meters. The first one is the identity."""
     characters: Float64[Tensor, "characters order"]
     """Of each motion. The first is one everywhere."""
 

@@ -45,7 +45,7 @@ class Motion:
         """Return the symmetry that follows from this and another one: the other's image of this plane or axis."""
         return replace(self, direction=other.linear @ self.direction, point=other.apply(self.point[None])[0])
 
-    def centred(self, middle: Vector) -> "Motion":
+    def centered(self, middle: Vector) -> "Motion":
         """Return the same motion, its point the one nearest to `middle`."""
         offset = middle - self.point
         along = (offset @ self.direction) * self.direction
@@ -54,5 +54,5 @@ class Motion:
     def apart(self, other: "Motion", middle: Vector) -> tuple[float, float]:
         """Return the angle between two planes or axes, degrees, and how far apart they pass the `middle`."""
         cosine = min(1.0, abs(float(self.direction @ other.direction)))
-        gap = self.centred(middle).point - other.centred(middle).point
+        gap = self.centered(middle).point - other.centered(middle).point
         return math.degrees(math.acos(cosine)), float(np.linalg.norm(gap))

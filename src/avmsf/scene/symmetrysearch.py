@@ -9,7 +9,7 @@ from torch import Tensor
 
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import SceneError
-from avmsf.scene.neighbourhoods import NEIGHBOURS, read_neighbourhoods
+from avmsf.scene.neighborhoods import NEIGHBORS, read_neighborhoods
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
 from avmsf.scene.symmetryalignment import Halves
 from avmsf.scene.symmetrycandidates import (
@@ -31,7 +31,7 @@ _QUERIES = 1500
 _SPACINGS = (0.01, 0.016)
 """Bounds of the spacing that errors are measured in, in diagonals: things are not made, nor scanned, more exactly than
 the first lets pass, and what is off by more than the second lets pass is so however few points there are."""
-_FEWEST = 10 * NEIGHBOURS
+_FEWEST = 10 * NEIGHBORS
 _PRIMES = (2, 3, 5, 7, 11)
 _MIRRORS, _AXES, _TURNS = 24, 30, 40
 """Candidates from matching pairs, and turns about the axes among them, that are fitted."""
@@ -79,9 +79,9 @@ def find_symmetries(
             f"expected a tolerance above 0 and a limit of at least {_FEWEST} points, found {tolerance:g} and {limit}"
         )
     random = np.random.default_rng(int(torch.randint(2**31 - 1, (1,), generator=generator_of(seed))))
-    places, middle, diagonal = _normalised(points)
+    places, middle, diagonal = _normalized(points)
     places = _evened(places, limit, random)
-    surface = read_neighbourhoods(places)
+    surface = read_neighborhoods(places)
     halves = Halves.of(places, _QUERIES, bounds=_SPACINGS, generator=random)
     coarse = CoarseCloud.of(surface, halves.queries[:150])
     group = Group(Judge(halves, tolerance, missing))
@@ -110,7 +110,7 @@ def _symmetries(group: Group, spacing: float, middle: Float[np.ndarray, " 3"], d
     ]
 
     def vectors(judged: Judged) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-        point = middle + diagonal * judged.motion.centred(np.zeros(3)).point
+        point = middle + diagonal * judged.motion.centered(np.zeros(3)).point
         return torch.from_numpy(_pointing(judged.motion.direction)), torch.from_numpy(point)
 
     turns = sorted(group.turns, key=lambda each: (not each.continuous, -(each.order or 0), each.error))
@@ -124,7 +124,7 @@ def _symmetries(group: Group, spacing: float, middle: Float[np.ndarray, " 3"], d
     )
 
 
-def _normalised(
+def _normalized(
     points: Float[Tensor, "points 3"],
 ) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, " 3"], float]:
     """Return the points about their middle in units of their diagonal, and both."""
@@ -159,7 +159,7 @@ def _evened(
     """Return at most `limit` points, drawn by the area that falls to each, so that dense parts give up most."""
     if len(places) <= limit:
         return places
-    areas = read_neighbourhoods(places).spacing ** 2
+    areas = read_neighborhoods(places).spacing ** 2
     areas = np.minimum(areas, 9 * np.median(areas))
     return places[random.choice(len(places), limit, replace=False, p=areas / areas.sum())]
 

@@ -18,13 +18,13 @@ from avmsf.capture.surface import Surface
 from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.errors import SceneError
 from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.rasteriser import Rasteriser
+from avmsf.scene.rasterizer import Rasterizer
 
 _COVERED = 0.5
 """Share of a pixel that the object must cover for the pixel to tell its depth."""
 
 DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
-"""What gives the depth of the first surface that each pixel of a camera sees, metres along the axis; 0 where none."""
+"""What gives the depth of the first surface that each pixel of a camera sees, meters along the axis; 0 where none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Sight:
     places: Float[Tensor, "points 2"]
     """In the image, pixels; meaningless where the share is zero."""
     depth: Float[Tensor, " points"]
-    """Metres along the optical axis."""
+    """Meters along the optical axis."""
     share: Float[Tensor, " points"]
     """From 0, hidden or outside the image or its mask, to 1, seen."""
     past: Float[Tensor, " points"]
@@ -56,7 +56,7 @@ def look(
 ) -> Sight:
     """Return what a view's camera sees of the points, given the depth that it sees at each pixel.
 
-    `reach`, metres, is how far behind the seen surface a point may lie and still be on it. Two pixels' width at the
+    `reach`, meters, is how far behind the seen surface a point may lie and still be on it. Two pixels' width at the
     point's depth is added to it, since a slanted surface is that much deeper or nearer in the next pixel.
     """
     camera = view.camera
@@ -77,12 +77,12 @@ def look(
     return Sight(places, deep, torch.where(inside, share, 0.0), torch.where(inside, past, 0.0), camera)
 
 
-def depth_of_cloud(cloud: GaussianCloud, rasteriser: Rasteriser) -> DepthMap:
+def depth_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer) -> DepthMap:
     """Return what renders the depth of Gaussians, 0 where they cover less than half of a pixel."""
 
     def render(camera: Camera) -> Float[Tensor, "height width"]:
         with torch.no_grad():
-            rendering = rasteriser(cloud, camera, background=cloud.centers.new_zeros(3))
+            rendering = rasterizer(cloud, camera, background=cloud.centers.new_zeros(3))
             return torch.where(rendering.alpha >= _COVERED, rendering.depth, 0.0)
 
     return render
@@ -105,7 +105,7 @@ def depth_of_surface(surface: Surface) -> DepthMap:
 
 
 def depth_reach(cloud: GaussianCloud, camera: Camera) -> Float[Tensor, " points"]:
-    """Return each Gaussian's standard deviation along a camera's optical axis, metres."""
+    """Return each Gaussian's standard deviation along a camera's optical axis, meters."""
     axis = camera.world_to_camera[2, :3].to(cloud.centers)
     w, x, y, z = torch.nn.functional.normalize(cloud.rotations, dim=1).unbind(1)
     # The axis in each Gaussian's own frame: the rotation matrix's columns times it.

@@ -9,10 +9,10 @@ from avmsf.simulate.solid import Solid
 
 
 def block(size: tuple[float, float, float], cells: tuple[int, int, int]) -> Solid:
-    """Return a block from the origin to `size` metres, `cells` boxes along each axis, six tetrahedra a box.
+    """Return a block from the origin to `size` meters, `cells` boxes along each axis, six tetrahedra a box.
 
     The tetrahedra of a box are the six ways from its lowest corner to its highest along the axes, so that those of
-    neighbouring boxes meet in whole sides. Raises SimulationError for sizes and numbers that are not positive.
+    neighboring boxes meet in whole sides. Raises SimulationError for sizes and numbers that are not positive.
     """
     if not all(0 < side < float("inf") for side in size) or min(cells) < 1:
         raise SimulationError(f"a block of {size} m in {cells} boxes: expected sizes above 0 and 1 box or more an axis")

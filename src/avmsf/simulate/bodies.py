@@ -25,7 +25,7 @@ Tell = Callable[[str], None]
 
 
 _LARGEST = 10.0
-"""Metres along its longest side beyond which a mesh is likelier to count millimetres."""
+"""Meters along its longest side beyond which a mesh is likelier to count millimeters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ def _scale(recipe: ObjectRecipe, vertices: Tensor) -> float:
         raise SimulationError("the mesh has no extent: all of its vertices lie in one place; export it again")
     if recipe.size is None and longest > _LARGEST:
         raise SimulationError(
-            f"the mesh is {longest:g} m long, and expected are metres, at most {_LARGEST:g} of them: if it counts "
-            f"millimetres, give --size {longest / 1000:g}; else say how long it is by --size"
+            f"the mesh is {longest:g} m long, and expected are meters, at most {_LARGEST:g} of them: if it counts "
+            f"millimeters, give --size {longest / 1000:g}; else say how long it is by --size"
         )
     return 1.0 if recipe.size is None else recipe.size / longest

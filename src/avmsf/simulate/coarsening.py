@@ -19,7 +19,7 @@ def coarsen(
     shortest: float,
     turn: float,
 ) -> Int[np.ndarray, "coarser 3"]:
-    """Return triangles on some of the points with few edges shorter than `shortest` metres.
+    """Return triangles on some of the points with few edges shorter than `shortest` meters.
 
     The shortest edges go first. One stays where without it a triangle would turn by more than the angle of cosine
     `turn`, or away from `normals`, the surface's own at the points, where the rim would move, where the surface would
@@ -61,17 +61,17 @@ class _Collapse:
             else:
                 continue
             self._move(gone, stays)
-            for near in sorted(self._neighbours(stays)):
+            for near in sorted(self._neighbors(stays)):
                 if (length := self._length(stays, near)) < self._shortest:
                     heapq.heappush(heap, (length, _edge(stays, near)))
 
     def _may_move(self, gone: int, stays: int) -> bool:
         """Return whether the skin stays a skin of much the same form."""
         shared = self._around[gone] & self._around[stays]
-        # Two vertices that have more neighbours in common than triangles would fold the skin onto itself.
-        if len(self._neighbours(gone) & self._neighbours(stays)) != len(shared):
+        # Two vertices that have more neighbors in common than triangles would fold the skin onto itself.
+        if len(self._neighbors(gone) & self._neighbors(stays)) != len(shared):
             return False
-        for near in self._neighbours(gone) - {stays}:
+        for near in self._neighbors(gone) - {stays}:
             length = self._length(stays, near)
             if length > 2.0 * self._shortest and length > self._length(gone, near):
                 return False
@@ -107,17 +107,15 @@ class _Collapse:
         x, y, z = normal
         return min(x * u + y * v + z * w for u, v, w in (self._normals[corner] for corner in face))
 
-    def _neighbours(self, vertex: int) -> set[int]:
+    def _neighbors(self, vertex: int) -> set[int]:
         return {corner for row in self._around[vertex] for corner in self.faces[row]} - {vertex}
 
     def _on_rim(self, vertex: int) -> bool:
-        return len(self._neighbours(vertex)) != len(self._around[vertex])
+        return len(self._neighbors(vertex)) != len(self._around[vertex])
 
     def _straight_rim(self, gone: int, stays: int) -> bool:
         """Return whether the rim runs on from `stays` over `gone` without a corner."""
-        onward = [
-            near for near in self._neighbours(gone) - {stays} if len(self._around[gone] & self._around[near]) == 1
-        ]
+        onward = [near for near in self._neighbors(gone) - {stays} if len(self._around[gone] & self._around[near]) == 1]
         if len(onward) != 1:
             return False
         start, middle, end = (self._points[vertex] for vertex in (stays, gone, onward[0]))

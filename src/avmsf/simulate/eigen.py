@@ -36,11 +36,11 @@ class Vibrations:
     squares: Float64[np.ndarray, " modes"]
     """Squared angular frequencies, 1/s2."""
     shapes: Float64[np.ndarray, "freedoms modes"]
-    """Mass-normalised displacements, 1 / sqrt(kg)."""
+    """Mass-normalized displacements, 1 / sqrt(kg)."""
 
 
 def rigid_motions(nodes: Float64[np.ndarray, "nodes 3"], mass: scipy.sparse.csr_array) -> np.ndarray:
-    """Return three shifts and three turns of the nodes, mass-normalised and orthogonal, [3 nodes, 6]."""
+    """Return three shifts and three turns of the nodes, mass-normalized and orthogonal, [3 nodes, 6]."""
     total = mass.sum()
     arms = nodes - (mass @ nodes).sum(axis=0) / total
     motions = np.zeros((len(nodes), 3, _RIGID))
@@ -141,7 +141,7 @@ def _largest_responses(
 
 
 def _orthonormal(motions: np.ndarray, mass: scipy.sparse.csr_array, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return motions without their part in the basis, mass-normalised and orthogonal, and what makes them of those.
+    """Return motions without their part in the basis, mass-normalized and orthogonal, and what makes them of those.
 
     Directions in which nothing is left are left out.
     """

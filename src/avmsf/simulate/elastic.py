@@ -37,11 +37,11 @@ class ElasticModes:
     frequency: Float64[Tensor, " modes"]
     """Undamped natural frequencies, Hz."""
     nodes: Float64[Tensor, "nodes 3"]
-    """Places on the body's surface at which the shapes are known: corners and edge middles of its triangles, metres."""
+    """Places on the body's surface at which the shapes are known: corners and edge middles of its triangles, meters."""
     triangles: Int[Tensor, "triangles 6"]
     """Rows of `nodes`: three corners, counter-clockwise from outside, then the middles of the edges 01, 12 and 20."""
     shapes: Float64[Tensor, "nodes modes 3"]
-    """Mass-normalised displacement, 1 / sqrt(kg): the integral of density times its square over the body is 1."""
+    """Mass-normalized displacement, 1 / sqrt(kg): the integral of density times its square over the body is 1."""
     material: Material
     mass: float
     """Kilograms."""
@@ -92,7 +92,7 @@ class ElasticModes:
         unfit = torch.nonzero(~torch.isfinite(places).all(dim=1)).flatten()
         if len(unfit):
             row = int(unfit[0])
-            raise SimulationError(f"place {row} is {places[row].tolist()}: expected finite coordinates, in metres")
+            raise SimulationError(f"place {row} is {places[row].tolist()}: expected finite coordinates, in meters")
         return self._closest(places.double().numpy())
 
     def _shapes_in(self, found: Closest) -> Float64[Tensor, "contacts modes 3"]:
@@ -139,7 +139,7 @@ def elastic_modes(
     """Return the lowest `count` elastic modes of a body by second-order finite elements, none above `highest` Hz.
 
     The factors multiply Young's modulus and the density in each cell. The body is free, or held by `springs`: places
-    on its surface and their stiffness in newtons per metre, the same in all directions. A free body's six rigid
+    on its surface and their stiffness in newtons per meter, the same in all directions. A free body's six rigid
     motions are no modes of it. On soft springs they are slow modes, and every mode that has more than half of its
     kinetic energy in a rigid motion is left out. Springs so stiff that the body bends before it moves as a whole
     leave no such mode, and then none is left out. `fixed` names nodes of `SecondOrder.of(solid)` that do not move. With

@@ -31,7 +31,7 @@ class SecondOrder:
 
     solid: Solid
     nodes: Float64[np.ndarray, "nodes 3"]
-    """The solid's points, then the middles of the edges, metres."""
+    """The solid's points, then the middles of the edges, meters."""
     cells: Int[np.ndarray, "cells 10"]
     """Rows of `nodes`: a cell's corners, then the middles of its edges 01, 12, 02, 03, 13 and 23."""
 
@@ -86,7 +86,7 @@ class SecondOrder:
 def stiffness(
     mesh: SecondOrder, material: Material, factor: Float64[Tensor, " cells"] | None = None
 ) -> scipy.sparse.bsr_array:
-    """Return the stiffness matrix over the components of the nodes' displacements, newtons per metre.
+    """Return the stiffness matrix over the components of the nodes' displacements, newtons per meter.
 
     `factor` multiplies Young's modulus, a number a cell. Row 3 n + i is the force along axis i on node n.
     """
@@ -110,7 +110,7 @@ def stiffness(
 def mass(mesh: SecondOrder, density: Float64[Tensor, " cells"]) -> scipy.sparse.csr_array:
     """Return the consistent mass matrix over the nodes, kilograms; all three components have the same.
 
-    `density` is in kilograms per cubic metre.
+    `density` is in kilograms per cubic meter.
     """
     weight = (mesh.solid.volumes * density).numpy()
     return mesh.assemble(weight[:, None, None] * _REFERENCE_MASS)

@@ -44,7 +44,7 @@ def recording_starts(
 def smooth_field(
     places: Float64[Tensor, "points 3"], spread: float, *, diagonal: float, generator: np.random.Generator
 ) -> Float64[Tensor, " points"]:
-    """Return factors that vary smoothly over a body of this diagonal, metres, with a mean near 1.
+    """Return factors that vary smoothly over a body of this diagonal, meters, with a mean near 1.
 
     Their logarithm is a sum of plane waves with random directions, phases and wavelengths, of this root mean square.
     """
@@ -73,7 +73,7 @@ def support_places(
 
 
 def support_springs(mass: float, imperfections: Imperfections) -> float:
-    """Return the stiffness of each spring under a body of this mass, newtons per metre."""
+    """Return the stiffness of each spring under a body of this mass, newtons per meter."""
     return mass * (2.0 * math.pi * imperfections.support) ** 2 / _LEGS
 
 

@@ -12,7 +12,7 @@ class Material:
 
     name: str
     density: float
-    """Kilograms per cubic metre."""
+    """Kilograms per cubic meter."""
     young: float
     """Young's modulus, pascals."""
     poisson: float

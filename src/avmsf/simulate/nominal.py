@@ -80,7 +80,7 @@ class NominalBody:
     """One guess at what lies behind an object's surface, and how it would vibrate."""
 
     wall: float | None
-    """Thickness of its wall, metres; None for a filled body."""
+    """Thickness of its wall, meters; None for a filled body."""
     elastic: ElasticModes
     """Nominal material."""
     fine: bool = True
@@ -120,7 +120,7 @@ def nominal_bodies(
 ) -> NominalBodies:
     """Return the bodies that may lie behind a surface, with the lowest `count` modes of each, made of `material`.
 
-    `walls` states what to try: thicknesses in metres, None for what the surface encloses. By itself it tries that,
+    `walls` states what to try: thicknesses in meters, None for what the surface encloses. By itself it tries that,
     and walls of `WALLS` times the surface's size where the surface is a sheet or holds much more than the wall would;
     of a `Shape`, walls all over its range of thickness. Where one body is left, it has about `freedoms` degrees of
     freedom, at most a fifth more; of several each has at most `TRIAL`, or `WALL_TRIAL`, enough to choose by, and
@@ -162,7 +162,7 @@ def nominal_bodies(
     for reason in reasons:
         told(f"not tried: {reason}")
     if not bodies:
-        other = "state its wall in metres if it has one" if guessed else "state another wall, or none"
+        other = "state its wall in meters if it has one" if guessed else "state another wall, or none"
         raise SimulationError(f"no body can be made of this surface ({'; '.join(reasons)}): mend the mesh, or {other}")
     if len(bodies) == 1 and not bodies[0].fine:
         bodies = [refined(surface, bodies[0], freedoms=freedoms, cache=cache, tell=tell)]
@@ -291,7 +291,7 @@ class _Maker:
         elif wall >= self.checked.width:
             raise SimulationError(
                 f"a wall of {1000 * wall:.3g} mm is thicker than the object, which is "
-                f"{1000 * self.checked.width:.3g} mm wide: state the wall's thickness in metres"
+                f"{1000 * self.checked.width:.3g} mm wide: state the wall's thickness in meters"
             )
         elif guessed and self._shape is None:
             self.checked.expect_hollow(wall)
@@ -428,7 +428,7 @@ def _expect_settings(count: int, freedoms: int, walls: Sequence[float | None] | 
     if freedoms < FEWEST:
         raise SimulationError(f"freedoms = {freedoms}: expected {FEWEST} degrees of freedom or more")
     if walls is not None and not len(walls):
-        raise SimulationError("walls is empty: expected thicknesses in metres, None among them for a filled body")
+        raise SimulationError("walls is empty: expected thicknesses in meters, None among them for a filled body")
     for wall in walls or ():
         if wall is not None and not 0 < wall < float("inf"):
             raise SimulationError(f"wall = {wall:g} m: expected more than 0, or None for a filled body")
@@ -444,5 +444,5 @@ def _grouped(refused: Mapping[float | None, str]) -> list[str]:
 
 
 def body_name(wall: float | None) -> str:
-    """Return what a body of this wall, metres, is called, with two digits."""
+    """Return what a body of this wall, meters, is called, with two digits."""
     return "filled" if wall is None else f"wall of {1000 * wall:.2g} mm"

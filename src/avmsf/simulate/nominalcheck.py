@@ -38,7 +38,7 @@ class CheckedSurface:
 
     @cached_property
     def width(self) -> float:
-        """Extent along the second of the axes that the vertices spread along, metres: of a sheet, its narrower side."""
+        """Extent along the second of the axes that the vertices spread along, meters: of a sheet, its narrower side."""
         places = self.skin.points - self.skin.points.mean(axis=0)
         _, axes = np.linalg.eigh(places.T @ places)
         return float(np.sort(np.ptp(places @ axes, axis=0))[1])
@@ -52,7 +52,7 @@ class CheckedSurface:
 
     @cached_property
     def mean_thickness(self) -> float | None:
-        """Twice the volume over the area, metres: of a thin wall, its thickness; None for a sheet, which holds none."""
+        """Twice the volume over the area, meters: of a thin wall, its thickness; None for a sheet, which holds none."""
         if self.lids > _LIDS:
             return None
         return 2.0 * abs(_held(self.skin)) / float(self.skin.areas.sum())
@@ -75,7 +75,7 @@ class CheckedSurface:
             )
 
     def sheet(self) -> Skin:
-        """Return what a wall can follow: the largest part, neighbours facing alike.
+        """Return what a wall can follow: the largest part, neighbors facing alike.
 
         Raises SimulationError where other parts are more than loose bits, and as `Skin.oriented` does.
         """
@@ -150,7 +150,7 @@ def _parts(skin: Skin) -> Int[np.ndarray, " faces"]:
 
 
 def _held(skin: Skin) -> float:
-    """Return the volume inside a skin whose holes have straight lids, cubic metres; less than 0 where it faces in."""
+    """Return the volume inside a skin whose holes have straight lids, cubic meters; less than 0 where it faces in."""
     lids = _lids(skin)
     return skin.volume + float((np.cross(lids[:, 0], lids[:, 1]) * lids[:, 2]).sum() / 6.0)
 

@@ -2,7 +2,7 @@
 
 A scan's noise is drawn afresh at each vertex, while a surface runs on from one vertex to the next. Of the surfaces
 that balance closeness to the vertices against bending, (1 + strength L L) places = vertices with L the mean difference
-from the neighbours, generalised cross-validation takes the one that would foretell left-out vertices best.
+from the neighbors, generalised cross-validation takes the one that would foretell left-out vertices best.
 """
 
 import math
@@ -16,7 +16,7 @@ from scipy.sparse.linalg import splu
 from avmsf.simulate.skin import Skin, unit
 
 ROUGH = 20.0
-"""Degrees that neighbouring triangles differ by on the mean, in a mesh that is likelier noisy than finely shaped."""
+"""Degrees that neighboring triangles differ by on the mean, in a mesh that is likelier noisy than finely shaped."""
 _FINE = 0.06
 """Mean edge over the body's size from which on a mesh is too coarse to tell noise from form: a box turns by 60."""
 _PROBES = 8
@@ -28,7 +28,7 @@ _KEPT = 0.8
 
 
 def roughness(skin: Skin) -> float:
-    """Return the mean angle between the normals of neighbouring triangles, degrees; 0 for a mesh of few long edges."""
+    """Return the mean angle between the normals of neighboring triangles, degrees; 0 for a mesh of few long edges."""
     corners = skin.points[skin.faces]
     normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     ends = np.sort(skin.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -47,7 +47,7 @@ def roughness(skin: Skin) -> float:
 
 
 def denoised(skin: Skin) -> tuple[Skin, float]:
-    """Return a noisy mesh without its noise, and how far that moved the vertices, metres, root mean square.
+    """Return a noisy mesh without its noise, and how far that moved the vertices, meters, root mean square.
 
     A mesh that is not rough, or whose vertices foretell each other no better when smoothed, comes back as it is, with
     0. The volume of a closed one stays.
@@ -77,7 +77,7 @@ def denoised(skin: Skin) -> tuple[Skin, float]:
 
 
 def averaged(skin: Skin, rounds: int) -> Skin:
-    """Return a skin whose points were moved, so many times, to the mean of themselves and their neighbours.
+    """Return a skin whose points were moved, so many times, to the mean of themselves and their neighbors.
 
     The volume of a closed one stays.
     """
@@ -89,7 +89,7 @@ def averaged(skin: Skin, rounds: int) -> Skin:
 
 
 def _bending(skin: Skin) -> scipy.sparse.csc_array:
-    """Return the squared difference of each point from the mean of its neighbours, as a matrix."""
+    """Return the squared difference of each point from the mean of its neighbors, as a matrix."""
     difference = scipy.sparse.eye_array(len(skin.points)) - _averaging(_joined(skin))
     return (difference.T @ difference).tocsc()
 

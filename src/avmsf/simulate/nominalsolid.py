@@ -86,7 +86,7 @@ def filled_solid(checked: CheckedSurface, freedoms: int, *, wall: float | None =
 
 
 def wall_solids(checked: CheckedSurface, freedoms: int) -> Callable[[float], Solid]:
-    """Return what makes a wall of a thickness, metres, with about so many degrees of freedom inwards of a surface.
+    """Return what makes a wall of a thickness, meters, with about so many degrees of freedom inwards of a surface.
 
     The skin is remeshed once for all thicknesses. Raises SimulationError for several parts and for triangles that
     face different ways; what it returns does as `shell` does.

@@ -7,8 +7,8 @@ The thin plate of Kirchhoff and Navier, struck from above. Mode (m, n), m and n 
     Rayleigh damping    d = (alpha + beta omega^2) / 2,
     damped frequency    sqrt(omega^2 - d^2) / (2 pi)
 
-for a plate of a by b metres, h thick. A blow of one newton-second at x moves the pick-up point p by
-phi(x) phi(p) / omega_d exp(-d t) sin(omega_d t) metres in each mode, omega_d being the damped angular frequency. What
+for a plate of a by b meters, h thick. A blow of one newton-second at x moves the pick-up point p by
+phi(x) phi(p) / omega_d exp(-d t) sin(omega_d t) meters in each mode, omega_d being the damped angular frequency. What
 is heard is the pseudo-velocity, omega_d times that displacement: as loud as the velocity, in the phase of the
 displacement. So a sound is exactly the paper's equation 3 with gains phi(x) phi(p), and no mode is lost among others.
 """
@@ -28,16 +28,16 @@ class Plate:
     """A plate in the plane z = 0 with a corner at the origin, `length` along x, `width` along y; steel unless told."""
 
     length: float = 0.24
-    """Side along x, metres."""
+    """Side along x, meters."""
     width: float = 0.24 / math.cbrt(3.0)
-    """Side along y, metres. The square of length over width is irrational, so that no two modes share a frequency; with
+    """Side along y, meters. The square of length over width is irrational, so that no two modes share a frequency; with
     this ratio the closest two of the 43 below 8 kHz lie 23 Hz apart, three times their half-power width."""
     thickness: float = 0.002
-    """Metres."""
+    """Meters."""
     young: float = 2e11
     """Young's modulus, pascals."""
     density: float = 7850.0
-    """Kilograms per cubic metre."""
+    """Kilograms per cubic meter."""
     poisson: float = 0.29
     """Poisson's ratio."""
     alpha: float = 5.0
@@ -58,7 +58,7 @@ class PlateModes:
     damping: Float64[Tensor, " modes"]
     """Amplitude decay rates, 1/s."""
     gains: Float64[Tensor, "contacts modes"]
-    """Signed amplitude of exp(-d t) sin(2 pi f t) for a blow of one newton-second, metres per second."""
+    """Signed amplitude of exp(-d t) sin(2 pi f t) for a blow of one newton-second, meters per second."""
     numbers: Int[Tensor, "modes 2"]
     """Half waves (m, n) along x and along y."""
 
@@ -82,8 +82,8 @@ def plate_modes(
         torch.arange(1, math.floor(side * reach) + 1, dtype=torch.long) for side in (plate.length, plate.width)
     ]
     numbers = torch.cartesian_prod(*half_waves).reshape(-1, 2)
-    per_metre = numbers.double() / torch.tensor([plate.length, plate.width], dtype=torch.float64)
-    omega = scale * per_metre.square().sum(dim=1)
+    per_meter = numbers.double() / torch.tensor([plate.length, plate.width], dtype=torch.float64)
+    omega = scale * per_meter.square().sum(dim=1)
     damping = 0.5 * (plate.alpha + plate.beta * omega**2)
     frequency = torch.sqrt((omega**2 - damping**2).clamp(min=0.0)) / (2.0 * math.pi)
     # A mode that is damped beyond its critical damping creeps back and does not sound.
@@ -96,14 +96,14 @@ def plate_modes(
         )
     heard = heard[torch.argsort(frequency[heard])]
     pickup = torch.tensor([[plate.pickup[0] * plate.length, plate.pickup[1] * plate.width]], dtype=torch.float64)
-    gains = _shapes(plate, places[:, :2], per_metre[heard]) * _shapes(plate, pickup, per_metre[heard])
+    gains = _shapes(plate, places[:, :2], per_meter[heard]) * _shapes(plate, pickup, per_meter[heard])
     return PlateModes(
         frequency[heard], damping[heard], gains * _half_sine(frequency[heard] * contact_time), numbers[heard]
     )
 
 
 def ring(modes: PlateModes, *, sample_rate: float, samples: int) -> Float64[Tensor, "contacts samples"]:
-    """Return the noiseless sounds of the blows, metres per second for one newton-second, exact in float64."""
+    """Return the noiseless sounds of the blows, meters per second for one newton-second, exact in float64."""
     times = torch.arange(samples, dtype=torch.float64) / sample_rate
     sounds = torch.zeros(len(modes.gains), samples, dtype=torch.float64)
     # A mode at a time: the table of all modes over a long sound would be larger than the sounds.
@@ -171,10 +171,10 @@ def _half_sine(cycles: Float64[Tensor, " modes"]) -> Float64[Tensor, " modes"]:
 
 
 def _shapes(
-    plate: Plate, places: Float64[Tensor, "contacts 2"], per_metre: Float64[Tensor, "modes 2"]
+    plate: Plate, places: Float64[Tensor, "contacts 2"], per_meter: Float64[Tensor, "modes 2"]
 ) -> Float64[Tensor, "contacts modes"]:
-    """Return mass-normal mode shapes, 1 / sqrt(kg), of modes with `per_metre` half waves a metre along x and y."""
-    sines = torch.sin(math.pi * places[:, None, :] * per_metre)
+    """Return mass-normal mode shapes, 1 / sqrt(kg), of modes with `per_meter` half waves a meter along x and y."""
+    sines = torch.sin(math.pi * places[:, None, :] * per_meter)
     mass = plate.density * plate.thickness * plate.length * plate.width
     return 2.0 / math.sqrt(mass) * sines.prod(dim=-1)
 

@@ -25,11 +25,11 @@ from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.vibration import Vibration
 
 AIR_DENSITY = 1.204
-"""Kilograms per cubic metre, at 20 degrees Celsius."""
+"""Kilograms per cubic meter, at 20 degrees Celsius."""
 SOUND_SPEED = 343.2
-"""Metres per second, at 20 degrees Celsius."""
+"""Meters per second, at 20 degrees Celsius."""
 CLOSEST = 0.01
-"""Metres to the surface within which a patch is no small source."""
+"""Meters to the surface within which a patch is no small source."""
 
 
 def radiated(
@@ -41,7 +41,7 @@ def radiated(
 ) -> Complex128[Tensor, " modes"]:
     """Return the pressure at the microphone, pascals, of each damped mode for a push of one newton second on it alone.
 
-    `microphone` is a place in the object frame, metres. `retardation` scales the differences of the patches' delays:
+    `microphone` is a place in the object frame, meters. `retardation` scales the differences of the patches' delays:
     0 hears the whole body at once. Raises SimulationError for a microphone closer than `CLOSEST` to the surface.
     """
     places, outward, motion = _patches(modes)

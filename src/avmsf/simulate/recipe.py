@@ -24,13 +24,13 @@ class Hammer:
     mass: float = 0.02
     """Of its head, kilograms."""
     radius: float = 0.003
-    """Of its tip, metres."""
+    """Of its tip, meters."""
     young: float = 2e11
     """Young's modulus of its tip, pascals: 2e11 is steel, 3e9 a hard plastic, 1e7 rubber."""
     poisson: float = 0.29
     """Poisson's ratio of its tip."""
     speed: float = 0.5
-    """With which it meets the body, metres per second."""
+    """With which it meets the body, meters per second."""
     pulse: Literal["hertz", "half-sine"] = "hertz"
     """hertz: a round tip; half-sine: a flat one."""
     contact_time: float = 0.0
@@ -68,7 +68,7 @@ class Imperfections:
     retardation: float = 1.0
     """Part of the differences of delay between the body and the microphone that is heard, 0 to 1."""
     contact: float = 0.0015
-    """Distance between where a blow was written down and where it fell, along the surface, metres, root mean square."""
+    """Distance between where a blow was written down and where it fell, along the surface, meters, root mean square."""
     direction: float = 5.0
     """Angle between the blow's direction as written and as it was, degrees, root mean square."""
     force: float = 0.02
@@ -128,16 +128,16 @@ class ObjectRecipe:
     kind: str = "bowl"
     """Shape to make: `avmsf simulate --list` names them."""
     mesh: Path | None = None
-    """A mesh or scan to take in place of a shape: obj, ply, glb or stl, in metres."""
+    """A mesh or scan to take in place of a shape: obj, ply, glb or stl, in meters."""
     thickness: float | None = None
-    """Of the walls, metres. None draws a shape's, and fills a mesh, which is a solid body then; with a thickness its
+    """Of the walls, meters. None draws a shape's, and fills a mesh, which is a solid body then; with a thickness its
     surface is the outside of a wall."""
     material: str = "ceramic"
     """Name in the table of materials."""
     seed: int = 0
     """Start of all chance: the shape's proportions, the contacts, the noise, the imperfections."""
     size: float | None = None
-    """Longest side of the bounding box, metres; as drawn or as scanned where it is not given."""
+    """Longest side of the bounding box, meters; as drawn or as scanned where it is not given."""
     up: Literal["x", "y", "z"] = "z"
     """Axis that points to the sky: a hammer comes from above or from the side."""
     modes: int = 64
@@ -153,7 +153,7 @@ class ObjectRecipe:
     noise_db: float | None = -30.0
     """Room noise: its root mean square over that of the noiseless sounds from their impacts on, dB; None for none."""
     microphone: tuple[float, float, float] = (0.45, -0.35, 0.4)
-    """Where it stands, from the middle of the object's bounding box, metres."""
+    """Where it stands, from the middle of the object's bounding box, meters."""
     views: int = 72
     """Pictures to render, on three circles around the object; 0 for none."""
     view_size: int = 256

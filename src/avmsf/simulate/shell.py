@@ -29,7 +29,7 @@ _FLATTEST = 0.05
 
 
 def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
-    """Return the wall of `thickness` metres that lies inwards of a surface, against its triangles' normals.
+    """Return the wall of `thickness` meters that lies inwards of a surface, against its triangles' normals.
 
     The surface is an open sheet, whose rims are closed straight through the wall, or the outer skin of a hollow body.
     It is remeshed to triangles with sides of about `detail` times its size, the diagonal of the box around it. Where it
@@ -128,7 +128,7 @@ def _folded(skin: Skin, offsets: np.ndarray) -> np.ndarray:
 
 
 def _prisms(faces: Int[np.ndarray, "faces 3"], points: int) -> Int[np.ndarray, "cells 4"]:
-    """Return three tetrahedra for each triangle; those of neighbours meet in whole sides.
+    """Return three tetrahedra for each triangle; those of neighbors meet in whole sides.
 
     The diagonal of a prism's side starts at the outer one of its vertices that comes first, whichever prism asks.
     The cells are of positive volume where the inner vertices lie behind the triangle.

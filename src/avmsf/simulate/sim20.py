@@ -36,7 +36,7 @@ _WALLS = {
     "tray-polycarbonate": 0.006,
 }
 _SIZES = {"blob-polycarbonate": 0.5, "tube-steel": 0.5}
-"""Walls and longest sides that differ from what is drawn, metres: where few modes would be heard, or most too low."""
+"""Walls and longest sides that differ from what is drawn, meters: where few modes would be heard, or most too low."""
 SIM20 = {
     name: ObjectRecipe(kind=kind, material=material, seed=seed, size=_SIZES.get(name), thickness=_WALLS.get(name))
     for seed, (kind, material) in enumerate(_OBJECTS, start=1)

@@ -139,7 +139,7 @@ def _captured(
     settings = CaptureSettings(
         name=name,
         seconds=_kept(recipe) / recipe.sample_rate,
-        normalise="done",
+        normalize="done",
         align=bool((truth.starts != 0.0).any()),
     )
     prepared = []

@@ -84,7 +84,7 @@ def is_written(recipe: ObjectRecipe, folder: str | Path) -> bool:
 
 
 def write_textured(mesh: TexturedMesh, folder: Path) -> None:
-    """Write a mesh in its colours: as `surface.ply` where they stand at its vertices, else as `surface.glb`."""
+    """Write a mesh in its colors: as `surface.ply` where they stand at its vertices, else as `surface.glb`."""
     if all(texture.shape[:2] == (1, 1) for texture in mesh.textures):
         _write_painted(mesh, folder / "surface.ply")
     else:
@@ -92,7 +92,7 @@ def write_textured(mesh: TexturedMesh, folder: Path) -> None:
 
 
 def _write_painted(mesh: TexturedMesh, path: Path) -> None:
-    """Write colours at vertices; where a vertex has another colour in each face, every face gets corners of its own."""
+    """Write colors at vertices; where a vertex has another color in each face, every face gets corners of its own."""
     vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
     pixels = np.stack([texture[0, 0].numpy() for texture in mesh.textures])[mesh.materials.numpy()]
     corners = np.rint(mesh.colors.numpy() * pixels[:, None]).astype(np.uint8)
@@ -105,7 +105,7 @@ def _write_painted(mesh: TexturedMesh, path: Path) -> None:
 
 
 def _write_pictured(mesh: TexturedMesh, path: Path) -> None:
-    """Write one part for each texture, tinted by the mean of the colours that its faces have besides."""
+    """Write one part for each texture, tinted by the mean of the colors that its faces have besides."""
     parts = []
     for number, texture in enumerate(mesh.textures):
         chosen = np.flatnonzero(mesh.materials.numpy() == number)

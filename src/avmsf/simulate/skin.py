@@ -18,23 +18,23 @@ class Skin:
     """Triangles with an area, no two vertices in one place."""
 
     points: Float64[np.ndarray, "points 3"]
-    """Object frame, metres; every one belongs to a triangle."""
+    """Object frame, meters; every one belongs to a triangle."""
     faces: Int[np.ndarray, "faces 3"]
     """Rows of `points`, counter-clockwise from outside."""
 
     @property
     def size(self) -> float:
-        """Diagonal of the box around the skin, metres."""
+        """Diagonal of the box around the skin, meters."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
     @property
     def areas(self) -> Float64[np.ndarray, " faces"]:
-        """Square metres."""
+        """Square meters."""
         return 0.5 * np.linalg.norm(_doubled(self.points[self.faces]), axis=1)
 
     @property
     def volume(self) -> float:
-        """Cubic metres inside a closed skin."""
+        """Cubic meters inside a closed skin."""
         corners = self.points[self.faces]
         return float((np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2]).sum() / 6.0)
 
@@ -103,7 +103,7 @@ class Skin:
             )
         if not np.isfinite(points).all():
             row = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-            raise SimulationError(f"vertex {row} is {points[row].tolist()}: expected finite coordinates, in metres")
+            raise SimulationError(f"vertex {row} is {points[row].tolist()}: expected finite coordinates, in meters")
         places, rows = np.unique(points[faces.ravel()], axis=0, return_inverse=True)
         welded = rows.reshape(-1, 3)
         wide = np.linalg.norm(_doubled(places[welded]), axis=1) > 1e-12 * np.linalg.norm(np.ptp(places, axis=0)) ** 2
@@ -114,7 +114,7 @@ class Skin:
         return cls.compact(places, welded[wide])
 
     def oriented(self) -> "Skin":
-        """Return the skin without triangles that share an edge with two others or face against their neighbours.
+        """Return the skin without triangles that share an edge with two others or face against their neighbors.
 
         The widest are kept. Raises SimulationError where more than a twentieth of the area would be lost.
         """
@@ -130,13 +130,13 @@ class Skin:
         lost = float(areas[~kept].sum() / areas.sum())
         if lost > 0.05:
             raise SimulationError(
-                f"{lost:.0%} of the surface faces against its neighbours or meets more than one of them at an edge: "
+                f"{lost:.0%} of the surface faces against its neighbors or meets more than one of them at an edge: "
                 "expected triangles counter-clockwise from outside; make the normals of the mesh consistent"
             )
         return self.compact(self.points, self.faces[kept])
 
     def remeshed(self, length: float) -> "Skin":
-        """Return the skin with edges of about `length` metres, shorter ones only where the skin bends sharply."""
+        """Return the skin with edges of about `length` meters, shorter ones only where the skin bends sharply."""
         # In this order, for what is coarsened next to long edges would keep them.
         return self._refined(1.5 * length).coarsened(0.75 * length, turn=_CREASE)
 
@@ -155,7 +155,7 @@ class Skin:
             faces = np.concatenate([_split(faces, middle, pattern) for pattern in range(8)])
 
     def coarsened(self, shortest: float, *, turn: float) -> "Skin":
-        """Return the skin with few edges shorter than `shortest` metres, as `coarsen` takes them out."""
+        """Return the skin with few edges shorter than `shortest` meters, as `coarsen` takes them out."""
         faces = coarsen(self.points, self.faces, self.normals, shortest=shortest, turn=turn)
         return self.compact(self.points, faces)
 

@@ -23,7 +23,7 @@ class Solid:
     """Straight-edged tetrahedra that fill a body."""
 
     points: Float64[Tensor, "points 3"]
-    """Corners, object frame, metres; every one belongs to a tetrahedron."""
+    """Corners, object frame, meters; every one belongs to a tetrahedron."""
     cells: Int[Tensor, "cells 4"]
     """Rows of `points` at the corners of each tetrahedron, all of positive volume."""
 
@@ -45,7 +45,7 @@ class Solid:
         corners = points[used]
         if not bool(torch.isfinite(corners).all()):
             row = int(used[(~torch.isfinite(corners)).any(dim=1).nonzero()[0]])
-            raise SimulationError(f"point {row} is {points[row].tolist()}: expected finite coordinates, in metres")
+            raise SimulationError(f"point {row} is {points[row].tolist()}: expected finite coordinates, in meters")
         volumes = _volumes(corners, rows)
         turned = torch.where((volumes < 0)[:, None], rows[:, [0, 2, 1, 3]], rows)
         solid = cls(corners, turned)
@@ -54,17 +54,17 @@ class Solid:
 
     @cached_property
     def volumes(self) -> Float64[Tensor, " cells"]:
-        """Volume of each tetrahedron, cubic metres."""
+        """Volume of each tetrahedron, cubic meters."""
         return _volumes(self.points, self.cells)
 
     @property
     def volume(self) -> float:
-        """Cubic metres."""
+        """Cubic meters."""
         return float(self.volumes.sum())
 
     @cached_property
     def size(self) -> float:
-        """Diagonal of the box around the body, metres."""
+        """Diagonal of the box around the body, meters."""
         return float((self.points.amax(dim=0) - self.points.amin(dim=0)).norm())
 
     @cached_property

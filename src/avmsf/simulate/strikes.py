@@ -28,7 +28,7 @@ class Strikes:
     """Blows as they fell and as they were written down, row for row."""
 
     places: Float64[Tensor, "contacts 3"]
-    """Where they fell, metres."""
+    """Where they fell, meters."""
     directions: Float64[Tensor, "contacts 3"]
     """Unit vectors along which the hammer moved."""
     written_places: Float64[Tensor, "contacts 3"]

@@ -51,7 +51,7 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
     if skin.open_edges and _flatness(skin) < 2.0 * _ENVELOPE * detail * skin.size:
         raise SimulationError(f"the mesh encloses no volume, it is a flat sheet: {advice}")
     coarse = skin.coarsened(_SHORTEST * detail * skin.size, turn=_TURN)
-    points, cells = _tetrahedralise(coarse, detail, timeout)
+    points, cells = _tetrahedralize(coarse, detail, timeout)
     if not len(cells):
         raise SimulationError(f"the mesh encloses no volume ({skin.open_edges} of its edges are open): {advice}")
     solid = _largest(Solid.build(torch.from_numpy(points), torch.from_numpy(cells)))
@@ -59,7 +59,7 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
     return solid
 
 
-def _tetrahedralise(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
+def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
     """Return points and cells as pytetwild's process leaves them."""
     found = importlib.util.find_spec("pytetwild")
     assert found is not None
@@ -132,7 +132,7 @@ def _behind(skin: Skin, found: Closest, places: Float64[np.ndarray, "places 3"])
 
 
 def _flatness(skin: Skin) -> float:
-    """Return the extent of the skin's corners along the axis that they spread least along, metres."""
+    """Return the extent of the skin's corners along the axis that they spread least along, meters."""
     places = skin.points[skin.faces].reshape(-1, 3)
     places = places - places.mean(axis=0)
     _, axes = np.linalg.eigh(places.T @ places)

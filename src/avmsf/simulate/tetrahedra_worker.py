@@ -13,21 +13,21 @@ import numpy as np
 
 
 def main(job_path: str, result_path: str) -> None:
-    """Tetrahedralise the job's triangles."""
+    """Tetrahedralize the job's triangles."""
     with np.load(job_path) as job:
         core = _load_core(str(job["library"]))
         points, cells = core.tetrahedralize_mesh(
             job["points"],
             job["faces"],
-            True,  # optimise the tetrahedra's form
+            True,  # optimize the tetrahedra's form
             False,  # do not leave out simplifying the triangles first
             float(job["edge"]),  # length of edges over the diagonal of the box around all
-            0.0,  # length of edges in metres: none, the one above holds
+            0.0,  # length of edges in meters: none, the one above holds
             float(job["envelope"]),  # how far the surface may move, over that diagonal
             100.0,  # energy at which a tetrahedron's form is good enough; 10 makes a thin wall three times as costly
             False,  # do not coarsen in the end
             1,  # threads
-            40,  # rounds of optimising at most
+            40,  # rounds of optimizing at most
             6,  # least talkative
             True,  # quiet
             False,  # corners in the ordinary order

@@ -1,6 +1,6 @@
 """Damped vibrations of a body: Rayleigh damping, dampers at its supports, and damping that couples its modes.
 
-In the coordinates q of the undamped modes, whose shapes are mass-normalised, a force f at a place x obeys
+In the coordinates q of the undamped modes, whose shapes are mass-normalized, a force f at a place x obeys
 
     q'' + C q' + Omega^2 q = phi(x) f,   Omega the angular frequencies on a diagonal.
 

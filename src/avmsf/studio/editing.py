@@ -22,7 +22,7 @@ _MATERIAL, _MODE = ("from", "to"), ("mode", "db", "pitch", "decay")
 _OLD_CONTROL = '"Material it is of"'
 """What the page calls its choice of the old material."""
 _LIMITS = {
-    # Lengths of struck objects lie between a millimetre and tens of metres; frequencies go with 1 / size.
+    # Lengths of struck objects lie between a millimeter and tens of meters; frequencies go with 1 / size.
     "size": (1e-3, 1e3),
     # From one end of hearing, 20 Hz, to the other, 20 kHz. What is farther off is inaudible for every object.
     "pitch": (1e-3, 1e3),

@@ -46,7 +46,7 @@ class Finder:
 
     field: SoundField
     points: Float[Tensor, "points 3"]
-    """The page's points, on the object as the field has it now, metres."""
+    """The page's points, on the object as the field has it now, meters."""
     length: float
     """Lengths on that object over those of the page's picture."""
     likeness: "Likeness" = dataclasses.field(default_factory=lambda: Likeness())
@@ -74,7 +74,7 @@ class Finder:
     def locate(self, recording: Recording) -> list[dict[str, Any]]:
         """Return the blows of a recording, each with a value for every point of the page.
 
-        Lengths are those of the page's picture, metres. Raises LocationError as `locate_blows`.
+        Lengths are those of the page's picture, meters. Raises LocationError as `locate_blows`.
         """
         self.prepare()
         blows = locate_blows(self.field, recording, settings=self.settings, locator=self.locator)
@@ -84,7 +84,7 @@ class Finder:
         values = describe_blow(contact, self.symmetries, LEVEL)
         for each in (values, values["cosine"], *values["counterparts"]):
             each["place"] = [value / self.length for value in each["place"]]
-        values["region"]["radius_metres"] /= self.length
+        values["region"]["radius_meters"] /= self.length
         return {
             "seconds": seconds,
             "row": contact.most_probable,

@@ -13,7 +13,7 @@ class Place:
     """One blow's contact, and how it was struck."""
 
     contact: tuple[float, float, float]
-    """Object frame, metres."""
+    """Object frame, meters."""
     direction: tuple[float, float, float] | None = None
     """Along which the hammer moved, into the object; any length but zero."""
     newtons: float | None = None
@@ -24,7 +24,7 @@ class Place:
         """Return the place of a request's query x, y, z, perhaps nx, ny, nz, newtons. Raises RefusedError (400)."""
         contact = _vector(query, REQUIRED[1:])
         if contact is None:
-            raise RefusedError(400, "expected the contact as x, y and z in metres, found none: click the object first")
+            raise RefusedError(400, "expected the contact as x, y and z in meters, found none: click the object first")
         if max(map(abs, contact)) > FARTHEST:
             raise RefusedError(400, f"expected a contact within {FARTHEST:g} m of the origin, found {contact}")
         direction = _vector(query, DIRECTION)

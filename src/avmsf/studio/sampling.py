@@ -19,7 +19,7 @@ def length_of(field: SoundField) -> float:
 
 
 def sample(field: SoundField, points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"]) -> SampledField:
-    """Return the table of a field at points of the object that it was fitted to, metres."""
+    """Return the table of a field at points of the object that it was fitted to, meters."""
     sampled = SampledField.of(field, points.double() * length_of(field), normals)
     return replace(sampled, points=points)
 

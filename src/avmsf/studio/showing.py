@@ -86,7 +86,7 @@ class Showcase:
             mute = revision.field is None
             surface = find_reconstructed(self.opened) if fresh else None
             remarks += write_bundle(
-                sampled, path, object=shown, metres=self.metres, surface=surface, strikes=strikes, mute=mute
+                sampled, path, object=shown, meters=self.meters, surface=surface, strikes=strikes, mute=mute
             ).remarks
             manifest = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
             manifest["name"] = revision.name or manifest["name"] or self.opened.name
@@ -137,7 +137,7 @@ class Showcase:
         """Return points of the object where no field holds any. Raises StudioError where nothing shows the object."""
         path = find_object(self.opened)
         if path is not None and not is_gaussians(path):
-            return _on_mesh(read_surface(path, metres=self.metres))
+            return _on_mesh(read_surface(path, meters=self.meters))
         if path is not None:
             points = read_splats(path).centers
         else:
@@ -155,9 +155,9 @@ class Showcase:
         return points, outward_normals(points)
 
     @property
-    def metres(self) -> float:
-        """Metres in one unit of the object's mesh."""
-        return 1.0 if self.opened.object is not None else self.opened.settings.surface_metres
+    def meters(self) -> float:
+        """Meters in one unit of the object's mesh."""
+        return 1.0 if self.opened.object is not None else self.opened.settings.surface_meters
 
     def _strikes(self, field: SoundField | None) -> tuple[Impacts | None, tuple[str, ...]]:
         """Return the capture's strikes each from its own onset, or a word on why they cannot be compared."""

@@ -133,7 +133,7 @@ def posix(text: str) -> str:
 
 def _cells(names: Sequence[str], file: str, place: Place, settings: CaptureSettings) -> list[str]:
     """Return a row's cells, in the table's unit; columns that nobody reads stay empty."""
-    values = dict(zip(REQUIRED[1:], (value / settings.metres for value in place.contact), strict=True))
+    values = dict(zip(REQUIRED[1:], (value / settings.meters for value in place.contact), strict=True))
     if place.direction is not None:
         length = math.hypot(*place.direction)
         values |= dict(zip(DIRECTION, (value / length for value in place.direction), strict=True))

@@ -17,7 +17,7 @@ from torch import Tensor
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.innerproducts import gram, poles_of, project
 from avmsf.modal.residual import Residual
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 
 _RIDGE = 1e-10
 """Relative to the Gram matrix's diagonal: two modes that a short sound cannot tell apart share what they explain."""
@@ -88,29 +88,29 @@ class Extractor:
         up_to = 0.5 * sample_rate if highest is None else min(highest, 0.5 * sample_rate)
         return cls(bank, sample_rate, samples, up_to, inner, inverse, mixing, spread)
 
-    def extract(self, sound: Float[Tensor, " samples"], *, colour: Residual | None) -> Amplitudes:
-        """Return the amplitudes in a sound; `colour` is the noise to expect, of which the shape alone counts.
+    def extract(self, sound: Float[Tensor, " samples"], *, color: Residual | None) -> Amplitudes:
+        """Return the amplitudes in a sound; `color` is the noise to expect, of which the shape alone counts.
 
         Its level is measured in the sound's own quiet bands, and where a band holds more than that which the modes
-        leave over, it is taken to be as noisy as it is. Without `colour` there is no noise.
+        leave over, it is taken to be as noisy as it is. Without `color` there is no noise.
         """
         products, _ = project(sound[None], poles_of(self.bank, self.sample_rate))
         both = self.inverse @ products[0]
         values = torch.complex(*both.chunk(2))
         energy = float(sound.double().square().sum())
-        if colour is None:
+        if color is None:
             return Amplitudes(values, torch.zeros_like(self.bank.frequency), products[0], energy)
-        power, quiet = self._noise(sound, values, colour)
+        power, quiet = self._noise(sound, values, color)
         place = self.bank.frequency / (0.5 * self.sample_rate) * (len(power) - 1)
         left = place.floor().long().clamp(0, len(power) - 2)
         noise = torch.lerp(power[left], power[left + 1], place - left)
         return Amplitudes(values, noise, products[0], max(energy - self.samples * quiet, 0.0))
 
     def _noise(
-        self, sound: Float[Tensor, " samples"], values: Complex128[Tensor, " modes"], colour: Residual
+        self, sound: Float[Tensor, " samples"], values: Complex128[Tensor, " modes"], color: Residual
     ) -> tuple[Float64[Tensor, " bands"], float]:
         """Return the noise's power in bands up to half the sample rate, and on the mean what is there throughout."""
-        modelled = synthesise(
+        modelled = synthesize(
             values.real[None],
             self.bank.frequency,
             self.bank.damping,
@@ -122,7 +122,7 @@ class Extractor:
         free = self.samples / max(self.samples - 2 * len(self.bank), 0.5 * self.samples)
         cells = free * _cell_power(sound.double() - modelled)
         own = cells.mean(0)
-        shape = _at(colour.magnitude.double(), len(own)).square()
+        shape = _at(color.magnitude.double(), len(own)).square()
         if not bool(shape.any()):
             shape = torch.ones_like(own)
         shape = shape.clamp_min(1e-6 * float(shape.mean()))

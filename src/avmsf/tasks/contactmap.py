@@ -23,8 +23,8 @@ COMPARABLE = 0.25
 """Part of the likeliest place's probability from which on another place is as good an answer."""
 _LEAST_LEFT = 0.01
 """Part of a sound that detuned modes leave at least: less is not told from rounding and from what noise adds."""
-_NEIGHBOUR_SPACINGS = 2.5
-_NEIGHBOUR_PART = 0.04
+_NEIGHBOR_SPACINGS = 2.5
+_NEIGHBOR_PART = 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Peak:
     row: int
     """Its likeliest point."""
     position: Float32[Tensor, " 3"]
-    """Where that is, object frame, metres."""
+    """Where that is, object frame, meters."""
     probability: float
     """That the blow fell here: of all points that hang together with this one."""
     points: Bool[Tensor, " points"]
@@ -56,7 +56,7 @@ class ContactMap:
         return f"ContactMap({len(self.points)} points, most probable ({where}) m with {first.probability:.0%}{more})"
 
     points: Float32[Tensor, "points 3"]
-    """Object frame, metres."""
+    """Object frame, meters."""
     distance: Float64[Tensor, " points"]
     """The paper's cosine distance between heard and foretold gains, for a blow of either polarity: 0 where they agree
     up to a factor, 1 where they have nothing in common."""
@@ -95,7 +95,7 @@ class ContactMap:
 
     @property
     def position(self) -> Float32[Tensor, " 3"]:
-        """Where the most probable point is, object frame, metres. Raises LocationError after a `refusal`."""
+        """Where the most probable point is, object frame, meters. Raises LocationError after a `refusal`."""
         if self.refusal is not None:
             raise LocationError(self.refusal)
         return self.points[self.most_probable]
@@ -115,16 +115,16 @@ class ContactMap:
 
     @cached_property
     def radius(self) -> float:
-        """Metres up to which two points of a region are taken to be one place.
+        """Meters up to which two points of a region are taken to be one place.
 
-        Two and a half times the distance between neighbouring points, and no less than 4 % of the object's diagonal.
+        Two and a half times the distance between neighboring points, and no less than 4 % of the object's diagonal.
         """
         places = self.points.double().numpy()
         diagonal = float(np.linalg.norm(np.ptp(places, axis=0)))
         if len(places) < 2:
             return diagonal
         spacing = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
-        return max(_NEIGHBOUR_SPACINGS * spacing, _NEIGHBOUR_PART * diagonal)
+        return max(_NEIGHBOR_SPACINGS * spacing, _NEIGHBOR_PART * diagonal)
 
     def peaks(self, level: float = LEVEL, *, comparable: float = COMPARABLE) -> tuple[Peak, ...]:
         """Return the separate places in the credible region, likeliest first, whose probabilities are comparable.

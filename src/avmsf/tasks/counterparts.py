@@ -18,7 +18,7 @@ class Counterpart:
     """A place that may have been struck as well as the likeliest one."""
 
     position: Float32[Tensor, " 3"]
-    """Object frame, metres."""
+    """Object frame, meters."""
     probability: float
     """That the blow fell there."""
     symmetry: RotationalSymmetry | MirrorSymmetry | None
@@ -47,9 +47,9 @@ def name_counterpart(
     probability: float,
     tolerance: float,
 ) -> Counterpart:
-    """Return `other` as a counterpart of `place` (metres), with the symmetry that carries one to the other best.
+    """Return `other` as a counterpart of `place` (meters), with the symmetry that carries one to the other best.
 
-    Images farther than `tolerance` metres from `other` do not count, nor do symmetries that leave `place` about where
+    Images farther than `tolerance` meters from `other` do not count, nor do symmetries that leave `place` about where
     it is.
     """
     nearest, found, turned = tolerance, None, None

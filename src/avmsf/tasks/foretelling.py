@@ -12,7 +12,7 @@ from avmsf.field.uncertainty import fitted_mixture, has_posterior
 
 _BATCH = 2048
 """Points whose gains are asked for at once."""
-_NEIGHBOURS = 8
+_NEIGHBORS = 8
 """Of a point, by which it is told how gains vary about it."""
 _PATCH = 1.0 / 9.0
 """Variance over a square of surface around a point, over the mean square difference from the squares about it."""
@@ -76,7 +76,7 @@ def patches(
     points: Float[Tensor, "points 3"], gains: Complex64[Tensor, "points modes"]
 ) -> Float32[Tensor, "points modes"]:
     """Return the variance of gains over the patch of surface that each point stands for."""
-    count = min(_NEIGHBOURS, len(points) - 1)
+    count = min(_NEIGHBORS, len(points) - 1)
     total = torch.zeros(gains.shape)
     if count < 1:
         return total

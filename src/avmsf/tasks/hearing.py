@@ -180,13 +180,13 @@ def settings_for(recording: Recording, settings: CaptureSettings) -> CaptureSett
     force, response = settings.force_channel, settings.response_channel
     kept = replace(
         settings,
-        normalise="none",
+        normalize="none",
         # A single channel is the sound, wherever the capture has its force.
         force_channel=force if force is not None and count > 1 and force <= count else None,
         response_channel=response if response is not None and response <= count else None,
     )
-    if settings.normalise == "deconvolve" and kept.force_channel is not None:
-        return replace(kept, normalise="deconvolve")
+    if settings.normalize == "deconvolve" and kept.force_channel is not None:
+        return replace(kept, normalize="deconvolve")
     return kept
 
 

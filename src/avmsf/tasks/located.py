@@ -40,7 +40,7 @@ def enlarged(symmetries: Symmetries, factor: float) -> Symmetries:
 def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: float) -> dict[str, Any]:
     """Return where a blow fell, within which region with a probability of `level`, and what else fits, and why.
 
-    Lengths in metres. Of a refused sound the status, the reason and the figures behind it. Raises LocationError for a
+    Lengths in meters. Of a refused sound the status, the reason and the figures behind it. Raises LocationError for a
     level that is not between 0 and 1.
     """
     if contact.refusal is not None:
@@ -57,7 +57,7 @@ def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: flo
         "place": contact.position.tolist(),
         "region": {
             "level": level,
-            "radius_metres": _radius(contact, level),
+            "radius_meters": _radius(contact, level),
             "share": float(contact.region(level).double().mean()),
         },
         "explained": contact.explained,
@@ -84,7 +84,7 @@ def not_located(reason: str) -> dict[str, Any]:
 
 
 def _radius(contact: ContactMap, level: float) -> float:
-    """Return how far from the likeliest place the blow fell at most, with a probability of `level`, metres."""
+    """Return how far from the likeliest place the blow fell at most, with a probability of `level`, meters."""
     apart = (contact.points.double() - contact.position.double()).norm(dim=1)
     order = torch.argsort(apart, stable=True)
     reached = torch.cumsum(contact.probability[order], 0) >= level * contact.probability.sum()

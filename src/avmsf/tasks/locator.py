@@ -38,7 +38,7 @@ class Locator:
 
     field: SoundField
     points: Float32[Tensor, "points 3"]
-    """Object frame, metres."""
+    """Object frame, meters."""
     gains: Complex64[Tensor, "points modes"]
     """What the field foretells: amplitudes of sines, and of cosines as imaginary part, in the training sounds' unit."""
     variance: Float32[Tensor, "points modes"]
@@ -66,7 +66,7 @@ class Locator:
         areas: ArrayLike | None = None,
         use_residual: bool = True,
     ) -> "Locator":
-        """Return the locator of a field, over the points (metres) of its gains unless others are given.
+        """Return the locator of a field, over the points (meters) of its gains unless others are given.
 
         `directions`, unit vectors, are those of blows at the points; without them they go straight into the surface.
         `areas` are how much of the surface each point stands for, in any unit; without them all the same. Without
@@ -104,7 +104,7 @@ class Locator:
         heard = sound.detach().cpu()[: self.field.samples]
         self._expect_sound(heard)
         length = self._length(len(heard), float("inf") if highest is None else highest)
-        amplitudes = length.extractor.extract(heard, colour=self.field.residual if self.heeds_residual else None)
+        amplitudes = length.extractor.extract(heard, color=self.field.residual if self.heeds_residual else None)
         detuned = length.detuned.fitted(heard)
         # What is left beside loud noise is known badly, but it is no less than what modes explain, in tune or not.
         amplitudes = replace(amplitudes, energy=max(amplitudes.energy, amplitudes.fitted, float(detuned.max())))

@@ -16,7 +16,7 @@ from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_sounds
 from avmsf.modal.extraction.finders import HighResolution
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.material import Material
 from avmsf.tasks.reference import Reference, read_clip, wav_files
 
@@ -156,7 +156,7 @@ class MaterialStatistics:
             damping = 0.5 * (self.alpha + self.beta * (2 * math.pi * frequency).square()).clamp_min(1e-3)
             signed = torch.where(turns < 0.5, -size, size).float()[heard]
             made.append(
-                synthesise(signed[None], frequency[heard], damping[heard], samples=samples, sample_rate=sample_rate)
+                synthesize(signed[None], frequency[heard], damping[heard], samples=samples, sample_rate=sample_rate)
             )
         return torch.cat(made)
 

@@ -12,7 +12,7 @@ from avmsf.errors import EditError
 from avmsf.field.gainfield import Gains
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.synthesis import synthesise_phased
+from avmsf.modal.synthesis import synthesize_phased
 from avmsf.tasks.edits import edited
 
 
@@ -118,7 +118,7 @@ class Struck:
         samples: int,
         device: torch.device | None = None,
     ) -> "Struck":
-        """Strike a field straight into its surface at contacts (object frame, metres)."""
+        """Strike a field straight into its surface at contacts (object frame, meters)."""
         known = field.known(contacts)
         place = torch.device("cpu") if device is None else device
         parts = (known.mean, known.quadrature, known.damping)
@@ -143,7 +143,7 @@ class Struck:
         quadrature = self.known.quadrature
         # A silent mode's phase must not run beyond what float64 resolves.
         frequency = torch.where(heard, bank.frequency, self.bank.frequency)
-        return synthesise_phased(
+        return synthesize_phased(
             self.known.mean * scale,
             frequency,
             bank.damping if self.known.damping is None else bank.damping * self.known.damping,

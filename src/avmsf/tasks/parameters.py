@@ -67,7 +67,7 @@ PARAMETERISATIONS = {each.name: each for each in (HIERARCHICAL, PUBLISHED, INDEP
 
 
 class EditVariables:
-    """An edit on its way, and its optimiser."""
+    """An edit on its way, and its optimizer."""
 
     def __init__(self, start: ModalEdit, edited: Int[Tensor, " edited"], parameters: Parameterisation) -> None:
         """Begin at `start`; the modes `edited` move by themselves, the others follow the common factors alone.
@@ -85,7 +85,7 @@ class EditVariables:
             if rate > 0:
                 groups.append({"params": [self.values[name]], "lr": rate, "rate": rate})
         # Targets change from step to step: a long memory of the gradient's square would brake what chance once pushed.
-        self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99))
+        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
 
     def edit(self) -> ModalEdit:
         """Return the edit as it stands, differentiable in the values."""
@@ -107,25 +107,25 @@ class EditVariables:
 
     def differentiate(self, loss: Float[Tensor, ""]) -> bool:
         """Take the gradient of a loss and the penalty; return whether it is finite."""
-        self.optimiser.zero_grad()
+        self.optimizer.zero_grad()
         torch.autograd.backward(loss + self.penalty())
         moving = [value.grad for value in self.values.values() if value.grad is not None]
         return all(bool(torch.isfinite(gradient).all()) for gradient in moving)
 
     def move(self, *, done: float) -> None:
         """Take the step that the gradient asks for, with a part `done` of all steps behind it."""
-        for group in self.optimiser.param_groups:
+        for group in self.optimizer.param_groups:
             group["lr"] = group["rate"] * (0.525 + 0.475 * math.cos(math.pi * done))
-        self.optimiser.step()
+        self.optimizer.step()
 
     def state(self) -> dict[str, Any]:
         """Return all that decides how it goes on: tensors, numbers, containers of these."""
         values = {name: value.detach().cpu().clone() for name, value in self.values.items()}
-        return {"values": values, "optimiser": self.optimiser.state_dict()}
+        return {"values": values, "optimizer": self.optimizer.state_dict()}
 
     def resume(self, state: dict[str, Any]) -> None:
         """Go back to what `state` returned."""
         with torch.no_grad():
             for name, value in self.values.items():
                 value.copy_(state["values"][name])
-        self.optimiser.load_state_dict(state["optimiser"])
+        self.optimizer.load_state_dict(state["optimizer"])

@@ -32,7 +32,7 @@ def retune(
 
     `pitch` multiplies frequencies, `decay` the times in which modes die away, and `gains_db` raises modes by so many
     decibels, -inf mutes one; each is one number for all modes or one a mode, in the bank's order. `brightness_db` tilts
-    the spectrum by so many decibels an octave about `brightness_centre`, at the frequencies that modes come to have.
+    the spectrum by so many decibels an octave about `brightness_center`, at the frequencies that modes come to have.
     Ratios of gains between places stay.
 
     Without values nothing changes. Two edits after one another are the one with both factors and the sums of decibels,
@@ -50,8 +50,8 @@ def retune(
         raise EditError(f"brightness_db = {brightness_db:g}: expected decibels an octave, as 3")
     bank = ModalBank(field.bank.frequency * factors["pitch"], field.bank.damping / factors["decay"])
     if brightness_db:
-        centre = brightness_centre(field, bank)
-        levels = levels + brightness_db * torch.log2(bank.frequency / centre)
+        center = brightness_center(field, bank)
+        levels = levels + brightness_db * torch.log2(bank.frequency / center)
     entry: dict[str, Any] = {
         "edit": "retune",
         "pitch": _told(factors["pitch"]),
@@ -62,8 +62,8 @@ def retune(
     return edited(field, bank, 10.0 ** (levels / 20.0), entry=entry)
 
 
-def brightness_centre(field: SoundField, bank: ModalBank | None = None) -> float:
-    """Return the frequency, Hz, that brightness leaves as loud as it is: where a field's energy has its centre.
+def brightness_center(field: SoundField, bank: ModalBank | None = None) -> float:
+    """Return the frequency, Hz, that brightness leaves as loud as it is: where a field's energy has its center.
 
     The geometric mean of the frequencies, those of `bank` where one is given, each counted by the mean square of its
     gains over the object as these were before any edit; so that edits do not move it, but as pitch does.

@@ -18,7 +18,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, LocationError
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.tasks.amplitudes import Extractor
 from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.hearing import Sound, as_recording, at_field_rate, describe, own_settings, read_if_path, settings_for
@@ -55,9 +55,9 @@ def locate_blows(
     recording = read_if_path(recording)
     whole = as_recording(recording, field, sample_rate=sample_rate)
     chosen = settings_for(whole, own_settings(recording, field) if settings is None else settings)
-    if chosen.normalise == "deconvolve":
+    if chosen.normalize == "deconvolve":
         raise LocationError(
-            f'{whole.name}: normalise = "deconvolve" divides one push of the hammer out of a recording, not several: '
+            f'{whole.name}: normalize = "deconvolve" divides one push of the hammer out of a recording, not several: '
             "cut it into a recording for each blow, and locate these"
         )
     notes = describe(whole, chosen)
@@ -151,10 +151,10 @@ def still_ringing(
     heard = torch.nonzero(field.bank.frequency < min(0.5 * rate, highest or 0.5 * rate)).flatten()
     bank = ModalBank(field.bank.frequency[heard], field.bank.damping[heard])
     extractor = Extractor.of(bank, sample_rate=rate, samples=stop - begin)
-    values = extractor.extract(sound[begin:stop], colour=None).values
+    values = extractor.extract(sound[begin:stop], color=None).values
     seconds = (start - begin) / rate
     values = values * torch.polar(torch.exp(-bank.damping * seconds), 2.0 * torch.pi * bank.frequency * seconds)
-    return synthesise(
+    return synthesize(
         values.real[None],
         bank.frequency,
         bank.damping,

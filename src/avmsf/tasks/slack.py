@@ -23,7 +23,7 @@ _MOST = 0.03
 """The same over the object's diagonal, at most."""
 _REACH = 2.5
 """Standard deviations up to which an answer is spread."""
-_NEIGHBOURS = 6
+_NEIGHBORS = 6
 
 
 def contacts_of(field: SoundField) -> int | None:
@@ -35,15 +35,15 @@ def contacts_of(field: SoundField) -> int | None:
 
 
 def areas_of(points: Float[Tensor, "points 3"]) -> Float64[Tensor, " points"]:
-    """Return the area of surface that falls to each of at least two points, square metres, by its neighbours."""
+    """Return the area of surface that falls to each of at least two points, square meters, by its neighbors."""
     places = points.double().numpy()
-    count = min(_NEIGHBOURS, len(places) - 1)
+    count = min(_NEIGHBORS, len(places) - 1)
     distances, _ = cKDTree(places).query(places, k=count + 1)
     return torch.from_numpy(np.pi * distances[:, -1] ** 2 / (count + 0.5))
 
 
 def spread_by(points: Float[Tensor, "points 3"], *, contacts: int | None) -> csr_array | None:
-    """Return what spreads probabilities of points (metres) over those about: [points, points], its columns sum to one.
+    """Return what spreads probabilities of points (meters) over those about: [points, points], its columns sum to one.
 
     None for a field of unknown contacts, and for points that are all at one place.
     """

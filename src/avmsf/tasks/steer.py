@@ -77,7 +77,7 @@ class SteerProgress:
     preview: Float[Tensor, " samples"] | None
     """The edited field's sound at one place, at the field's rate, every so many steps and at the end."""
     place: Float[Tensor, " 3"] | None = None
-    """The place of the preview, object frame, metres."""
+    """The place of the preview, object frame, meters."""
 
 
 def steer(

@@ -17,7 +17,7 @@ from avmsf.errors import ExtractionError
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ShortTime, lowest_frequency
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.plate import Plate, PlateModes, plate_modes, sample_contacts, strike
 
 RATE = 16000.0
@@ -55,7 +55,7 @@ def impacts_of(sounds: Tensor, rate: float = RATE) -> Impacts:
 
 
 def make(bank: ModalBank, gains: Tensor, *, rate: float, samples: int, noise: float, seed: int = 0) -> Tensor:
-    sounds = synthesise(gains, bank.frequency, bank.damping, samples=samples, sample_rate=rate)
+    sounds = synthesize(gains, bank.frequency, bank.damping, samples=samples, sample_rate=rate)
     return sounds + noise * torch.randn(sounds.shape, generator=seeded(seed))
 
 

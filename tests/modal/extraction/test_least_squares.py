@@ -10,7 +10,7 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import NormalEquations, fit_gains, fit_sine_gains, refine
 from avmsf.modal.innerproducts import gram, own_gram, poles_of, project
 from avmsf.modal.phase import common_phase
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 
 RATE = 8000.0
 
@@ -119,7 +119,7 @@ def test_gains_have_the_dtype_of_the_sounds_and_render_them():
     _, _, sounds = draw(BANK, dtype=torch.float32)
     gains, quadrature = fit_gains(sounds, BANK, sample_rate=RATE)
     assert gains.dtype == quadrature.dtype == torch.float32
-    rendered = synthesise(gains, BANK.frequency, BANK.damping, samples=6000, sample_rate=RATE, quadrature=quadrature)
+    rendered = synthesize(gains, BANK.frequency, BANK.damping, samples=6000, sample_rate=RATE, quadrature=quadrature)
     assert float((rendered - sounds).abs().max()) < 3e-6 * float(sounds.abs().max())
 
 

@@ -12,7 +12,7 @@ from avmsf.modal.extraction.extract import Extraction, extract_sounds
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.extraction.quality import ModeQuality, measure_quality
 from avmsf.modal.residual import Residual
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 
 RATE = 8000.0
 SAMPLES = 8000
@@ -28,7 +28,7 @@ TRUTH = bank_of((400.0, 8.0), (700.0, 15.0), (1500.0, 30.0))
 
 
 def record(bank: ModalBank, gains: Tensor, *, noise: float = LEVEL, seed: int = 0, quadrature: float = 0.0) -> Tensor:
-    sounds = synthesise(
+    sounds = synthesize(
         gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE, quadrature=quadrature * gains
     )
     return sounds + noise * torch.randn(sounds.shape, generator=seeded(seed), dtype=torch.float64)
@@ -130,7 +130,7 @@ def test_coherence_is_one_for_one_phase_modulo_pi_and_low_for_random_phases() ->
     gains = shapes(64, 1)
     assert float(quality_of(record(bank, gains, quadrature=-0.7), bank).coherence) > 0.999
     turned = torch.polar(torch.ones(64, 1), 2 * math.pi * torch.rand(64, 1, generator=seeded(8))).to(torch.complex128)
-    sounds = synthesise(
+    sounds = synthesize(
         turned.real, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE, quadrature=turned.imag
     )
     # Of 64 random phases the resultant is 1/8 in the root mean square.

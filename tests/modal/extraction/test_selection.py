@@ -13,7 +13,7 @@ from avmsf.modal.extraction.forward import choose
 from avmsf.modal.extraction.least_squares import NormalEquations
 from avmsf.modal.extraction.selection import Candidates, chance_ratio, merge, prune, select
 from avmsf.modal.innerproducts import gram, poles_of
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 
 RATE = 8000.0
 SAMPLES = 6000
@@ -30,7 +30,7 @@ TRUTH = bank_of([300.0, 700.0, 703.0, 1500.0, 2900.0], [5.0, 6.0, 7.0, 30.0, 80.
 def record(bank: ModalBank, *, noise: float = 0.0, contacts: int = 4, seed: int = 0) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     gains = torch.randn(contacts, len(bank), generator=generator, dtype=torch.float64)
-    sounds = synthesise(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
+    sounds = synthesize(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
     return sounds + noise * torch.randn(contacts, SAMPLES, generator=generator, dtype=torch.float64)
 
 
@@ -103,7 +103,7 @@ def test_silence_yields_no_candidate(significance: float):
     assert len(frequency) == len(damping) == 0
 
 
-def test_doubles_are_merged_and_neighbours_kept():
+def test_doubles_are_merged_and_neighbors_kept():
     bank = merge(
         torch.tensor([700.0, 300.0, 700.0001, 703.0, 700.0], dtype=torch.float64),
         torch.tensor([6.0, 5.0, 6.001, 7.0, 60.0], dtype=torch.float64),
@@ -124,7 +124,7 @@ def test_selection_takes_the_modes_from_among_the_rest():
     assert chosen.damping.tolist() == TRUTH.damping.tolist()
 
 
-def test_selection_refuses_what_only_leaks_from_a_neighbour():
+def test_selection_refuses_what_only_leaks_from_a_neighbor():
     sounds = record(TRUTH, noise=0.03)
     leaked = merge(
         torch.cat([TRUTH.frequency, torch.tensor([302.0, 1510.0], dtype=torch.float64)]),
@@ -134,10 +134,10 @@ def test_selection_refuses_what_only_leaks_from_a_neighbour():
     assert sift(sounds, leaked, noise=0.03).frequency.tolist() == TRUTH.frequency.tolist()
 
 
-def test_selection_refuses_what_is_faint_beside_a_neighbour():
+def test_selection_refuses_what_is_faint_beside_a_neighbor():
     bank = bank_of([300.0, 303.0], [10.0, 10.0])
     gains = torch.tensor([[1.0, 10 ** (-75 / 20)]], dtype=torch.float64)
-    sounds = synthesise(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
+    sounds = synthesize(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
     assert select_one(sounds, bank).frequency.tolist() == [300.0]
 
 
@@ -211,14 +211,14 @@ def test_pruning_leaves_no_cancelling_modes():
 def test_pruning_keeps_the_most_needed():
     gains = torch.tensor([[1.0, 0.1, 0.5]], dtype=torch.float64)
     bank = bank_of([300.0, 900.0, 2000.0], [10.0, 10.0, 10.0])
-    sounds = synthesise(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
+    sounds = synthesize(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
     assert prune(sounds, bank, flat(1e-5, bank, 1), count=2, **SIFTING).frequency.tolist() == [300.0, 2000.0]
 
 
 def test_range_leaves_faint_modes_out():
     gains = torch.tensor([[1.0, 10 ** (-50 / 20), 10 ** (-70 / 20)]], dtype=torch.float64)
     bank = bank_of([300.0, 900.0, 2000.0], [10.0, 10.0, 10.0])
-    sounds = synthesise(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
+    sounds = synthesize(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
     for keep in (
         lambda: prune(sounds, bank, flat(1e-9, bank, 1), count=9, **SIFTING),
         lambda: select_one(sounds, bank),

@@ -6,7 +6,7 @@ from avmsf.capture.datasets.numbering import shared_objects
 from avmsf.capture.datasets.objectfolder_compact import ObjectFolderCompact
 from avmsf.capture.datasets.objectfolder_raw import ObjectFolderRaw
 from avmsf.capture.datasets.realimpact import RealImpact
-from avmsf.capture.datasets.recognise import open_dataset
+from avmsf.capture.datasets.recognize import open_dataset
 
 __all__ = [
     "CaptureCollection",

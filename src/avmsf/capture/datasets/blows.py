@@ -35,7 +35,7 @@ class Blow:
     """What the capture calls it."""
     recording: Recording
     contact: Float64[np.ndarray, " 3"]
-    """Object frame, metres."""
+    """Object frame, meters."""
     newtons: float | None = None
     """Peak force, where it is known."""
     gain_db: float = 0.0

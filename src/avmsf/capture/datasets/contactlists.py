@@ -40,7 +40,7 @@ class ContactFolder:
         return wrong
 
     def place(self, identifier: str, contact: str) -> Float64[np.ndarray, " 3"]:
-        """Return a contact, metres in the mesh's frame. Raises DatasetError for one that is missing or malformed."""
+        """Return a contact, meters in the mesh's frame. Raises DatasetError for one that is missing or malformed."""
         return read_array(self._path(identifier, contact), CONTACT, shown=f"{FOLDER}/{identifier}/{contact}.npy")
 
     def __str__(self) -> str:
@@ -81,7 +81,7 @@ class ContactLists:
         return f"contact {contact} stands in none of {', '.join(path.name for path in self.files)}"
 
     def place(self, identifier: str, contact: str) -> Float64[np.ndarray, " 3"]:
-        """Return a contact, metres in the mesh's frame. Raises DatasetError for one that is not listed."""
+        """Return a contact, meters in the mesh's frame. Raises DatasetError for one that is not listed."""
         wrong = self.judge(identifier, contact)
         if wrong is not None:
             raise DatasetError(f"object {identifier}: {wrong}")
@@ -151,6 +151,6 @@ def _understand(record: Any, where: str) -> tuple[tuple[str, str], tuple[float, 
     contact = record.get("contact")
     numbers = isinstance(contact, list) and all(type(value) in (int, float) for value in contact)
     if not numbers or len(contact) != 3 or not np.isfinite(contact).all():
-        raise DatasetError(f"{where}: contact is {contact!r}; expected three numbers, metres")
+        raise DatasetError(f"{where}: contact is {contact!r}; expected three numbers, meters")
     x, y, z = map(float, contact)
     return (str(int(found[1])), str(int(found[2]))), (x, y, z)

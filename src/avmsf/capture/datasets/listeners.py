@@ -5,7 +5,7 @@ from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 
 SAME_PLACE = 1e-3
-"""Metres within which two microphones stood in one place."""
+"""Meters within which two microphones stood in one place."""
 
 
 def closest_rows(

@@ -27,7 +27,7 @@ from avmsf.errors import CaptureError, DatasetError
 PARTS = ("audio", "contacts", "global_gt_points", "split.json", "scale.json")
 """What a complete copy holds; pictures, touch and spectrograms beside them are not used."""
 POINTS = ArrayForm("float64", (1024, 3))
-SETTINGS = CaptureSettings(normalise="none")
+SETTINGS = CaptureSettings(normalize="none")
 SPLITS = ("train", "val", "test")
 
 

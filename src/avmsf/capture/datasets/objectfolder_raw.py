@@ -26,7 +26,7 @@ RATE = 48_000.0
 FRAMES = 288_000
 """Of each recording: 6 s, one of them before the blow."""
 DOWNLOAD = "https://download.cs.stanford.edu/viscam/ObjectFolder_Real"
-SETTINGS = CaptureSettings(force_channel=1, response_channel=2, normalise="peak")
+SETTINGS = CaptureSettings(force_channel=1, response_channel=2, normalize="peak")
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,8 @@ DOWNLOAD = "http://downloads.cs.stanford.edu/viscam/RealImpact"
 SELF_INTERSECTING = (37, 51, 73, 83)
 """Objects whose meshes intersect themselves."""
 OFF_MESH = 1e-3
-"""Metres that a struck vertex may lie off the mesh's vertices."""
-SETTINGS = CaptureSettings(normalise="none", align=False)
+"""Meters that a struck vertex may lie off the mesh's vertices."""
+SETTINGS = CaptureSettings(normalize="none", align=False)
 
 
 class RealImpact:

@@ -1,4 +1,4 @@
-"""A plain background's colour, which may change smoothly over an image, and how far from it an object begins."""
+"""A plain background's color, which may change smoothly over an image, and how far from it an object begins."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -16,7 +16,7 @@ _BORDER = 0.02
 
 
 def distances_from_background(views: Sequence[View]) -> list[UInt8[np.ndarray, "height width"]]:
-    """Return for each pixel how far its colour is from the background's: the largest channel's difference, of 255.
+    """Return for each pixel how far its color is from the background's: the largest channel's difference, of 255.
 
     Each image's background is a quadratic in the pixel's place, fitted to its border and to that of all images: so
     that light falling off to the corners is no object, and an object that covers a whole border no background.
@@ -28,7 +28,7 @@ def distances_from_background(views: Sequence[View]) -> list[UInt8[np.ndarray, "
 def threshold(distances: Sequence[UInt8[np.ndarray, "height width"]]) -> int:
     """Return the greatest distance that is still background, by Otsu's criterion on logarithms, all images together.
 
-    Logarithms, because an object's own colours spread far wider than a background's noise: on the plain scale the dark
+    Logarithms, because an object's own colors spread far wider than a background's noise: on the plain scale the dark
     half of a white object in raking light is cut away.
     """
     borders = np.concatenate([_border(distance[..., None]) for distance in distances])
@@ -54,7 +54,7 @@ def _distance(image: np.ndarray, common: Float[np.ndarray, " 3"]) -> UInt8[np.nd
     background = np.broadcast_to(common, image.shape)
     expected = np.broadcast_to(common, colors.shape)
     for tolerance in (48.0, 24.0, 24.0):
-        # Colours far from what is expected belong to the object, where it leaves the image.
+        # Colors far from what is expected belong to the object, where it leaves the image.
         plain = np.abs(colors - expected).max(axis=1) < tolerance
         if plain.sum() < 0.25 * len(colors):
             break

@@ -71,7 +71,7 @@ def read_colmap(model: Path, images: Path) -> Shots:
 
 
 def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the model's points [points, 3] and their colours [points, 3] in 8 bits; None where it has no points."""
+    """Return the model's points [points, 3] and their colors [points, 3] in 8 bits; None where it has no points."""
     for suffix, reader in ((".bin", colmap_binary), (".txt", colmap_text)):
         path = model / f"points3D{suffix}"
         if path.is_file():

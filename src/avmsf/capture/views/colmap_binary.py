@@ -98,7 +98,7 @@ def read_images(path: Path) -> list[ImageRecord]:
 
 
 def read_points(path: Path) -> tuple[Float[np.ndarray, "points 3"], UInt8[np.ndarray, "points 3"]]:
-    """Read places and colours from points3D.bin; raises CaptureError where it is truncated."""
+    """Read places and colors from points3D.bin; raises CaptureError where it is truncated."""
     reader = _Reader(path)
     (count,) = reader.take("Q")
     places, colors = [], []

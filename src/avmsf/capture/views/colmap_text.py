@@ -32,7 +32,7 @@ def read_images(path: Path) -> list[ImageRecord]:
 
 
 def read_points(path: Path) -> tuple[Float[np.ndarray, "points 3"], UInt8[np.ndarray, "points 3"]]:
-    """Read places and colours from points3D.txt; raises CaptureError with the line that is malformed."""
+    """Read places and colors from points3D.txt; raises CaptureError with the line that is malformed."""
     points = [_parsed(path, row, line, _point) for row, line in _lines(path) if line]
     places = np.array([place for place, _ in points], dtype=np.float64).reshape(-1, 3)
     return places, np.array([color for _, color in points], dtype=np.uint8).reshape(-1, 3)

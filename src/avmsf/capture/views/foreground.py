@@ -1,4 +1,4 @@
-"""The object told from a plain background: by colour in each image, then by what all views agree on."""
+"""The object told from a plain background: by color in each image, then by what all views agree on."""
 
 import warnings
 from collections.abc import Sequence
@@ -36,8 +36,8 @@ _BLUR = 2
 def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
     """Return the views, with masks for those that had none, which must show the object before a plain background.
 
-    The background's colour, which may change smoothly over an image, comes from the images' borders; the object may
-    cross them, but must leave most of all borders free. What differs from it in colour is object, if the other views
+    The background's color, which may change smoothly over an image, comes from the images' borders; the object may
+    cross them, but must leave most of all borders free. What differs from it in color is object, if the other views
     agree: a coarse visual hull of the first masks drops spots and folds of the background, and fills shadows that are
     as dark as a dark background where nearly all other views show object. So it may also close a narrow gap through
     which only one view in thirty sees the background; wider ones stay open. Masks are 0 or 255. Given masks stay as
@@ -78,7 +78,7 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
 
 
 def background_color(views: Sequence[View]) -> Float[Tensor, " 3"]:
-    """Return the median colour outside the masks, 0 to 1, each channel on its own; float32.
+    """Return the median color outside the masks, 0 to 1, each channel on its own; float32.
 
     Views without a mask do not count, nor do the pixels next to a mask's edge, where object and background mix.
     Raises CaptureError where no pixel lies outside.
@@ -136,8 +136,8 @@ def _outlines(masks: Sequence[Bool[np.ndarray, "height width"]], cameras: Sequen
 def _agreed(
     distance: UInt8[np.ndarray, "height width"], cut: int, outline: _Outline
 ) -> Bool[np.ndarray, "height width"]:
-    """Return a view's mask from its own colours and the hull."""
-    # The farther a pixel's colour from the background's, the fewer views need to agree: a fold in the background is
+    """Return a view's mask from its own colors and the hull."""
+    # The farther a pixel's color from the background's, the fewer views need to agree: a fold in the background is
     # hardly brighter than the rest of it, and a shadow on the object hardly darker than the cut.
     mask = (distance > 2 * cut) & outline.possible
     mask |= (distance > cut) & outline.near
@@ -156,7 +156,7 @@ def _trimmed(
 ) -> Bool[np.ndarray, "height width"]:
     """Return the mask without the blur at its edge: pixels less than half as far from the background as next to them.
 
-    The cut is low, for the sake of shadows, and would leave a rim of mixed colours around all that is bright.
+    The cut is low, for the sake of shadows, and would leave a rim of mixed colors around all that is bright.
     """
     inner = cv2.erode(mask.astype(np.uint8), _disc(_BLUR), borderValue=1) > 0
     brightest = cv2.dilate(np.where(mask, distance, 0).astype(np.uint8), _disc(_BLUR))
@@ -186,8 +186,8 @@ def _refuse_busy(different: Sequence[Bool[np.ndarray, "height width"]], names: S
     share = float(np.concatenate(borders).mean())
     if share > _BUSY:
         raise CaptureError(
-            f"expected a plain background, found that {share:.0%} of the images' borders differ from it in colour "
-            f"({listed(names)}): give masks, or photograph the object before one colour and with room around it"
+            f"expected a plain background, found that {share:.0%} of the images' borders differ from it in color "
+            f"({listed(names)}): give masks, or photograph the object before one color and with room around it"
         )
 
 

@@ -19,9 +19,9 @@ class Hull:
     """Cubes around an object with the votes of the views on each."""
 
     centers: Float[np.ndarray, "places 3"]
-    """Object frame, metres."""
+    """Object frame, meters."""
     edge: float
-    """Of a cube, metres."""
+    """Of a cube, meters."""
     seeing: Int[np.ndarray, " places"]
     """How many views have the place inside their image."""
     agreeing: Int[np.ndarray, " places"]
@@ -62,7 +62,7 @@ def silhouette(
     if not ahead.any():
         return np.zeros((camera.height, camera.width), dtype=bool), 1.0
     footprint = max(camera.focal) * hull.edge / float(np.median(depth[ahead]))
-    # A cube covers at most one pixel of an image this small, so that neighbours leave no gap that closing leaves open.
+    # A cube covers at most one pixel of an image this small, so that neighbors leave no gap that closing leaves open.
     shrink = max(1.0, footprint)
     width, height = int(np.ceil(camera.width / shrink)), int(np.ceil(camera.height / shrink))
     columns, rows = np.floor(across / shrink), np.floor(down / shrink)

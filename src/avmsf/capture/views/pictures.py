@@ -1,4 +1,4 @@
-"""Photographs and masks as files hold them: PNG, JPEG or WebP, 8 or 16 bit, grey or colour, with or without alpha."""
+"""Photographs and masks as files hold them: PNG, JPEG or WebP, 8 or 16 bit, gray or color, with or without alpha."""
 
 import contextlib
 import io
@@ -57,7 +57,7 @@ def scale(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def read_picture(path: Path) -> Picture:
-    """Read a photograph, its pixels as they are stored; alpha becomes the mask and lays the colour before black.
+    """Read a photograph, its pixels as they are stored; alpha becomes the mask and lays the color before black.
 
     An alpha channel that is opaque everywhere is no mask. 16 bits become 8. An orientation tag (EXIF) has no effect:
     see `read_upright`. Raises CaptureError where the file is missing, corrupt or of another kind, PictureSizeError
@@ -70,7 +70,7 @@ def read_picture(path: Path) -> Picture:
     if pixels.shape[2] == 3 or (pixels[..., 3] == 255).all():
         return Picture(color)
     mask = np.ascontiguousarray(pixels[..., 3])
-    # What a transparent pixel's colour is nobody knows; before black, edges blend as in a photograph of a black room.
+    # What a transparent pixel's color is nobody knows; before black, edges blend as in a photograph of a black room.
     before_black = (color.astype(np.uint16) * mask[..., None] + 127) // 255
     return Picture(before_black.astype(np.uint8), mask)
 
@@ -113,7 +113,7 @@ def _is_small(content: bytes, path: Path) -> bool:
 
 
 def _decode(path: Path, flags: int) -> np.ndarray:
-    """Return the file's pixels as 8 bits, blue first where there are colours."""
+    """Return the file's pixels as 8 bits, blue first where there are colors."""
     try:
         content = path.read_bytes()
     except OSError as error:

@@ -22,7 +22,7 @@ def read_views(
     folder: str | Path,
     *,
     longest: int | None = None,
-    metres: float = 1.0,
+    meters: float = 1.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[View, ...]:
     """Read a folder of photographs with cameras, sorted by name, as undistorted views.
@@ -30,7 +30,7 @@ def read_views(
     `folder` holds a `transforms.json` or a COLMAP model (in `sparse/0`, `sparse` or itself, images in `images/`), or
     is the path of a JSON file of that kind; the JSON goes first where both are there. Masks come from the images'
     alpha channel, from where the JSON says, or from `masks/`. `longest` is the most pixels that a side may have;
-    larger images are scaled down with their cameras. `metres` is the length of the file's unit. `progress` is called
+    larger images are scaled down with their cameras. `meters` is the length of the file's unit. `progress` is called
     with the number of images done and of all.
 
     Warns with CaptureWarning of what was left out or mended. Raises CaptureError where cameras cannot be read, where
@@ -38,8 +38,8 @@ def read_views(
     """
     if longest is not None and longest < 1:
         raise CaptureError(f"expected the longest side in pixels, at least 1, found {longest}")
-    if not (math.isfinite(metres) and metres > 0):
-        raise CaptureError(f"expected the length of the cameras' unit in metres, found {metres}")
+    if not (math.isfinite(meters) and meters > 0):
+        raise CaptureError(f"expected the length of the cameras' unit in meters, found {meters}")
     base, found = _find_shots(Path(folder))
     shots = sorted(found.shots, key=lambda shot: shot.name)
     _refuse_repeated(shots, found.origin)
@@ -49,7 +49,7 @@ def read_views(
         findings.remarks.append(f"{len(strangers)} images have no camera and are left out: {listed(strangers)}")
     views = []
     for done, shot in enumerate(shots, start=1):
-        view = read_view(shot, base, longest, metres, findings)
+        view = read_view(shot, base, longest, meters, findings)
         views += [] if view is None else [view]
         if progress is not None:
             progress(done, len(shots))

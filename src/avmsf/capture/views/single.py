@@ -37,7 +37,7 @@ class Findings:
         return self.remarks + [f"{len(names)} {kind}: {listed(names)}" for kind, names in kinds.items() if names]
 
 
-def read_view(shot: Shot, base: Path, longest: int | None, metres: float, findings: Findings) -> View | None:
+def read_view(shot: Shot, base: Path, longest: int | None, meters: float, findings: Findings) -> View | None:
     """Read one shot's image and mask into a pinhole's view; None, and a finding, where there is nothing to see."""
     try:
         picture = read_picture(shot.image)
@@ -56,7 +56,7 @@ def read_view(shot: Shot, base: Path, longest: int | None, metres: float, findin
         findings.empty.append(shot.name)
         return None
     pose = shot.world_to_camera.clone()
-    pose[:3, 3] *= metres
+    pose[:3, 3] *= meters
     mask = None if picture.mask is None else torch.from_numpy(picture.mask)
     return View(shot.name, torch.from_numpy(picture.color), lens.camera(pose), mask)
 

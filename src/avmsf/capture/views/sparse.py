@@ -15,11 +15,11 @@ from avmsf.errors import CaptureError
 
 
 def read_sparse_points(
-    folder: str | Path, *, metres: float = 1.0
+    folder: str | Path, *, meters: float = 1.0
 ) -> tuple[Float[Tensor, "points 3"], UInt8[Tensor, "points 3"]] | None:
-    """Return the points that structure from motion found and their colours; None where there are none.
+    """Return the points that structure from motion found and their colors; None where there are none.
 
-    Metres, float64. They lie in the frame of `read_views`' cameras: the COLMAP model's own points, or beside a
+    Meters, float64. They lie in the frame of `read_views`' cameras: the COLMAP model's own points, or beside a
     `transforms.json` the file that it names as `ply_file_path`. Raises CaptureError where such a file cannot be read.
     """
     folder = Path(folder)
@@ -31,11 +31,11 @@ def read_sparse_points(
         found = None if model is None else read_points(model)
     if found is None:
         return None
-    return torch.from_numpy(found[0] * metres), torch.from_numpy(found[1])
+    return torch.from_numpy(found[0] * meters), torch.from_numpy(found[1])
 
 
 def _read_ply(transforms: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the points of the file that transforms.json names, grey where it has no colours."""
+    """Return the points of the file that transforms.json names, gray where it has no colors."""
     named = load_record(transforms).get("ply_file_path")
     if not isinstance(named, str) or not named:
         return None

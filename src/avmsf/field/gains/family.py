@@ -19,7 +19,7 @@ class Sites:
     """Impacts: where, and along which direction."""
 
     points: Float64[Tensor, "sites 3"]
-    """Object frame, metres."""
+    """Object frame, meters."""
     directions: Float64[Tensor, "sites 3"]
     """Unit vectors along which the hammer moves; the same for all where nothing is known of them."""
 
@@ -88,7 +88,7 @@ class KernelFamily(ABC):
     reference: Sites
     """The impacts that scales and regressions are defined by: those of the fit."""
     size: float
-    """Diagonal of the box around the object, metres."""
+    """Diagonal of the box around the object, meters."""
     shares: Float64[Tensor, "kernels basis"]
     """Scaled."""
 

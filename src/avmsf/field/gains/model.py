@@ -49,7 +49,7 @@ class MixtureGains:
     __repr__ = short_repr
 
     points: Float32[Tensor, "points 3"]
-    """Points of the object's surface, object frame, metres."""
+    """Points of the object's surface, object frame, meters."""
     training: Sites
     """The impacts that the gains are known at."""
     families: tuple[KernelFamily, ...]
@@ -69,7 +69,7 @@ class MixtureGains:
 
     @property
     def contacts(self) -> Float64[Tensor, "contacts 3"]:
-        """Their places, metres."""
+        """Their places, meters."""
         return self.training.points
 
     @property
@@ -120,7 +120,7 @@ class MixtureGains:
         return next((each.modes for each in self._of(Elastic)), None)
 
     def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
-        """Return the mean gains of impacts at contacts (metres) along unit vectors, see `sites`."""
+        """Return the mean gains of impacts at contacts (meters) along unit vectors, see `sites`."""
         sites = self.sites(contacts, directions)
         series = torch.zeros(len(sites), self.mixture.values.shape[1], dtype=torch.float64)
         for family, coefficients in zip(self.families, self._coefficients, strict=True):

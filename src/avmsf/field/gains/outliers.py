@@ -203,16 +203,16 @@ class Outlier:
     ratio: float
     """Log predictive ratio, nats per mode: below zero the place predicts its gains worse than no place does."""
     place: tuple[float, float, float]
-    """Where it is explained best, object frame, metres."""
+    """Where it is explained best, object frame, meters."""
     place_ratio: float
     """The ratio there."""
     distance: float
-    """From its own place, metres."""
+    """From its own place, meters."""
     reversed: bool
     """Whether the opposite direction explains it at its own place."""
 
     def describe(self, names: Sequence[str], contacts: Float[Tensor, "contacts 3"]) -> str:
-        """Return what is wrong with it in words, from the names and places (metres) of all training contacts."""
+        """Return what is wrong with it in words, from the names and places (meters) of all training contacts."""
         ratios = (
             f"log predictive ratio {self.ratio:.2g} nats, there {self.place_ratio:.2g}; above 0 the place is plausible"
         )

@@ -174,7 +174,7 @@ class Visual(KernelFamily):
         points: Float32[Tensor, "points 3"],
         features: Float32[Tensor, "points dim"],
     ) -> None:
-        """Set up from an object's points, metres, and their features, in any unit."""
+        """Set up from an object's points, meters, and their features, in any unit."""
         super().__init__(reference, size)
         self.points, self.features = points, features
         spread = features.double().var(0, correction=0).sum()

@@ -23,7 +23,7 @@ SHORTEST = 256
 """Samples of the shortest beginning that is still searched."""
 _SHORTENING = 4
 _EDGE = 0.2
-"""Part of a band on either side over which its filter fades: what lies there belongs to the neighbours."""
+"""Part of a band on either side over which its filter fades: what lies there belongs to the neighbors."""
 _RINGING = 5
 """Decimated samples after the onset in which the band filter itself still rings."""
 _LEAST_FALL = 0.1

@@ -29,7 +29,7 @@ from avmsf.modal.extraction.esprit import SHORTEST
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, lowest_frequency, noise_bins
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual, estimate_residual
-from avmsf.modal.synthesis import synthesise
+from avmsf.modal.synthesis import synthesize
 
 _KEY = "avmsf-modes"
 _ALIGNMENT = "alignment."
@@ -81,7 +81,7 @@ def extract_sounds(
     if len(bank) == 0:
         raise ExtractionError(_why_no_mode(sounds, sample_rate))
     gains, quadrature = fit_gains(sounds, bank, sample_rate=sample_rate)
-    modes = synthesise(
+    modes = synthesize(
         gains, bank.frequency, bank.damping, samples=sounds.shape[1], sample_rate=sample_rate, quadrature=quadrature
     )
     residual = estimate_residual(sounds, modes, bins=noise_bins(sounds.shape[1]))

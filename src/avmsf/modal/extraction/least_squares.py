@@ -135,7 +135,7 @@ class NormalEquations:
         """
         scale = torch.sqrt(torch.diagonal(self.gram))
         modes = len(scale) // 2
-        inverse = torch.linalg.inv(_normalise(self.gram, scale)).reshape(2, modes, 2, modes)
+        inverse = torch.linalg.inv(_normalize(self.gram, scale)).reshape(2, modes, 2, modes)
         own = torch.diagonal(inverse, dim1=1, dim2=3).permute(2, 0, 1)
         pairs = (self.solve() * scale).reshape(-1, 2, modes).permute(2, 1, 0)
         lost = (pairs * torch.linalg.solve(own, pairs)).sum(1).T
@@ -199,10 +199,10 @@ def _solve(
     gram: Float64[Tensor, "basis basis"], products: Float64[Tensor, "rows basis"]
 ) -> Float64[Tensor, "rows basis"]:
     scale = torch.sqrt(torch.diagonal(gram))
-    return torch.linalg.solve(_normalise(gram, scale), (products / scale).T).T / scale
+    return torch.linalg.solve(_normalize(gram, scale), (products / scale).T).T / scale
 
 
-def _normalise(
+def _normalize(
     gram: Float64[Tensor, "basis basis"], scale: Float64[Tensor, " basis"]
 ) -> Float64[Tensor, "basis basis"]:
     ridge = _RIDGE * torch.eye(len(scale), dtype=gram.dtype, device=gram.device)

@@ -1,4 +1,4 @@
-"""Random modes in place of extracted ones: the paper's row without initialisation."""
+"""Random modes in place of extracted ones: the paper's row without initialization."""
 
 import math
 

@@ -19,7 +19,7 @@ _APART = 0.01
 """Least part of a mode that the others must not span: with less, gains of large and opposite modes would cancel."""
 _SAME = 0.03
 """Candidates closer than this part of their width, with dampings as close, are one."""
-_NEIGHBOURS = 30
+_NEIGHBORS = 30
 """Kept candidates just below a new one among which it may find its double."""
 
 
@@ -39,7 +39,7 @@ def merge(
 
     kept: list[int] = []
     for row in range(len(ascending)):
-        if not any(repeats(row, other) for other in kept[-_NEIGHBOURS:]):
+        if not any(repeats(row, other) for other in kept[-_NEIGHBORS:]):
             kept.append(row)
     index = order[torch.tensor(kept, dtype=torch.long)]
     return ModalBank(frequency[index], damping[index])
@@ -113,7 +113,7 @@ def select(
     """Return `known` and up to `count` of `found`: those that explain most of what is left beside each other.
 
     A candidate counts only when it explains `significance` times the energy that it would explain of noise, mean over
-    the sounds, and within `range_db` of the strongest of its neighbourhood. `samples` is the sounds' length.
+    the sounds, and within `range_db` of the strongest of its neighborhood. `samples` is the sounds' length.
     """
     if len(found.bank) == 0:
         return known.bank
@@ -155,7 +155,7 @@ def prune(
 
     A mode goes when leaving it out loses less than `significance` times what it would explain of noise, when that loss
     lies `range_db` below the greatest, or when the others nearly span it, so that its gain would be large only to be
-    cancelled by theirs; of neighbours that could stand in for each other the least needed goes first.
+    cancelled by theirs; of neighbors that could stand in for each other the least needed goes first.
     """
     system = NormalEquations.of(sounds, poles_of(bank, sample_rate))
     total = torch.zeros(0, dtype=torch.float64)

@@ -30,7 +30,7 @@ def narrow_band(
 ) -> Complex[Tensor, "contacts bins frames"]:
     """Return the analytic signal of every bin's own inverse transform, sampled once a hop.
 
-    `fft_size` and `hop` in samples, hop a divisor of fft_size. A steady sine of amplitude a at a bin's centre has
+    `fft_size` and `hop` in samples, hop a divisor of fft_size. A steady sine of amplitude a at a bin's center has
     modulus 2a/3 there and a/6 in each of the two bins beside it: together they make up the sound (Hann window).
     """
     window = torch.hann_window(fft_size, dtype=sounds.dtype)
@@ -38,7 +38,7 @@ def narrow_band(
     reach = fft_size // hop // 2
     lags = torch.arange(-reach, reach + 1)
     weights = torch.nn.functional.pad(window, (0, 1))[fft_size // 2 + lags * hop]
-    # A frame's time zero is its own beginning: at its centre half the transform has passed, `lag` frames on bin x lag.
+    # A frame's time zero is its own beginning: at its center half the transform has passed, `lag` frames on bin x lag.
     bins = torch.arange(fft_size // 2 + 1)
     passed = torch.remainder(bins[:, None] * (lags[None, :] * hop - fft_size // 2), fft_size)
     turns = passed.to(sounds.dtype) * (2 * math.pi / fft_size)

@@ -1,4 +1,4 @@
-"""Objects made by rule, every seed another individual: triangles with colours, tetrahedra and known symmetries."""
+"""Objects made by rule, every seed another individual: triangles with colors, tetrahedra and known symmetries."""
 
 from avmsf.simulate.shapes.kinds import KINDS, make_shape
 from avmsf.simulate.shapes.shape import Shape, Symmetry, textured

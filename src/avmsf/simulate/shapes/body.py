@@ -15,7 +15,7 @@ class Body:
     """A solid in the making.
 
     A prism over a triangle is cut into three tetrahedra. Each of its four-sided sides is cut from the start of the edge
-    whose corner comes first in `order` to the end of the other, so that neighbours cut it alike.
+    whose corner comes first in `order` to the end of the other, so that neighbors cut it alike.
     """
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class Body:
 
     @property
     def extent(self) -> float:
-        """Longest side of the bounding box, metres."""
+        """Longest side of the bounding box, meters."""
         return float(np.ptp(np.concatenate(self._points), axis=0).max())
 
     def solid(self, *, scale: float = 1.0) -> Solid:

@@ -1,4 +1,4 @@
-"""Glaze and decor: colours of a surface by chance, some of which follow its form and some do not."""
+"""Glaze and decor: colors of a surface by chance, some of which follow its form and some do not."""
 
 import math
 from collections.abc import Callable
@@ -47,10 +47,10 @@ def glaze(points: Float64[np.ndarray, "points 3"], random: np.random.Generator) 
     paint = fitting[random.integers(len(fitting))]
     decor = DECORS[int(random.integers(len(DECORS)))]
     inside = np.clip(0.5 + decor(places, random) / _EDGE, 0.0, 1.0)[:, None]
-    colours = ground + inside * (paint - ground)
+    colors = ground + inside * (paint - ground)
     cloudy = 0.03 + 0.07 * random.random()
     light = 1.0 + cloudy * _waves(places, random, 0.35, 12) + 0.02 * random.standard_normal(len(points))
-    return np.clip(colours * light[:, None], 0.0, 1.0)
+    return np.clip(colors * light[:, None], 0.0, 1.0)
 
 
 def _bands(places: np.ndarray, random: np.random.Generator) -> np.ndarray:

@@ -126,7 +126,7 @@ def skillet(random: np.random.Generator, wall: float | None) -> Draft:
 
 
 def _add_handle(body: Body, turned: Turned, low: float, high: float, reach: float, random: np.random.Generator) -> None:
-    """Add an ear at angle 0 between two heights that stands out by `reach`, metres."""
+    """Add an ear at angle 0 between two heights that stands out by `reach`, meters."""
     above, below = _ring_at(turned, high, _BANDS), _ring_at(turned, low, _BANDS)
     if (above + below + _BANDS) % 2:
         # The diagonals of the upper patch, upside down, are the lower one's only every second band.

@@ -25,16 +25,16 @@ _MAKERS: tuple[Maker, ...] = (
 KINDS: Mapping[str, Maker] = MappingProxyType({maker.__name__: maker for maker in _MAKERS})
 """What draws and builds an individual of each kind."""
 _LARGEST = 100.0
-"""Metres."""
+"""Meters."""
 _FEWEST_FACES = 6000
 _ROUNDS = 4
 """Drafts until walls and size are both as asked for."""
 
 
 def make_shape(kind: str, *, seed: int = 0, size: float | None = None, wall: float | None = None) -> Shape:
-    """Return one individual of a kind in `KINDS`; another seed draws other proportions and colours.
+    """Return one individual of a kind in `KINDS`; another seed draws other proportions and colors.
 
-    `size` is the longest side of its bounding box and `wall` the nominal thickness of its walls, metres; both are
+    `size` is the longest side of its bounding box and `wall` the nominal thickness of its walls, meters; both are
     drawn where they are not given, and a size alone scales the walls with everything else. Raises SimulationError for
     an unknown kind, for a negative seed, for sizes that are not positive, and for walls so thick that they fold over
     themselves or leave nothing of the shape.
@@ -52,11 +52,11 @@ def make_shape(kind: str, *, seed: int = 0, size: float | None = None, wall: flo
     except SimulationError as error:
         raise SimulationError(f"{kind} of seed {seed}, walls {1000.0 * scale * draft.wall:g} mm: {error}") from error
     points, faces = _skin(solid)
-    colours = glaze(points, _chance(kind, seed, "colours"))
+    colors = glaze(points, _chance(kind, seed, "colors"))
     return Shape(
         name=f"{kind}-{seed}",
         surface=Surface(torch.from_numpy(points).float(), torch.from_numpy(faces)),
-        colours=torch.from_numpy(colours).float(),
+        colors=torch.from_numpy(colors).float(),
         thickness=draft.wall * scale,
         symmetry=draft.symmetry,
         solid=solid,
@@ -83,7 +83,7 @@ def _chance(kind: str, seed: int, name: str) -> np.random.Generator:
 
 
 def _skin(solid: Solid) -> tuple[Float64[np.ndarray, "points 3"], Int[np.ndarray, "faces 3"]]:
-    """Return a solid's outer triangles, each cut in four, and again until they are fine enough for colours."""
+    """Return a solid's outer triangles, each cut in four, and again until they are fine enough for colors."""
     used, rows = np.unique(solid.boundary.numpy(), return_inverse=True)
     points, faces = solid.points.numpy()[used], rows.reshape(-1, 3)
     while len(faces) < _FEWEST_FACES:

@@ -11,19 +11,19 @@ from avmsf.simulate.shapes.shape import Symmetry
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """A shape without its colours."""
+    """A shape without its colors."""
 
     body: Body
     wall: float
-    """Nominal thickness, metres."""
+    """Nominal thickness, meters."""
     symmetry: Symmetry
 
 
 Maker = Callable[[np.random.Generator, float | None], Draft]
-"""Draws the proportions of one individual; walls as thick as told, metres, or drawn too."""
+"""Draws the proportions of one individual; walls as thick as told, meters, or drawn too."""
 
 
 def drawn_wall(random: np.random.Generator, low: float, high: float, wall: float | None) -> float:
-    """Return the wall that was asked for, or one between two bounds, metres; draws in both cases."""
+    """Return the wall that was asked for, or one between two bounds, meters; draws in both cases."""
     drawn = random.uniform(low, high)
     return drawn if wall is None else wall

@@ -23,7 +23,7 @@ class Profile:
     """The middle of a wall as a smooth curve from the axis, or the lower end of a tube, outwards to the rim."""
 
     controls: Sequence[tuple[float, float, float]]
-    """Radius, height and thickness, metres; the curve starts at the first, ends at the last and rounds those between.
+    """Radius, height and thickness, meters; the curve starts at the first, ends at the last and rounds those between.
     At the axis the first two have one height, so that the curve crosses it level."""
 
     @cached_property
@@ -38,7 +38,7 @@ class Profile:
 
     @cached_property
     def length(self) -> float:
-        """Metres along the curve."""
+        """Meters along the curve."""
         return float(np.linalg.norm(np.diff(self._curve[1][:, :2], axis=0), axis=1).sum())
 
     def at(self, along: Float64[np.ndarray, " places"]) -> Float64[np.ndarray, "places 3"]:

@@ -15,11 +15,11 @@ class Rod:
     """A rod in the plane y = 0, of oval cross-section."""
 
     curve: Float64[np.ndarray, "layers 2"]
-    """Its middle, x and z, from the patch it leaves, metres."""
+    """Its middle, x and z, from the patch it leaves, meters."""
     widths: Float64[np.ndarray, " layers"]
-    """Along y, metres."""
+    """Along y, meters."""
     heights: Float64[np.ndarray, " layers"]
-    """Across y, metres."""
+    """Across y, meters."""
 
     def layers(
         self,

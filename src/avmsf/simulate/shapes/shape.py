@@ -33,7 +33,7 @@ class Symmetry:
     mirrors: Float64[Tensor, "planes 3"] = field(default_factory=_no_planes)
     """Unit normals of mirror planes, apart from those that contain an axis of every angle."""
     point: Float64[Tensor, " 3"] = field(default_factory=_origin)
-    """A point of the axis and of all planes, object frame, metres."""
+    """A point of the axis and of all planes, object frame, meters."""
 
     @property
     def none(self) -> bool:
@@ -48,18 +48,18 @@ class Shape:
     name: str
     """Kind and seed, such as "mug-3"."""
     surface: Surface
-    """Closed triangles, counter-clockwise from outside, metres: the solid's skin, its triangles cut finer."""
-    colours: Float[Tensor, "points 3"]
+    """Closed triangles, counter-clockwise from outside, meters: the solid's skin, its triangles cut finer."""
+    colors: Float[Tensor, "points 3"]
     """Red, green, blue at each vertex of the surface as displayed (sRGB), 0 to 1."""
     thickness: float
-    """Nominal thickness of the walls, metres; of a lump without walls its smallest extent."""
+    """Nominal thickness of the walls, meters; of a lump without walls its smallest extent."""
     symmetry: Symmetry
-    """Of the shape; colours need not follow it."""
+    """Of the shape; colors need not follow it."""
     solid: Solid
     """Tetrahedra, in the surface to rounding."""
 
 
 def textured(shape: Shape) -> TexturedMesh:
-    """Return a shape's surface in its colours, to render it with `avmsf.capture.meshviews.render_views`."""
+    """Return a shape's surface in its colors, to render it with `avmsf.capture.meshviews.render_views`."""
     faces = shape.surface.faces
-    return TexturedMesh.build(shape.surface.vertices, faces, colors=shape.colours[faces])
+    return TexturedMesh.build(shape.surface.vertices, faces, colors=shape.colors[faces])

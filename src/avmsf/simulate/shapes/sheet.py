@@ -14,7 +14,7 @@ class Sheet:
     """Triangles on the middle of a wall."""
 
     middle: Float64[np.ndarray, "points 3"]
-    """Metres."""
+    """Meters."""
     offsets: Float64[np.ndarray, "points 3"]
     """From the middle to the upper side of the wall, the side from which triangles are counter-clockwise."""
     triangles: Int[np.ndarray, "triangles 3"]
@@ -30,7 +30,7 @@ class Sheet:
         triangles: Int[np.ndarray, "triangles 3"],
         order: Int[np.ndarray, " points"],
     ) -> "Sheet":
-        """Return the sheet whose thickness at each point is `walls`, measured across the triangles, metres."""
+        """Return the sheet whose thickness at each point is `walls`, measured across the triangles, meters."""
         return cls(middle, 0.5 * walls[:, None] * mitred_normals(middle, triangles), triangles, order)
 
 

@@ -65,11 +65,11 @@ class Turned:
         return Patch.of(self.sheet.triangles, self.sheet.order, np.arange(self.rings.starts[last + 1]), lower=lower)
 
     def outside(self, patch: Patch) -> Float64[np.ndarray, "columns 3"]:
-        """Return where a patch's points lie on the lower side, metres."""
+        """Return where a patch's points lie on the lower side, meters."""
         return self.sheet.middle[patch.rows] - self.sheet.offsets[patch.rows]
 
     def top(self, patch: Patch) -> Float64[np.ndarray, "columns 3"]:
-        """Return where a patch's points lie on the upper side, metres."""
+        """Return where a patch's points lie on the upper side, meters."""
         return self.sheet.middle[patch.rows] + self.sheet.offsets[patch.rows]
 
     def add_foot(self, body: Body, ring: int, bottom: float) -> None:

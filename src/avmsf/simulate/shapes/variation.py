@@ -65,7 +65,7 @@ def _spread(
 def _thickness(
     places: Float64[np.ndarray, "points 3"], triangles: Int[np.ndarray, "triangles 3"], size: float
 ) -> Float64[np.ndarray, " triangles"]:
-    """Return how far the body reaches behind the middle of each triangle, metres."""
+    """Return how far the body reaches behind the middle of each triangle, meters."""
     middle = 0.5 * (places.min(axis=0) + places.max(axis=0))
     # Embree counts in float32: the body is moved to the origin and given size 1.
     corners = (places[triangles] - middle) / size

@@ -1,4 +1,4 @@
-/** A small diagram: axes and curves on a canvas that is as sharp as the screen, in the page's own colours. */
+/** A small diagram: axes and curves on a canvas that is as sharp as the screen, in the page's own colors. */
 
 const MARGIN = { left: 34, right: 8, top: 8, bottom: 20 };
 
@@ -59,7 +59,7 @@ export class Chart {
     context.stroke();
   }
 
-  curve(shares, colour, { width = 1.5, dash = [], fill = false } = {}) {
+  curve(shares, color, { width = 1.5, dash = [], fill = false } = {}) {
     const { context } = this;
     context.save();
     context.beginPath();
@@ -71,7 +71,7 @@ export class Chart {
       if (place) context.lineTo(x, y);
       else context.moveTo(x, y);
     });
-    context.strokeStyle = colour;
+    context.strokeStyle = color;
     context.lineWidth = width;
     context.setLineDash(dash);
     context.stroke();
@@ -79,7 +79,7 @@ export class Chart {
       context.lineTo(this.x(shares.at(-1)[0]), this.y(1));
       context.lineTo(this.x(shares[0][0]), this.y(1));
       context.globalAlpha = 0.16;
-      context.fillStyle = colour;
+      context.fillStyle = color;
       context.fill();
     }
     context.restore();

@@ -160,4 +160,4 @@ export function makeTabs(sheets) {
 }
 
 export const seconds = (value) => (value < 1 ? `${(1000 * value).toPrecision(3)} ms` : `${value.toPrecision(3)} s`);
-export const millimetres = (place) => place.map((value) => (1000 * value).toFixed(1)).join(", ");
+export const millimeters = (place) => place.map((value) => (1000 * value).toFixed(1)).join(", ");

@@ -1,7 +1,7 @@
 /** The tab that finds a blow: a recording in, where on the object it was struck painted and listed. */
 
-import { amountScale } from "./colours.js";
-import { attempt, button, element, filePicker, millimetres, say } from "./dom.js";
+import { amountScale } from "./colors.js";
+import { attempt, button, element, filePicker, millimeters, say } from "./dom.js";
 import { RecordButton } from "./recordbutton.js";
 import { numbers, server } from "./server.js";
 import { expectWav } from "./wav.js";
@@ -127,9 +127,9 @@ function clearFound(studio) {
 const percent = (share) => `${(100 * share).toPrecision(2)} %`;
 
 function describe(studio, blow) {
-  const { level, radius_metres: radius, share } = blow.region;
+  const { level, radius_meters: radius, share } = blow.region;
   const facts = [
-    ["Place", `${millimetres(blow.place)} mm`],
+    ["Place", `${millimeters(blow.place)} mm`],
     [`${percent(level)} region`, `${(1000 * radius).toFixed(1)} mm about it, ${percent(share)} of the surface`],
   ];
   if (blow.explained !== undefined && blow.explained !== null)
@@ -141,7 +141,7 @@ function describe(studio, blow) {
     parts.push(element("h3", {}, "Sounds alike"));
     const places = element("ul", { className: "listing" });
     for (const { place, probability, words } of blow.counterparts) {
-      const text = `${millimetres(place)} mm, ${percent(probability)}${words ? `: ${words}` : ""}`;
+      const text = `${millimeters(place)} mm, ${percent(probability)}${words ? `: ${words}` : ""}`;
       places.append(element("li", {}, text));
     }
     parts.push(places);

@@ -201,7 +201,7 @@ function takeDrops({ take }) {
 /** For scripts and tests: the same doors as the pointer's. */
 window.avmsf = {
   ready: null,
-  /** Strike a contact, by its row or by a place on the object, metres. */
+  /** Strike a contact, by its row or by a place on the object, meters. */
   strike(contact, { force = 1, contactTime = null } = {}) {
     const { studio } = window.avmsf;
     const row = typeof contact === "number" ? contact : studio.view.contactAt(contact).row;
@@ -212,7 +212,7 @@ window.avmsf = {
   renderOffline: (blows, seconds, options) => window.avmsf.studio.engine.renderOffline(blows, seconds, options),
   pick: (clientX, clientY) => window.avmsf.studio.view.pick(clientX, clientY),
   project: (place) => window.avmsf.studio.view.project(place),
-  /** Values and colours that the contacts are painted by; null without paint. */
+  /** Values and colors that the contacts are painted by; null without paint. */
   painted: () => window.avmsf.studio.view.painted,
 };
 

@@ -1,6 +1,6 @@
 /** The table of the modes: pitch, decay and level at the contact struck last; one is chosen to paint its shape. */
 
-import { signScale } from "./colours.js";
+import { signScale } from "./colors.js";
 import { button, element, seconds } from "./dom.js";
 
 const COLUMNS = [

@@ -102,7 +102,7 @@ export class PointGrid {
     return found;
   }
 
-  /** How far apart neighbours lie, in the middle of the list of some of them. */
+  /** How far apart neighbors lie, in the middle of the list of some of them. */
   get spacing() {
     if (this.count < 2) return this.diagonal / 50;
     const step = Math.max(1, Math.floor(this.count / 200));

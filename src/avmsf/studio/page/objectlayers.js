@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 
-import { Neighbours } from "./neighbours.js";
+import { Neighbors } from "./neighbors.js";
 import { subdivide } from "./subdivide.js";
 import { TriangleTree } from "./triangletree.js";
 
@@ -15,8 +15,8 @@ export class PointLayer {
     this.grid = grid;
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.BufferAttribute(grid.points, 3));
-    this.colours = new THREE.BufferAttribute(new Uint8Array(grid.points.length), 3, true);
-    geometry.setAttribute("color", this.colours);
+    this.colors = new THREE.BufferAttribute(new Uint8Array(grid.points.length), 3, true);
+    geometry.setAttribute("color", this.colors);
     const material = new THREE.PointsMaterial({
       size: 1.7 * spacing,
       vertexColors: true,
@@ -31,10 +31,10 @@ export class PointLayer {
     return null;
   }
 
-  paint(colours) {
-    if (colours) this.colours.array.set(colours);
-    else this.colours.array.fill(150);
-    this.colours.needsUpdate = true;
+  paint(colors) {
+    if (colors) this.colors.array.set(colors);
+    else this.colors.array.fill(150);
+    this.colors.needsUpdate = true;
   }
 
   dispose() {
@@ -91,13 +91,13 @@ export class MeshLayer {
     return along === Infinity ? null : ray.at(along, new THREE.Vector3());
   }
 
-  paint(colours) {
-    this.scene.visible = !colours;
-    if (this.painted) this.painted.visible = Boolean(colours);
-    if (!colours) return;
+  paint(colors) {
+    this.scene.visible = !colors;
+    if (this.painted) this.painted.visible = Boolean(colors);
+    if (!colors) return;
     this.painted ??= this.#finerCopy();
     const attribute = this.painted.geometry.attributes.color;
-    attribute.array.set(this.neighbours.mix(colours, toLight));
+    attribute.array.set(this.neighbors.mix(colors, toLight));
     attribute.needsUpdate = true;
   }
 
@@ -108,7 +108,7 @@ export class MeshLayer {
     geometry.setAttribute("position", new THREE.BufferAttribute(position, 3));
     geometry.setAttribute("normal", new THREE.BufferAttribute(fine.normal.array, 3));
     geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(position.length), 3));
-    this.neighbours = new Neighbours(this.grid, position);
+    this.neighbors = new Neighbors(this.grid, position);
     const material = new THREE.MeshLambertMaterial({ vertexColors: true, side: THREE.DoubleSide });
     const copy = new THREE.Mesh(geometry, material);
     this.object.add(copy);
@@ -175,15 +175,15 @@ export class SplatLayer {
     return first ? first.point : null;
   }
 
-  paint(colours) {
+  paint(colors) {
     if (!this.own) {
-      if (!colours) return;
+      if (!colors) return;
       this.#readOwn();
     }
     const { rgba } = this;
-    if (!colours) rgba.count = 0;
+    if (!colors) rgba.count = 0;
     else {
-      const mixed = this.neighbours.mix(colours);
+      const mixed = this.neighbors.mix(colors);
       for (let splat = 0; splat < this.lightness.length; splat++) {
         const light = 1 - SHADING + SHADING * this.lightness[splat];
         for (let channel = 0; channel < 3; channel++)
@@ -200,14 +200,14 @@ export class SplatLayer {
     const places = [];
     const opacities = [];
     const lightness = [];
-    this.splats.forEachSplat((_, centre, scales, turn, opacity, colour) => {
-      places.push(centre.x, centre.y, centre.z);
+    this.splats.forEachSplat((_, center, scales, turn, opacity, color) => {
+      places.push(center.x, center.y, center.z);
       opacities.push(255 * opacity);
-      lightness.push(Math.min(0.3 * colour.r + 0.6 * colour.g + 0.1 * colour.b, 1));
+      lightness.push(Math.min(0.3 * color.r + 0.6 * color.g + 0.1 * color.b, 1));
     });
     this.own = Uint8Array.from(opacities);
     this.lightness = Float32Array.from(lightness);
-    this.neighbours = new Neighbours(this.grid, Float32Array.from(places));
+    this.neighbors = new Neighbors(this.grid, Float32Array.from(places));
     this.rgba = new this.spark.RgbaArray();
     this.rgba.ensureCapacity(lightness.length);
     this.splats.splatRgba = this.rgba;

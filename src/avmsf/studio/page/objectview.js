@@ -7,7 +7,7 @@ import { MeshLayer, PointLayer, SplatLayer } from "./objectlayers.js";
 import { Viewpoint } from "./viewpoint.js";
 
 /** Contacts about a place among which one on the near side of a wall is sought. */
-const WALL_NEIGHBOURS = 16;
+const WALL_NEIGHBORS = 16;
 
 /** The object cannot be shown; the message says why. */
 export class ViewError extends Error {}
@@ -106,7 +106,7 @@ export class ObjectView {
     this.layer = layer;
     this.source = source;
     this.scene.add(layer.object);
-    layer.paint(this.painted?.colours ?? null);
+    layer.paint(this.painted?.colors ?? null);
     this.redraw();
   }
 
@@ -162,7 +162,7 @@ export class ObjectView {
       const [ax, ay, az] = [x - along * dx, y - along * dy, z - along * dz];
       // Math.hypot is tenfold slower, and this runs for every contact.
       const beside = Math.sqrt(ax * ax + ay * ay + az * az);
-      // Among neighbours on the near side, the one that the ray comes closest to.
+      // Among neighbors on the near side, the one that the ray comes closest to.
       const cost = along + 3 * beside;
       if (beside <= reach && cost < best) [best, nearest] = [cost, row];
     }
@@ -171,7 +171,7 @@ export class ObjectView {
 
   /** The contact nearest to a place; along a `sight`, of those whose side of a thin wall it meets. */
   contactAt(place, sight = null) {
-    const near = this.grid.nearest(...place, sight && this.normals ? WALL_NEIGHBOURS : 1);
+    const near = this.grid.nearest(...place, sight && this.normals ? WALL_NEIGHBORS : 1);
     const meets = ({ row, distance }) =>
       distance <= 3 * this.spacing && this.normalOf(row).reduce((sum, value, at) => sum + value * sight[at], 0) < 0;
     const { row, distance } = (near.length > 1 && near.find(meets)) || near[0];
@@ -201,8 +201,8 @@ export class ObjectView {
 
   /** Paint each contact by its value on a scale; null takes the paint off. */
   paint(values, scale) {
-    this.painted = values && { values, colours: scale.colours(values) };
-    this.layer.paint(this.painted?.colours ?? null);
+    this.painted = values && { values, colors: scale.colors(values) };
+    this.layer.paint(this.painted?.colors ?? null);
     this.redraw();
   }
 

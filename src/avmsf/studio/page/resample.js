@@ -21,7 +21,7 @@ export function resample(samples, from, to) {
   return out;
 }
 
-/** The weights of the neighbours of each of the places between two samples that are asked for, in turn. */
+/** The weights of the neighbors of each of the places between two samples that are asked for, in turn. */
 function sincs(phases, cut) {
   const reach = Math.ceil(CROSSINGS / cut), width = 2 * reach + 2;
   const weights = new Float64Array(phases * width);

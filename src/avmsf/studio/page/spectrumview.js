@@ -137,13 +137,13 @@ export class SpectrumView {
       [0, 0.25, 0.5, 0.75, 1].map((share) => ({ share, words: `${Math.round(top - share * RANGE_DB)}` })),
     );
     if (this.compared) {
-      for (const [{ levels }, colour, dash] of [
+      for (const [{ levels }, color, dash] of [
         [this.compared.recording, chart.ink.second, []],
         [this.compared.model, chart.ink.accent, []],
       ]) {
         const loudest = Math.max(...levels);
         const shares = Array.from(levels, (level, place) => [place / (levels.length - 1), down(level - loudest)]);
-        chart.curve(shares, colour, { width: 1.3, dash });
+        chart.curve(shares, color, { width: 1.3, dash });
       }
       return;
     }
@@ -154,12 +154,12 @@ export class SpectrumView {
         if (frequency < LOW || frequency > HIGH) continue;
         const place = across(frequency);
         // What it was at the blow stays to be seen, faintly.
-        for (const [height, colour, width] of [
+        for (const [height, color, width] of [
           [level, chart.ink.faint, 1],
           [now, chart.ink.accent, 2],
         ]) {
           if (height < top - RANGE_DB) continue;
-          chart.curve([[place, 1], [place, down(height)]], colour, { width });
+          chart.curve([[place, 1], [place, down(height)]], color, { width });
         }
       }
     }

@@ -1,13 +1,13 @@
 /** Where the next recording is struck: a contact that is clicked or typed, or a strike that is recorded again. */
 
-import { button, element, millimetres, say } from "./dom.js";
+import { button, element, millimeters, say } from "./dom.js";
 
 const NOWHERE = Object.freeze({ contact: null, direction: null, redo: null, digest: null });
 
 /** A blow goes into the surface. */
 export const inward = (normal) => normal?.map((value) => -value) ?? null;
 
-export const placeInWords = ({ contact, redo }) => (redo ? `of ${redo}` : `at ${millimetres(contact)} mm`);
+export const placeInWords = ({ contact, redo }) => (redo ? `of ${redo}` : `at ${millimeters(contact)} mm`);
 
 export class StrikePlace {
   /** {contact, direction, redo, digest}: what is recorded belongs here; never changed, only another put in its place. */

@@ -1,4 +1,4 @@
-/** Finer triangles, so that colours at corners can show what many contacts between the corners have. */
+/** Finer triangles, so that colors at corners can show what many contacts between the corners have. */
 
 /** Triangles that one becomes, by how many of its edges are halved. */
 const PARTS = [1, 2, 3, 4];

@@ -1,4 +1,4 @@
-"""The CPU rasteriser: how right it is, beside the oracle, and how fast, beside plain torch."""
+"""The CPU rasterizer: how right it is, beside the oracle, and how fast, beside plain torch."""
 
 import math
 import os
@@ -13,42 +13,42 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.cameras import Camera
-from avmsf.scene.cpu import NumbaRasteriser
+from avmsf.scene.cpu import NumbaRasterizer
 from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.rasteriser import Rendering
-from benchmarks.rasterisers import render_everywhere, render_padded
+from avmsf.scene.rasterizer import Rendering
+from benchmarks.rasterizers import render_everywhere, render_padded
 from benchmarks.report import Options, Report, Table, tell
 
 _BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 _TENSORS = tuple(each.name for each in fields(GaussianCloud))
 
 
-def measure_rasteriser(options: Options) -> Report:
+def measure_rasterizer(options: Options) -> Report:
     """Return error and time at 10,000 Gaussians and 256 x 256 pixels; the oracle judges the same cloud."""
     count, side, repeats = (300, 48, 2) if options.quick_look else (10_000, 256, 15)
     cloud, camera = speckled_sphere(count), looking_at_sphere(side)
     target = torch.rand(side, side, 3, generator=torch.Generator().manual_seed(1))
-    own = NumbaRasteriser()
+    own = NumbaRasterizer()
     times: list[tuple[float, float]] = []
     # The first turn compiles and fills caches; it is not counted.
     for repeat in range(repeats + 1):
         times.append((_seconds(own, cloud, camera, target), _seconds(render_padded, cloud, camera, target)))
-        tell(f"rasteriser {repeat} of {repeats}: {1e3 * times[-1][0]:.1f} ms, padded {1e3 * times[-1][1]:.0f} ms")
+        tell(f"rasterizer {repeat} of {repeats}: {1e3 * times[-1][0]:.1f} ms, padded {1e3 * times[-1][1]:.0f} ms")
     taken, plain = (median(column) for column in zip(*times[1:], strict=True))
     best, plain_best = (min(column) for column in zip(*times[1:], strict=True))
     image_error, gradient_errors, undecided = compare(cloud, camera)
     figures = {
-        "rasteriser.speedup": plain / taken,
-        "rasteriser.image_error": image_error,
-        "rasteriser.gradient_error": max(gradient_errors.values()),
-        "rasteriser.step_milliseconds": 1e3 * taken,
-        "rasteriser.step_milliseconds_least": 1e3 * best,
-        "rasteriser.padded_milliseconds": 1e3 * plain,
-        "rasteriser.padded_milliseconds_least": 1e3 * plain_best,
-        "rasteriser.undecided_pixels": undecided,
+        "rasterizer.speedup": plain / taken,
+        "rasterizer.image_error": image_error,
+        "rasterizer.gradient_error": max(gradient_errors.values()),
+        "rasterizer.step_milliseconds": 1e3 * taken,
+        "rasterizer.step_milliseconds_least": 1e3 * best,
+        "rasterizer.padded_milliseconds": 1e3 * plain,
+        "rasterizer.padded_milliseconds_least": 1e3 * plain_best,
+        "rasterizer.undecided_pixels": undecided,
     }
     conventions = (
-        f"rasteriser: {count} Gaussians of degree 1 on a sphere, {side} x {side} pixels, numba "
+        f"rasterizer: {count} Gaussians of degree 1 on a sphere, {side} x {side} pixels, numba "
         f"{numba.get_num_threads()} and torch {torch.get_num_threads()} threads on {os.cpu_count()} processors; image "
         f"and gradients of its L1 distance from a noise image, medians of {repeats} turns taken by the two in "
         "alternation. speedup: 16 x 16 tiles padded to the longest list, plain torch and autograd, over ours.",
@@ -57,11 +57,11 @@ def measure_rasteriser(options: Options) -> Report:
         "where a Gaussian covers 1/255 or would leave 1e-4 within one part in 5,000, so that rounding decides.",
     )
     rows = list(figures.items()) + [(f"gradient_error of {name}", error) for name, error in gradient_errors.items()]
-    return Report(conventions, (Table("rasteriser", ("figure", "value"), rows),), figures)
+    return Report(conventions, (Table("rasterizer", ("figure", "value"), rows),), figures)
 
 
 def speckled_sphere(count: int, *, degree: int = 1, seed: int = 0) -> GaussianCloud:
-    """Return Gaussians of many shapes, opacities and colours about a sphere of 0.1 m, each overlapping some others."""
+    """Return Gaussians of many shapes, opacities and colors about a sphere of 0.1 m, each overlapping some others."""
     generator = torch.Generator().manual_seed(seed)
 
     def draw(*shape: int) -> Float[Tensor, "..."]:
@@ -91,7 +91,7 @@ def compare(cloud: GaussianCloud, camera: Camera, *, band: int = 8) -> tuple[flo
     The oracle takes `band` rows of the image at a time.
     """
     own_cloud, true_cloud = _leaves(cloud, torch.float32), _leaves(cloud, torch.float64)
-    own = NumbaRasteriser()(own_cloud, camera, background=_BACKGROUND)
+    own = NumbaRasterizer()(own_cloud, camera, background=_BACKGROUND)
     slopes = torch.randn(own.color.shape, generator=torch.Generator().manual_seed(2))
     worst, left_out = 0.0, 0
     for top in range(0, camera.height, band):

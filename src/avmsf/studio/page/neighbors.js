@@ -1,34 +1,34 @@
 /** What lies between contacts is painted as the nearest of them are. */
 
-const NEIGHBOURS = 3;
+const NEIGHBORS = 3;
 
 /** Rows and weights of the contacts nearest to each of many places. */
-export class Neighbours {
+export class Neighbors {
   constructor(grid, places) {
-    // Corners of neighbouring triangles are one place.
+    // Corners of neighboring triangles are one place.
     const { which, firsts } = together(places);
     this.which = which;
-    this.rows = new Uint32Array(NEIGHBOURS * firsts.length);
-    this.weights = new Float32Array(NEIGHBOURS * firsts.length);
-    const rows = new Int32Array(NEIGHBOURS), distances = new Float64Array(NEIGHBOURS);
+    this.rows = new Uint32Array(NEIGHBORS * firsts.length);
+    this.weights = new Float32Array(NEIGHBORS * firsts.length);
+    const rows = new Int32Array(NEIGHBORS), distances = new Float64Array(NEIGHBORS);
     firsts.forEach((first, place) => {
       const [x, y, z] = [places[3 * first], places[3 * first + 1], places[3 * first + 2]];
-      const found = grid.nearestInto(x, y, z, NEIGHBOURS, rows, distances);
+      const found = grid.nearestInto(x, y, z, NEIGHBORS, rows, distances);
       let sum = 0;
       for (let rank = 0; rank < found; rank++) sum += 1 / (distances[rank] + 1e-3 * grid.cell) ** 2;
       for (let rank = 0; rank < found; rank++) {
-        this.rows[NEIGHBOURS * place + rank] = rows[rank];
-        this.weights[NEIGHBOURS * place + rank] = 1 / (distances[rank] + 1e-3 * grid.cell) ** 2 / sum;
+        this.rows[NEIGHBORS * place + rank] = rows[rank];
+        this.weights[NEIGHBORS * place + rank] = 1 / (distances[rank] + 1e-3 * grid.cell) ** 2 / sum;
       }
     });
   }
 
-  /** Bytes of `colours`, three for each contact, mixed for every place, and each taken through `change`. */
-  mix(colours, change = (value) => value) {
+  /** Bytes of `colors`, three for each contact, mixed for every place, and each taken through `change`. */
+  mix(colors, change = (value) => value) {
     const mixed = new Float32Array(this.rows.length);
     for (let entry = 0; entry < this.rows.length; entry++) {
-      const place = 3 * Math.floor(entry / NEIGHBOURS), row = 3 * this.rows[entry], weight = this.weights[entry];
-      for (let channel = 0; channel < 3; channel++) mixed[place + channel] += weight * colours[row + channel];
+      const place = 3 * Math.floor(entry / NEIGHBORS), row = 3 * this.rows[entry], weight = this.weights[entry];
+      for (let channel = 0; channel < 3; channel++) mixed[place + channel] += weight * colors[row + channel];
     }
     for (let place = 0; place < mixed.length; place++) mixed[place] = change(mixed[place]);
     const all = new Float32Array(3 * this.which.length);

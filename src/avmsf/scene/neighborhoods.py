@@ -1,7 +1,7 @@
 """What the surface is like about the points of a cloud: its normals, spacing and open edges, and shape descriptors.
 
 A cloud knows no faces. A plane through a point's nearest points stands for the surface there, so that the normals have
-no side, and what is smaller than such a neighbourhood is smoothed away. Nothing here depends on the object's pose.
+no side, and what is smaller than such a neighborhood is smoothed away. Nothing here depends on the object's pose.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-NEIGHBOURS = 24
+NEIGHBORS = 24
 """Points that a plane is laid through: few enough for detail, enough to average noise away."""
 _WIDER = 2
 """How many times more points open edges are judged by: chance moves the mean of a few points about."""
@@ -19,40 +19,40 @@ _SHELLS = (0.08, 0.16, 0.28)
 
 
 @dataclass(frozen=True, eq=False)
-class Neighbourhoods:
+class Neighborhoods:
     """Points of a cloud with the surface about each."""
 
     points: Float[np.ndarray, "points 3"]
-    """Moved along the normals into the planes of their neighbours, which takes most of the noise away."""
+    """Moved along the normals into the planes of their neighbors, which takes most of the noise away."""
     normals: Float[np.ndarray, "points 3"]
     """Unit normals, of either sign."""
     spacing: Float[np.ndarray, " points"]
     """Side of the square of surface that falls to one point, in the unit of the points."""
     openings: Float[np.ndarray, "points 3"]
-    """Which way the surface ends: the neighbours' mean seen from the point, reversed, within the plane, in radii of the
-    neighbourhood: about 0 within a surface, .42 at a straight open edge."""
+    """Which way the surface ends: the neighbors' mean seen from the point, reversed, within the plane, in radii of the
+    neighborhood: about 0 within a surface, .42 at a straight open edge."""
 
 
-def read_neighbourhoods(points: Float[np.ndarray, "points 3"], *, count: int = NEIGHBOURS) -> Neighbourhoods:
+def read_neighborhoods(points: Float[np.ndarray, "points 3"], *, count: int = NEIGHBORS) -> Neighborhoods:
     """Lay a plane through every point's `count` nearest points, itself among them."""
     distances, rows = cKDTree(points).query(points, k=min(_WIDER * count, len(points)))
     wide = points[rows] - points[:, None]
     offsets = wide[:, :count]
     means = offsets.mean(axis=1)
-    centred = offsets - means[:, None]
-    _, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))
+    centered = offsets - means[:, None]
+    _, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", centered, centered))
     normals = directions[:, :, 0]
     along = np.einsum("ni,ni->n", means, normals)[:, None] * normals
-    # A disc of surface holds the neighbours: its area divided among them is what falls to each.
+    # A disc of surface holds the neighbors: its area divided among them is what falls to each.
     spacing = distances[:, offsets.shape[1] - 1] * np.sqrt(np.pi / offsets.shape[1])
     lean = wide.mean(axis=1)
     lean -= np.einsum("ni,ni->n", lean, normals)[:, None] * normals
     openings = -lean / np.maximum(distances[:, -1:], np.finfo(float).tiny)
-    return Neighbourhoods(points + along, normals, spacing, openings)
+    return Neighborhoods(points + along, normals, spacing, openings)
 
 
-def describe_neighbourhoods(
-    surface: Neighbourhoods,
+def describe_neighborhoods(
+    surface: Neighborhoods,
     rows: Int[np.ndarray, " rows"],
     others: Int[np.ndarray, " others"],
     *,

@@ -13,12 +13,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from avmsf.capture.cameras import Camera
 from avmsf.errors import SceneError
-from avmsf.scene.cpu import NumbaRasteriser
+from avmsf.scene.cpu import NumbaRasterizer
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.projection import project
-from avmsf.scene.rasteriser import Rendering, choose_rasteriser
-from benchmarks.rasteriser import measure_rasteriser
-from benchmarks.rasterisers import render_everywhere, render_padded, splats
+from avmsf.scene.rasterizer import Rendering, choose_rasterizer
+from benchmarks.rasterizer import measure_rasterizer
+from benchmarks.rasterizers import render_everywhere, render_padded, splats
 from benchmarks.report import Options
 
 NAMES = tuple(each.name for each in fields(GaussianCloud))
@@ -53,7 +53,7 @@ def leaves(cloud: GaussianCloud, dtype: torch.dtype = torch.float32) -> Gaussian
 
 
 def image_of(cloud: GaussianCloud, camera: Camera) -> Rendering:
-    return NumbaRasteriser()(cloud, camera, background=BACKGROUND)
+    return NumbaRasterizer()(cloud, camera, background=BACKGROUND)
 
 
 def single(place: tuple[float, float, float], *, scale: float = 0.01, logit: float = 1.0) -> GaussianCloud:
@@ -100,8 +100,8 @@ def test_images_and_gradients_are_the_oracles(degree: int, distance: float) -> N
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
-def test_colours_turn_with_the_direction_of_view(degree: int) -> None:
-    # In an image's gradient by the centers the places drown the directions: here the colours are on their own.
+def test_colors_turn_with_the_direction_of_view(degree: int) -> None:
+    # In an image's gradient by the centers the places drown the directions: here the colors are on their own.
     own, true = leaves(cloud_of(degree=degree)), leaves(cloud_of(degree=degree), torch.float64)
     found, radii = (project(own, camera_of())[place] for place in (3, 5))
     expected = splats(true, camera_of()).colors
@@ -115,7 +115,7 @@ def test_colours_turn_with_the_direction_of_view(degree: int) -> None:
         assert float((gradient - truth).norm() / truth.norm()) < 1e-5, name
 
 
-def test_the_padded_rasteriser_does_the_same_work() -> None:
+def test_the_padded_rasterizer_does_the_same_work() -> None:
     cloud, camera = cloud_of(), camera_of()
     for side in (8, 16):
         padded = render_padded(cloud, camera, background=BACKGROUND, side=side)
@@ -134,7 +134,7 @@ def test_a_round_gaussian_straight_ahead_is_a_bell() -> None:
     alpha = opacity * torch.exp(-((across - 20) ** 2 + (down - 13) ** 2) / (2 * variance))
     alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
     torch.testing.assert_close(found.alpha, alpha, atol=1e-6, rtol=0)
-    # The constant harmonic is 1 / (2 sqrt(pi)); a colour is half more, and nothing is darker than black.
+    # The constant harmonic is 1 / (2 sqrt(pi)); a color is half more, and nothing is darker than black.
     light = 0.5 / math.sqrt(math.pi)
     color = torch.tensor([0.5 + light, 0.5, 0.5 - light])
     torch.testing.assert_close(
@@ -302,7 +302,7 @@ def test_other_tensors_than_float32_on_the_cpu_are_refused() -> None:
     with pytest.raises(SceneError, match="found the cloud's centers in float64 on cpu"):
         image_of(leaves(cloud_of(5), torch.float64), camera_of())
     with pytest.raises(SceneError, match="found the background in float64"):
-        NumbaRasteriser()(cloud_of(5), camera_of(), background=BACKGROUND.double())
+        NumbaRasterizer()(cloud_of(5), camera_of(), background=BACKGROUND.double())
     away = GaussianCloud(*(getattr(cloud_of(5), name).to("meta") for name in NAMES))
     with pytest.raises(SceneError, match="found the cloud's centers in float32 on meta"):
         image_of(away, camera_of())
@@ -315,21 +315,21 @@ def test_views_of_other_tensors_are_read_right() -> None:
     assert torch.equal(image_of(strided, camera_of()).color, image_of(cloud, camera_of()).color)
 
 
-def test_each_device_has_its_rasteriser() -> None:
-    assert isinstance(choose_rasteriser("cpu"), NumbaRasteriser)
-    assert isinstance(choose_rasteriser(torch.device("cpu")), NumbaRasteriser)
+def test_each_device_has_its_rasterizer() -> None:
+    assert isinstance(choose_rasterizer("cpu"), NumbaRasterizer)
+    assert isinstance(choose_rasterizer(torch.device("cpu")), NumbaRasterizer)
     with pytest.raises(SceneError, match="found 'mps'"):
-        choose_rasteriser("mps")
+        choose_rasterizer("mps")
 
 
 def test_a_missing_card_or_package_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(SceneError, match="choose the device 'cpu'"):
-        choose_rasteriser("cuda")
+        choose_rasterizer("cuda")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(SceneError, match=r"pip install 'avmsf\[gpu\]'"):
-        choose_rasteriser("cuda:0")
+        choose_rasterizer("cuda:0")
 
 
 def test_gsplat_is_given_what_it_expects(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -344,7 +344,7 @@ def test_gsplat_is_given_what_it_expects(monkeypatch: pytest.MonkeyPatch) -> Non
 
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    own = choose_rasteriser("cuda")
+    own = choose_rasterizer("cuda")
     with pytest.raises(SceneError, match="expected a cloud on a CUDA device, found it on cpu"):
         own(single((0.0, 0.0, 0.5)), AHEAD, background=BACKGROUND)
     # There is no card here: only the question where a tensor lies is answered otherwise.
@@ -371,7 +371,7 @@ def test_gsplat_is_given_what_it_expects(monkeypatch: pytest.MonkeyPatch) -> Non
     assert float(found.radii) == 5.0
     found.screen.retain_grad()
     found.color.sum().backward()
-    # The sum of all colours is 6 x 27 x 40 times that of the places.
+    # The sum of all colors is 6 x 27 x 40 times that of the places.
     torch.testing.assert_close(found.screen.grad, torch.full((1, 2), 6.0 * 27 * 40))
 
 
@@ -381,7 +381,7 @@ def test_gsplat_renders_what_the_cpu_does() -> None:
     cloud, camera = cloud_of(degree=3), camera_of()
     there = GaussianCloud(*(getattr(cloud, name).cuda() for name in NAMES))
     here, other = leaves(cloud), leaves(there)
-    found = choose_rasteriser("cuda")(other, camera, background=BACKGROUND.cuda())
+    found = choose_rasterizer("cuda")(other, camera, background=BACKGROUND.cuda())
     expected = image_of(here, camera)
     _, undecided = render_everywhere(cloud, camera, background=BACKGROUND)
     # gsplat reckons all in float32, and cuts off by rectangles that it takes in float32 too.
@@ -395,7 +395,7 @@ def test_gsplat_renders_what_the_cpu_does() -> None:
 
 
 def test_the_benchmark_measures_what_it_says() -> None:
-    figures = measure_rasteriser(Options(("rasteriser",), quick_look=True)).figures
-    assert {"rasteriser.speedup", "rasteriser.step_milliseconds"} < set(figures)
-    assert 0 < figures["rasteriser.image_error"] < 1e-5
-    assert 0 < figures["rasteriser.gradient_error"] < 1e-4
+    figures = measure_rasterizer(Options(("rasterizer",), quick_look=True)).figures
+    assert {"rasterizer.speedup", "rasterizer.step_milliseconds"} < set(figures)
+    assert 0 < figures["rasterizer.image_error"] < 1e-5
+    assert 0 < figures["rasterizer.gradient_error"] < 1e-4

@@ -49,7 +49,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("own/captures/bowl", CaptureCollection, ("bowl",)),
     ],
 )
-def test_each_kind_is_recognised(place: Path, path: str, kind: type[Dataset], objects: tuple[str, ...]) -> None:
+def test_each_kind_is_recognized(place: Path, path: str, kind: type[Dataset], objects: tuple[str, ...]) -> None:
     dataset = open_dataset(place / path)
     assert isinstance(dataset, kind)
     assert dataset.objects() == objects

@@ -1,4 +1,4 @@
-/** Colours for numbers: one ramp for amounts, one for signs; the legend draws the very same. */
+/** Colors for numbers: one ramp for amounts, one for signs; the legend draws the very same. */
 
 const AMOUNT = [
   [28, 16, 68],
@@ -29,14 +29,14 @@ class Scale {
     this.toShare = toShare;
   }
 
-  colour(value) {
+  color(value) {
     return between(this.stops, this.toShare(value));
   }
 
   /** Red, green, blue of every value, 0..255, three bytes each. */
-  colours(values) {
+  colors(values) {
     const all = new Uint8Array(3 * values.length);
-    for (let row = 0; row < values.length; row++) all.set(this.colour(values[row]).map(Math.round), 3 * row);
+    for (let row = 0; row < values.length; row++) all.set(this.color(values[row]).map(Math.round), 3 * row);
     return all;
   }
 

@@ -17,11 +17,11 @@ class Rendering:
     """What a camera sees of a cloud; differentiable by the cloud's tensors."""
 
     color: Float[Tensor, "height width 3"]
-    """The blended colours over the background, about 0 to 1."""
+    """The blended colors over the background, about 0 to 1."""
     alpha: Float[Tensor, "height width"]
     """How much of each pixel the Gaussians cover, 0 to 1."""
     depth: Float[Tensor, "height width"]
-    """Mean depth of what covers the pixel, metres along the optical axis; 0 where nothing does."""
+    """Mean depth of what covers the pixel, meters along the optical axis; 0 where nothing does."""
     screen: Float[Tensor, "points 2"]
     """The centers' places in the image, pixels. After `retain_grad`, the backward pass leaves the loss's derivative by
     them in `grad`, for densification."""
@@ -30,19 +30,19 @@ class Rendering:
 
 
 @runtime_checkable
-class Rasteriser(Protocol):
+class Rasterizer(Protocol):
     """Anything that renders clouds as `Rendering` says: Gaussians sorted by depth, blended front to back (3DGS).
 
-    `choose_rasteriser` gives the one for a device. Derivatives are those by the cloud's tensors; camera and background
+    `choose_rasterizer` gives the one for a device. Derivatives are those by the cloud's tensors; camera and background
     have none.
     """
 
     def __call__(self, cloud: GaussianCloud, camera: Camera, *, background: Float[Tensor, " 3"]) -> Rendering:
-        """Return what `camera` sees before a `background` colour."""
+        """Return what `camera` sees before a `background` color."""
         ...
 
 
-def choose_rasteriser(device: torch.device | str) -> Rasteriser:
+def choose_rasterizer(device: torch.device | str) -> Rasterizer:
     """Return what renders clouds whose tensors lie on `device`: numba kernels on the CPU, gsplat on CUDA.
 
     Raises SceneError for any other device, and for CUDA where gsplat or the device is missing.
@@ -50,9 +50,9 @@ def choose_rasteriser(device: torch.device | str) -> Rasteriser:
     kind = torch.device(device).type
     # Imported when they are chosen: both build on this module, and who renders nothing waits for no compiler.
     if kind == "cpu":
-        from avmsf.scene.cpu import NumbaRasteriser
+        from avmsf.scene.cpu import NumbaRasterizer
 
-        return NumbaRasteriser()
+        return NumbaRasterizer()
     if kind != "cuda":
         raise SceneError(f"expected a device of kind 'cpu' or 'cuda', found {str(device)!r}: move the cloud to one")
     if not torch.cuda.is_available():
@@ -60,6 +60,6 @@ def choose_rasteriser(device: torch.device | str) -> Rasteriser:
             "expected a CUDA device, found none that this torch can use: choose the device 'cpu', or install the torch "
             "that fits your graphics card"
         )
-    from avmsf.scene.cuda import GsplatRasteriser
+    from avmsf.scene.cuda import GsplatRasterizer
 
-    return GsplatRasteriser()
+    return GsplatRasterizer()

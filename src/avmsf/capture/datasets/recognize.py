@@ -20,7 +20,7 @@ SOUGHT = (
 
 
 def open_dataset(path: str | Path, *, contacts: str | Path | None = None, table: str | Path | None = None) -> Dataset:
-    """Return the dataset that a folder holds, recognised by what lies in it.
+    """Return the dataset that a folder holds, recognized by what lies in it.
 
     `contacts` says where ObjectFolder Real's contacts are, `table` where its objects' names (`ObjectFolderRaw`). Where
     the raw and the compact form share a folder the raw one is taken, which knows the forces. Raises DatasetError for a

@@ -1,4 +1,4 @@
-"""Rasterisers in plain torch, their gradients by autograd: one to be right, one to be as fast as torch alone is.
+"""Rasterizers in plain torch, their gradients by autograd: one to be right, one to be as fast as torch alone is.
 
 Both are written from the definitions of 3D Gaussian Splatting (Kerbl et al. 2023) and share no line with the package's.
 `render_everywhere` puts every Gaussian at every pixel, in whatever precision the cloud comes in: the oracle.
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from avmsf.capture.cameras import Camera
 from avmsf.scene.gaussians import GaussianCloud
-from avmsf.scene.rasteriser import Rendering
+from avmsf.scene.rasterizer import Rendering
 
 _NEAR, _BLUR, _MARGIN = 0.01, 0.3, 0.3
 _FAINTEST, _OPAQUE, _LEAST = 1 / 255, 0.999, 1e-4
@@ -34,7 +34,7 @@ class Splats:
     opacities: Float[Tensor, " points"]
     colors: Float[Tensor, "points 3"]
     depths: Float[Tensor, " points"]
-    """Along the optical axis, metres."""
+    """Along the optical axis, meters."""
 
     def take(self, chosen: Int[Tensor, " chosen"]) -> "Splats":
         """Return the Gaussians of the given rows."""
@@ -202,7 +202,7 @@ def _matrices(rotations: Float[Tensor, "points 4"]) -> Float[Tensor, "points 3 3
 
 
 def _basis(directions: Float[Tensor, "points 3"]) -> Float[Tensor, "points 16"]:
-    """Return the real spherical harmonics to degree 3, from their normalised Legendre form."""
+    """Return the real spherical harmonics to degree 3, from their normalized Legendre form."""
     x, y, z = directions.unbind(1)
     one, root = torch.ones_like(x), math.sqrt(1 / math.pi)
     return torch.stack(
