@@ -40,7 +40,7 @@ from avmsf.simulate.material import CERAMIC, WOOD
 from avmsf.studio import leading, locating, modules, server, studio, worker
 from avmsf.studio.locating import Finder
 from avmsf.studio.modules import find_modules, with_local_modules
-from avmsf.studio.opening import MESHES, Opened, find_object, open_target
+from avmsf.studio.opening import Opened, find_object, open_target
 from avmsf.studio.routes import PAGE
 from avmsf.studio.server import serve
 from avmsf.tasks.located import enlarged
