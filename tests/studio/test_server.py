@@ -494,7 +494,7 @@ def test_a_mesh_called_as_a_captures_own_opens_the_folder_that_it_lies_in(
     assert "a folder of its name next to it, which becomes the capture" in told
     for name in ("surface.obj", *SPLATS):
         assert name in told
-    assert "open the folder that they lie in as the capture" in told
+    assert "open the folder that holds them as the capture" in told
 
 
 def wavefront(folder: Path) -> Path:
@@ -665,7 +665,9 @@ def test_the_command_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
     assert list((tmp_path / "temporary").iterdir()) == []
 
 
-def test_the_command_says_what_it_needs(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_says_what_it_needs(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     assert main(["studio"]) == 2
     assert "expected a field, a capture folder" in capsys.readouterr().err
     assert main(["studio", "nothing.safetensors"]) == 2
@@ -674,7 +676,9 @@ def test_the_command_says_what_it_needs(capsys: pytest.CaptureFixture[str], monk
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     del sys.modules["avmsf.studio.server"]
     monkeypatch.delitem(sys.modules, "avmsf.studio.server", raising=False)
-    assert main(["studio", "nothing.safetensors"]) == 2
+    present = tmp_path / "field.safetensors"
+    present.write_bytes(b"")
+    assert main(["studio", str(present)]) == 2
     assert "pip install 'avmsf[studio]'" in capsys.readouterr().err
 
 

@@ -46,10 +46,13 @@ def as_rows(values: ArrayLike, name: str, *, count: int) -> Float[Tensor, "rows 
 def as_floats(values: float | int | ArrayLike, name: str) -> Float[Tensor, "*shape"]:
     """Return numbers of any shape as floats on the CPU. Raises ArrayError for what are no numbers."""
     try:
-        found = torch.as_tensor(values if isinstance(values, Tensor) else np.asarray(values, dtype=np.float64))
+        found = torch.as_tensor(values if isinstance(values, Tensor) else np.asarray(values))
     except (ValueError, TypeError) as error:
         raise ArrayError(f"{name}: expected numbers in an array or nested lists ({error})", name=name) from error
-    return found.detach().cpu() if found.is_floating_point() else found.detach().cpu().double()
+    if found.is_complex():
+        raise ArrayError(f"{name}: expected real numbers, got {found.dtype}", name=name)
+    kept = isinstance(values, Tensor) and found.is_floating_point()
+    return found.detach().cpu() if kept else found.detach().cpu().double()
 
 
 def _finite(found: Tensor, name: str) -> Tensor:

@@ -70,10 +70,10 @@ class Capture:
         from avmsf.bench.evaluation import split
 
         start = 0 if seed is None else random.Random(seed).randrange(len(self.impacts))
-        if isinstance(train_size, int):
-            train, test = split(self.impacts, count=train_size, start=start)
-        else:
+        if isinstance(train_size, float):
             train, test = split(self.impacts, fraction=train_size, start=start)
+        else:
+            train, test = split(self.impacts, count=int(train_size), start=start)
         return replace(self, impacts=train), replace(self, impacts=test)
 
 

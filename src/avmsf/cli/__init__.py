@@ -95,6 +95,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             print(f"avmsf {words[0]}: interrupted", file=sys.stderr)
             code = INTERRUPTED
+        finally:
+            verbosity.quiet = verbosity.verbose = False
         return TERMINATED if code == INTERRUPTED and signal.SIGTERM in received else code
 
 

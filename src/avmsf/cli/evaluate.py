@@ -108,7 +108,11 @@ def _draw_curves(
     for name in objects:
         record = results.read(name)
         assert record is not None
-        found = curves(record, metric=options.metric)
+        try:
+            found = curves(record, metric=options.metric)
+        except EvaluationError as error:
+            screen.print(f"failed: {error}", soft_wrap=True)
+            continue
         starts = counted(options.starts, "choice")
         title = f"{record.identifier}: {counted(record.contacts, 'contact')}, {starts} of training contacts"
         picture, values = (results.path / name / f"learning-curve.{ending}" for ending in ("png", "json"))

@@ -1,7 +1,7 @@
 """`avmsf fit`: a capture folder in, a field file out."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.fit import Options
-from avmsf.cli.printing import console, print_json, say
+from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scores import compare, parts_words, quality_words, score_table, score_values
 from avmsf.cli.writing import expect_writable
@@ -50,8 +50,9 @@ def run(options: Options) -> int:
     try:
         with FitBar() as bar:
             fitted, modes = fit_capture(
-                replace(capture, impacts=train),
+                capture,
                 options.pipeline,
+                train=train,
                 features=features,
                 features_report=made,
                 output=options.output,
@@ -65,18 +66,19 @@ def run(options: Options) -> int:
         where = f"from {checkpoint}, or delete it" if checkpoint.exists() else "from the start of training"
         say(f"avmsf fit: interrupted; give the same command again to go on {where}")
         return INTERRUPTED
+    screen = console(errors=options.json)
     for sentence in describe_alignment(modes, train):
-        say(sentence)
+        screen.print(sentence, soft_wrap=True)
     save(fitted, options.output)
     discard_unfinished(options.output)
     doing("comparing the field with the recordings that it was not fitted to")
     scores = {} if test is None else compare(fitted, train, test, modes)
-    screen = console(errors=options.json)
     if test is not None:
         shown = ", ".join(test.names[:_SHOWN]) + f" and {len(test) - _SHOWN} more" * (len(test) > _SHOWN)
         say(f"not trained on: {shown}")
     print_fitted(screen, fitted, train, test, scores, options.output)
     screen.print(f"wrote {options.output}", soft_wrap=True)
+    next_command("avmsf render", options.output, "--position X Y Z -o impact.wav")
     if options.json:
         print_json(
             {

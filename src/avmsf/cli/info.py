@@ -61,6 +61,7 @@ def run(options: Options) -> int:
         settings = None if options.settings is None else CaptureSettings.read(options.settings)
         doing("comparing the field with the capture's recordings")
         recorded, what = _held_out(read_capture(options.capture, settings).impacts, field)
+        recorded = field.aligned(recorded)
         scores = {"field": evaluate(Fitted(field, recorded.sounds.shape[1]), recorded)}
         screen.print(score_table(f"{len(recorded)} contacts, {what}; lower is better", scores))
         values |= {"compared_with": {"recordings": list(recorded.names), "which": what, "scores": score_values(scores)}}

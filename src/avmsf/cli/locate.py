@@ -49,7 +49,7 @@ def run(options: Options) -> int:
     force = None if options.force is None else Force(options.force)
     known = _Known(load(options.field))
     truth = _true_contact(options, known.field)
-    say("avmsf locate: preparing gains over the surface and their reliability, once a run (seconds to minutes)")
+    say("preparing gains over the surface and their reliability, once a run (seconds to minutes)")
     screen = console(errors=options.json)
     quality = known.field.quality
     verdict = known.field.origin.report.get("guess") if quality is None else quality.verdict

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import Progress as Bar
 
 from avmsf._utils.caching import discard
-from avmsf.capture import Capture
+from avmsf.capture import Capture, Impacts
 from avmsf.errors import FitError
 from avmsf.field.config import GainModel
 from avmsf.field.fit import Progress, fit
@@ -35,28 +35,30 @@ def fit_capture(
     capture: Capture,
     config: PipelineConfig | None = None,
     *,
+    train: Impacts | None = None,
     features: FeatureField | None = None,
     features_report: Mapping[str, Any] | None = None,
     output: Path | None = None,
     log: Callable[[str], None] = lambda message: None,
     progress: Callable[[Progress], None] | None = None,
 ) -> tuple[SoundField, Extraction]:
-    """Fit a field to all recordings of a capture; return it and the modes that it started from.
+    """Fit a field to all recordings of a capture, or to those of `train`; return it and the modes that it started from.
 
-    `features` describe the object's points, and `features_report` how they were made; without them they are positions
-    on the mesh, or in the box of the contacts where there is no mesh. With the path of an `output`, files next to it
-    keep the modes, the elastic modes and the state of the training: after an interruption the same call goes on from
-    them. Who has saved the field discards them (`discard_unfinished`).
+    The contacts of all recordings say where the object is. `features` describe the object's points, and
+    `features_report` how they were made; without them they are positions on the mesh, or in the box of the contacts
+    where there is no mesh. With the path of an `output`, files next to it keep the modes, the elastic modes and the
+    state of the training: after an interruption the same call goes on from them. Who has saved the field discards them
+    (`discard_unfinished`).
 
     Raises as the stages do: CaptureError, ExtractionError, FitError, SimulationError, FieldFileError.
     """
     config = PipelineConfig() if config is None else config
-    train = capture.impacts
+    train = capture.impacts if train is None else train
     if features is None:
         points = _points_of(capture, config, log)
     else:
         points = features
-        expect_on_object(train, points.points)
+        expect_on_object(capture.impacts, points.points)
     if len(train) < _FEW:
         log(f"{len(train)} recordings tell little of how loud modes are between contacts; {_FEW} or more tell much")
     # Before the modes: what is wrong with the object's shape shows in less time than they take.
@@ -115,10 +117,13 @@ def fit_with_progress(
     with Bar(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("fitting", total=None)
 
+        def say(message: str) -> None:
+            bar.console.print(message, markup=False, highlight=False, soft_wrap=True)
+
         def show(step: Progress) -> None:
             bar.update(task, description=step.stage, completed=step.step, total=step.steps)
 
-        return fit_capture(capture, config, features=features, log=bar.console.print, progress=show)[0]
+        return fit_capture(capture, config, features=features, log=say, progress=show)[0]
 
 
 def unfinished(output: Path, ending: str) -> Path:

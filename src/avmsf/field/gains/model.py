@@ -350,7 +350,7 @@ class MixtureGains:
 def _expect_sound(tensors: Mapping[str, Tensor]) -> None:
     """Raise ValueError for values that no fit leaves: they would fail only when gains are asked for."""
     if not bool((tensors["object_size"] > 0).all()):
-        raise ValueError(f"expected object_size above 0, got {float(tensors['scale'].min()):g}")
+        raise ValueError(f"expected object_size above 0, got {float(tensors['object_size'].min()):g}")
     for name in ("weights", "noise_floor"):
         if not bool((tensors[name] >= 0).all()):
             raise ValueError(f"expected {name} of 0 or more, got {float(tensors[name].min()):g}")

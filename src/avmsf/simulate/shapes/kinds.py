@@ -52,7 +52,8 @@ def make_shape(kind: str, *, seed: int = 0, size: float | None = None, wall: flo
     except SimulationError as error:
         raise SimulationError(f"{kind} of seed {seed}, walls {1000.0 * scale * draft.wall:g} mm: {error}") from error
     points, faces = _skin(solid)
-    colors = glaze(points, _chance(kind, seed, "colors"))
+    # The name is part of the seed: with another one, all objects have other colors.
+    colors = glaze(points, _chance(kind, seed, "colours"))
     return Shape(
         name=f"{kind}-{seed}",
         surface=Surface(torch.from_numpy(points).float(), torch.from_numpy(faces)),
