@@ -165,7 +165,7 @@ def test_check_of_a_good_capture_ends_with_0(capture: Path, capsys: Streams) -> 
     assert "001.wav" in out
     assert "008.wav" in out
     assert "no problem found" in out
-    assert err == ""
+    assert err == f"next: avmsf modes {capture}\n"
 
 
 @pytest.mark.parametrize(("strays", "said"), [((), "1 warning"), (("stray.wav",), "2 warnings")])

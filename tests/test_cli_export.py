@@ -189,7 +189,7 @@ def refused(words: list[str], capsys: Streams) -> str:
 @pytest.mark.parametrize(
     ("to", "name", "written"),
     [
-        ("wavs", "s2.wav", "a folder with a wav file for each blow, a table and an SFZ instrument"),
+        ("wavs", "s2.wav", "a folder with a wav file for each impact, a table and an SFZ instrument"),
         ("avmsf-demo", "bowl.ZIP", "a folder in the layout of the paper's demo"),
         ("web", "page.glb", "a page as a folder, or as one file whose name ends in .html"),
     ],

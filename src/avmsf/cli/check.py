@@ -14,7 +14,7 @@ from avmsf.capture.proposals import Proposal, propose_settings, settings_text, w
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.check import Options
-from avmsf.cli.printing import console, decimals, print_json, say, table
+from avmsf.cli.printing import console, decimals, next_command, print_json, say, table
 from avmsf.errors import CaptureError, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.finders import HighResolution
@@ -72,6 +72,7 @@ def run(options: Options) -> int:
     if aligned is not None:
         wrong += bool(aligned.not_aligned) + bool(aligned.inverted)
     screen.print("no problem found" if not wrong else f"readable, with {counted(wrong, 'warning')}", soft_wrap=True)
+    next_command("avmsf modes", options.capture)
     return 0
 
 
@@ -111,7 +112,7 @@ def _table(report: CaptureReport, title: str, aligned: AlignmentReport | None) -
     delays = {} if aligned is None else aligned.delays
     left = [] if aligned is None else aligned.not_aligned
     doubtful = [] if aligned is None else [*left, *aligned.inverted]
-    columns = ["recording", "state", "length s", "rate Hz", "peak dB", "noise dB", "clipped", "onset s", "2nd blow s"]
+    columns = ["recording", "state", "length s", "rate Hz", "peak dB", "noise dB", "clipped", "onset s", "2nd impact s"]
     rows = [
         (
             row.file,

@@ -57,7 +57,7 @@ def read_contacts(path: Path, *, meters: float) -> Contacts:
     if missing or len(lines) < 2:
         lacking = f"the column {missing[0]} is missing" if missing else "there is no row"
         raise CaptureError(
-            f"{path}: {lacking}; expected a header line with x,y,z (and perhaps file) and one row a blow"
+            f"{path}: {lacking}; expected a header line with x,y,z (and perhaps file) and one row for each impact"
         )
     places, names, normals = [], [], []
     for line, cells in lines[1:]:

@@ -17,7 +17,7 @@ from avmsf.cli.clapcurve import CLAP
 from avmsf.cli.contacts import contacts_at, refuse_far
 from avmsf.cli.editmaterial import MaterialChange
 from avmsf.cli.options.edit import ModeOptions, Options
-from avmsf.cli.printing import console, decimals, figure, print_json, say, table
+from avmsf.cli.printing import console, decimals, figure, next_command, print_json, say, table
 from avmsf.cli.steering import Steering, beside
 from avmsf.cli.writing import Level, OutputError, expect_writable, write_sound
 from avmsf.errors import EditError
@@ -113,6 +113,7 @@ def run(options: Options) -> int:
                 "modes": _rows(before, after),
             }
         )
+    next_command("avmsf render", options.output, "--position X Y Z -o impact.wav")
     return 0
 
 
@@ -195,7 +196,7 @@ def _show(
     )
     pictures = {
         MODES: modes,
-        SPECTROGRAMS: draw_sound_change(*sounds, sample_rate=old.sample_rate, title=f"a blow on {name}, edited"),
+        SPECTROGRAMS: draw_sound_change(*sounds, sample_rate=old.sample_rate, title=f"an impact at {name}, edited"),
     }
     for each, picture in pictures.items():
         save_picture(picture, folder / each)

@@ -33,7 +33,7 @@ _FILES: dict[Format, tuple[str, ...]] = {"gltf": GLTF_SUFFIXES, "faust": FAUST_S
 _FOLDERS: dict[Format, str] = {
     "web": "a page as a folder, or as one file whose name ends in .html",
     "avmsf-demo": "a folder in the layout of the paper's demo",
-    "wavs": "a folder with a wav file for each blow, a table and an SFZ instrument",
+    "wavs": "a folder with a wav file for each impact, a table and an SFZ instrument",
 }
 """Formats that are folders, and what is written."""
 _ENDINGS = frozenset(

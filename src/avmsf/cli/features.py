@@ -1,9 +1,11 @@
 """`avmsf features`: features on an object's surface out of what a folder shows of it."""
 
+import shlex
+
 from avmsf.capture.together import expect_one_unit
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.features import Options
-from avmsf.cli.printing import console, print_json, say
+from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import features_words, settings_for, stage_line
 from avmsf.cli.writing import expect_writable
@@ -48,4 +50,6 @@ def run(options: Options) -> int:
         screen.print(f"wrote {options.output}", soft_wrap=True)
     if options.json:
         print_json({"features": str(options.output or features.path), **report})
+    made = shlex.quote(str(options.output or features.path))
+    next_command("avmsf fit", options.folder, f"--features {made} --gain-model network -o field.safetensors")
     return 0

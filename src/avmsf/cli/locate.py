@@ -44,7 +44,7 @@ def run(options: Options) -> int:
             f"--probability is {options.probability:g}; expected a probability between 0 and 1, such as 0.9"
         )
     if options.output is not None:
-        expect_writable(options.output / "blow.png")
+        expect_writable(options.output / "impact.png")
     settings = _settings(options)
     force = None if options.force is None else Force(options.force)
     known = _Known(load(options.field))

@@ -8,7 +8,7 @@ from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_rows, quality_rows
 from avmsf.cli.options.modes import Options
-from avmsf.cli.printing import console, decimals, figure, print_json, say, table
+from avmsf.cli.printing import console, decimals, figure, next_command, print_json, say, table
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.modal.extraction.finders import finder_named
 from avmsf.modal.extraction.quality import measure_quality
@@ -61,6 +61,7 @@ def run(options: Options) -> int:
                 "supporting_poles": [asdict(row) | asdict(how) for row, how in supporting],
             }
         )
+    next_command("avmsf fit", options.capture, "-o field.safetensors")
     return 0
 
 

@@ -9,7 +9,7 @@ from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.fit import part_contacts, print_fitted, refuse_with_material, show_guess
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.reconstruct import Options
-from avmsf.cli.printing import console, figure, print_json, say, table
+from avmsf.cli.printing import console, figure, next_command, print_json, say, table
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import features_words, settings_for
@@ -69,6 +69,7 @@ def run(options: Options) -> int:
     screen.print(f"the field is {made.field}", soft_wrap=True)
     if options.output is not None:
         screen.print(f"wrote {options.output}", soft_wrap=True)
+    next_command("avmsf render", options.output or made.field, "--position X Y Z -o impact.wav")
     if options.json:
         print_json(
             {

@@ -6,7 +6,7 @@ from pathlib import Path
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.options.simulate import Options
-from avmsf.cli.printing import console, print_json, print_result, say, table
+from avmsf.cli.printing import console, next_command, print_json, print_result, say, table
 from avmsf.errors import SimulationError
 from avmsf.simulate.material import MATERIALS
 from avmsf.simulate.recipe import ObjectRecipe
@@ -38,6 +38,7 @@ def run(options: Options) -> int:
     text = f"wrote {options.output}" if len(recipes) == 1 else f"wrote {len(recipes)} objects to {options.output}"
     values = {"output": str(options.output), "objects": [str(folder / name) for name in recipes]}
     print_result(text, values, json=options.json)
+    next_command("avmsf check", folder / next(iter(recipes)))
     return 0
 
 

@@ -12,7 +12,7 @@ from avmsf.capture.together import expect_one_unit
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.scenes import with_seed
 from avmsf.cli.options.surface import Options
-from avmsf.cli.printing import print_result, say
+from avmsf.cli.printing import next_command, print_result, say
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import settings_for, stage_line
 from avmsf.cli.writing import OutputError, expect_writable
@@ -61,6 +61,7 @@ def run(options: Options) -> int:
     lines += [f"wrote {path}" for path in (options.output, options.picture) if path is not None]
     values = {"surface": str(options.output or kept.path), "triangles": len(surface.faces)}
     print_result("\n".join(lines), values, json=options.json)
+    next_command("avmsf reconstruct", options.folder, "-o field.safetensors")
     return 0
 
 
