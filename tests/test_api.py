@@ -248,6 +248,9 @@ def test_impacts_and_surfaces_are_made_of_arrays(tmp_path):
     with pytest.raises(ArrayError) as caught:
         avmsf.Surface.of(surface.vertices, [[0, 1, 2], [0, 1, 3]])
     assert caught.value.row == 1
+    with pytest.raises(ArrayError) as caught:
+        avmsf.Surface.of(surface.vertices, [[0, 1, 1.5]])
+    assert (caught.value.name, caught.value.row) == ("faces", 0)
 
 
 def test_paths_may_be_strings(tmp_path):

@@ -36,12 +36,13 @@ class Surface:
         Raises ArrayError for other shapes, for vertices that are not finite and for corners that are no vertices.
         """
         places = as_vectors(vertices, "vertices").float()
-        corners = as_vectors(faces, "faces").long() if len(faces) else torch.zeros(0, 3, dtype=torch.long)
-        wrong = torch.nonzero(((corners < 0) | (corners >= len(places))).any(1)).flatten()
+        given = as_vectors(faces, "faces") if len(faces) else torch.zeros(0, 3)
+        corners = given.long()
+        wrong = torch.nonzero(((corners != given) | (corners < 0) | (corners >= len(places))).any(1)).flatten()
         if len(wrong):
             row = int(wrong[0])
             raise ArrayError(
-                f"faces: expected rows of vertices, 0 to {len(places) - 1}, got {corners[row].tolist()} (row {row})",
+                f"faces: expected rows of vertices, 0 to {len(places) - 1}, got {given[row].tolist()} (row {row})",
                 name="faces",
                 row=row,
             )
