@@ -2,17 +2,13 @@
 
 import shlex
 
-from avmsf.capture.together import expect_one_unit
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.features import Options
 from avmsf.cli.printing import console, next_command, print_json, say
-from avmsf.cli.scenebar import SceneBar
-from avmsf.cli.scenes import features_words, settings_for, stage_line
+from avmsf.cli.scenes import features_words, opened_scene, stage_line
 from avmsf.cli.writing import expect_writable
 from avmsf.files import copy_whole
 from avmsf.pipeline.config import SceneConfig
-from avmsf.pipeline.scene import SceneStages
-from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.featurestore import read_report
 
 
@@ -20,25 +16,13 @@ def run(options: Options) -> int:
     """Make the features; return 130 where Ctrl-C stopped it."""
     if options.output is not None:
         expect_writable(options.output)
-    settings = settings_for(options)
-    expect_one_unit(options.folder, settings)
-    stages = StageFolder(options.kept)
+    config = SceneConfig(options.views, options.splat, options.config)
     try:
-        with SceneBar() as bar:
-            scene = SceneStages(
-                options.folder,
-                stages,
-                SceneConfig(options.views, options.splat, options.config),
-                settings=settings,
-                listener=bar.listener,
-                device=options.device,
-            )
-            scene.expect_any()
-            with stages.lock("avmsf features"):
-                features = scene.features
-                report = read_report(features.path)
-                if options.output is not None:
-                    copy_whole(features.path, options.output)
+        with opened_scene(options, config, command="avmsf features") as scene:
+            features = scene.features
+            report = read_report(features.path)
+            if options.output is not None:
+                copy_whole(features.path, options.output)
     except KeyboardInterrupt:
         say("avmsf features: interrupted; the same command goes on from where it was")
         return INTERRUPTED

@@ -1,18 +1,41 @@
 """What the verbs that turn a folder's look into features have in common."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from avmsf.capture import CaptureSettings
 from avmsf.capture.folder import settings_of
+from avmsf.capture.together import expect_one_unit
 from avmsf.cli.options.scenes import SceneOptions
-from avmsf.pipeline.stages import Kept
+from avmsf.cli.scenebar import SceneBar
+from avmsf.pipeline.config import SceneConfig
+from avmsf.pipeline.scene import SceneStages
+from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.symmetry import Symmetries
 
 
 def settings_for(options: SceneOptions) -> CaptureSettings:
     """Return the settings of the capture that the folder is, or the defaults."""
     return settings_of(options.folder) if options.settings is None else CaptureSettings.read(options.settings)
+
+
+@contextmanager
+def opened_scene(options: SceneOptions, config: SceneConfig, *, command: str) -> Iterator[SceneStages]:
+    """Yield the stages of the options' folder, which show their progress and are locked for the command.
+
+    Raises SceneError for a folder that shows nothing of the object.
+    """
+    settings = settings_for(options)
+    expect_one_unit(options.folder, settings)
+    stages = StageFolder(options.kept)
+    with SceneBar() as bar:
+        scene = SceneStages(
+            options.folder, stages, config, settings=settings, listener=bar.listener, device=options.device
+        )
+        scene.expect_any()
+        with stages.lock(command):
+            yield scene
 
 
 def stage_line(name: str, kept: Kept) -> str:

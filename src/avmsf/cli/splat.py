@@ -1,16 +1,12 @@
 """`avmsf splat`: a folder's photographs, video or mesh in, Gaussians out."""
 
-from avmsf.capture.together import expect_one_unit
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.splat import Options
 from avmsf.cli.printing import next_command, print_result, say
-from avmsf.cli.scenebar import SceneBar
-from avmsf.cli.scenes import settings_for, stage_line
+from avmsf.cli.scenes import opened_scene, stage_line
 from avmsf.cli.writing import expect_writable
 from avmsf.files import copy_whole
 from avmsf.pipeline.config import SceneConfig
-from avmsf.pipeline.scene import SceneStages
-from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.ply import read_splats
 
 
@@ -18,25 +14,13 @@ def run(options: Options) -> int:
     """Make the Gaussians; return 130 where Ctrl-C stopped it."""
     if options.output is not None:
         expect_writable(options.output)
-    settings = settings_for(options)
-    expect_one_unit(options.folder, settings)
-    stages = StageFolder(options.kept)
+    config = SceneConfig(views=options.views, splat=options.config)
     try:
-        with SceneBar() as bar:
-            scene = SceneStages(
-                options.folder,
-                stages,
-                SceneConfig(views=options.views, splat=options.config),
-                settings=settings,
-                listener=bar.listener,
-                device=options.device,
-            )
-            scene.expect_any()
-            with stages.lock("avmsf splat"):
-                cloud = scene.cloud
-                gaussians = len(read_splats(cloud.path))
-                if options.output is not None:
-                    copy_whole(cloud.path, options.output)
+        with opened_scene(options, config, command="avmsf splat") as scene:
+            cloud = scene.cloud
+            gaussians = len(read_splats(cloud.path))
+            if options.output is not None:
+                copy_whole(cloud.path, options.output)
     except KeyboardInterrupt:
         say("avmsf splat: interrupted; the same command goes on from where it was")
         return INTERRUPTED

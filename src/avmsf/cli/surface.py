@@ -8,19 +8,15 @@ import trimesh
 from avmsf.bench.pictures import expect_format, save_picture
 from avmsf.bench.surfacepictures import draw_surface
 from avmsf.capture.surface import Surface, SurfaceKind, find_surface, read_surface, write_surface
-from avmsf.capture.together import expect_one_unit
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.scenes import with_seed
 from avmsf.cli.options.surface import Options
 from avmsf.cli.printing import next_command, print_result, say
-from avmsf.cli.scenebar import SceneBar
-from avmsf.cli.scenes import settings_for, stage_line
+from avmsf.cli.scenes import opened_scene, stage_line
 from avmsf.cli.writing import OutputError, expect_writable
 from avmsf.files import write_whole
 from avmsf.pipeline.config import SceneConfig
 from avmsf.pipeline.reconstruct import keep_surface, object_shape
-from avmsf.pipeline.scene import SceneStages
-from avmsf.pipeline.stages import StageFolder
 
 
 def run(options: Options) -> int:
@@ -30,27 +26,14 @@ def run(options: Options) -> int:
     if options.picture is not None:
         expect_format(options.picture)
     kind = "ply" if options.output is None else kind_of(options.output)
-    settings = settings_for(options)
-    expect_one_unit(options.folder, settings)
-    stages = StageFolder(options.kept)
+    config = with_seed(SceneConfig(views=options.views, splat=options.splat), options.seed)
     try:
-        with SceneBar() as bar:
-            scene = SceneStages(
-                options.folder,
-                stages,
-                with_seed(SceneConfig(views=options.views, splat=options.splat), options.seed),
-                settings=settings,
-                listener=bar.listener,
-                device=options.device,
-            )
-            scene.expect_any()
-            with stages.lock("avmsf surface"):
-                kept = keep_surface(stages, *object_shape(find_surface(options.folder, settings), scene))
-                surface = read_surface(kept.path)
-                if options.output is not None:
-                    write_whole(
-                        options.output, lambda place: write_surface(surface, place, kind=kind), raising=OutputError
-                    )
+        with opened_scene(options, config, command="avmsf surface") as scene:
+            given = find_surface(options.folder, scene.settings)
+            kept = keep_surface(scene.stages, *object_shape(given, scene))
+            surface = read_surface(kept.path)
+            if options.output is not None:
+                write_whole(options.output, lambda place: write_surface(surface, place, kind=kind), raising=OutputError)
     except KeyboardInterrupt:
         say("avmsf surface: interrupted; the same command goes on from where it was")
         return INTERRUPTED
