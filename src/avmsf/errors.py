@@ -8,12 +8,41 @@ from pathlib import Path
 from typing import Any
 
 
-class AvmsfError(Exception):
-    """Something the user gave cannot be used; the message says what was expected, what was found and what to do."""
+class _Located(Exception):  # noqa: N818 - warnings have it too
+    """Where the input at fault is, and what it is; None for what does not apply."""
+
+    def __init__(
+        self,
+        message: str = "",
+        *,
+        file: Path | str | None = None,
+        row: int | None = None,
+        name: str | None = None,
+        value: Any = None,
+    ) -> None:
+        super().__init__(message)
+        self.file = None if file is None else Path(file)
+        """The file or folder."""
+        self.row = row
+        """The line of a text file, from 1 with the header, or the index in an array, from 0."""
+        self.name = name
+        """The argument, option, column, key, method or object."""
+        self.value = value
+        """What was found in place of what was expected: a number, a text, a shape, a list of names."""
 
 
-class AvmsfWarning(UserWarning):
-    """Something is not as it should be, and the work goes on; the message says what, and what to do."""
+class AvmsfError(_Located):
+    """Something the user gave cannot be used; the message says what was expected, what was found and what to do.
+
+    The attributes `file`, `row`, `name` and `value` say the same to programs.
+    """
+
+
+class AvmsfWarning(_Located, UserWarning):
+    """Something is not as it should be, and the work continues; the message says what, and what to do.
+
+    The attributes are those of AvmsfError.
+    """
 
 
 class FolderInUseError(AvmsfError):
@@ -23,7 +52,11 @@ class FolderInUseError(AvmsfError):
         self.folder, self.holder, self.advice = folder, holder, advice
         names = ("command", "process", "since")
         who = ", ".join(f"{name} {holder[name]}" for name in names if name in holder) or "it does not say which"
-        super().__init__(f"{folder}: another process writes there ({who}): wait until it has ended{advice}")
+        super().__init__(
+            f"{folder}: another process writes there ({who}): wait until it has ended{advice}",
+            file=folder,
+            value=holder,
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by the arguments: an exception pickles its message alone."""
@@ -31,12 +64,7 @@ class FolderInUseError(AvmsfError):
 
 
 class ArrayError(AvmsfError):
-    """An array given to a function has a shape or values that cannot be used."""
-
-    def __init__(self, message: str, *, name: str = "", row: int | None = None) -> None:
-        super().__init__(message)
-        self.name, self.row = name, row
-        """The argument, and its first row at fault."""
+    """An array given to a function has a shape or values that cannot be used: argument `name`, first index `row`."""
 
 
 class PositionError(ArrayError):
