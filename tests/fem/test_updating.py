@@ -84,7 +84,7 @@ def test_shapes_at_places_not_struck_and_frequencies_come_nearer_to_the_true_one
     before, after = (1.0 - agreement(each, true) for each in (nominal(), modes))
     assert after.mean() < 0.5 * before.mean()
     ratio = [torch.log(each.frequency[:MODES] / true.frequency).std() for each in (nominal(), modes)]
-    assert ratio[1] < 0.4 * ratio[0]
+    assert ratio[1] < 0.5 * ratio[0]
 
 
 def test_a_body_that_is_the_nominal_one_stays_as_it_is():

@@ -1,5 +1,6 @@
 """The elastic family on a plate whose mode shapes are products of cosines: prediction, frequency factors, densities."""
 
+import math
 from dataclasses import replace
 from itertools import product
 
@@ -9,12 +10,13 @@ import torch
 from avmsf.field.gains import elastic as module
 from avmsf.field.gains.elastic import (
     FACTORS,
+    FREQUENCY_ERRORS,
     PERTURBATIONS,
     REACH,
     REMAINDERS,
     WIDTHS,
     Elastic,
-    factor_log_prior,
+    frequency_log_prior,
 )
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, weigh_factors
@@ -23,6 +25,8 @@ from avmsf.field.gains.model import MixtureGains
 from gain_cases import SIZE, families, impacts, measured, plate
 
 SHAPES = 6
+UNCHANGED = len(FACTORS) // 2 * len(FREQUENCY_ERRORS)
+"""Row of the pair of a factor of 1 and the least error."""
 PROFILES = len(PERTURBATIONS) + len(WIDTHS)
 
 
@@ -120,10 +124,10 @@ def test_a_factor_on_all_frequencies_is_found(factor):
     weigh_factors([WeighedFamily.of(each, gains, NOISE_SHARES) for each in given], gains)
     elastic = given[-1]
     assert isinstance(elastic, Elastic)
-    assert float(elastic.factor_weights.sum()) == pytest.approx(1.0)
-    found = FACTORS[elastic.factor_weights.argmax()]
-    # The factors considered are 5 % apart.
-    assert abs(float(torch.log(found / factor))) <= 0.05
+    assert float(elastic.frequency_weights.sum()) == pytest.approx(1.0)
+    found = elastic.factor
+    # The frequencies are exact, and the factors considered 1 % apart.
+    assert abs(math.log(found / factor)) <= 0.01
 
 
 def test_a_fit_finds_the_factor_and_predicts_as_well_with_it():
@@ -133,7 +137,7 @@ def test_a_fit_finds_the_factor_and_predicts_as_well_with_it():
     for each, factor in ((nominal, 1.0), (scaled, 0.75)):
         body = each.families[-1]
         assert isinstance(body, Elastic)
-        assert abs(float(torch.log(FACTORS[body.factor_weights.argmax()] / factor))) <= 0.05
+        assert abs(math.log(body.factor / factor)) <= 0.05
 
 
 def test_gains_tell_the_factor_where_frequencies_do_not():
@@ -144,16 +148,30 @@ def test_gains_tell_the_factor_where_frequencies_do_not():
     gains = replace(measured(sites), frequency=1.3 * progression[:5])
     given = [*families(sites, elastic=False), body]
     weigh_factors([WeighedFamily.of(each, gains, NOISE_SHARES) for each in given], gains)
-    assert abs(float(torch.log(FACTORS[body.factor_weights.argmax()] / 1.3))) <= 0.05
+    assert abs(math.log(body.factor / 1.3)) <= 0.05
 
 
 def test_a_frequency_alone_tells_which_of_two_alike_shapes_a_mode_is():
     """With one contact gains say nothing: the kernels whose center is nearest in frequency are most probable."""
     given = family(1)
-    given.factor_weights = torch.where(torch.arange(len(FACTORS)) == 60, 1.0, 0.0).double()
+    given.frequency_weights = torch.where(torch.arange(len(given.frequency_weights)) == UNCHANGED, 1.0, 0.0).double()
     prior = given.log_prior(torch.log(plate().frequency)).reshape(PROFILES, SHAPES, len(REMAINDERS), SHAPES)
     assert torch.equal(prior[0, :, 0].argmax(0), torch.arange(SHAPES))
     assert torch.equal(prior, prior[:1, :, :1].expand_as(prior))
+
+
+@pytest.mark.parametrize(("scatter", "expected"), [(0.0, 0.01), (0.025, 0.03)])
+def test_all_modes_together_tell_how_exact_the_frequencies_are(scatter, expected):
+    sites = impacts(8, seed=1)
+    gains = measured(sites)
+    offsets = scatter * torch.tensor([1.0, -1.0, 1.0, 1.0, -1.0], dtype=torch.float64)
+    gains = replace(gains, frequency=gains.frequency * offsets.exp())
+    given = families(sites)
+    weigh_factors([WeighedFamily.of(each, gains, NOISE_SHARES) for each in given], gains)
+    elastic = given[-1]
+    assert isinstance(elastic, Elastic)
+    weights = elastic.frequency_weights.reshape(len(FACTORS), -1).sum(0)
+    assert FREQUENCY_ERRORS[int(weights.argmax())] == expected
 
 
 def test_the_density_of_a_measured_frequency_integrates_to_one():
@@ -161,9 +179,9 @@ def test_the_density_of_a_measured_frequency_integrates_to_one():
     given = family(3)
     low, high = torch.log(plate().frequency[[0, -1]]) + torch.tensor([-1.5, 1.5])
     grid = torch.linspace(float(low), float(high), 601, dtype=torch.float64)
-    given.factor_weights = torch.where(torch.arange(len(FACTORS)) == 60, 1.0, 0.0).double()
+    given.frequency_weights = torch.where(torch.arange(len(given.frequency_weights)) == UNCHANGED, 1.0, 0.0).double()
     width = float(grid[-1] - grid[0]) + 0.2
-    total = torch.trapezoid(given.match(grid)[60].exp(), grid) / width
+    total = torch.trapezoid(given.match(grid)[UNCHANGED].exp(), grid) / width
     assert total.tolist() == pytest.approx([1.0 / SHAPES] * SHAPES, rel=1e-3)
     prior = given.log_prior(grid).reshape(PROFILES, SHAPES, len(REMAINDERS), -1)[0, :, 0]
     assert float(torch.trapezoid(prior.exp().sum(0), grid)) / width == pytest.approx(1.0, rel=1e-3)
@@ -177,12 +195,12 @@ def test_shapes_outside_the_measured_range_are_not_expected_in_it():
         shapes=torch.cat([plate().shapes] * 2, dim=1),
     )
     measured_modes = torch.log(plate().frequency)
-    one, other = (Elastic(impacts(3, seed=1), SIZE, body).match(measured_modes)[60] for body in (plate(), more))
+    one, other = (Elastic(impacts(3, seed=1), SIZE, body).match(measured_modes)[UNCHANGED] for body in (plate(), more))
     assert torch.allclose(other[:SHAPES], one, rtol=1e-9)
 
 
 def test_the_factors_prior_is_a_density_of_the_log_factor():
-    density = factor_log_prior().exp()
+    density = frequency_log_prior().exp()[:: len(FREQUENCY_ERRORS)]
     # Its terms leave out the 1 / sqrt(2 pi) that all have in common.
     total = float(torch.trapezoid(density, torch.log(FACTORS))) / (2.0 * torch.pi) ** 0.5
     assert total == pytest.approx(1.0, abs=0.01)

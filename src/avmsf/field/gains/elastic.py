@@ -11,8 +11,10 @@ its share. Shapes nearer in frequency than the perturbation mix freely. Where sh
 broader profile serves, g_kj = exp(-log(f_k / f_j)^2 / 2 w^2) + 1/1000: whatever lies near in frequency.
 
 Which shape a mode is follows from its gains and from its frequency f: given shape k and a factor c on all nominal
-frequencies (the body's material and scale are not known), log f is normal about log(c f_k) with one of several standard
-deviations; under all other families it is uniform over the measured range.
+frequencies (the body's material and scale are not known), log f is normal about log(c f_k); under all other families it
+is uniform over the measured range. Its standard deviation is the same for most modes of a body, one of several, and a
+few modes have another: so the strongest modes together tell how exact the body's frequencies are, and with one or two
+impacts these tell which shape each mode is.
 """
 
 import math
@@ -37,14 +39,18 @@ REACH = 0.15
 """Length of the remainder's kernel over the object's size."""
 _FAR = 1e-3
 """Least weight of a shape in a broad profile."""
-_FREQUENCY_ERRORS = (0.01, 0.03, 0.08, 0.2)
+FREQUENCY_ERRORS = (0.01, 0.03, 0.08, 0.2)
 """Standard deviations of log frequency about the nominal one, equally probable."""
+_EXCEPTIONS = 0.2
+"""Share of the modes whose standard deviation is any of these, not that of the other modes."""
 _MEMORY = 4_000_000
 """Numbers of a basis held at once."""
+_IMPROBABLE = 1e-6
+"""Probability of a factor, over the most probable one's, below which it is left out."""
 _MARGIN = 0.1
 """Log frequency by which the range of measured modes is widened at both ends."""
-FACTORS = torch.exp(torch.arange(-60, 61, dtype=torch.float64) * 0.05)
-"""Factors on the nominal frequencies that are considered."""
+FACTORS = torch.exp(torch.arange(-300, 301, dtype=torch.float64) * 0.01)
+"""Factors on the nominal frequencies that are considered, in steps of the least error."""
 _FACTOR_PRIOR = ((0.5, 0.0, 0.05), (0.15, -0.29, 0.1), (0.15, -1.4, 0.15), (0.2, 0.0, 0.8))
 """Probability, mean and standard deviation of the log factor, relative to aluminum. The square root of Young's modulus
 over density lies within 4 % for glass, ceramics, iron, steel and aluminum, at .75 of it for wood, at .22 to .29 of it
@@ -60,8 +66,8 @@ class Elastic(KernelFamily):
         super().__init__(reference, size)
         # As a file keeps them, so that a field that was read renders what the saved one does.
         self.modes = replace(modes, shapes=modes.shapes.float().double(), perturbations=None)
-        self.factor_weights = torch.softmax(factor_log_prior(), dim=0)
-        """Probability of each of `FACTORS`."""
+        self.frequency_weights = torch.softmax(frequency_log_prior(), dim=0)
+        """Probability of each pair of `FACTORS` and `FREQUENCY_ERRORS`, the pairs of one factor in a row."""
         self._latest: tuple[Sites, Float64[Tensor, "sites shapes"]] | None = None
         self._reach = torch.tensor([REACH * size], dtype=torch.float64)
         apart = torch.log(modes.frequency[:, None] / modes.frequency)
@@ -112,10 +118,16 @@ class Elastic(KernelFamily):
 
         Over the density of a frequency of which nothing is known; averaged over the factors.
         """
-        each = self.match(log_frequency) + self.factor_weights.log()[:, None, None]
         profiles = len(PERTURBATIONS) + len(WIDTHS)
-        shared = torch.logsumexp(each, dim=0)[None, :, None].expand(profiles, -1, len(REMAINDERS), -1)
-        return shared.flatten(0, 2)
+        shared = self.shape_log_prior(log_frequency)[None, :, None]
+        return shared.expand(profiles, -1, len(REMAINDERS), -1).flatten(0, 2)
+
+    def shape_log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "shapes modes"]:
+        """Return the same of each shape."""
+        weights = self.frequency_weights
+        pairs = torch.nonzero(weights > _IMPROBABLE * weights.max()).flatten()
+        each = self.match(log_frequency, pairs=pairs) + weights[pairs].log()[:, None, None]
+        return torch.logsumexp(each, dim=0)
 
     def shape_evidence(self, evidence: Float64[Tensor, "kernels noises series"]) -> Float64[Tensor, "shapes series"]:
         """Return the log evidence of each shape as center, all else being equally probable."""
@@ -123,16 +135,31 @@ class Elastic(KernelFamily):
         each = evidence.reshape(shape).transpose(0, 1).flatten(1, 2)
         return torch.logsumexp(each, dim=1) - math.log(each.shape[1])
 
-    def match(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "factors shapes modes"]:
-        """Return the same for each factor on the nominal frequencies."""
+    @property
+    def factor(self) -> float:
+        """The most probable factor on the nominal frequencies."""
+        return float(FACTORS[self.frequency_weights.reshape(len(FACTORS), -1).sum(1).argmax()])
+
+    def match(
+        self,
+        log_frequency: Float64[Tensor, " modes"],
+        *,
+        pairs: Int[Tensor, " pairs"] | None = None,
+        modes: Int[Tensor, " some"] | None = None,
+    ) -> Float64[Tensor, "pairs shapes some"]:
+        """Return the same for some or all pairs of a factor and an error, as in `frequency_weights`, and some modes."""
         low, high = float(log_frequency.min()) - _MARGIN, float(log_frequency.max()) + _MARGIN
-        nominal = torch.log(FACTORS[:, None] * self.modes.frequency)
+        errors = torch.tensor(FREQUENCY_ERRORS, dtype=torch.float64)
+        pairs = torch.arange(len(FACTORS) * len(errors)) if pairs is None else pairs
+        nominal = torch.log(FACTORS[pairs // len(errors), None] * self.modes.frequency)
         inside = ((nominal > low) & (nominal < high)).sum(1).clamp_min(1).double()
-        error = torch.tensor(_FREQUENCY_ERRORS, dtype=torch.float64)
-        apart = (log_frequency - nominal[..., None])[..., None]
-        normal = torch.exp(-0.5 * (apart / error).square()) / (error * math.sqrt(2.0 * math.pi))
-        density = normal.mean(-1).clamp_min(torch.finfo(torch.float64).tiny)
-        return density.log() - inside.log()[:, None, None] + math.log(high - low)
+        shares = (1.0 - _EXCEPTIONS) * torch.eye(len(errors), dtype=torch.float64) + _EXCEPTIONS / len(errors)
+        constants = torch.log(shares / (errors * math.sqrt(2.0 * math.pi)))[pairs % len(errors)]
+        square = (log_frequency[slice(None) if modes is None else modes] - nominal[..., None]).square_()
+        found = torch.full_like(square, -torch.inf)
+        for error, constant in zip(FREQUENCY_ERRORS, constants.T, strict=True):
+            found = torch.logaddexp(found, square * (-0.5 / error**2) + constant[:, None, None])
+        return found.add_((math.log(high - low) - inside.log())[:, None, None])
 
     @cached_property
     def _known(self) -> Float64[Tensor, "contacts shapes"]:
@@ -152,10 +179,10 @@ class Elastic(KernelFamily):
         return squared_exponential(sites.points, others.points, self._reach)[0] * sites.cosine(others)
 
 
-def factor_log_prior() -> Float64[Tensor, " factors"]:
-    """Return the log density of each log factor before anything is measured."""
+def frequency_log_prior() -> Float64[Tensor, " pairs"]:
+    """Return the log density of the log factor of each pair in `Elastic.frequency_weights` before any measurement."""
     terms = [
         math.log(weight / deviation) - 0.5 * ((torch.log(FACTORS) - mean) / deviation).square()
         for weight, mean, deviation in _FACTOR_PRIOR
     ]
-    return torch.logsumexp(torch.stack(terms), dim=0)
+    return torch.logsumexp(torch.stack(terms), dim=0).repeat_interleave(len(FREQUENCY_ERRORS))

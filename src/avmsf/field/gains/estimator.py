@@ -19,7 +19,7 @@ from avmsf.fem.thickness import search_thickness
 from avmsf.fem.updating import update
 from avmsf.field.config import AUTO, NETWORK, GainModel
 from avmsf.field.gains.bodies import CandidateBodies
-from avmsf.field.gains.elastic import FACTORS, Elastic
+from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.family import KernelFamily, Sites, sites_along
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
 from avmsf.field.gains.mixture import NOISE_SHARES
@@ -368,7 +368,7 @@ def _report(
             "updating_nats": body.updated,
             "refined": body.fine,
             "weight": weight,
-            "frequency_factor": float(FACTORS[family.factor_weights.argmax()]),
+            "frequency_factor": family.factor,
         }
         for body, family, weight in zip(bodies, elastic, weights, strict=True)
     ]

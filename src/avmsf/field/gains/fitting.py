@@ -9,7 +9,7 @@ from jaxtyping import Bool, Complex128, Float32, Float64
 from torch import Tensor
 
 from avmsf.fem.updating import Matched
-from avmsf.field.gains.elastic import FACTORS, Elastic, factor_log_prior
+from avmsf.field.gains.elastic import Elastic, frequency_log_prior
 from avmsf.field.gains.family import KernelFamily
 from avmsf.field.gains.mixture import (
     NOISE_SHARES,
@@ -150,20 +150,22 @@ def total_evidence(families: Sequence[WeighedFamily], measured: MeasuredGains) -
 
 
 def weigh_factors(families: Sequence[WeighedFamily], measured: MeasuredGains) -> None:
-    """Give each elastic family the probabilities of the factors on its frequencies, from the strongest modes.
+    """Give each elastic family the probabilities of factors on its frequencies and of their errors.
+
+    The strongest modes decide.
 
     A mode is a perturbed shape of the body with some frequency, or no shape of it; both parts of its gains share the
-    shape. Given a factor the modes are independent of each other.
+    shape. Given factor and error the modes are independent of each other.
     """
     unknown = _no_shape(families)
     energy = measured.energy * measured.distinct
     rows = torch.topk(energy, min(_STRONGEST, int(measured.distinct.sum()))).indices
     for each in families:
         if isinstance(each.family, Elastic):
-            density = each.family.match(torch.log(measured.frequency))
-            single = torch.logsumexp(density + _shape(each, each.family), dim=1)
-            both = torch.logaddexp(single, unknown)[:, rows]
-            each.family.factor_weights = torch.softmax(both.sum(1) + factor_log_prior(), dim=0)
+            density = each.family.match(torch.log(measured.frequency), modes=rows)
+            single = torch.logsumexp(density + _shape(each, each.family)[:, rows], dim=1)
+            both = torch.logaddexp(single, unknown[rows])
+            each.family.frequency_weights = torch.softmax(both.sum(1) + frequency_log_prior(), dim=0)
 
 
 def matched(families: Sequence[WeighedFamily], elastic: Elastic, measured: MeasuredGains) -> Matched:
@@ -171,12 +173,9 @@ def matched(families: Sequence[WeighedFamily], elastic: Elastic, measured: Measu
     weighed = [*families, WeighedFamily.of(elastic, measured, NOISE_SHARES)]
     total, active = total_evidence(weighed, measured), measured.informative
     # Parts that say nothing of their mode's shape are left out, and each mode counts its frequency once.
-    prior = torch.logsumexp(
-        elastic.match(torch.log(measured.frequency)) + elastic.factor_weights.log()[:, None, None], dim=0
-    )
+    prior = elastic.shape_log_prior(torch.log(measured.frequency))
     joined = torch.cat([prior + _shape(weighed[-1], elastic, active), _no_shape(families, active)[None]])
-    factor = float(FACTORS[elastic.factor_weights.argmax()])
-    return Matched(total, torch.softmax(joined, dim=0)[:-1], math.log(factor))
+    return Matched(total, torch.softmax(joined, dim=0)[:-1], math.log(elastic.factor))
 
 
 def _shape(
