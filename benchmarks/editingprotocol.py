@@ -10,17 +10,20 @@ needs no weights.
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
 
 from avmsf.bench.clap import Clap
 from avmsf.bench.editing import EditScore, judge, write_scores
-from avmsf.bench.editingobjects import REALIMPACT_26, SHAPES, STRANGERS, KnownObject, recorded_objects
+from avmsf.bench.editingobjects import REALIMPACT_26, SHAPES, STRANGERS, KnownObject, PaperFields, recorded_objects
 from avmsf.bench.editmethods import GENERATED, EditMethod, Recast, towards_reference, towards_words
 from avmsf.bench.edittasks import RECORDED_TRANSITIONS, SEVEN_TRANSITIONS, EditTask, prompted_tasks
+from avmsf.capture.datasets.dataset import Dataset
 from avmsf.capture.datasets.recognize import open_dataset
 from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.pipeline.config import DINO, PRESETS
+from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.tasks.config import SteerConfig
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.stableaudio import StableAudio
@@ -60,6 +63,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--generated", type=float, default=GENERATED, help="seconds of a directly generated sound")
     parser.add_argument("--clap", help="CLAP: a name on the hub or a folder; without it, no CLAP score")
     parser.add_argument("--steps", type=int, default=None, help="of each descent; by itself what `avmsf edit` takes")
+    preset = "paper: modes of section 3.4, fields trained as published, its parameters of an edit"
+    parser.add_argument("--preset", choices=("default", "paper"), default="default", help=preset)
+    parser.add_argument("--encoder", default=DINO, help="of --preset paper: DINOv2's name or folder, or descriptors")
+    parser.add_argument("--cache", type=Path, help="folder that keeps Gaussians and features of --preset paper")
     parser.add_argument("--seed", type=int, default=0, help="of all chance")
     parser.add_argument("--record", type=Path, help="JSON file for all scores and the embeddings they rest on")
     parser.add_argument("--figures", type=Path, help="folder for UMAP and CLAP figures, as editingfigures draws them")
@@ -68,6 +75,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error("expected the folder of a dataset or --simulated, one of the two")
     if chosen.model is None and (chosen.clap, chosen.model_seconds, chosen.generated) != (None, None, GENERATED):
         parser.error("--clap, --model-seconds and --generated go with --model, which is not given")
+    paper = chosen.preset == "paper"
+    if paper and (chosen.simulated or chosen.cache is None):
+        parser.error("--preset paper goes with the folder of a dataset and with --cache")
     if chosen.figures is not None and chosen.record is None:
         parser.error("--figures goes with --record, which is not given")
     try:
@@ -78,7 +88,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cast = (
             simulated_cast(words=words, seed=chosen.seed)
             if chosen.simulated
-            else recorded_cast(chosen.dataset, words=words, seed=chosen.seed)
+            else recorded_cast(
+                chosen.dataset, words=words, seed=chosen.seed, paper=(chosen.encoder, chosen.cache) if paper else None
+            )
         )
         report = measure(
             cast,
@@ -88,6 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             generated=chosen.generated,
             seed=chosen.seed,
             record=chosen.record,
+            paper=paper,
         )
         if chosen.figures is not None:
             write_figures(chosen.record, chosen.figures)
@@ -98,8 +111,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def recorded_cast(folder: Path, *, words: bool, seed: int = 0) -> Cast:
-    """Return the objects of RealImpact that are there. Raises AvmsfError where it cannot be read or holds too few."""
+def recorded_cast(folder: Path, *, words: bool, seed: int = 0, paper: tuple[str, Path] | None = None) -> Cast:
+    """Return the objects of RealImpact that are there; `paper` names an encoder and a folder for what it makes.
+
+    Raises AvmsfError where the dataset cannot be read or holds too few.
+    """
     dataset = open_dataset(folder)
     missing = sorted(set(REALIMPACT_26) - set(dataset.objects()))
     if len(REALIMPACT_26) - len(missing) < LEAST:
@@ -108,18 +124,25 @@ def recorded_cast(folder: Path, *, words: bool, seed: int = 0) -> Cast:
             f"are known, expected at least {LEAST}: download more of them, such as {', '.join(missing[:3])}"
         )
     tell(f"editing: extracting modes of {len(REALIMPACT_26) - len(missing)} objects")
-    objects = recorded_objects(dataset)
+    objects = recorded_objects(dataset, paper=None if paper is None else _paper_fields(dataset, *paper))
     present = {each.material for each in objects}
     transitions = [each for each in RECORDED_TRANSITIONS if {each.source, each.target} <= present]
     tasks = prompted_tasks(objects, transitions, seed=seed) if words else tuple(referred_tasks(objects, seed=seed))
     if not tasks:
         pairs = ", ".join(f"{each.source} to {each.target}" for each in RECORDED_TRANSITIONS)
         raise EvaluationError(f"{folder} holds no pair of materials that the protocol leads from and to ({pairs})")
-    what = f"{len(objects)} objects of RealImpact, the nearest microphone, modes extracted from all recordings, gains "
-    what += "by kernels of positions (which 26 objects and which prompts the paper took is not said there, so that "
-    what += "these are ours)"
+    fields = "fields by kernels of positions" if paper is None else f"modes and fields of the paper, encoder {paper[0]}"
+    what = (
+        f"{len(objects)} objects of RealImpact, the nearest microphone, modes extracted from all recordings, {fields} "
+    )
+    what += "(which 26 objects and which prompts the paper took is not said there, so that these are ours)"
     left_out = f"not there, and left out: {', '.join(missing) or 'none'}."
     return Cast("realimpact", objects, tasks, what, known=False, remarks=(left_out,))
+
+
+def _paper_fields(dataset: Dataset, encoder: str, cache: Path) -> PaperFields:
+    looks = ObjectLooks(dataset, cache, paper=replace(PRESETS["paper"].scene.lift, encoder=encoder))
+    return PaperFields(lambda name: looks(name, "paper"))
 
 
 def simulated_cast(*, words: bool, seed: int = 0) -> Cast:
@@ -147,6 +170,7 @@ def measure(
     generated: float = GENERATED,
     seed: int = 0,
     record: Path | None = None,
+    paper: bool = False,
 ) -> Report:
     """Return the table of all methods, mean over edits and by transition.
 
@@ -158,9 +182,11 @@ def measure(
         settings["preview_every"] = max(1, (steps or SteerConfig().steps) // PREVIEWS)
     methods: tuple[EditMethod, ...]
     if model is not None:
-        methods = towards_words(model, settings, generated=generated)
+        methods = towards_words(model, settings, generated=generated, paper=paper)
     else:
-        methods = tuple(each for each in towards_reference(settings) if cast.known or not isinstance(each, Recast))
+        methods = tuple(
+            each for each in towards_reference(settings, paper=paper) if cast.known or not isinstance(each, Recast)
+        )
     scores = judge(cast.tasks, methods, spaces, clap=clap, progress=_tell_score)
     if record is not None:
         write_scores(scores, spaces, record)

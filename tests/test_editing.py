@@ -14,8 +14,10 @@ import torch
 from avmsf.bench.clap import Clap
 from avmsf.bench.editing import judge, spectral_distance, write_scores
 from avmsf.bench.editingobjects import (
+    PUBLISHED,
     REALIMPACT_26,
     KnownObject,
+    PaperFields,
     SolvedShape,
     drawn_size,
     heard_modes,
@@ -40,7 +42,10 @@ from avmsf.capture.datasets.realimpact import SELF_INTERSECTING
 from avmsf.capture.folder import Capture
 from avmsf.errors import AvmsfWarning, EditError, EvaluationError
 from avmsf.modal.bank import ModalBank
+from avmsf.modal.extraction.extract import extract_sounds
+from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.synthesis import synthesize
+from avmsf.scene.features import FeatureField
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
 from avmsf.simulate.material import GLASS, MATERIALS, STEEL, WOOD
@@ -202,6 +207,24 @@ def test_recorded_objects_are_those_there_are():
         recorded_objects(Recorded("59_stand"))
 
 
+def test_the_papers_objects_have_short_time_modes_and_a_trained_network():
+    dataset, asked = Recorded("68_WoodBoard"), []
+
+    def features(name: str) -> FeatureField:
+        asked.append(name)
+        return FeatureField.from_points(plate_impacts(4).contacts)
+
+    config = replace(PUBLISHED, warmup_steps=1, steps=1, clusters=4)
+    (found,) = recorded_objects(dataset, paper=PaperFields(features, config))
+    sounds = plate_impacts(4).sounds
+    modes = extract_sounds(sounds, sample_rate=plate_impacts(4).sample_rate, method=ShortTime())
+    assert torch.equal(found.modes.bank.frequency, modes.bank.frequency)
+    assert asked == []
+    assert found.sound_field.origin.report["gain_model"] == "attention"
+    assert asked == ["68_WoodBoard"]
+    assert float(found.sound_field.residual.magnitude.max()) > 0
+
+
 def leave_out_umap(monkeypatch: pytest.MonkeyPatch) -> None:
     """Judge by plain distances: UMAP takes its time to compile."""
     laid_out = MaterialSpace.of
@@ -218,7 +241,7 @@ def test_the_protocol_of_recorded_objects_runs_without_words(tmp_path, monkeypat
     names = [*_named("ceramic")[:1], *_named("wood")[:7]]
     made = tuple(replace(struck(REALIMPACT_26[name]), name=name) for name in names)
     monkeypatch.setattr(protocol, "open_dataset", lambda folder: Recorded(*names))
-    monkeypatch.setattr(protocol, "recorded_objects", lambda dataset: made)
+    monkeypatch.setattr(protocol, "recorded_objects", lambda dataset, paper: made)
     monkeypatch.setattr(protocol, "RECORDED_TRANSITIONS", RECORDED_TRANSITIONS[:1])
     leave_out_umap(monkeypatch)
     report = protocol.measure(protocol.recorded_cast(tmp_path, words=False), steps=1, record=tmp_path / "scores.json")

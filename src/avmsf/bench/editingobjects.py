@@ -10,24 +10,25 @@ fields know the true shapes.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
 
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float64, Int
 from torch import Tensor
 
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
-from avmsf.field.config import FitConfig
+from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.recipes import GainRecipe
+from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
-from avmsf.modal.extraction.extract import Extraction, extract_modes
+from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_sounds
+from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.residual import Residual
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import farthest_points
@@ -75,6 +76,25 @@ _SMALLEST, _LARGEST = 0.7, 1.4
 """Factors on the size that a shape is drawn in."""
 _FAINTEST_DB = -60.0
 """Energy of a mode over the loudest one's, decibels, below which nobody hears it."""
+DIRECT = FitConfig(steps=0, damping="shared", residual=False)
+"""Settings of a field without training end to end and without residual noise, which no edit changes."""
+PUBLISHED = replace(PAPER, damping="shared")
+"""The paper's field. Its damping is not chosen: the five recordings of an object leave nothing to choose by."""
+
+
+@dataclass(frozen=True, eq=False)
+class PaperFields:
+    """Objects as the paper reconstructs them: modes of section 3.4, and the attention network with residual noise."""
+
+    features: Callable[[str], FeatureField]
+    """Makes the visual features of an object, by its name."""
+    config: FitConfig = PUBLISHED
+    """Settings of the fit."""
+
+    def object(self, name: str, material: str, impacts: Impacts) -> "KnownObject":
+        """Return an object of a name. Raises ExtractionError where no mode is found."""
+        modes = extract_sounds(impacts.sounds, sample_rate=impacts.sample_rate, method=ShortTime())
+        return KnownObject(name, material, impacts, modes, Attention(), partial(self.features, name), self.config)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +107,11 @@ class KnownObject:
     modes: Extraction
     """True or extracted, row for row of the impacts."""
     recipe: GainRecipe = field(default_factory=MixtureEstimator)
-    """How its field spreads the gains."""
-    points: Float[Tensor, "points 3"] | None = None
-    """Of its surface, meters; the contacts alone where nothing else is known."""
+    """The gain model of its field."""
+    features: Callable[[], FeatureField] | None = None
+    """Makes the points of its surface with what the gain model reads; the contacts alone where nothing is known."""
+    config: FitConfig = DIRECT
+    """Settings of its field."""
 
     @property
     def bank(self) -> ModalBank:
@@ -98,10 +120,9 @@ class KnownObject:
 
     @cached_property
     def sound_field(self) -> SoundField:
-        """Its field, without training end to end."""
-        features = FeatureField.from_points(self.impacts.contacts if self.points is None else self.points)
-        config = FitConfig(steps=0, damping="shared", residual=False)
-        return fit(self.impacts, features, self.modes, config, gains=self.recipe, capture=self.name)
+        """Its field."""
+        features = FeatureField.from_points(self.impacts.contacts) if self.features is None else self.features()
+        return fit(self.impacts, features, self.modes, self.config, gains=self.recipe, capture=self.name)
 
 
 def heard_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = math.inf) -> ModalBank:
@@ -119,9 +140,12 @@ def heard_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = mat
     return ModalBank(bank.frequency[kept], bank.damping[kept])
 
 
-def recorded_objects(dataset: Dataset, materials: Mapping[str, str] = REALIMPACT_26) -> tuple[KnownObject, ...]:
+def recorded_objects(
+    dataset: Dataset, materials: Mapping[str, str] = REALIMPACT_26, *, paper: PaperFields | None = None
+) -> tuple[KnownObject, ...]:
     """Read objects of a dataset by name and material, and extract their modes from all of their recordings.
 
+    Modes and fields are those of the default, fitted without training, or the `paper`'s.
     Objects that the dataset does not hold are left out, so that a part of it will do. Raises DatasetError and
     ExtractionError as reading and extracting do, and EvaluationError where the dataset has none of them.
     """
@@ -134,7 +158,11 @@ def recorded_objects(dataset: Dataset, materials: Mapping[str, str] = REALIMPACT
     found = []
     for name in held:
         impacts = dataset.capture(name).impacts
-        found.append(KnownObject(name, materials[name], impacts, extract_modes(impacts)))
+        found.append(
+            KnownObject(name, materials[name], impacts, extract_modes(impacts))
+            if paper is None
+            else paper.object(name, materials[name], impacts)
+        )
     return tuple(found)
 
 
@@ -196,7 +224,8 @@ class SolvedShape:
         modes = Extraction(bank, -amplitudes.imag.float(), Residual(level), amplitudes.real.float())
         bodies = NominalBodies((NominalBody(None, elastic),), {})
         recipe = MixtureEstimator(bodies=CandidateBodies(bodies))
-        return KnownObject(name, material.name, impacts, modes, recipe, elastic.nodes[self._spread])
+        features = partial(FeatureField.from_points, elastic.nodes[self._spread])
+        return KnownObject(name, material.name, impacts, modes, recipe, features)
 
     @cached_property
     def _spread(self) -> Int[Tensor, " points"]:

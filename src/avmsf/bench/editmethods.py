@@ -18,11 +18,11 @@ from avmsf.errors import EvaluationError
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import extract_sounds
-from avmsf.modal.extraction.finders import HighResolution
+from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
 from avmsf.simulate.material import MATERIALS
 from avmsf.tasks.config import DistillationConfig, SteerConfig
 from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation
-from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, SEARCHED, Parameterisation
+from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, PUBLISHED, SEARCHED, Parameterisation
 from avmsf.tasks.recast import recast
 from avmsf.tasks.steer import Guide, SteerProgress, steer
 
@@ -128,6 +128,8 @@ class Generation:
 
     model: TextToAudio
     seconds: float = GENERATED
+    finder: ModeFinder = field(default_factory=HighResolution)
+    """How modes are found in the sound."""
     name: str = "generation"
 
     def edit(self, task: EditTask) -> Edited:
@@ -136,22 +138,23 @@ class Generation:
         made = self.model.generate(task.words(), seconds=self.seconds, seed=task.seed).double().cpu()
         recording = Recording(f"generated from {task.words()!r}", made[None].numpy(), rate, "FLOAT")
         sound = torch.from_numpy(np.array(prepare(recording, CaptureSettings()).sound))[None]
-        modes = extract_sounds(sound, sample_rate=rate, method=HighResolution())
+        modes = extract_sounds(sound, sample_rate=rate, method=self.finder)
         bank = heard_modes(modes.bank, torch.complex(modes.gains.double(), modes.quadrature.double()))
         return Edited(bank, sound.float(), rate)
 
 
-def towards_reference(config: Mapping[str, Any] | None = None) -> tuple[EditMethod, ...]:
+def towards_reference(config: Mapping[str, Any] | None = None, *, paper: bool = False) -> tuple[EditMethod, ...]:
     """Return the methods of the protocol without words.
 
-    As it was; every mode by itself, from there and from where our search ends; ours; and the laws of elasticity.
+    As it was; every mode by itself, from there and from where our search ends; ours, or the `paper`'s parameters; and
+    the laws of elasticity.
     """
-    settings = config or {}
+    settings, parameters = config or {}, PUBLISHED if paper else HIERARCHICAL
     return (
         Untouched(),
         Steered("unconstrained", _reference, INDEPENDENT, settings),
         Steered("searched", _reference, SEARCHED, settings),
-        Steered("hierarchical", _reference, HIERARCHICAL, settings),
+        Steered(parameters.name, _reference, parameters, settings),
         Recast(),
     )
 
@@ -162,10 +165,12 @@ def towards_words(
     *,
     distillation: DistillationConfig | None = None,
     generated: float = GENERATED,
+    paper: bool = False,
 ) -> tuple[EditMethod, ...]:
     """Return the methods of the paper's table: as it was, generation (of a model that can), Audio-SDS, and ours.
 
-    `config` are settings of `SteerConfig`; `generated` is how many seconds direct generation makes.
+    `config` are settings of `SteerConfig`; `generated` is how many seconds direct generation makes. The `paper`'s form
+    has its parameters of an edit, and its extraction from generated sounds.
     """
 
     def guide(task: EditTask) -> Guide:
@@ -173,12 +178,14 @@ def towards_words(
         return DecoderDistillation(model, task.words(), sample_rate=rate, config=distillation)
 
     settings = config or {}
-    generation = (Generation(model, generated),) if isinstance(model, TextToAudio) else ()
+    finder: ModeFinder = ShortTime() if paper else HighResolution()
+    parameters = PUBLISHED if paper else HIERARCHICAL
+    generation = (Generation(model, generated, finder),) if isinstance(model, TextToAudio) else ()
     return (
         Untouched(),
         *generation,
         Steered("audio-sds", guide, INDEPENDENT, settings),
-        Steered("hierarchical", guide, HIERARCHICAL, settings),
+        Steered(parameters.name, guide, parameters, settings),
     )
 
 
