@@ -17,7 +17,7 @@ def record_of(example: _Record, values: Any, name: str) -> _Record:
     examples = {each.name: getattr(example, each.name) for each in fields(example)}  # type: ignore[arg-type]
     if values.keys() != examples.keys():
         differing = ", ".join(sorted(values.keys() ^ examples.keys()))
-        raise ValueError(f"{name} lacks or adds {differing}")
+        raise ValueError(f"{name}: missing or unknown {differing}")
     return type(example)(**{each: like(value, examples[each], f"{name}.{each}") for each, value in values.items()})
 
 
@@ -28,12 +28,12 @@ def like(value: Any, example: Any, name: str) -> Any:
     if isinstance(example, float) and type(value) is int and abs(value) <= sys.float_info.max:
         return float(value)
     if type(value) is not type(example):
-        raise TypeError(f"{name} is {value!r}, not of type {type(example).__name__}")
+        raise TypeError(f"{name}: expected {type(example).__name__}, got {value!r}")
     return value
 
 
 def count_of(value: Any, name: str, *, least: int = 1) -> int:
     """Return a whole number of `least` or more. Raises TypeError or ValueError for what is none."""
     if like(value, 1, name) < least:
-        raise ValueError(f"{name} is {value}")
+        raise ValueError(f"{name}: expected {least} or more, got {value}")
     return int(value)
