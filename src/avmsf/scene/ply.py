@@ -253,7 +253,7 @@ def _text_table(path: Path, content: bytes, before: tuple[_Element, ...], vertic
 
 def _short(path: Path, found: int, expected: int) -> SceneError:
     return SceneError(
-        f"{path}: expected {expected} vertices, got {found}; the file is truncated: copy or export it again",
+        f"{path}: expected {expected} vertices, got {found}; the file is truncated; copy or export it again",
         file=path,
         row=found,
         value=found,
