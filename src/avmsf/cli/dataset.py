@@ -20,9 +20,7 @@ def run(options: Options) -> int:
         print_json(asdict(report))
     readable = sum(_readable(each) for each in report.objects)
     if not readable:
-        say(
-            f"avmsf dataset: {options.dataset}: expected a readable object, found none; fix the listed problems"
-        )
+        say(f"avmsf dataset: {options.dataset}: expected a readable object, found none; fix the listed problems")
         return UNREADABLE
     recordings = sum(each.recordings for each in report.objects)
     screen.print(
