@@ -235,8 +235,8 @@ class Places:
         if not least <= wanted < len(self.rows):
             raise EvaluationError(
                 f"expected {least} to {len(self.rows) - 1} training contacts of "
-                f"{counted(self.recordings, 'recording')} at {counted(len(self.rows), 'contact')}, got {wanted}; choose "
-                "another number or record more contacts",
+                f"{counted(self.recordings, 'recording')} at {counted(len(self.rows), 'contact')}, got {wanted}; "
+                "choose another number or record more contacts",
                 name="count",
                 value=wanted,
             )

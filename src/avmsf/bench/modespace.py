@@ -240,7 +240,7 @@ class MaterialSpace:
             apart = float(np.abs(np.asarray(model.embedding_) - self.stored).max())
             if not apart <= _TOLERANCE:
                 raise EvaluationError(
-                    f"expected the recomputed embedding within {_TOLERANCE:g} of the stored, got {apart:.3g}; "
+                    f"expected the embedding within {_TOLERANCE:g} of the stored one, got {apart:.3g}; "
                     f"install {', '.join(f'{name} {each}' for name, each in self.versions)}, or compute the space again",
                     name="embedding",
                     value=apart,
