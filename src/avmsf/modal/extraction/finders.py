@@ -179,7 +179,7 @@ def finder_named(method: ExtractionMethod, modes: int) -> ModeFinder:
 def expect_modes(modes: int) -> None:
     """Raise `ExtractionError` unless at least one mode is asked for."""
     if modes < 1:
-        raise ExtractionError(f"modes = {modes}: expected 1 or more, the most that are kept")
+        raise ExtractionError(f"modes: expected 1 or more, got {modes}", name="modes", value=modes)
 
 
 def lowest_frequency(samples: int, sample_rate: float) -> float:
