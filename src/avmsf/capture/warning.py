@@ -1,4 +1,4 @@
-"""The one warning of this floor: the capture can be read, and its owner should know something about it."""
+"""The one warning of this package: the capture can be read, but something in it looks wrong."""
 
 from avmsf.errors import AvmsfWarning
 
