@@ -9,16 +9,16 @@ from avmsf.errors import CaptureError
 
 @dataclass(frozen=True)
 class Location:
-    """A file, or one item in it."""
+    """A file, one item in it, or an item alone."""
 
-    file: Path | str
+    file: Path | str | None
     row: int | None = None
     """Line of a table from 1, or index in a list from 0."""
     item: str = ""
     """What messages call it: "row 3", "frame 0", "image left.png"."""
 
     def __str__(self) -> str:
-        return f"{self.file}, {self.item}" if self.item else str(self.file)
+        return ", ".join(str(part) for part in (self.file, self.item) if part)
 
     def error(self, message: str, *, name: str | None = None, value: Any = None) -> CaptureError:
         """Return an error about what is there."""

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from avmsf.capture.mesh_file import expect_corners, expect_finite_vertices, load_parts
 from avmsf.capture.surface import Surface
-from avmsf.capture.warning import CaptureWarning
+from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
 
 GRAY = 0.7
@@ -131,8 +131,8 @@ def read_textured_mesh(path: str | Path, *, meters: float = 1.0) -> TexturedMesh
         )
     except CaptureError as error:
         raise CaptureError(f"{path}: {error}", file=path, row=error.row, name=error.name, value=error.value) from error
-    for message, name, value in remarks:
-        warnings.warn(CaptureWarning(f"{path}: {message}", file=path, name=name, value=value), stacklevel=2)
+    for remark in remarks:
+        warnings.warn(remark.about(path), stacklevel=2)
     return mesh
 
 
@@ -162,11 +162,10 @@ class _Paint:
     colors: np.ndarray
     coordinates: np.ndarray
     texture: np.ndarray
-    remark: tuple[str, str, str | None] | None = None
-    """Message, name and value of a warning."""
+    remark: Remark | None = None
 
 
-_COLORLESS = ("has neither texture nor colors; it is rendered gray", "colors", None)
+_COLORLESS = Remark("has neither texture nor colors; it is rendered gray", name="colors")
 
 
 def _paint(part: trimesh.Trimesh, lacking: dict[str, str]) -> _Paint:
@@ -189,15 +188,15 @@ def _paint(part: trimesh.Trimesh, lacking: dict[str, str]) -> _Paint:
         try:
             texture = np.array(image.convert("RGB"))
         except (OSError, SyntaxError, ValueError) as error:  # what Pillow raises for images that are cut or corrupt
-            message = f"its texture cannot be read ({error}); it is rendered gray"
-            return _Paint(gray, nowhere, white, (message, "texture", None))
+            remark = Remark(f"its texture cannot be read ({error}); it is rendered gray", name="texture")
+            return _Paint(gray, nowhere, white, remark)
         coordinates = np.nan_to_num(np.asarray(visual.uv, dtype=np.float64)[faces])
         tint = np.asarray([255.0] * 3 if factor is None else factor, dtype=np.float64)[:3] / 255.0
         return _Paint(np.broadcast_to(tint, gray.shape).copy(), coordinates, texture)
     name = str(getattr(material, "name", ""))
     if name in lacking:
         message = f"its texture {lacking[name]} is missing; the part is rendered gray"
-        return _Paint(gray, nowhere, white, (message, "texture", lacking[name]))
+        return _Paint(gray, nowhere, white, Remark(message, name="texture", value=lacking[name]))
     if factor is None and "kd" not in getattr(material, "kwargs", {}):
         return _Paint(gray, nowhere, white, _COLORLESS)
     tint = np.asarray(material.main_color, dtype=np.float64)[:3] / 255.0
