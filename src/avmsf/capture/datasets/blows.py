@@ -93,7 +93,7 @@ def gather(
         before=cut.before,
         after=cut.after,
     )
-    remarks += cut.remarks + _repeated(impacts) + _misplaced(impacts, surface, origin=origin)
+    remarks += [str(each) for each in cut.remarks] + _repeated(impacts) + _misplaced(impacts, surface, origin=origin)
     if remarks:
         warnings.warn(CaptureWarning(f"{origin}: {listed(remarks)}", name=origin, value=tuple(remarks)), stacklevel=3)
     return Capture(name, impacts, surface)
