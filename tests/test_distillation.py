@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import pytest
 import torch
 
-from avmsf.errors import EditError
+from avmsf.errors import AvmsfWarning, EditError
 from avmsf.tasks.clips import level, levelled
 from avmsf.tasks.config import DistillationConfig, SteerConfig
 from avmsf.tasks.distillation import AudioDiffusion, DecoderDistillation, noised, partial_denoising

@@ -288,11 +288,11 @@ def bank_of(extraction: Extraction) -> tuple[torch.Tensor, torch.Tensor]:
 def test_nothing_can_be_started_from_nothing():
     train, _ = parts()
     generator = torch.Generator()
-    with raises(FitError):
+    with raises(FitError, name="modes", value=0):
         random_modes(train, modes=0, bins=17, generator=generator)
-    with raises(FitError):
+    with raises(FitError, name="bins", value=1):
         random_modes(train, modes=3, bins=1, generator=generator)
-    with raises(FitError):
+    with raises(FitError, name="train", value=100):
         random_modes(replace(train, sounds=train.sounds[:, :100]), modes=3, bins=17, generator=generator)
 
 

@@ -241,7 +241,7 @@ class MaterialSpace:
             if not apart <= _TOLERANCE:
                 raise EvaluationError(
                     f"expected the embedding within {_TOLERANCE:g} of the stored one, got {apart:.3g}; "
-                    f"install {', '.join(f'{name} {each}' for name, each in self.versions)}, or compute the space again",
+                    f"install {', '.join(f'{name} {each}' for name, each in self.versions)}, or compute it again",
                     name="embedding",
                     value=apart,
                 )
