@@ -12,6 +12,7 @@ from avmsf.bench.evaluation import Scores
 from avmsf.bench.pictures import draw_gains, draw_modes, draw_scores, draw_spectrograms, save_picture
 from avmsf.errors import EvaluationError
 from avmsf.modal.bank import ModalBank
+from raising import raises
 
 BANK = ModalBank(
     torch.tensor([200.0, 1000.0, 1010.0], dtype=torch.float64), torch.tensor([2.0, 10.0, 20.0], dtype=torch.float64)
@@ -103,5 +104,5 @@ def test_a_picture_has_the_format_that_its_name_says(tmp_path: Path) -> None:
     for name, start in (("a.png", b"\x89PNG"), ("a.PDF", b"%PDF"), ("deep/a.svg", b"<?xml")):
         save_picture(figure, tmp_path / name)
         assert (tmp_path / name).read_bytes().startswith(start)
-    with pytest.raises(EvaluationError, match=r"ends in .png, .pdf or .svg, found .jpeg"):
+    with raises(EvaluationError, value=".jpeg"):
         save_picture(figure, tmp_path / "a.jpeg")

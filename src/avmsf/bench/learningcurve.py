@@ -51,9 +51,11 @@ def curves(record: ObjectRecord, *, metric: str) -> tuple[Curve, ...]:
         known = sorted({name for outcome in record.outcomes for name in outcome.values})
         reason = next((each.failure for each in record.outcomes if each.failure), record.failure)
         raise EvaluationError(
-            f"{record.identifier}: no method has the metric {metric!r}; there are {', '.join(known)}"
+            f"{record.identifier}: expected a metric of {', '.join(known)}, got {metric!r}"
             if known
-            else f"{record.identifier}: {reason or 'nothing was measured'}"
+            else f"{record.identifier}: {reason or 'nothing was measured'}",
+            name="metric",
+            value=metric,
         )
     return tuple(_curve(method, by_count) for method, by_count in found.items())
 

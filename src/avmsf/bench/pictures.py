@@ -41,7 +41,9 @@ def expect_format(path: Path) -> str:
     ending = path.suffix.lower().lstrip(".")
     if ending not in FORMATS:
         raise EvaluationError(
-            f"{path}: a picture's name ends in .png, .pdf or .svg, found {path.suffix or 'no ending'}"
+            f"{path}: expected a name that ends in .png, .pdf or .svg, got {path.suffix or 'no ending'}",
+            file=path,
+            value=path.suffix,
         )
     return ending
 

@@ -137,4 +137,6 @@ def protocol_named(name: str) -> EvaluationProtocol:
         return PROTOCOLS[name]
     near = difflib.get_close_matches(name, PROTOCOLS, n=1)
     guess = f"; did you mean {near[0]}?" if near else ""
-    raise EvaluationError(f"no protocol is called {name!r}: there are {', '.join(PROTOCOLS)}{guess}")
+    raise EvaluationError(
+        f"expected a protocol of {', '.join(PROTOCOLS)}, got {name!r}{guess}", name="protocol", value=name
+    )

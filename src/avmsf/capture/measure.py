@@ -70,16 +70,16 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         not np.array_equal(recording.channel(each), response) for each in others
     ):
         problems.append(
-            f"its channels hold one sound, up to a constant factor and rounding: channel {channel} is read; to choose "
+            f"its channels hold one sound, up to a constant factor and rounding: channel {channel} is used; to choose "
             "another, write response_channel in capture.toml"
         )
     if clipped:
         problems.append(f"{counted(clipped, 'clipped sample')}: turn the gain down and record it again")
     if second is not None:
-        problems.append(f"a second blow at {second / rate:.3f} s: record it again, or keep fewer seconds")
+        problems.append(f"a second impact at {second / rate:.3f} s: record it again, or reduce seconds")
     if noise > HIGHEST_NOISE_DB:
         problems.append(
-            f"never quieter than {-noise:.0f} dB below the peak: noise, no clear blow, or cut while it still rings"
+            f"its noise is only {-noise:.0f} dB below the peak: noisy, no clear impact, or cut before it has decayed"
         )
     if recording.subtype in EIGHT_BIT:
         problems.append(f"only 8 bits a sample ({recording.subtype}): its noise hides the decay; record 16 or more")
