@@ -84,10 +84,8 @@ def test_blows_on_another_object_are_left_out_and_refused_where_there_are_no_oth
 def test_a_channel_that_is_silent_is_refused_as_such(locator):
     sound, _ = overlapping([0.1], [1.0], seed=33)
     two = Recording("two.wav", np.stack([np.zeros(len(sound)), sound.double().numpy()]), RATE, "FLOAT")
-    with pytest.raises(LocationError) as caught:
+    with raises(LocationError, file="two.wav", value=0.0):
         locate_blows(true_field(), two, settings=CaptureSettings(response_channel=1), locator=locator)
-    assert "two.wav" in str(caught.value)
-    assert "silen" in str(caught.value)
 
 
 def test_settings_count_as_for_one_blow(locator):

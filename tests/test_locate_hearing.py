@@ -118,9 +118,10 @@ def test_samples_without_a_sound_are_refused(samples, name, value):
     ids=["noise", "hum"],
 )
 def test_sounds_that_neither_rise_nor_fall_are_refused(samples):
-    with pytest.raises(LocationError) as caught:
+    with raises(LocationError, file="the recording") as caught:
         hear(samples, true_field())
-    assert "6 dB" in str(caught.value)
+    # Decibels between the loudest and the quietest part.
+    assert 0.0 <= caught.value.value < 6.0
 
 
 def test_samples_of_several_channels_and_impossible_rates_are_refused():
@@ -138,10 +139,8 @@ def test_samples_of_several_channels_and_impossible_rates_are_refused():
 def test_channels_follow_the_capture_where_the_recording_has_them():
     one = recorded(struck(1, seed=25).sounds[0]).channels[0]
     two = Recording("hit.wav", np.stack([0.1 * one[::-1], one]), RATE, "FLOAT")
-    with pytest.raises(LocationError) as caught:
+    with raises(LocationError, file="hit.wav", name="response_channel", value=2):
         hear(two, true_field())
-    assert "hit.wav" in str(caught.value)
-    assert "response_channel" in str(caught.value)
     settings = CaptureSettings(response_channel=2, highpass=30.0)
     assert abs(hear(two, true_field(), settings=settings).onset - 1800) <= 8
     # What the field was fitted to was read so, though from its first sample on: a blow is sought all the same.

@@ -142,7 +142,7 @@ def as_recording(
 
 def location_error(error: AvmsfError) -> LocationError:
     """Return an error of a recording, with its attributes, as a LocationError."""
-    return LocationError(str(error), file=error.file, row=error.row, name=error.name, value=error.value)
+    return LocationError(str(error), **error.attributes)
 
 
 def too_short(recording: str | None, samples: int, least: int, sample_rate: float) -> LocationError:
