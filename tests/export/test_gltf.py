@@ -172,9 +172,8 @@ def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colors(tmp_path, m
     high = few.vertices[:, 2] > 0.05
     np.testing.assert_allclose(few.colors[high], torch.tensor([[1.0, 0.0, 0.0]]).expand(int(high.sum()), 3), atol=0.01)
     monkeypatch.setattr("avmsf.capture.mesh_file.MAX_FACES", 5000)
-    with pytest.raises(CaptureError) as caught:
+    with raises(CaptureError, file="ball.ply", value=5120):
         read_look(tmp_path / "ball.ply", table())
-    assert all(each in str(caught.value) for each in ("ball.ply", "5,000", "5,120"))
 
 
 def test_another_ending_and_anothers_file_are_refused(tmp_path):

@@ -150,18 +150,15 @@ def test_what_cannot_vibrate_or_is_in_another_unit_is_refused():
     good = box(LENGTH, WIDTH, HEIGHT)
     with raises(FitError, name="surface_unit", value=pytest.approx(1000 * LENGTH)):
         guess_field(Surface(good.vertices * 1000, good.faces), "steel")
-    with pytest.raises(SimulationError) as caught:
+    with raises(SimulationError, name="material", value="kryptonite"):
         guess_field(good, "kryptonite")
-    assert "kryptonite" in str(caught.value)
     corners = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.1, 0.0], [0.0, 0.1, 0.0]])
     sheet = Surface(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]))
     with raises(SimulationError, name="wall"):
         guess_field(sheet, "steel")
     tiny = box(0.012, 0.004, 0.003, cuts=(6, 2, 2))
-    with pytest.raises(SimulationError) as caught:
+    with raises(SimulationError, name="frequency"):
         guess_field(tiny, "steel", body=QUICK, modes=6)
-    assert caught.value.name != "wall"
-    assert "Hz" in str(caught.value)
 
 
 def test_recordings_are_not_passed_over(tmp_path: Path):
