@@ -57,29 +57,29 @@ REALIMPACT_26: Mapping[str, str] = MappingProxyType(
 )
 """Materials of 26 objects of RealImpact by their names. The paper evaluates on 26 and names none: the choice is ours.
 
-It is of those whose own name tells the material, the first seven of each by number, iron and metal as one, without the
-meshes that intersect themselves. Of glass there is one."""
+Those whose name contains the material, the first seven of each by number, iron and metal as one, without
+self-intersecting meshes. There is one of glass."""
 
 SHAPES = ("bowl", "mug", "plate", "pot")
-"""Kinds of the simulated objects that the clusters are made of."""
+"""Kinds of the simulated objects in the clusters."""
 STRANGERS = ("goblet", "tray")
-"""Kinds of those that are edited and referred to: no other object of the same shape is in any cluster."""
+"""Kinds of the edited objects and of the references: no cluster has an object of the same shape."""
 POISSON = 0.27
 _MODES = 40
 """Lowest elastic modes of each shape."""
 _CONTACTS, _POINTS = 16, 400
-"""Struck to be recorded, and all that an edit may strike."""
+"""Recorded contacts, and all contacts of an edit."""
 _MICROPHONE = (0.45, -0.35, 0.4)
 """From the middle of the object, meters."""
 _SMALLEST, _LARGEST = 0.7, 1.4
 """Factors on the size that a shape is drawn in."""
 _FAINTEST_DB = -60.0
-"""Energy of a mode over the loudest one's, decibels, below which nobody hears it."""
+"""Energy relative to the strongest mode's, decibels, below which a mode is inaudible."""
 
 
 @dataclass(frozen=True, eq=False)
 class KnownObject:
-    """An object of a known material, what was heard of it, and its modes."""
+    """An object of a known material, its recordings, and its modes."""
 
     name: str
     material: str
@@ -87,13 +87,13 @@ class KnownObject:
     modes: Extraction
     """True or extracted, row for row of the impacts."""
     recipe: GainRecipe = field(default_factory=MixtureEstimator)
-    """How its field spreads the gains."""
+    """Gain model of its field."""
     points: Float[Tensor, "points 3"] | None = None
-    """Of its surface, meters; the contacts alone where nothing else is known."""
+    """Of its surface, meters; by default the contacts."""
 
     @property
     def bank(self) -> ModalBank:
-        """Those of its modes that are heard."""
+        """Its audible modes."""
         return heard_modes(self.modes.bank, torch.complex(self.modes.gains.double(), self.modes.quadrature.double()))
 
     @cached_property

@@ -1,4 +1,4 @@
-"""All that is measured of one method's sounds: the convention's metrics, CDPAM, and modes against the truth."""
+"""The metrics of one method's sounds: the convention's, CDPAM, and those of its modes against the ground truth."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -21,27 +21,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What one method's sounds of the test contacts are worth."""
+    """Metrics of one method's sounds at the test contacts."""
 
     values: dict[str, tuple[float | None, ...]]
-    """Each metric's figure for every test contact; None where it was not taken."""
+    """Each metric's value for every test contact; None where it was not computed."""
     figures: dict[str, float | None]
-    """Figures that are of all test contacts at once."""
+    """Values over all test contacts."""
 
 
 @dataclass(frozen=True)
 class Judging:
-    """What is measured."""
+    """Which metrics are computed."""
 
     convention: Convention = PAPER
     level: Literal["full-scale", "raw"] = "full-scale"
-    """full-scale: all sounds of an object by one factor, so that its loudest recording peaks at one, the scale on which
-    L1, ENV and CDPAM of different objects can be averaged. A choice of unit that no
-    method sees. raw: in the unit of the recordings, such as pascals per newton."""
+    """full-scale: all sounds of an object times one factor, so that its loudest recording has a peak of one and L1, ENV
+    and CDPAM of different objects can be averaged; methods do not depend on it. raw: in the unit of the recordings,
+    such as pascals per newton."""
     cdpam: bool = True
-    """Whether CDPAM is among the metrics; it takes the longest of them."""
+    """Whether to compute CDPAM, the slowest metric."""
     cdpam_contacts: int = 8
-    """Test contacts of a case, spread evenly over them, that CDPAM is taken of; 0 for all."""
+    """Number of test contacts per case, evenly spaced, at which CDPAM is computed; 0 for all."""
 
     def __post_init__(self) -> None:
         if self.cdpam_contacts < 0:
@@ -65,7 +65,7 @@ class Judging:
         *,
         loudest: float,
     ) -> Judgement:
-        """Measure what `renderer` made of the test contacts; `truth`, where known, has the rows of `test`.
+        """Compute the metrics of `renderer` at the test contacts; `truth`, if known, has the rows of `test`.
 
         Its time counts from the first sample of the recordings, as the renderer's does (`truth_from_first_sample`).
         `loudest` is the peak of the object's loudest recording, in the unit of the recordings. Raises as `score`, and

@@ -1,4 +1,4 @@
-"""All methods by name: what turns an object's training blows into a renderer."""
+"""All methods by name; a method fits a renderer to an object's training recordings."""
 
 import difflib
 import hashlib
@@ -27,18 +27,18 @@ from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.finders import ShortTime
 
 NEIGHBORS = 3
-"""Nearest strikes that are averaged (the paper's KNN), or all where there are fewer."""
+"""Number of nearest recordings that are averaged (the paper's KNN), or all where there are fewer."""
 _RECORDED = "recorded:"
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """A method that needs no training worth the name."""
+    """A method without training."""
 
     name: str
-    """What tables call it."""
+    """Name in tables."""
     make: Callable[[Task], Renderer] = field(repr=False)
-    """Makes the renderer from the task's training blows."""
+    """Makes the renderer from the task's training recordings."""
 
     def fit(self, task: Task) -> Renderer:
         """Make the renderer. Raises AvmsfError where it cannot."""
@@ -47,7 +47,7 @@ class Baseline:
 
 @dataclass(frozen=True)
 class RecordedMethod:
-    """Another system, by the wav files that it made: FOLDER/OBJECT/RECORDING.wav, as `Recorded` reads them."""
+    """Another system, by its wav files: FOLDER/OBJECT/RECORDING.wav, as `Recorded` reads them."""
 
     folder: Path
     """Holds a folder of sounds for every object."""

@@ -1,4 +1,4 @@
-"""Many objects, one after the other or many at a time on ray: the same figures either way."""
+"""Evaluation of many objects, sequentially or in parallel on ray, with the same results."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -15,10 +15,10 @@ from avmsf.errors import EvaluationError
 
 @dataclass(frozen=True)
 class Workers:
-    """Who computes."""
+    """Processes that compute."""
 
     count: int = 1
-    """Objects at a time on this computer; with 1 and no address, ray is not needed."""
+    """Number of parallel objects on this computer; with 1 and no address, ray is not needed."""
     address: str | None = None
     """A ray cluster's address, or `auto`; its computers must see data and results under the same paths."""
 
@@ -29,12 +29,12 @@ class Workers:
 
 @dataclass(frozen=True)
 class RunProgress:
-    """How far an evaluation is."""
+    """Progress of an evaluation."""
 
     words: str
     """The stage that has begun or ended."""
     done: int
-    """Objects that are through."""
+    """Number of finished objects."""
     total: int
 
 

@@ -1,4 +1,4 @@
-"""Sounds that someone else's system has made, judged like any other renderer's."""
+"""Sounds of another system, from files, evaluated like those of any renderer."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +17,8 @@ class Recorded:
     """Wav files, one a recording of the object, that are looked up by the contact of that recording.
 
     FOLDER/RECORDING.wav for the recording called RECORDING or RECORDING.wav, whose name may hold folders. Of several
-    recordings at one contact the first that has a file stands for all. Files are read when they are asked for, so
-    that only those of the contacts to be judged need be there.
+    recordings at one contact the first with a file is used for all. Files are read on demand, so that only those of the
+    evaluated contacts are needed.
     """
 
     folder: Path

@@ -1,4 +1,4 @@
-"""A folder of results: a file an object, written whole after every method, so that a kill loses one method at most."""
+"""A folder of results: one file per object, written atomically after every method, so that a kill loses one method."""
 
 import json
 import math
@@ -13,61 +13,61 @@ from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
 
 IDENTITY, OBJECTS = "protocol.json", "objects"
-"""The file that says what the folder's figures are, and the folder of the objects' files."""
+"""The file that identifies the evaluation, and the folder of the objects' files."""
 _MAX_BYTES = 64 << 20
-"""Largest file of results that is read: three million figures, as of 100 strikes by 10 metrics in 3000 cases."""
+"""Largest file of results that is read: three million values, as of 100 contacts by 10 metrics in 3000 cases."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one method came to in one case of an object."""
+    """Result of one method in one case of an object."""
 
     case: str
     """The case's key."""
     method: str
     values: Mapping[str, tuple[float | None, ...]] = field(default_factory=dict)
-    """Each metric's figure for every test contact, in the case's order; None where it was not taken."""
+    """Each metric's value for every test contact, in the case's order; None where it was not computed."""
     figures: Mapping[str, float | None] = field(default_factory=dict)
-    """Figures that are of all test contacts at once."""
+    """Values over all test contacts."""
     fit_seconds: float = 0.0
-    """Without what methods share: modes and features."""
+    """Without the modes and features, which methods share."""
     render_seconds: float = 0.0
     """For all test contacts."""
     sounds: Mapping[str, str] = field(default_factory=dict)
-    """Files of sounds to listen to, relative to the folder, by the names of their recordings."""
+    """Files of sounds for the page, relative to the folder, by the names of their recordings."""
     report: Mapping[str, Any] = field(default_factory=dict)
-    """What the method chose on its way."""
+    """Choices that the method made."""
     failure: str | None = None
-    """Why there is no figure, in one line."""
+    """Reason for missing values, in one line."""
 
 
 @dataclass(frozen=True)
 class CaseRecord:
-    """One case of an object, with names in place of rows."""
+    """One case of an object, with names in place of indices."""
 
     key: str
     label: str
     train: tuple[str, ...]
     test: tuple[str, ...]
     sounds: Mapping[str, str] = field(default_factory=dict)
-    """Files of the recordings that methods can be listened to beside."""
+    """Files of the recordings for the page."""
     shared_seconds: float = 0.0
-    """What modes and features took, which all methods share."""
+    """Time of modes and features, which all methods share."""
 
 
 @dataclass(frozen=True)
 class ObjectRecord:
-    """All that is known of one object's evaluation."""
+    """Evaluation of one object."""
 
     identifier: str
     name: str = ""
     material: str | None = None
     inferred: bool = False
-    """Whether name and material are concluded rather than read."""
+    """Whether name and material are inferred rather than read."""
     digest: str = ""
-    """Of the recordings, and of the truth where it is known."""
+    """Of the recordings, and of the ground truth where it is known."""
     contacts: int = 0
-    """How many places were struck."""
+    """Number of distinct contacts."""
     sample_rate: float = 0.0
     duration: float = 0.0
     """Seconds of every sound."""
@@ -77,7 +77,7 @@ class ObjectRecord:
     """Why the object could not be evaluated at all."""
 
     def done(self, case: str, method: str) -> bool:
-        """Whether this method has figures in this case; failures are tried again."""
+        """Whether this method has values in this case; failures are retried."""
         return any(each.case == case and each.method == method and each.failure is None for each in self.outcomes)
 
     def adding(self, outcome: Outcome) -> "ObjectRecord":
@@ -88,7 +88,7 @@ class ObjectRecord:
 
 @dataclass(frozen=True)
 class ResultsFolder:
-    """Where an evaluation keeps what it has found."""
+    """Folder in which an evaluation stores its results."""
 
     path: Path
 
@@ -130,7 +130,7 @@ class ResultsFolder:
         write_json(place, {**wanted, "methods": {**kept, **methods}})
 
     def identity(self) -> dict[str, Any]:
-        """Return what the folder's figures are, methods among it. Raises EvaluationError where there is none."""
+        """Return the evaluation that the folder holds, with its methods. Raises EvaluationError where there is none."""
         place = self.path / IDENTITY
         read = self._read(place)
         if not isinstance(read.get("methods"), dict):

@@ -147,7 +147,7 @@ def evaluation_of(
     body: BodyConfig,
     geometry: Geometry = "mesh",
 ) -> Evaluation:
-    """Return the plan of an evaluation that keeps features and surfaces in the folder `kept`."""
+    """Return the plan of an evaluation that stores features and surfaces in the folder `kept`."""
     lift, paper = settled_lifts(scene.lift, methods)
     scene = replace(scene, lift=lift)
     settings = {"scene": asdict(scene), "paper": asdict(paper), "geometry": geometry, "body": asdict(body)}
@@ -176,10 +176,10 @@ def run_shown(
 
 
 def settled_lifts(lift: LiftConfig, methods: Sequence[Method]) -> tuple[LiftConfig, LiftConfig]:
-    """Return how features are made, and how in the paper's form, with the encoders that will be taken.
+    """Return the settings of features, and those of the paper's form, with the encoders that will be used.
 
-    What replaces DINOv2 is said, and is part of what results are stored under. Raises SceneError where a method needs
-    the paper's encoder and it is not to be had.
+    The replacement of DINOv2 is printed, and is part of the results' identity. Raises SceneError where a method needs
+    the paper's encoder and it is not available.
     """
     paper = PRESETS["paper"].scene.lift
     if lift.encoder != AUTO:
@@ -190,7 +190,7 @@ def settled_lifts(lift: LiftConfig, methods: Sequence[Method]) -> tuple[LiftConf
 
 
 def title_of(dataset: Dataset, folder: Path) -> str:
-    """Return what reports call a dataset: captures by their folder, which tells them from other captures."""
+    """Return a dataset's name in reports: captures by their folder, which identifies them."""
     return folder.resolve().name if isinstance(dataset, CaptureCollection) else dataset.name
 
 

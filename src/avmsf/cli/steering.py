@@ -1,4 +1,4 @@
-"""An edit towards words, recordings or a material's sound on the command line: its guide, progress and previews."""
+"""Guided edits on the command line, by a prompt, recordings or a material: guide, progress and previews."""
 
 import dataclasses
 import math
@@ -29,22 +29,22 @@ from avmsf.tasks.steer import Guide, SteerProgress, steer
 
 _PREVIEW = Level("peak", -1.0)
 _GENERATED_SECONDS = 3.0
-"""Length of a sound that is made of a prompt alone."""
+"""Duration of a sound that is generated from a prompt only."""
 _OF_THE_MODEL = ("--model", "--negative", "--model-seconds", "--device", "--generated", "--clap")
-"""Options that nothing but words needs."""
+"""Options that only a prompt needs."""
 
 
 @dataclass(frozen=True)
 class Steering(GuideOptions):
-    """A descent towards a prompt, recordings, or the sound of a material; only one of them.
+    """A guided edit towards a prompt, recordings, or the sound of a material; only one of them.
 
-    While it runs, the sound as it stands can be heard beside the output. An interrupted edit leaves its state there;
-    the same command goes on from it to the same result.
+    A preview is written next to the output while it runs. An interrupted edit leaves its state there; the same command
+    continues from it to the same result.
     """
 
     @property
     def asked(self) -> bool:
-        """Whether there is anything to lead to."""
+        """Whether there is a guide."""
         return bool(self._guides)
 
     def expect_usable(self) -> None:
@@ -81,9 +81,9 @@ class Steering(GuideOptions):
             )
 
     def apply(self, field: SoundField, *, output: Path, old: Material | None) -> SoundField:
-        """Return the edited field; `output` is where it will be written, and its state and preview lie beside it.
+        """Return the edited field; its state and preview are written next to `output`, its later file.
 
-        `old` is what the field is of, needed for `like_material` alone.
+        `old` is the field's material, needed only for `like_material`.
         """
         guide = self._guide(field, old)
         preview, checkpoint = beside(output, "preview.wav"), beside(output, "checkpoint")
@@ -156,7 +156,7 @@ def _expect_unchanged(given: list[str], wanted: str) -> None:
 
 
 class SteerBar:
-    """A bar with the loss and the pitch so far, and a preview that is written over; in a file or a pipe, lines."""
+    """A bar with the present loss and pitch, and a preview that is overwritten; in a file or a pipe, lines."""
 
     def __init__(self, preview: Path, *, sample_rate: float) -> None:
         self.preview, self.sample_rate, self.live = preview, sample_rate, sys.stderr.isatty()
@@ -194,5 +194,5 @@ class SteerBar:
 
 
 def beside(output: Path, ending: str) -> Path:
-    """Return where a part of an unfinished edit is kept: beside the field that it will become."""
+    """Return the path of a part of an unfinished edit: next to its later file."""
     return output.with_name(f"{output.name}.{ending}")

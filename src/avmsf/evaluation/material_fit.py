@@ -1,4 +1,4 @@
-"""DiffSound's inverse problem: the material, and the thickness of walls, whose modes sound like recorded clips.
+"""DiffSound's inverse problem: material and wall thickness from recorded clips.
 
 Jin et al. (DiffSound, SIGGRAPH 2024) predict one sound for all clips, the lowest 16 modes with the same amplitude, and
 move Young's modulus and Poisson's ratio by Adam until its spectra are those of the clips: first by optimal transport,
@@ -65,17 +65,17 @@ _ROUNDS = 2
 
 @dataclass(frozen=True)
 class DiffSoundConfig:
-    """How a material is fitted."""
+    """Settings of the fit of a material."""
 
     material: str | None = None
-    """Name in the table of materials of what the object is made of, at which the descent starts; None tries all."""
+    """Initial material, by its name in the table of materials; None tries all."""
     transport_steps: int = 12
     """Steps by optimal transport, each with one clip; 1000, with all clips, in the published program."""
     difference_steps: int = 100
     """Steps by differences of spectra; 2000 in the published program."""
     search: int = 60
-    """Generations in which the whole range is then searched for a smaller difference, half as many near a thickness
-    that was found; none in the published program."""
+    """Generations of the following global search for a smaller difference, and half as many near a thickness that was
+    found; none in the published program."""
 
     def __post_init__(self) -> None:
         if self.material is not None:
@@ -89,20 +89,20 @@ class DiffSoundConfig:
 
 @dataclass(frozen=True)
 class MaterialFit:
-    """What the clips say of a body."""
+    """Fitted material and wall thickness of a body."""
 
     stiffness: float
     """E / rho, m2/s2."""
     poisson: float
     thickness: float | None
-    """Of the walls on average, meters; None for a filled body."""
+    """Mean wall thickness, meters; None for a solid body."""
     difference: float
-    """The objective that was reached: the mean difference of spectra."""
+    """Value of the objective: the mean difference of spectra."""
     body: IsotropicModes
     """The body of that thickness."""
 
     def modes(self) -> ElasticModes:
-        """Return the body's modes, of the fitted material with a density of 1 kg/m3, which sounds do not tell."""
+        """Return the body's modes, of the fitted material with a density of 1 kg/m3, which sounds do not determine."""
         return self.body.modes(Material("fitted", 1.0, self.stiffness, self.poisson, 0.0, 0.0))
 
 

@@ -22,11 +22,11 @@ from avmsf.tasks.modaledit import ModalEdit, Struck
 
 @runtime_checkable
 class AudioDiffusion(Protocol):
-    """A frozen latent diffusion model that makes sound from words."""
+    """A frozen latent diffusion model from text to audio."""
 
     @property
     def name(self) -> str:
-        """What reports and checkpoints call it."""
+        """Name in reports and checkpoints."""
         ...
 
     @property
@@ -50,7 +50,7 @@ class AudioDiffusion(Protocol):
         ...
 
     def describe(self) -> dict[str, Any]:
-        """Return what tells it from other models of its name, its weights, window and precision, as plain values."""
+        """Return its weights, window and precision, which identify it, as plain values."""
         ...
 
     def encode(self, waveforms: Float[Tensor, "contacts channels samples"]) -> Float[Tensor, "contacts dim frames"]:
@@ -64,9 +64,9 @@ class AudioDiffusion(Protocol):
         ...
 
     def embed(self, prompt: str, negative: str | None, *, seconds: float) -> Any:
-        """Return what `denoised` is conditioned on: words for a sound of so many seconds.
+        """Return the conditioning of `denoised`: a prompt for a sound of this duration.
 
-        `negative` is what to move away from; None is no words at all.
+        `negative` is a text to move away from; None is no text.
         """
         ...
 
@@ -80,7 +80,7 @@ class AudioDiffusion(Protocol):
     ) -> Float[Tensor, "contacts dim frames"]:
         """Return the clean latents that the model sees in noisy ones, float32 (see the module's text).
 
-        With classifier-free guidance g the estimate is u + g (c - u), c with the words and u with the negative ones.
+        With classifier-free guidance g the estimate is u + g (c - u), c with the prompt and u with the negative one.
         """
         ...
 
@@ -115,7 +115,7 @@ def partial_denoising(
 
 
 def expect_prompt(prompt: str) -> str:
-    """Return a prompt without the blanks around it. Raises `EditError` for an empty one."""
+    """Return a prompt without surrounding blanks. Raises `EditError` for an empty one."""
     if not prompt.strip():
         raise EditError(
             'expected a prompt, such as "a wooden bowl is struck", got an empty one', name="prompt", value=prompt
@@ -124,7 +124,7 @@ def expect_prompt(prompt: str) -> str:
 
 
 class DecoderDistillation:
-    """A guide towards words (Audio-SDS's decoder variant with partial multi-step denoising)."""
+    """A guide towards a prompt (Audio-SDS's decoder variant with partial multi-step denoising)."""
 
     def __init__(
         self,
@@ -135,7 +135,7 @@ class DecoderDistillation:
         negative: str | None = None,
         config: DistillationConfig | None = None,
     ) -> None:
-        """Set a prompt for sounds of `sample_rate` Hz, that of the field, and words to lead away from.
+        """Set a prompt for sounds of `sample_rate` Hz, that of the field, and a negative prompt.
 
         Raises `EditError` for an empty prompt.
         """
@@ -146,7 +146,7 @@ class DecoderDistillation:
         self._conditioning: tuple[int, Any] | None = None
 
     def describe(self) -> dict[str, Any]:
-        """Return what tells it from other guides, as plain values."""
+        """Return its identifying settings, as plain values."""
         return {
             "prompt": self.prompt,
             "negative": self.negative,
@@ -164,16 +164,16 @@ class DecoderDistillation:
     def targets(
         self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator
     ) -> Float[Tensor, "contacts samples"]:
-        """Return what the model makes of rendered sounds, at their own level; a row that it spoils is not finite.
+        """Return the model's denoised versions of rendered sounds, at their level; failed rows are not finite.
 
-        A batch that does not fit into the GPU's memory is halved, with a warning, and stays so. Raises `EditError`
-        where not even one sound fits, and for sounds too long for the model.
+        A batch that does not fit into the GPU's memory is halved, with a warning, for all later steps too. Raises
+        `EditError` where one sound does not fit, and for sounds too long for the model.
         """
         with torch.no_grad():
             heard = resampled(sounds, sample_rate=self.sample_rate, wanted=self.model.sample_rate)
             lowest, highest = self.config.lowest, self.config.highest
             level = lowest + (highest - lowest) * torch.rand(len(sounds), generator=generator)
-            # One seed a sound: what is drawn depends neither on the batch nor on the device.
+            # One seed a sound, so that the noise depends neither on the batch nor on the device.
             seeds = torch.randint(1 << 62, (len(sounds),), generator=generator).tolist()
             made: list[Tensor] = []
             while len(made) < len(sounds):
@@ -201,7 +201,7 @@ class DecoderDistillation:
         if self._conditioning is None or self._conditioning[0] != samples:
             words = model.embed(self.prompt, self.negative, seconds=samples / model.sample_rate)
             self._conditioning = (samples, words)
-        # A model of sound has heard music at full scale, not newtons: the loudest sample becomes .5.
+        # The model was trained on audio at full scale: the peak becomes .5.
         peak = heard.abs().amax(dim=1, keepdim=True).clamp_min(torch.finfo(heard.dtype).tiny)
         waveforms = (0.5 * heard / peak)[:, None].expand(-1, model.channels, -1).to(model.device)
         latents = model.encode(waveforms)
