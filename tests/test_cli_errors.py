@@ -33,7 +33,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 AT = "--position 0.1 0.05 0"
 WRONG = {
-    "check plate --settings wrong.toml": "unit is 'miles'",
+    "check plate --settings wrong.toml": "'miles'",
     "modes nowhere": "nowhere: expected a capture folder",
     "modes plate --settings nowhere.toml": "nowhere.toml: expected a capture.toml",
     "modes plate --picture modes.gif": "ends in .png, .pdf or .svg, found .gif",
@@ -47,7 +47,7 @@ WRONG = {
     "fit plate --output f.safetensors --train-count 4 --train-fraction 0.5": "leave one of them out",
     "fit plate --output f.safetensors --validation 2": "validation = 2.0: expected 0 to 0.5",
     "render nowhere.safetensors --position 0 0 0 -o s": "nowhere.safetensors: expected a field file",
-    f"render not-ours.safetensors {AT} --output s": "a file of another kind",
+    f"render not-ours.safetensors {AT} --output s": "RIFF",
     "render field.safetensors --output s": "expected contacts either by --position",
     f"render field.safetensors {AT} --contact-table no-z.csv --output s": "expected contacts either by --position",
     "render field.safetensors --position 50 60 0 --output s": "--unit says",
