@@ -40,20 +40,22 @@ def opened_scene(options: SceneOptions, config: SceneConfig, *, command: str) ->
 
 def stage_line(name: str, kept: Kept) -> str:
     """Say what a stage cost."""
-    return f"{name:9} {kept.seconds:7.1f} s{'' if kept.fresh else ' (kept from before)'}  {kept.path}"
+    return f"{name:9} {kept.seconds:7.1f} s{'' if kept.fresh else ' (cached)'}  {kept.path}"
 
 
 def features_words(report: Mapping[str, Any]) -> str:
-    """Say what the features are, how sure of them the views are, and which symmetries they obey."""
+    """Return a summary of the features: their encoder, the agreement of the views, and the symmetries."""
     lines = [
         f"features: {report['encoder']}, on {report['points']} points, {report['unseen']} of which no view sees; views "
         f"agree on {100 * report['agreement']:.0f} % of the features' variance"
     ]
     if report.get("dropped"):
-        lines.append(f"left out: {report['dropped']} Gaussians inside the object or behind its surface in the views")
+        lines.append(f"left out: {report['dropped']} Gaussians inside the object or behind its surface")
     if "symmetries" in report:
         lines.append(Symmetries.from_dict(report["symmetries"]).summary())
     if "orbit_spread" in report:
         before, after = report["orbit_spread"]
-        lines.append(f"spread over orbits, in the features' own spread: {before:.3f} before pooling, {after:.3f} after")
+        lines.append(
+            f"relative standard deviation over symmetric points: {before:.3f} before pooling, {after:.3f} after"
+        )
     return "\n".join(lines)
