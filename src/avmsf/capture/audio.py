@@ -60,7 +60,7 @@ class Recording:
         """Return one channel, counted from 1 as sound editors count them; `CaptureError` where there is none."""
         if not 1 <= number <= len(self.channels):
             raise CaptureError(
-                f"{self.name}: expected a channel from 1 to {len(self.channels)}, got {number}: correct "
+                f"{self.name}: expected a channel from 1 to {len(self.channels)}, got {number}; correct "
                 "response_channel or force_channel in capture.toml",
                 file=self.name,
                 name="channel",
@@ -80,7 +80,7 @@ class Recording:
         left = [index + 1 for index in range(len(self.channels)) if index + 1 != force_channel]
         if not left:
             raise CaptureError(
-                f"{self.name}: expected a channel with the sound, got only the force channel: record both, or remove "
+                f"{self.name}: expected a channel with the sound, got only the force channel; record both, or remove "
                 "force_channel from capture.toml",
                 file=self.name,
                 name="response_channel",
@@ -91,7 +91,7 @@ class Recording:
         loudest = max(left, key=lambda each: float(np.std(self.channels[each - 1])))
         if not all(self._agree(loudest, each) for each in left):
             raise CaptureError(
-                f"{self.name}: expected one channel with the sound, got {len(self.channels)} different ones: write "
+                f"{self.name}: expected one channel with the sound, got {len(self.channels)} different ones; write "
                 "response_channel = 1 (or another, counted from 1) in capture.toml, or save it as mono",
                 file=self.name,
                 name="response_channel",
@@ -166,22 +166,22 @@ def decode_recording(source: Path | SoundBytes, name: str) -> Recording:
         reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
         size = source.stat().st_size if isinstance(source, Path) else source.getbuffer().nbytes
         raise CaptureError(
-            f"{name}: expected a sound file, got {size} bytes that cannot be read ({reason}): export it again as wav",
+            f"{name}: expected a sound file, got {size} bytes that cannot be read ({reason}); export it again as wav",
             file=name,
             name="bytes",
             value=size,
         ) from error
     if not samples.size:
-        raise CaptureError(f"{name}: expected samples, got none: record or export it again", file=name, value=0)
+        raise CaptureError(f"{name}: expected samples, got none; record or export it again", file=name, value=0)
     if not np.isfinite(samples).all():
         count = int((~np.isfinite(samples)).sum())
         raise CaptureError(
-            f"{name}: expected finite samples, got {count} that are not: export it again", file=name, value=count
+            f"{name}: expected finite samples, got {count} that are not; export it again", file=name, value=count
         )
     peak = float(np.abs(samples).max())
     if peak > MAX_PEAK:
         raise CaptureError(
-            f"{name}: expected samples of at most {MAX_PEAK:g}, got {peak:.3g}: export it again", file=name, value=peak
+            f"{name}: expected samples of at most {MAX_PEAK:g}, got {peak:.3g}; export it again", file=name, value=peak
         )
     return Recording(name, np.ascontiguousarray(samples.T), rate, subtype)
 
@@ -204,7 +204,7 @@ def refuse_rate(rate: float, name: str) -> None:
     if not LOWEST_RATE <= rate <= HIGHEST_RATE:
         raise CaptureError(
             f"{name}: expected a sample rate of {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz (the file's rate times "
-            f"playback_speed), got {rate:g} Hz: export it at another rate",
+            f"playback_speed), got {rate:g} Hz; export it at another rate",
             file=name,
             name="sample_rate",
             value=rate,
@@ -216,7 +216,7 @@ def refuse_peak(sound: Float64[np.ndarray, " frames"], name: str) -> None:
     peak = float(np.abs(sound).max())
     if not MIN_PEAK <= peak <= MAX_PEAK:
         raise CaptureError(
-            f"{name}: expected a peak of {MIN_PEAK:g} to {MAX_PEAK:g}, got {peak:.3g}: export it again, or check the "
+            f"{name}: expected a peak of {MIN_PEAK:g} to {MAX_PEAK:g}, got {peak:.3g}; export it again, or check the "
             "force that it is divided by",
             file=name,
             name="peak",
@@ -228,7 +228,7 @@ def refuse_silence(sound: Float64[np.ndarray, " frames"], name: str) -> None:
     """Raise `CaptureError` where every sample is the same."""
     if np.ptp(sound) == 0:
         raise CaptureError(
-            f"{name}: expected a sound, got silence (all {len(sound)} samples are {sound[0]:g}): "
+            f"{name}: expected a sound, got silence (all {len(sound)} samples are {sound[0]:g}); "
             "record it again, or choose another response_channel",
             file=name,
             value=float(sound[0]),
@@ -261,7 +261,7 @@ def _refuse_long(file: soundfile.SoundFile, name: str) -> None:
     if samples > MAX_SAMPLES:
         raise RecordingLengthError(
             f"{name}: expected at most {MAX_SAMPLES:,} samples in all channels, got {samples:,} "
-            f"({file.frames / file.samplerate / 60:.3g} minutes of {file.channels}): cut it to the seconds around the "
+            f"({file.frames / file.samplerate / 60:.3g} minutes of {file.channels}); cut it to the seconds around the "
             "impact",
             file=name,
             value=samples,

@@ -26,7 +26,7 @@ def expect_sudden(sound: Float64[np.ndarray, " samples"], *, sample_rate: float,
     if loudest < _SUDDEN * quietest:
         level = 20 * math.log10(loudest / quietest)
         raise CaptureError(
-            f"{name}: expected an impact, its loudest 10 ms at least 6 dB above its quietest, got {level:.1f} dB: "
+            f"{name}: expected an impact, its loudest 10 ms at least 6 dB above its quietest, got {level:.1f} dB; "
             "record a single impact with silence before or after it",
             file=name,
             value=level,
@@ -41,5 +41,5 @@ def clipping(response: Float64[np.ndarray, " frames"], *, name: str) -> str | No
     share = 100.0 * clipped / len(response)
     return (
         f"{name}: {clipped} samples ({share:.2g} %) are clipped at {np.abs(response).max():.3g}, which no mode can "
-        "explain: turn the gain down and record it again"
+        "explain; turn the gain down and record it again"
     )

@@ -34,7 +34,7 @@ class Camera:
         if not all(map(math.isfinite, numbers)) or min(self.focal) <= 0 or min(self.width, self.height) < 1:
             raise CaptureError(
                 f"expected a camera with finite numbers, positive focal lengths and a size in pixels, got focal "
-                f"lengths {self.focal}, principal point {self.principal}, size {self.width} x {self.height}: check "
+                f"lengths {self.focal}, principal point {self.principal}, size {self.width} x {self.height}; check "
                 "the file that holds the cameras",
                 name="camera",
                 value=[*self.focal, *self.principal, self.width, self.height],
@@ -60,7 +60,7 @@ class Camera:
         right = torch.linalg.cross(forward, up)
         if float(right.norm()) < 1e-9 * max(float(forward.norm()) * float(up.norm()), 1e-300):
             raise CaptureError(
-                f"expected an up direction across the line of sight {forward.tolist()}, got {up.tolist()}: choose "
+                f"expected an up direction across the line of sight {forward.tolist()}, got {up.tolist()}; choose "
                 "another up, or another target than the camera's position",
                 name="up",
                 value=up.tolist(),

@@ -206,7 +206,7 @@ def _refuse_missing(folder: Path, strikes: list[Strike]) -> None:
     if len(missing) > 1:
         shown = f"{', '.join(missing[:5])}{', …' * (len(missing) > 5)}"
         raise CaptureError(
-            f"{TABLE}: expected a file for each row, {len(missing)} of {len(strikes)} are missing ({shown}): copy them "
+            f"{TABLE}: expected a file for each row, {len(missing)} of {len(strikes)} are missing ({shown}); copy them "
             f"into {folder}, or correct their names",
             file=folder / TABLE,
             name="file",

@@ -29,6 +29,6 @@ def expect_free(folder: Path) -> None:
     """Raise CaptureError unless a folder is empty or does not exist."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise CaptureError(
-            f"{folder}: expected a new or empty folder, got an existing one: choose another name or remove it",
+            f"{folder}: expected a new or empty folder, got an existing one; choose another name or remove it",
             file=folder,
         )

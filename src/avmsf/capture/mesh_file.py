@@ -55,7 +55,7 @@ def load_mesh(path: Path, *, raising: type[AvmsfError] = CaptureError) -> trimes
         raise raising(f"{path}: {error}", file=path, row=error.row, name=error.name, value=error.value) from error
     except Exception as error:  # trimesh's readers raise whatever their format's parsing raises
         raise raising(
-            f"{path}: expected a mesh or point cloud, got a file that cannot be read ({error}): export it again",
+            f"{path}: expected a mesh or point cloud, got a file that cannot be read ({error}); export it again",
             file=path,
         ) from error
     return scene
@@ -88,7 +88,7 @@ def _expect_small(path: Path) -> None:
     if size > most:
         advice = ", or export it as .glb" if suffix == ".gltf" else ""
         raise CaptureError(
-            f"expected at most {most:,} bytes, got {size:,}: reduce the mesh{advice}", name="bytes", value=size
+            f"expected at most {most:,} bytes, got {size:,}; reduce the mesh{advice}", name="bytes", value=size
         )
     if suffix == ".obj":
         _expect_small_obj(path)
@@ -140,7 +140,7 @@ def _expect_small_gltf(record: Any) -> None:
         count = each.get("count")
         if not isinstance(count, int) or count < 0:
             raise CaptureError(
-                f"expected a whole number as the count of accessor {row}, got {count!r}: export it again",
+                f"expected a whole number as the count of accessor {row}, got {count!r}; export it again",
                 row=row,
                 name="count",
                 value=count,
@@ -151,7 +151,7 @@ def _expect_small_gltf(record: Any) -> None:
 
 def _expect_at_most(most: int, found: int, what: str) -> None:
     if found > most:
-        raise CaptureError(f"expected at most {most:,} {what}, got {found:,}: reduce the mesh", name=what, value=found)
+        raise CaptureError(f"expected at most {most:,} {what}, got {found:,}; reduce the mesh", name=what, value=found)
 
 
 def _expect_sound(scene: trimesh.Scene) -> None:
@@ -164,7 +164,7 @@ def _expect_sound(scene: trimesh.Scene) -> None:
         _expect_at_most(3 * MAX_FACES, len(vertices), "vertices")
         if vertices.shape[1:] != (3,):
             raise CaptureError(
-                f"expected vertices of three coordinates, got {vertices.shape[1]}: export it again",
+                f"expected vertices of three coordinates, got {vertices.shape[1]}; export it again",
                 name="vertices",
                 value=list(vertices.shape),
             )
@@ -175,7 +175,7 @@ def _expect_sound(scene: trimesh.Scene) -> None:
     farthest = 0.0 if scene.bounds is None else float(np.abs(scene.bounds).max())
     if not farthest <= MAX_COORDINATE:
         raise CaptureError(
-            f"expected coordinates up to {MAX_COORDINATE:g}, got {farthest:.3g} (with all parts positioned): export "
+            f"expected coordinates up to {MAX_COORDINATE:g}, got {farthest:.3g} (with all parts positioned); export "
             "the mesh again",
             name="coordinates",
             value=farthest,
@@ -196,7 +196,7 @@ def expect_finite_vertices(vertices: np.ndarray) -> None:
         row = int(unfit.argmax())
         raise CaptureError(
             f"vertex {row}: expected finite coordinates, got {vertices[row].tolist()} ({int(unfit.sum())} of "
-            f"{len(vertices)} vertices are not finite): export the mesh again",
+            f"{len(vertices)} vertices are not finite); export the mesh again",
             row=row,
             name="vertices",
             value=vertices[row].tolist(),

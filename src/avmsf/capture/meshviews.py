@@ -273,7 +273,7 @@ def orbit_cameras(
     radius = float((high - low).norm()) / 2
     if not (math.isfinite(radius) and radius > 0):
         raise CaptureError(
-            f"expected a surface with a positive extent, got {radius:g} m: check its points",
+            f"expected a surface with a positive extent, got {radius:g} m; check its points",
             name="surface",
             value=radius,
         )

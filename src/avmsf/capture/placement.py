@@ -139,15 +139,15 @@ class Placement:
             found = f"{which} up to {_length(farthest)} ({relative} object diagonals) off the surface"
             if few:
                 shown = ", ".join(names[row] if names else f"row {row}" for row in self.off[:8])
-                return f"{found}, the others on it: check {shown}{', …' * (len(self.off) > 8)}"
+                return f"{found}, the others on it; check {shown}{', …' * (len(self.off) > 8)}"
         else:
             found = f"the contacts lie within {_length(self.spread)} on an object {_length(self.diagonal)} across"
         if self.mistake is not None:
             return f"{found}; {self.mistake}"
         if not self.off:
-            return f"{found}: check that both are in one frame and unit"
+            return f"{found}; check that both are in one frame and unit"
         return (
-            f"{found}, and no change of unit, axes or origin explains it: give both in one frame (structure from "
+            f"{found}, and no change of unit, axes or origin explains it; give both in one frame (structure from "
             "motion chooses its own: see `align_similarity`)"
         )
 

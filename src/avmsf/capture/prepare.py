@@ -104,7 +104,7 @@ def remove_rumble(
     if highpass < lowest:
         raise CaptureError(
             f"{recording.name}: expected a highpass of 0, or of at least {lowest:.3g} Hz, one period in the recording, "
-            f"got {highpass:g} Hz: change it in capture.toml",
+            f"got {highpass:g} Hz; change it in capture.toml",
             file=recording.name,
             name="highpass",
             value=highpass,
@@ -112,7 +112,7 @@ def remove_rumble(
     if highpass >= recording.sample_rate / 2:
         raise CaptureError(
             f"{recording.name}: expected a highpass below {recording.sample_rate / 2:g} Hz, half the sample rate, got "
-            f"{highpass:g} Hz: change it in capture.toml",
+            f"{highpass:g} Hz; change it in capture.toml",
             file=recording.name,
             name="highpass",
             value=highpass,
@@ -141,7 +141,7 @@ def refuse_short(kept: Float64[np.ndarray, " samples"], recording: Recording) ->
     if len(kept) < least:
         raise CaptureError(
             f"{recording.name}: expected at least {least} samples after the onset, got {len(kept)} "
-            f"({len(kept) / recording.sample_rate * 1e3:.3g} ms): record it again, or remove its row",
+            f"({len(kept) / recording.sample_rate * 1e3:.3g} ms); record it again, or remove its row",
             file=recording.name,
             name="samples",
             value=len(kept),
@@ -151,7 +151,7 @@ def refuse_short(kept: Float64[np.ndarray, " samples"], recording: Recording) ->
 def _find_pulse(force: Float64[np.ndarray, " frames"], name: str, settings: CaptureSettings) -> Pulse:
     if np.ptp(force) == 0:
         raise CaptureError(
-            f"{name}: expected a force in channel {settings.force_channel}, got silence: choose another force_channel "
+            f"{name}: expected a force in channel {settings.force_channel}, got silence; choose another force_channel "
             "or remove the recording",
             file=name,
             name="force_channel",

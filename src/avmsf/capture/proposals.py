@@ -104,7 +104,7 @@ def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
             file.write(settings_text(proposals))
     except FileExistsError as error:
         raise CaptureError(
-            f"{path}: expected no such file, got an existing one: add the proposed lines to it by hand", file=path
+            f"{path}: expected no such file, got an existing one; add the proposed lines to it by hand", file=path
         ) from error
     except OSError as error:
         raise CaptureError(f"{path}: cannot be written ({error.strerror or error})", file=path) from error

@@ -148,7 +148,7 @@ def _expect_job(images: Path, output: Path, *, camera_model: str, timeout: float
         raise CaptureError(f"{images}: expected a folder of photographs, got none", file=images)
     if (output / "sparse" / "0").exists():
         raise CaptureError(
-            f"{output / 'sparse' / '0'}: expected no cameras, got existing ones: remove it to estimate them again",
+            f"{output / 'sparse' / '0'}: expected no cameras, got existing ones; remove it to estimate them again",
             file=output / "sparse" / "0",
         )
 
@@ -186,7 +186,7 @@ def _stage_images(images: Path, begun: Path, *, shared_camera: bool) -> tuple[di
         odd = [name for name, size in sizes.items() if size != kinds[-1]]
         raise CaptureError(
             f"{images}: expected photographs of one size, got most of {kinds[-1][0]} x {kinds[-1][1]} pixels, but not "
-            f"{_some(odd)}: give photographs of one camera in one orientation, or set shared_camera=False",
+            f"{_some(odd)}; give photographs of one camera in one orientation, or set shared_camera=False",
             file=images,
             name="shared_camera",
             value=odd,
@@ -243,7 +243,7 @@ def _run_worker(begun: Path, *, timeout: float, progress: Callable[[MotionProgre
                 if seconds > timeout:
                     stage = _progress(log, seconds).stage
                     raise CaptureError(
-                        f"expected structure from motion within {timeout:g} s, got no result in the stage {stage}: "
+                        f"expected structure from motion within {timeout:g} s, got no result in the stage {stage}; "
                         "increase timeout, or give fewer or smaller photographs",
                         name=stage,
                         value=timeout,
@@ -302,7 +302,7 @@ def _refuse_few(models: Sequence[dict[str, Any]], everything: Sequence[str], *, 
     apart = f" in {len(models)} groups that could not be joined" if len(models) > 1 else ""
     raise CaptureError(
         f"{images}: expected cameras of most photographs, got {len(registered)} of {len(everything)}{apart}, none for "
-        f"{_some(lacking)}: take sharp photographs 10 to 15 degrees apart, with a patterned, fixed ground in view",
+        f"{_some(lacking)}; take sharp photographs 10 to 15 degrees apart, with a patterned, fixed ground in view",
         file=images,
         name="cameras",
         value=lacking,

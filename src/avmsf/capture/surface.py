@@ -77,7 +77,7 @@ def read_surface(path: str | Path, *, meters: float = 1.0) -> Surface:
         count += len(points)
     joined = np.concatenate(vertices)
     if not len(joined):
-        raise CaptureError(f"{path}: expected points, got none: export the surface again", file=path, value=0)
+        raise CaptureError(f"{path}: expected points, got none; export the surface again", file=path, value=0)
     return Surface(torch.from_numpy((joined * meters).astype(np.float32)), torch.from_numpy(np.concatenate(faces)))
 
 
@@ -87,7 +87,7 @@ def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
         named = Path(settings.surface)
         if named.is_absolute() or ".." in named.parts:
             raise CaptureError(
-                f"surface: expected a file in the capture folder, got {settings.surface!r}: copy it there",
+                f"surface: expected a file in the capture folder, got {settings.surface!r}; copy it there",
                 file=folder,
                 name="surface",
                 value=settings.surface,

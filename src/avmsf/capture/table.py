@@ -74,13 +74,13 @@ def read_cells(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
         lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in islice(reader, MAX_ROWS + 2)]
     except UnicodeDecodeError as error:
         raise CaptureError(
-            f"{path}: expected UTF-8 text: save it from the spreadsheet as 'CSV UTF-8'", file=path
+            f"{path}: expected UTF-8 text; save it from the spreadsheet as 'CSV UTF-8'", file=path
         ) from error
     except (OSError, ValueError, csv.Error) as error:
         raise CaptureError(f"{path}: expected a table, got a file that cannot be read: {error}", file=path) from error
     if len(lines) > MAX_ROWS + 1:
         raise CaptureError(
-            f"{path}: expected at most {MAX_ROWS:,} rows, got more: divide the table", file=path, row=lines[-1][0]
+            f"{path}: expected at most {MAX_ROWS:,} rows, got more; divide the table", file=path, row=lines[-1][0]
         )
     return [(line, cells) for line, cells in lines if any(cells)], separator
 
@@ -213,7 +213,7 @@ def _unit_vector(values: Sequence[float], where: Location) -> tuple[float, float
     length = math.hypot(*values)
     if length == 0:
         raise where.error(
-            "expected a direction as nx,ny,nz, got the zero vector: give a direction or remove the columns",
+            "expected a direction as nx,ny,nz, got the zero vector; give a direction or remove the columns",
             name=DIRECTION[0],
             value=list(values),
         )
@@ -232,6 +232,6 @@ def _inside(text: str, where: Location) -> str:
         raise where.error("expected a wav file's path as file, got nothing", name="file", value=text)
     if path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
         raise where.error(
-            f"expected a path inside the capture folder as file, got {text}: copy it there", name="file", value=text
+            f"expected a path inside the capture folder as file, got {text}; copy it there", name="file", value=text
         )
     return str(path)

@@ -107,7 +107,7 @@ def read_textured_mesh(path: str | Path, *, meters: float = 1.0) -> TexturedMesh
     parts = [part for part in load_parts(path) if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
         raise CaptureError(
-            f"{path}: expected a mesh with triangles to render, got none: export the mesh with its faces, or give the "
+            f"{path}: expected a mesh with triangles to render, got none; export the mesh with its faces, or give the "
             "points as the capture's surface",
             file=path,
             name="faces",
@@ -239,7 +239,7 @@ def _expect_mesh(vertices: Tensor, faces: Tensor) -> None:
     doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     if not bool((doubled != 0).any()):
         raise CaptureError(
-            f"expected triangles with an area, got {len(faces)} without: export the mesh again",
+            f"expected triangles with an area, got {len(faces)} without; export the mesh again",
             name="area",
             value=0.0,
         )

@@ -43,7 +43,7 @@ def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:
             for rate, count in counts.most_common()
         ]
         raise CaptureError(
-            f"expected recordings of one sample rate, got {', '.join(found)}: nothing is resampled, so convert them to "
+            f"expected recordings of one sample rate, got {', '.join(found)}; nothing is resampled, so convert them to "
             "one rate",
             name="sample_rate",
             value=[rate for rate, _ in counts.most_common()],
@@ -66,7 +66,7 @@ def judge_levels(peaks: Sequence[float], names: Sequence[str]) -> list[CaptureWa
     if np.ptp(levels) > MAX_RANGE_DB:
         raise CaptureError(
             f"{found}; expected at most {MAX_RANGE_DB:g} dB between the loudest and the faintest, got "
-            f"{np.ptp(levels):.0f}: export it at the scale of the others, or remove its row",
+            f"{np.ptp(levels):.0f}; export it at the scale of the others, or remove its row",
             file=names[worst],
             name="peak",
             value=peaks[worst],
@@ -77,11 +77,11 @@ def judge_levels(peaks: Sequence[float], names: Sequence[str]) -> list[CaptureWa
         above = ascending[-1] - ascending[-2]
         message = (
             f"{names[loudest]}: its peak, {peaks[loudest]:.3g}, is {above:.0f} dB above that of the next loudest "
-            f"recording; expected at most {USUAL_GAP_DB:g} dB: check its gain, its scale and its force"
+            f"recording; expected at most {USUAL_GAP_DB:g} dB; check its gain, its scale and its force"
         )
         return [CaptureWarning(message, file=names[loudest], name="peak", value=peaks[loudest])]
     if abs(away[worst]) > USUAL_RANGE_DB:
-        message = f"{found}; expected at most {USUAL_RANGE_DB:g} dB: check its scale and its force"
+        message = f"{found}; expected at most {USUAL_RANGE_DB:g} dB; check its scale and its force"
         return [CaptureWarning(message, file=names[worst], name="peak", value=peaks[worst])]
     return []
 
@@ -99,7 +99,7 @@ def common_length(
     least = shortest_allowed(rate)
     if asked < least:
         raise CaptureError(
-            f"seconds: expected at least {least} samples at {rate:g} Hz, got {asked} ({seconds:g} s): increase it in "
+            f"seconds: expected at least {least} samples at {rate:g} Hz, got {asked} ({seconds:g} s); increase it in "
             "capture.toml",
             name="seconds",
             value=seconds,
@@ -112,7 +112,7 @@ def common_length(
         remarks.append(
             CaptureWarning(
                 f"{name}: {shortest / rate:.3g} s after its onset, most recordings have {usual / rate:.3g} s; all "
-                "sounds are cut to this length: record it again or remove its row",
+                "sounds are cut to this length; record it again or remove its row",
                 file=name,
                 value=shortest / rate,
             )

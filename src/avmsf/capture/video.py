@@ -166,7 +166,7 @@ def _open(path: Path) -> cv2.VideoCapture:
     if not video.isOpened():
         video.release()
         raise CaptureError(
-            f"{path}: expected a video, got a file that cannot be read: convert it to MP4 (H.264)",
+            f"{path}: expected a video, got a file that cannot be read; convert it to MP4 (H.264)",
             file=path,
             name="format",
         )
@@ -177,14 +177,14 @@ def _open(path: Path) -> cv2.VideoCapture:
 def _expect_enough(path: Path, total: int, count: int) -> None:
     if total == 0:
         raise CaptureError(
-            f"{path}: expected a video with frames, got none that can be read: convert it to MP4 (H.264)",
+            f"{path}: expected a video with frames, got none that can be read; convert it to MP4 (H.264)",
             file=path,
             name="frames",
             value=0,
         )
     if total < count:
         raise CaptureError(
-            f"{path}: expected a video of at least {count} frames, got {total}: choose at most {total}",
+            f"{path}: expected a video of at least {count} frames, got {total}; choose at most {total}",
             file=path,
             name="count",
             value=total,

@@ -22,7 +22,7 @@ from avmsf.cli.heartbeat import beating, verbosity
 from avmsf.errors import AvmsfError, AvmsfWarning
 
 VERBS = {
-    "check": "Check the recordings of a capture: levels, noise, clipping, onsets, double hits and alignment.",
+    "check": "Check the recordings of a capture: levels, noise, clipping, onsets, second impacts and alignment.",
     "modes": "List the modes of an object: frequencies, dampings and levels, from all recordings of a capture.",
     "splat": "Fit 3D Gaussians to photographs, a video or a mesh, as a .ply file that any 3DGS viewer opens.",
     "features": "Compute visual features on an object's surface, equal at points that are symmetric to each other.",

@@ -78,7 +78,7 @@ def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
             if not np.isfinite(points).all():
                 row = int(np.isfinite(points).all(axis=1).argmin())
                 raise Location(path, row, f"point {row}").error(
-                    f"expected finite coordinates, got {points[row].tolist()}: run the reconstruction again",
+                    f"expected finite coordinates, got {points[row].tolist()}; run the reconstruction again",
                     value=points[row].tolist(),
                 )
             return (points, colors) if len(points) else None
@@ -89,7 +89,7 @@ def _lens(record: CameraRecord, where: Location) -> Lens:
     model = MODELS.get(record.model)
     if model is None:
         raise where.error(
-            f"expected a camera model among {', '.join(MODELS)}, got {record.model}: undistort the images first "
+            f"expected a camera model among {', '.join(MODELS)}, got {record.model}; undistort the images first "
             "(colmap image_undistorter)",
             name=where.item,
             value=record.model,
@@ -113,7 +113,7 @@ def _shot(record: ImageRecord, lenses: dict[int, Lens], file: Path, images: Path
     lens, where = lenses.get(record.camera), Location(file, item=f"image {record.name}")
     if lens is None:
         raise where.error(
-            f"expected a camera of the model ({', '.join(map(str, lenses))}), got camera {record.camera}: export all "
+            f"expected a camera of the model ({', '.join(map(str, lenses))}), got camera {record.camera}; export all "
             "parts of the model together",
             name=record.name,
             value=record.camera,
@@ -139,7 +139,7 @@ def _rotation(record: ImageRecord, where: Location) -> np.ndarray:
     length = float(np.linalg.norm(values))
     if not np.isfinite(length) or length < 1e-6:
         raise where.error(
-            f"expected a rotation's quaternion, got {record.quaternion}: run the mapper again",
+            f"expected a rotation's quaternion, got {record.quaternion}; run the mapper again",
             name=record.name,
             value=record.quaternion,
         )

@@ -65,7 +65,7 @@ class _Reader:
     def short(self) -> CaptureError:
         return CaptureError(
             f"{self.path}: expected a complete binary COLMAP file, got one that ends after {len(self.content)} bytes "
-            "inside a record: copy it again",
+            "inside a record; copy it again",
             file=self.path,
             value=len(self.content),
         )
@@ -79,7 +79,7 @@ def read_cameras(path: Path) -> list[CameraRecord]:
         number, model, width, height = reader.take("IiQQ")
         if model not in _MODELS:
             raise Location(path, item=f"camera {number}").error(
-                f"expected a known camera model, got number {model}: undistort the images first (colmap "
+                f"expected a known camera model, got number {model}; undistort the images first (colmap "
                 "image_undistorter)",
                 name=f"camera {number}",
                 value=model,

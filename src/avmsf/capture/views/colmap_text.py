@@ -54,7 +54,7 @@ def _parsed(path: Path, row: int, line: str, parse: Callable[[str], _Row]) -> _R
         return parse(line)
     except (ValueError, IndexError, OverflowError) as error:
         raise Location(path, row, f"row {row}").error(
-            f"expected a row as COLMAP writes it, got {line[:80]!r}: export the model again", value=line
+            f"expected a row as COLMAP writes it, got {line[:80]!r}; export the model again", value=line
         ) from error
 
 

@@ -48,7 +48,7 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
     """
     if len(views) < FEWEST:
         raise CaptureError(
-            f"expected at least {FEWEST} views, got {len(views)}: photograph more sides", name="views", value=len(views)
+            f"expected at least {FEWEST} views, got {len(views)}; photograph more sides", name="views", value=len(views)
         )
     bare = [index for index, view in enumerate(views) if view.mask is None]
     if not bare:
@@ -66,7 +66,7 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
         outlines = _outlines(masks, cameras)
         if outlines is None:
             message = (
-                "the first masks of the views have no common shape; each mask uses only its own image: check the masks "
+                "the first masks of the views have no common shape; each mask uses only its own image; check the masks "
                 "and the cameras"
             )
             warnings.warn(CaptureWarning(message, name="masks"), stacklevel=2)
@@ -92,7 +92,7 @@ def background_color(views: Sequence[View]) -> Float[Tensor, " 3"]:
             counts += np.stack([np.bincount(outside[:, channel], minlength=256) for channel in range(3)])
     if not counts.any():
         raise CaptureError(
-            "expected views whose masks leave some background, got none: find their foreground first",
+            "expected views whose masks leave some background, got none; find their foreground first",
             name="background",
             value=0,
         )
@@ -191,7 +191,7 @@ def _refuse_busy(different: Sequence[Bool[np.ndarray, "height width"]], names: S
     share = float(np.concatenate(borders).mean())
     if share > _BUSY:
         raise CaptureError(
-            f"expected a plain background, got {share:.0%} of the images' borders in other colors ({listed(names)}): "
+            f"expected a plain background, got {share:.0%} of the images' borders in other colors ({listed(names)}); "
             "give masks, or photograph the object in front of one color with a margin around it",
             name="background",
             value=share,
@@ -202,7 +202,7 @@ def _refuse_few(found: Sequence[str], count: int) -> None:
     if len(found) < FEWEST:
         raise CaptureError(
             f"expected an object in front of a plain background in at least {FEWEST} views, got {len(found)} of "
-            f"{count}: give masks",
+            f"{count}; give masks",
             name="object",
             value=len(found),
         )

@@ -51,7 +51,7 @@ class Lens:
             raise self.origin.error(
                 "expected finite intrinsics, positive focal lengths and a size in pixels, got focal lengths "
                 f"{self.focal}, principal point {self.principal}, distortion {self.distortion}, size {self.width} x "
-                f"{self.height}: calibrate this camera again",
+                f"{self.height}; calibrate this camera again",
                 name="intrinsics",
                 value=[*numbers, self.width, self.height],
             )
@@ -102,7 +102,7 @@ def _widest_pinhole(lens: Lens) -> Lens:
     narrow, wide = 4.0, 1 / _WIDEST
     if not _covers(lens, narrow):
         raise lens.origin.error(
-            f"expected an invertible distortion, got {lens.distortion}: check the camera model (fisheye: "
+            f"expected an invertible distortion, got {lens.distortion}; check the camera model (fisheye: "
             f"{lens.fisheye}) and the order of its coefficients",
             name="distortion",
             value=lens.distortion,

@@ -103,13 +103,13 @@ def _is_small(content: bytes, path: Path) -> bool:
         width, height = read_header(io.BytesIO(content)).size
     except Image.DecompressionBombError as error:
         raise PictureSizeError(
-            f"{path}: expected at most {MAX_PIXELS:,} pixels ({error}): scale it down", file=path
+            f"{path}: expected at most {MAX_PIXELS:,} pixels ({error}); scale it down", file=path
         ) from error
     except Exception:  # Pillow raises whatever the parsing of a damaged header raises
         return False
     if width * height > MAX_PIXELS:
         raise PictureSizeError(
-            f"{path}: expected at most {MAX_PIXELS:,} pixels, got {width:,} x {height:,}: scale the picture down",
+            f"{path}: expected at most {MAX_PIXELS:,} pixels, got {width:,} x {height:,}; scale the picture down",
             file=path,
             name="pixels",
             value=width * height,
@@ -129,7 +129,7 @@ def _decode(path: Path, flags: int) -> np.ndarray:
             pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     if pixels is None:
         raise CaptureError(
-            f"{path}: expected a complete PNG, JPEG or WebP image, got {len(content)} bytes that cannot be read: copy "
+            f"{path}: expected a complete PNG, JPEG or WebP image, got {len(content)} bytes that cannot be read; copy "
             "or export it again",
             file=path,
             name="bytes",
@@ -139,7 +139,7 @@ def _decode(path: Path, flags: int) -> np.ndarray:
         return ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if pixels.dtype != np.uint8:
         raise CaptureError(
-            f"{path}: expected 8 or 16 bits per channel, got {pixels.dtype}: export it as PNG",
+            f"{path}: expected 8 or 16 bits per channel, got {pixels.dtype}; export it as PNG",
             file=path,
             name="bits",
             value=str(pixels.dtype),

@@ -31,10 +31,10 @@ def rigid(matrix: Float[np.ndarray, "rows columns"], where: Location) -> tuple[F
         )
     if not np.isfinite(matrix).all():
         value = float(matrix[~np.isfinite(matrix)][0])
-        raise where.error(f"expected a finite pose, got {value}: estimate this camera again", name=key, value=value)
+        raise where.error(f"expected a finite pose, got {value}; estimate this camera again", name=key, value=value)
     if matrix.shape[0] == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise where.error(
-            f"expected 0 0 0 1 as the pose's last row, got {matrix[3].tolist()}: perhaps the matrix is transposed",
+            f"expected 0 0 0 1 as the pose's last row, got {matrix[3].tolist()}; perhaps the matrix is transposed",
             name=key,
             value=matrix[3].tolist(),
         )
@@ -52,7 +52,7 @@ def rigid(matrix: Float[np.ndarray, "rows columns"], where: Location) -> tuple[F
     if scale < 1e-9 or np.abs(stretches / scale - 1).max() > TOLERANCE:
         raise where.error(
             f"expected a rotation in the pose, got a matrix with the scales "
-            f"{', '.join(f'{stretch:.4g}' for stretch in stretches)} along its axes: remove the scales",
+            f"{', '.join(f'{stretch:.4g}' for stretch in stretches)} along its axes; remove the scales",
             name=key,
             value=stretches.tolist(),
         )
@@ -77,7 +77,7 @@ def judge_cameras(cameras: Sequence[Camera]) -> list[Remark]:
     spread = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
     if spread <= 1e-6 * float(np.linalg.norm(positions, axis=1).max()) + 1e-12:
         position = np.round(positions[0], 6).tolist()
-        message = f"expected cameras at several positions, got all {len(cameras)} at {position}: check the camera file"
+        message = f"expected cameras at several positions, got all {len(cameras)} at {position}; check the camera file"
         return [Remark(message, name="positions", value=position)]
     center = _common_point(positions, axes)
     if center is None:

@@ -79,7 +79,7 @@ def _find_shots(folder: Path) -> tuple[Path, Shots]:
     if model is None:
         others = sorted(path.name for path in folder.glob("*.json"))
         found = (
-            f"{listed(others)}: give the path of one of these"
+            f"{listed(others)}; give the path of one of these"
             if others
             else "neither: photographs without cameras need structure from motion first"
         )
@@ -98,7 +98,7 @@ def _refuse_repeated(shots: Sequence[Shot], origin: Path) -> None:
     repeated = sorted({one for one, other in pairwise(names) if one == other})
     if repeated:
         raise CaptureError(
-            f"{origin}: expected one camera for each image, got several for {listed(repeated)}: remove all but one",
+            f"{origin}: expected one camera for each image, got several for {listed(repeated)}; remove all but one",
             file=origin,
             name=repeated[0],
             value=repeated,

@@ -58,7 +58,7 @@ def refuse_many(count: int, where: Path) -> None:
     """Raise CaptureError for more than `MAX_SHOTS` photographs."""
     if count > MAX_SHOTS:
         raise CaptureError(
-            f"{where}: expected at most {MAX_SHOTS:,} photographs, got {count:,}: select some hundreds",
+            f"{where}: expected at most {MAX_SHOTS:,} photographs, got {count:,}; select some hundreds",
             file=where,
             name="photographs",
             value=count,

@@ -82,7 +82,7 @@ def _fit(shot: Shot, picture: Picture, findings: Findings) -> tuple[Picture, Len
     if not _same_shape((width, height), (lens.width, lens.height)):
         raise CaptureError(
             f"{shot.image}: expected an image of its camera's shape, {lens.width} x {lens.height} ({lens.origin}), got "
-            f"{width} x {height}: give the images of which the cameras were estimated, not cropped or rotated",
+            f"{width} x {height}; give the images of which the cameras were estimated, not cropped or rotated",
             file=shot.image,
             name="image",
             value=[width, height],
@@ -112,7 +112,7 @@ def _with_mask(shot: Shot, base: Path, picture: Picture, findings: Findings) -> 
         if not _same_shape((mask.shape[1], mask.shape[0]), (width, height)):
             raise CaptureError(
                 f"{path}: expected a mask of its image's shape, {width} x {height}, got {mask.shape[1]} x "
-                f"{mask.shape[0]}: make the mask of this image",
+                f"{mask.shape[0]}; make the mask of this image",
                 file=path,
                 name="mask",
                 value=[mask.shape[1], mask.shape[0]],

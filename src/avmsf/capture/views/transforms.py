@@ -88,7 +88,7 @@ def _lens(settings: Mapping[str, Any], where: Location, image_width: int, image_
     k1, k2, k3, k4, p1, p2 = (_number(settings, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if not fisheye and k4:
         raise where.error(
-            f"expected k1 k2 p1 p2 k3 of a perspective lens, got k4 = {k4}: calibrate again", name="k4", value=k4
+            f"expected k1 k2 p1 p2 k3 of a perspective lens, got k4 = {k4}; calibrate again", name="k4", value=k4
         )
     distortion = (k1, k2, k3, k4) if fisheye else (k1, k2, p1, p2, k3)
     return Lens(focal, principal, width, height, distortion, fisheye, where)
@@ -115,7 +115,7 @@ def _camera_model(settings: Mapping[str, Any], where: Location) -> str:
     name = str(settings.get("camera_model") or fallback).upper()
     if name not in PERSPECTIVE + FISHEYE:
         raise where.error(
-            f"expected a camera model among {', '.join(PERSPECTIVE + FISHEYE)}, got {name}: undistort the images first",
+            f"expected a camera model among {', '.join(PERSPECTIVE + FISHEYE)}, got {name}; undistort the images first",
             name="camera_model",
             value=name,
         )
