@@ -436,7 +436,7 @@ def test_others_sounds_that_do_not_fit_are_refused_by_name(tmp_path):
     soundfile.write(path, np.stack([sound, sound], axis=1), 8000, subtype="FLOAT")
     assert torch.equal(renderer.render(test.contacts[:1]), test.sounds[:1])
     path.write_bytes(b"no sound")
-    with raises(EvaluationError, file=path, name=None):
+    with raises(EvaluationError, file=path, name="bytes", value=8):
         renderer.render(test.contacts[:1])
     with raises(EvaluationError, name="names", value=3):
         RecordedMethod(tmp_path).fit(replace(task, names=task.names[:3]))

@@ -26,8 +26,8 @@ def test_stems_stand_at_the_modes_as_high_as_their_levels_and_decay_times() -> N
         (stems,) = (drawn for drawn in axes.collections if isinstance(drawn, LineCollection))
         assert np.allclose([segment[1] for segment in stems.get_segments()], np.c_[[200.0, 1000.0, 1010.0], heights])
     assert figure.get_suptitle() == "a bowl"
-    assert upper.get_ylabel() == "level (dB re strongest)"
-    assert (lower.get_xlabel(), lower.get_ylabel()) == ("frequency (Hz)", "decay by 60 dB (s)")
+    assert upper.get_ylabel() == "level (dB re strongest mode)"
+    assert (lower.get_xlabel(), lower.get_ylabel()) == ("frequency (Hz)", "decay time T60 (s)")
     # The doublet's labels would overlap: only the stronger is named.
     assert [text.get_text() for text in upper.texts] == ["1000", "200"]
 

@@ -32,7 +32,7 @@ class RunProgress:
     """How far an evaluation is."""
 
     words: str
-    """What has begun or ended."""
+    """The stage that has begun or ended."""
     done: int
     """Objects that are through."""
     total: int

@@ -32,9 +32,9 @@ _ARROW = 28.0
 
 
 def side_words(side: Side) -> str:
-    """Return where a side is seen from: how far round, and how far up or down."""
+    """Return a side's azimuth and elevation as text."""
     azimuth, elevation = side
-    return f"{azimuth:g}° round, {abs(elevation):g}° {'up' if elevation >= 0 else 'down'}"
+    return f"azimuth {azimuth:g}°, elevation {elevation:g}°"
 
 
 def view_from(side: Side, up: Sequence[float] = UP) -> Float[np.ndarray, "3 3"]:
