@@ -267,15 +267,15 @@ def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys
     assert (config.seed, config.clusters, config.fft_sizes) == (3, 8, (1024, 256))
     assert set(told["scores"]) == {
         "field",
-        "nearest strike",
+        "nearest recording",
         "mean waveform of 3 nearest",
         "mean waveform of 3 nearest, by direction",
         "mean gains of 3 nearest",
         "white noise",
-        "floor: the test strikes' own gains",
+        "floor: gains of the test recordings",
     }
     errors = {method: each["relative_stft"] for method, each in told["scores"].items()}
-    assert min(errors, key=lambda method: errors[method]) == "floor: the test strikes' own gains"
+    assert min(errors, key=lambda method: errors[method]) == "floor: gains of the test recordings"
     assert max(errors, key=lambda method: errors[method]) == "white noise"
     assert "fit, warm-up: 12 steps, loss" in err
     assert "fit, end to end: 6 steps, loss" in err
@@ -388,7 +388,7 @@ def test_nothing_clips_in_silence(field: Path, tmp_path: Path, capsys: Streams) 
     path = tmp_path / "loud.wav"
     words = ["render", str(field), *AT, "--output", str(path), "--normalize", "peak", "--level-db", "6"]
     assert main([*words, "--coding", "int16"]) == 2
-    assert "peaks at 2" in error_line(capsys)
+    assert "got 2" in error_line(capsys)
     assert not path.exists()
     assert main(words) == 0
     assert "peaks at +6.0 dB over full scale" in capsys.readouterr().err
@@ -404,7 +404,7 @@ def test_show_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
     assert told["sample_rate"] == RATE
     assert told["mode_count"] == len(told["modes"]) == len(fitted.bank)
     assert told["modes"][0]["frequency_hertz"] == float(fitted.bank.frequency[0])
-    assert told["compared_with"]["which"] == "the field was not fitted to these"
+    assert told["compared_with"]["which"] == "not training recordings"
     assert set(told["compared_with"]["recordings"]).isdisjoint(fitted.origin.trained_on)
     assert len(told["compared_with"]["recordings"]) == 3
     assert (len(told["trained_on"]), told["trained_on"][0]) == (5, "002.wav")

@@ -81,9 +81,9 @@ def test_no_impacts_have_no_places() -> None:
 
 
 def test_places_and_recordings_are_told_apart() -> None:
-    assert parts_words(*split(repeated(times=1), count=5)) == "15 places not trained on, 5 trained on"
+    assert parts_words(*split(repeated(times=1), count=5)) == "15 positions not trained on, 5 trained on"
     words = parts_words(*split(repeated(apart=0.002), count=5))
-    assert words == "15 places not trained on, 5 trained on (45 and 15 recordings)"
+    assert words == "15 positions not trained on, 5 trained on (45 and 15 recordings)"
 
 
 @pytest.mark.parametrize(("fraction", "places"), [(0.5, 22), (0.3, 13)])
