@@ -286,7 +286,7 @@ def test_force_mallet_and_volume_are_heeded(visit: Open) -> None:
     page = visit()
     force = page.locator(".slider", has_text="Force of a click").locator("input")
     force.fill("200")
-    page.click("text=Strike somewhere")
+    page.click("text=Strike at random")
     assert page.evaluate("avmsf.studio.last.force") == pytest.approx(20)
     page.click("text=Felt")
     assert page.evaluate("avmsf.studio.last.contactTime") == 0.012
@@ -427,7 +427,7 @@ def test_a_sound_that_the_browser_holds_back_is_told_until_it_plays(visit: Open)
              avmsf.strike(0);
            }"""
     )
-    page.wait_for_selector("text=The browser holds the sound back")
+    page.wait_for_selector("text=The browser blocks the sound")
     page.evaluate(
         """() => {
              const { context } = avmsf.studio.engine;
@@ -435,7 +435,7 @@ def test_a_sound_that_the_browser_holds_back_is_told_until_it_plays(visit: Open)
              context.dispatchEvent(new Event("statechange"));
            }"""
     )
-    page.wait_for_function("!document.getElementById('words').textContent.includes('holds the sound back')")
+    page.wait_for_function("!document.getElementById('words').textContent.includes('blocks the sound')")
 
 
 def test_a_field_without_contacts_is_not_told_to_be_struck(visit: Open) -> None:
