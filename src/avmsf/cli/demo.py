@@ -88,7 +88,7 @@ def _go_all_the_way(
         fitting=bar.fitting,
     )
     train, test = made.modes.aligned(train), made.modes.aligned(test)
-    bar.tell("page: a web page, sounds, pictures and scores")
+    bar.tell("page: a web page, sounds, figures and scores")
     shutil.move(made.field, folder / FIELD)
     shutil.move(folder / CACHE / CLOUD, folder / GAUSSIANS)
     field = load(folder / FIELD)
