@@ -128,7 +128,7 @@ def _go_all_the_way(
 
 
 def _title(train: Impacts, test: Impacts) -> str:
-    return f"{parts_words(train, test)}; lower is better; the floor has no noise, which L1-log counts"
+    return f"{parts_words(train, test)}; lower is better; the lower bound has no noise, which L1-log counts"
 
 
 def _write_sounds(folder: Path, field: SoundField, train: Impacts, heard: Impacts) -> None:
