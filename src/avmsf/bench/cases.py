@@ -128,9 +128,13 @@ class Growing:
 
     def __post_init__(self) -> None:
         if any(count < 1 for count in self.counts):
-            raise EvaluationError(f"expected numbers of places of 1 or more, got {list(self.counts)}")
+            raise EvaluationError(
+                f"expected numbers of contacts of 1 or more, got {list(self.counts)}",
+                name="counts",
+                value=list(self.counts),
+            )
         if self.starts < 1:
-            raise EvaluationError(f"starts = {self.starts}: expected 1 or more")
+            raise EvaluationError(f"expected 1 start or more, got {self.starts}", name="starts", value=self.starts)
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return a case for each start and number. Raises EvaluationError where a number leaves nothing to judge by."""
@@ -157,13 +161,16 @@ class Growing:
             if counts:
                 return counts
             raise EvaluationError(
-                f"expected more places than {places} to learn from {min(COUNTS)} and be judged by a quarter: record "
-                "more, or name the numbers of places"
+                f"expected more contacts than {places} to train on {min(COUNTS)} and test on a quarter; record more, "
+                "or give the numbers of contacts",
+                name="contacts",
+                value=places,
             )
         if max(self.counts) >= places:
             raise EvaluationError(
-                f"expected fewer places to learn from than all {places}, got {max(self.counts)}: ask for {places - 1} "
-                "at most"
+                f"expected at most {places - 1} of {places} contacts to train on, got {max(self.counts)}",
+                name="counts",
+                value=max(self.counts),
             )
         return tuple(sorted(set(self.counts)))
 
@@ -219,15 +226,19 @@ class Places:
         for place, rows in enumerate(self.rows):
             if row in rows:
                 return place
-        raise EvaluationError(f"expected a recording to start from, 0 to {self.recordings - 1}, got {row}")
+        raise EvaluationError(
+            f"expected the index of a recording, 0 to {self.recordings - 1}, got {row}", name="start", value=row
+        )
 
     def expect(self, wanted: int, *, least: int = 1) -> int:
-        """Return `wanted`, or raise EvaluationError where so many places to train on are too few or leave no other."""
+        """Return `wanted`, or raise EvaluationError for fewer training contacts than `least` or no test contact."""
         if not least <= wanted < len(self.rows):
             raise EvaluationError(
-                f"expected a number of places to train on from {least} to {len(self.rows) - 1}, so that one is left to "
-                f"test, got {wanted}: there are {counted(self.recordings, 'recording')} at "
-                f"{counted(len(self.rows), 'place')}; choose another number or record more places"
+                f"expected {least} to {len(self.rows) - 1} training contacts of "
+                f"{counted(self.recordings, 'recording')} at {counted(len(self.rows), 'contact')}, got {wanted}; "
+                "choose another number or record more contacts",
+                name="count",
+                value=wanted,
             )
         return wanted
 

@@ -52,8 +52,9 @@ def draw_cloud(
         rows["symmetries"] = torch.full((len(points), 3), _GRAY)
     if not rows or not sides or not len(points):
         raise EvaluationError(
-            f"expected points, colors or symmetries, and sides to draw, found {len(points)} points, {len(rows)} "
-            f"sets of colors and {len(sides)} sides"
+            f"expected points, colors or symmetries, and sides to draw, got {len(points)} points, {len(rows)} sets of "
+            f"colors and {len(sides)} sides",
+            value=(len(points), len(rows), len(sides)),
         )
     figure = Figure(figsize=(_INCHES * len(sides), _INCHES * len(rows) + 0.5), layout="constrained")
     grid = figure.subplots(len(rows), len(sides), squeeze=False)
@@ -129,7 +130,12 @@ def save_turntable(
 ) -> None:
     """Write an animated GIF of the cloud turning once in three seconds. Raises EvaluationError for another ending."""
     if path.suffix.lower() != ".gif" or frames < 2:
-        raise EvaluationError(f"{path}: expected a turntable of 2 or more frames named .gif, found {frames} frames")
+        raise EvaluationError(
+            f"{path}: expected a name that ends in .gif and 2 frames or more, got {frames} frames",
+            file=path,
+            name="frames",
+            value=frames,
+        )
     pictures = []
     for frame in range(frames):
         figure = Figure(figsize=(_TURNTABLE_INCHES, _TURNTABLE_INCHES), dpi=100)

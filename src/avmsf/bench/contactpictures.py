@@ -1,4 +1,4 @@
-"""Where a blow may have fallen, as a picture of the object from all sides and as a point cloud in colors."""
+"""The probability of a contact, as a picture of the object from all sides and as a colored point cloud."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -38,9 +38,9 @@ def draw_contact(
     truth: Float[Tensor, " 3"] | None = None,
     sides: Sequence[Side] = ALL_SIDES,
 ) -> Figure:
-    """Draw the probability of a contact over the object, and beneath it the paper's cosine distance, from all sides.
+    """Draw the probability of a contact over the object, and below it the paper's cosine distance, from all sides.
 
-    The likeliest place is marked blue, `others` that sound alike white, and the `truth` red where it is known.
+    The most probable contact is marked blue, equivalent `others` white, and the true contact, `truth`, red if given.
     """
     points = contact.points
     # The likeliest point and its neighborhood must not fall between those that are drawn.
@@ -59,7 +59,7 @@ def draw_contact(
     low, high = _span(contact)
     for line, (first, last, words, heat) in enumerate(
         (
-            (-_DECADES, 0.0, "log10 of probability over the greatest", SEQUENTIAL),
+            (-_DECADES, 0.0, "log10 of probability / maximum", SEQUENTIAL),
             (low, high, "cosine distance of the gains", f"{SEQUENTIAL}_r"),
         )
     ):
@@ -133,5 +133,5 @@ def _marked(
 
 def _title(title: str, marks: Sequence[tuple[Tensor, tuple[float, float, float]]]) -> str:
     used = {color for _, color in marks}
-    named = ((_FOUND, "blue: likeliest"), (_OTHER, "white: sounds alike"), (_TRUTH, "red: true contact"))
+    named = ((_FOUND, "blue: most probable"), (_OTHER, "white: equivalent"), (_TRUTH, "red: true contact"))
     return "\n".join([title, ", ".join(words for color, words in named if color in used)])

@@ -62,8 +62,8 @@ def judge(
 ) -> tuple[EditScore, ...]:
     """Return every method's scores in every task. An object's field is made beforehand and not counted as time.
 
-    What a method makes that holds no blow or no modes, or cannot make, has no score, and a warning says so: a model may
-    make anything.
+    A sound without an impact or without modes, and a method that fails, have no score, and a warning says so: a
+    generative model may return anything.
     """
     scores = []
     for task in tasks:
@@ -74,8 +74,10 @@ def judge(
                 made = method.edit(task)
             except (CaptureError, ExtractionError, EditError, EvaluationError) as error:
                 warnings.warn(
-                    f"{task.object.name} towards {task.target}, {method.name}: {error}; this has no score",
-                    AvmsfWarning,
+                    AvmsfWarning(
+                        f"{task.object.name} to {task.target}, {method.name}: no score, since {error}",
+                        **{**error.attributes, "name": f"{task.object.name} to {task.target}, {method.name}"},
+                    ),
                     stacklevel=2,
                 )
                 continue
@@ -134,7 +136,9 @@ def spectral_distance(made: Edited, reference: Reference) -> float:
     """
     if made.sample_rate != reference.sample_rate:
         raise EvaluationError(
-            f"sounds at {made.sample_rate:g} Hz and a reference at {reference.sample_rate:g} Hz; resample one of them"
+            f"expected a reference at {made.sample_rate:g} Hz, got {reference.sample_rate:g} Hz; resample one of them",
+            name="reference",
+            value=reference.sample_rate,
         )
     clips = lasting(reference.clips, made.sounds.shape[1]).double()
     heard, wanted = (

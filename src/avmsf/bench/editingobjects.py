@@ -108,13 +108,17 @@ def heard_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = mat
     """Return the modes below half the sample rate (Hz) that are within 60 dB of the loudest, in energy.
 
     `amplitudes` [contacts, modes] are complex or real; a mode's energy is their mean square over 4 d. A mode that an
-    edit has made silent or has moved out of reach tells nothing about a material. Raises EvaluationError where none is
-    heard.
+    edit has silenced or moved out of the band says nothing about a material. Raises EvaluationError where none is
+    audible.
     """
     energy = amplitudes.abs().double().square().mean(dim=0) / (4.0 * bank.damping)
     energy = torch.where(bank.frequency < 0.5 * sample_rate, energy, 0.0)
     if not bool(energy.max() > 0.0):
-        raise EvaluationError(f"none of {len(bank)} modes is heard: all are silent or lie beyond half the sample rate")
+        raise EvaluationError(
+            f"expected a mode with energy below half the sample rate, found none of {len(bank)}",
+            name="bank",
+            value=len(bank),
+        )
     kept = energy >= energy.max() * 10.0 ** (_FAINTEST_DB / 10.0)
     return ModalBank(bank.frequency[kept], bank.damping[kept])
 
@@ -128,8 +132,9 @@ def recorded_objects(dataset: Dataset, materials: Mapping[str, str] = REALIMPACT
     held = [name for name in dataset.objects() if name in materials]
     if not held:
         raise EvaluationError(
-            f"{dataset.name} holds none of the {len(materials)} objects whose materials are known, such as "
-            f"{', '.join(list(materials)[:3])}; download some of them"
+            f"{dataset.name}: expected objects of known materials such as {', '.join(list(materials)[:3])}, found none",
+            name=dataset.name,
+            value=0,
         )
     found = []
     for name in held:

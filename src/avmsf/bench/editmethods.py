@@ -78,7 +78,9 @@ class Recast:
         """Return the recast object. Raises EvaluationError for a material without constants."""
         for material in (task.object.material, task.target):
             if material not in MATERIALS:
-                raise EvaluationError(f"no constants are known of {material!r}; they are of {', '.join(MATERIALS)}")
+                raise EvaluationError(
+                    f"expected a material of {', '.join(MATERIALS)}, got {material!r}", name="material", value=material
+                )
         old, new = MATERIALS[task.object.material], MATERIALS[task.target]
         return heard(recast(task.object.sound_field, old, new), task)
 
@@ -191,5 +193,7 @@ def heard(edited: SoundField, task: EditTask) -> Edited:
 
 def _reference(task: EditTask) -> Guide:
     if task.reference is None:
-        raise EvaluationError(f"{task.object.name} towards {task.target}: expected a reference, found none")
+        raise EvaluationError(
+            f"{task.object.name} to {task.target}: expected a reference, found none", name="reference"
+        )
     return task.reference

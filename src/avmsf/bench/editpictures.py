@@ -1,4 +1,4 @@
-"""Pictures of an edit: an object's modes before and after it, and how one blow sounds."""
+"""Pictures of an edit: an object's modes before and after it, and the spectrograms of one impact."""
 
 from dataclasses import dataclass
 
@@ -71,11 +71,11 @@ def draw_edit(before: HeardModes, after: HeardModes, *, sample_rate: float, titl
         rings.plot([one[0], other[0]], [one[1], other[1]], color="gray", linewidth=0.5, alpha=0.5, zorder=0)
     _count(counts, drawn)
     levels.set_ylim(top - _RANGE_DB, top + 6.0)
-    levels.set_ylabel("level (dB re strongest before)")
+    levels.set_ylabel("level (dB re strongest mode before)")
     levels.legend()
     rings.set_yscale("log")
-    rings.set_ylabel("decay by 60 dB (s)")
-    counts.set_ylabel("modes a third of an octave")
+    rings.set_ylabel("decay time T60 (s)")
+    counts.set_ylabel("modes per third-octave band")
     counts.set_xlabel("frequency (Hz); hollow: silent")
     for axes in (levels, rings, counts):
         axes.set_xscale("log")
@@ -113,7 +113,7 @@ def draw_sound_change(
         axes.set_title(what)
         axes.set_xlabel("time (s)")
     grid[0].set_ylabel("frequency (kHz)")
-    figure.colorbar(image, ax=grid, label="level (dB, 0 = its loudest)", shrink=0.8)
+    figure.colorbar(image, ax=grid, label="level (dB re maximum of each)", shrink=0.8)
     figure.suptitle(title)
     return figure
 

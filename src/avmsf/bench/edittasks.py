@@ -39,7 +39,11 @@ class Transition:
     def prompts(self) -> tuple[str, str]:
         """Words for the target. Raises EvaluationError for a material that has none here."""
         if self.target not in PROMPTS:
-            raise EvaluationError(f"there are no prompts for {self.target!r}; there are for {', '.join(PROMPTS)}")
+            raise EvaluationError(
+                f"expected a target with prompts, {', '.join(PROMPTS)}, got {self.target!r}",
+                name="target",
+                value=self.target,
+            )
         return PROMPTS[self.target]
 
 
@@ -78,7 +82,7 @@ class EditTask:
     def words(self) -> str:
         """Return the prompt. Raises EvaluationError where there is none."""
         if self.prompt is None:
-            raise EvaluationError(f"{self.object.name} towards {self.target}: expected a prompt, found none")
+            raise EvaluationError(f"{self.object.name} to {self.target}: expected a prompt, found none", name="prompt")
         return self.prompt
 
 

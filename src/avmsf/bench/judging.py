@@ -45,10 +45,14 @@ class Judging:
 
     def __post_init__(self) -> None:
         if self.cdpam_contacts < 0:
-            raise EvaluationError(f"cdpam_contacts = {self.cdpam_contacts}: expected 0, for all, or more")
+            raise EvaluationError(
+                f"expected cdpam_contacts of 0 (all) or more, got {self.cdpam_contacts}",
+                name="cdpam_contacts",
+                value=self.cdpam_contacts,
+            )
 
     def prepare(self) -> None:
-        """Raise EvaluationError where something that is needed is not installed: before work of hours, not after."""
+        """Raise EvaluationError where a required package is not installed, before hours of computation."""
         if self.cdpam:
             _cdpam()
 
@@ -69,7 +73,9 @@ class Judging:
         """
         if renderer.sample_rate != test.sample_rate:
             raise EvaluationError(
-                f"the method's sounds are at {renderer.sample_rate:g} Hz and the recordings at {test.sample_rate:g} Hz"
+                f"expected a renderer at the recordings' {test.sample_rate:g} Hz, got {renderer.sample_rate:g} Hz",
+                name="sample_rate",
+                value=renderer.sample_rate,
             )
         if self.level == "full-scale" and loudest > 0:
             sounds, test = sounds / loudest, replace(test, sounds=test.sounds / loudest)

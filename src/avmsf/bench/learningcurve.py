@@ -1,4 +1,4 @@
-"""Learning curves: how the error falls with the number of training contacts, method by method, and their picture."""
+"""Learning curves: the error of each method by the number of training contacts, and their picture."""
 
 import math
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ class Curve:
     highest: tuple[float, ...]
     """Of the worst start."""
     starts: tuple[int, ...]
-    """How many starts have a figure."""
+    """How many starts have a value."""
 
     def values(self) -> dict[str, Any]:
         """Return the curve as plain values."""
@@ -37,7 +37,7 @@ class Curve:
 
 
 def curves(record: ObjectRecord, *, metric: str) -> tuple[Curve, ...]:
-    """Return each method's curve of one metric, as far as there are figures, in the order in which they came.
+    """Return each method's curve of one metric, as far as there are values, in the order of the record.
 
     Raises EvaluationError where no method has the metric.
     """
@@ -52,9 +52,11 @@ def curves(record: ObjectRecord, *, metric: str) -> tuple[Curve, ...]:
         known = sorted({name for outcome in record.outcomes for name in outcome.values})
         reason = next((each.failure for each in record.outcomes if each.failure), record.failure)
         raise EvaluationError(
-            f"{record.identifier}: no method has the metric {metric!r}; there are {', '.join(known)}"
+            f"{record.identifier}: expected a metric of {', '.join(known)}, got {metric!r}"
             if known
-            else f"{record.identifier}: {reason or 'nothing was measured'}"
+            else f"{record.identifier}: {reason or 'no value'}",
+            name="metric",
+            value=metric,
         )
     return tuple(_curve(method, by_count) for method, by_count in found.items())
 
@@ -78,7 +80,7 @@ def draw_learning_curve(found: Sequence[Curve], *, metric: str, title: str) -> F
     axes.set_yticks([tick for tick in _TICKS if low <= math.log10(tick) <= high])
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel("training contacts, spread as far apart as possible")
+    axes.set_xlabel("training contacts (farthest-point sampling)")
     axes.set_ylabel("relative STFT error (1 = silence)" if metric == "relative_stft" else metric)
     axes.grid(which="major")
     axes.legend()

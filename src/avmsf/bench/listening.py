@@ -1,4 +1,4 @@
-"""Sounds that are kept to be listened to, and pictures of them."""
+"""Sounds that are stored for listening, and pictures of them."""
 
 import base64
 import io
@@ -29,7 +29,7 @@ _LOWEST = 60.0
 
 
 def listening_gain(recorded: Float[Tensor, " samples"]) -> float:
-    """Return what a recording, and all that is heard beside it, is multiplied by."""
+    """Return the gain of a recording and of the predictions next to it."""
     peak = float(recorded.abs().max())
     return _PEAK / peak if peak > 0 else 1.0
 
@@ -68,7 +68,7 @@ class Heard:
             samples, rate = soundfile.read(io.BytesIO(content), dtype="float64")
         except (OSError, soundfile.LibsndfileError) as error:
             raise EvaluationError(
-                f"{path}: cannot be read as a kept sound ({error}); delete the object's file to have it made again"
+                f"{path}: expected a stored sound, got {error}; delete the object's file to compute it again", file=path
             ) from error
         return cls(content, torch.from_numpy(samples), float(rate))
 

@@ -94,7 +94,9 @@ class LocatingScores:
         rows = [row for row in self.rows if row.method == method]
         if not rows:
             judged = ", ".join(dict.fromkeys(row.method for row in self.rows))
-            raise EvaluationError(f"{self.name}: no strike was located by {method!r}; judged were {judged}")
+            raise EvaluationError(
+                f"{self.name}: expected a method of {judged}, got {method!r}", name="method", value=method
+            )
         means = {name: _mean([getattr(row, name) for row in rows]) for name in ("rmed", "rmed_modulo")}
         means["contact_error"] = means["rmed"] * self.diagonal / self.scale
         means["refused"] = _mean([float(row.refusal is not None) for row in rows])
@@ -139,21 +141,31 @@ def judge_locating(
     known = METHODS if diffsound is None else (*METHODS, DIFFSOUND)
     unknown = [method for method in methods if method not in known]
     if unknown or not methods:
-        raise EvaluationError(f"expected methods of {', '.join(known)}, found {', '.join(unknown) or 'none'}")
+        raise EvaluationError(
+            f"expected methods of {', '.join(known)}, got {', '.join(unknown) or 'none'}",
+            name="methods",
+            value=tuple(unknown),
+        )
     if test.sample_rate != locator.field.sample_rate:
         raise EvaluationError(
-            f"{name}: recordings at {test.sample_rate:g} Hz cannot be located by a field of "
-            f"{locator.field.sample_rate:g} Hz: resample them"
+            f"{name}: expected recordings at the field's {locator.field.sample_rate:g} Hz, got {test.sample_rate:g} Hz",
+            name="sample_rate",
+            value=test.sample_rate,
         )
     if truth is not None and len(truth) != len(test):
-        raise EvaluationError(f"{name}: {len(truth)} true contacts for {len(test)} recordings: give one for each")
+        raise EvaluationError(
+            f"{name}: expected a true contact for each of {len(test)} recordings, got {len(truth)}",
+            name="truth",
+            value=len(truth),
+        )
     right = test.contacts if truth is None else truth
     ground = _Ground(locator.points.double(), Images.none() if images is None else images, level)
     size = ground.diagonal if scale is None else scale
     if not (ground.diagonal > 0.0 and math.isfinite(size) and size > 0.0):
         raise EvaluationError(
-            f"{name}: points {ground.diagonal:g} m across and an object of {size:g} m: errors are relative to both, "
-            "which must be positive"
+            f"{name}: expected a positive diagonal and scale, got {ground.diagonal:g} m and {size:g} m",
+            name="scale",
+            value=(ground.diagonal, size),
         )
     alike = NearestSpectrum(train)
     rows: list[StrikeRow] = []

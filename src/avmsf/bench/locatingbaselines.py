@@ -29,7 +29,7 @@ class NearestSpectrum:
         Training recordings that are silent are never the nearest. Raises EvaluationError for a sound that is silent.
         """
         if not bool(sound.any()):
-            raise EvaluationError("a silent recording has no spectrum to compare; leave it out")
+            raise EvaluationError("expected a recording, got silence; omit it", name="sound", value=0.0)
         alike = self._signatures @ self._signature(sound)
         return int(torch.where(self.train.sounds.any(dim=1), alike, -torch.inf).argmax())
 

@@ -169,8 +169,10 @@ def method_named(name: str) -> Method:
     near = difflib.get_close_matches(name, METHODS, n=1)
     guess = f"; did you mean {near[0]}?" if near else ""
     raise EvaluationError(
-        f"no method is called {name!r}: there are {', '.join(METHODS)}, {PUBLISHED}FOLDER, {SMALL}FILE and "
-        f"{_RECORDED}FOLDER{guess}"
+        f"expected a method of {', '.join(METHODS)}, {PUBLISHED}FOLDER, {SMALL}FILE and {_RECORDED}FOLDER, got "
+        f"{name!r}{guess}",
+        name="method",
+        value=name,
     )
 
 
@@ -178,7 +180,12 @@ def _given(name: str, prefix: str, kind: Literal["a folder", "a file"], use: str
     """Return the path in a method's name. Raises EvaluationError where nothing is there."""
     path = Path(name.removeprefix(prefix)).expanduser()
     if name in (prefix, prefix[:-1]) or not (path.is_dir() if kind == "a folder" else path.is_file()):
-        raise EvaluationError(f"{name}: expected {kind} after `{prefix}`, {use}; found none of this name")
+        raise EvaluationError(
+            f"{name}: expected {kind} after `{prefix}`, {use}, found none",
+            file=path if path.name else None,
+            name="method",
+            value=name,
+        )
     return path
 
 

@@ -41,7 +41,9 @@ def expect_format(path: Path) -> str:
     ending = path.suffix.lower().lstrip(".")
     if ending not in FORMATS:
         raise EvaluationError(
-            f"{path}: a picture's name ends in .png, .pdf or .svg, found {path.suffix or 'no ending'}"
+            f"{path}: expected a name that ends in .png, .pdf or .svg, got {path.suffix or 'no ending'}",
+            file=path,
+            value=path.suffix,
         )
     return ending
 
@@ -55,7 +57,7 @@ def draw_modes(bank: ModalBank, level_db: Float[Tensor, " modes"], *, title: str
     bottom = 10.0 * math.floor(float(level.min()) / 10) - 5.0
     _stems(upper, frequency, level, bottom=bottom, color=FIRST)
     upper.set_ylim(bottom, float(level.max()) + 0.12 * (float(level.max()) - bottom))
-    upper.set_ylabel("level (dB re strongest)")
+    upper.set_ylabel("level (dB re strongest mode)")
     for row in _apart(frequency, level, most=8):
         place = (frequency[row], level[row])
         upper.annotate(
@@ -63,7 +65,7 @@ def draw_modes(bank: ModalBank, level_db: Float[Tensor, " modes"], *, title: str
         )
     _stems(lower, frequency, math.log(1000) / bank.damping.numpy(), bottom=0.0, color=SECOND)
     lower.set_ylim(bottom=0.0)
-    lower.set_ylabel("decay by 60 dB (s)")
+    lower.set_ylabel("decay time T60 (s)")
     lower.set_xlabel("frequency (Hz)")
     lower.set_xlim(0.0, 1.05 * float(frequency.max()))
     for axes in (upper, lower):
@@ -158,7 +160,7 @@ def draw_spectrograms(
         grid[row, 0].set_ylabel("frequency (kHz)" if unit > 1 else "frequency (Hz)")
     for axes in grid[-1]:
         axes.set_xlabel("time (s)")
-    figure.colorbar(image, ax=grid, label="level (dB, 0 = loudest recorded)", shrink=0.8)
+    figure.colorbar(image, ax=grid, label="level (dB re maximum of the recording)", shrink=0.8)
     figure.suptitle(title)
     return figure
 
@@ -187,7 +189,7 @@ def draw_scores(scores: Mapping[str, Scores], *, metric: str = "relative_stft", 
             va="center",
             fontsize=9,
         )
-    axes.set_xlabel("relative STFT error (0 = as recorded, 1 = as wrong as silence)")
+    axes.set_xlabel("relative STFT error (0 = recording, 1 = silence)")
     axes.grid(axis="x", which="both")
     figure.suptitle(title)
     return figure

@@ -93,29 +93,39 @@ class ResultsFolder:
     path: Path
 
     def begin(self, identity: Mapping[str, Any], methods: Mapping[str, str]) -> None:
-        """Take the folder for figures of this identity, or go on with what is there of it.
+        """Use the folder for results of this identity, or continue with those that it holds.
 
-        `identity` holds plain values that decide the figures; `methods` says of each method what it is. Methods may be
-        added later. Raises EvaluationError where the folder's figures are of another identity, or a method has changed.
+        `identity` holds plain values that determine the results; `methods` describes each method. Methods may be added
+        later. Raises EvaluationError where the folder's results are of another identity, or a method has changed.
         """
         wanted = json.loads(json.dumps(dict(identity)))
         place = self.path / IDENTITY
         known = self.identity() if place.exists() else {**wanted, "methods": {}}
         # A kill may leave a hidden part of the file behind.
         if not place.exists() and self.path.is_dir() and any(self.path.glob("[!.]*")):
-            raise EvaluationError(f"{self.path}: is not empty and holds no {IDENTITY}; choose a new --output")
+            raise EvaluationError(
+                f"{self.path}: expected an empty folder or one with {IDENTITY}, found others; choose a new --output",
+                file=self.path,
+                name="output",
+            )
         kept = known.pop("methods")
         for key in dict.fromkeys((*wanted, *known)):
             if wanted.get(key) != known.get(key):
                 raise EvaluationError(
-                    f"{self.path}: holds results of another evaluation: {key} is {_brief(known.get(key))} there and "
-                    f"{_brief(wanted.get(key))} here; results are not mixed, choose another --output"
+                    f"{self.path}: expected results with {key} = {_brief(wanted.get(key))}, got "
+                    f"{_brief(known.get(key))}; choose another --output",
+                    file=self.path,
+                    name=key,
+                    value=known.get(key),
                 )
         for name in methods:
             if name in kept and kept[name] != methods[name]:
                 raise EvaluationError(
-                    f"{self.path}: holds results of another method {name}: {_brief(kept[name])} there and "
-                    f"{_brief(methods[name])} here; results are not mixed, choose another --output"
+                    f"{self.path}: expected results of the method {name} = {_brief(methods[name])}, got "
+                    f"{_brief(kept[name])}; choose another --output",
+                    file=self.path,
+                    name=name,
+                    value=kept[name],
                 )
         write_json(place, {**wanted, "methods": {**kept, **methods}})
 
@@ -170,8 +180,9 @@ class ResultsFolder:
 
     def _damaged(self, place: Path, error: object) -> EvaluationError:
         return EvaluationError(
-            f"{place}: cannot be read as results of this version ({error}); delete the file to compute them again, or "
-            "choose another --output"
+            f"{place}: expected results of this version, got {error}; delete the file to compute them again, or choose "
+            "another --output",
+            file=place,
         )
 
 

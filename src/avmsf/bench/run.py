@@ -79,13 +79,16 @@ def run_object(
 def _of_same_recordings(
     record: ObjectRecord, digest: str, evaluation: Evaluation, results: ResultsFolder
 ) -> ObjectRecord:
-    """Return an object's record, an empty one where it has no figures; raise EvaluationError if they are of others."""
+    """Return an object's record, empty where it has no values; raise EvaluationError for other recordings' values."""
     if record.digest != digest and all(each.failure is not None for each in record.outcomes):
         record = ObjectRecord(record.identifier)
     if record.digest not in ("", digest):
         raise EvaluationError(
-            f"{results.path}: holds figures of other recordings of {record.identifier} than {evaluation.title} "
-            "holds now; results are not mixed, choose another --output"
+            f"{results.path}: expected results of the recordings of {record.identifier} in {evaluation.title}, got "
+            "those of others; choose another --output",
+            file=results.path,
+            name=record.identifier,
+            value=record.digest,
         )
     return replace(record, digest=digest)
 

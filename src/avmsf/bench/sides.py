@@ -32,9 +32,9 @@ _ARROW = 28.0
 
 
 def side_words(side: Side) -> str:
-    """Return where a side is seen from: how far round, and how far up or down."""
+    """Return a side's azimuth and elevation as text."""
     azimuth, elevation = side
-    return f"{azimuth:g}° round, {abs(elevation):g}° {'up' if elevation >= 0 else 'down'}"
+    return f"azimuth {azimuth:g}°, elevation {elevation:g}°"
 
 
 def view_from(side: Side, up: Sequence[float] = UP) -> Float[np.ndarray, "3 3"]:
@@ -45,7 +45,7 @@ def view_from(side: Side, up: Sequence[float] = UP) -> Float[np.ndarray, "3 3"]:
     azimuth, elevation = side
     sky = np.asarray(up, dtype=float)
     if sky.shape != (3,) or not np.isfinite(sky).all() or np.linalg.norm(sky) == 0.0:
-        raise EvaluationError(f"expected a direction of three numbers that points up, found {list(up)}")
+        raise EvaluationError(f"expected an up direction of three numbers, got {list(up)}", name="up", value=list(up))
     sky = sky / np.linalg.norm(sky)
     first = np.roll(np.eye(3)[np.argmax(np.abs(sky))], 1)
     first = first - (first @ sky) * sky

@@ -24,7 +24,9 @@ def draw_surface(surface: Surface, *, title: str) -> Figure:
     EvaluationError for a surface without triangles.
     """
     if not len(surface.faces):
-        raise EvaluationError(f"expected a surface of triangles to draw, got {len(surface.vertices)} points")
+        raise EvaluationError(
+            f"expected a surface with triangles, got {len(surface.vertices)} points", name="surface", value=0
+        )
     mesh = trimesh.Trimesh(_MILLIMETERS * surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
     figure = Figure(figsize=(14, 5), layout="constrained")
     whole, *cuts = figure.subplots(1, 3)

@@ -23,13 +23,11 @@ features without symmetry pooling."""
 
 
 def _no_family() -> BodyFamily:
-    raise EvaluationError("the object's shape is not known: expected a mesh, or views of it")
+    raise EvaluationError("expected a mesh or views of the object, found none", name="mesh")
 
 
 def _no_gaussians() -> GaussianCloud:
-    raise EvaluationError(
-        "the object has no Gaussians: expected views of it, its mesh, or a .ply of Gaussians in its folder"
-    )
+    raise EvaluationError("expected views, a mesh or a .ply of Gaussians of the object, found none", name="gaussians")
 
 
 @dataclass(frozen=True, eq=False)

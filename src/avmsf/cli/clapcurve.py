@@ -54,7 +54,12 @@ def _read(path: Path, clap: Clap) -> dict[int, float]:
         scores = {int(step): float(score) for step, score in read["scores"]}
         digest = read["digest"]
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise EditError(f"{path}: cannot be read as CLAP scores of an edit ({error}); delete it to go on") from error
+        raise EditError(f"{path}: expected CLAP scores, got {error}; delete the file to continue", file=path) from error
     if digest != clap.digest:
-        raise EditError(f"{path}: expected scores of {clap.name}, got those of another network; give that network")
+        raise EditError(
+            f"{path}: expected scores of {clap.name}, got those of another network; give that network",
+            file=path,
+            name="digest",
+            value=digest,
+        )
     return scores

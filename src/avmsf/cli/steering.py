@@ -54,23 +54,31 @@ class Steering(GuideOptions):
         """
         if len(self._guides) > 1:
             raise EditError(
-                f"expected one of --prompt, --like and --like-material, found {' and '.join(self._guides)}: edit by "
-                "one, then by the other"
+                f"expected one of --prompt, --like and --like-material, got {' and '.join(self._guides)}; use one "
+                "after the other",
+                name=self._guides[0],
+                value=tuple(self._guides),
             )
         if self.like_material is not None:
             material_named(self.like_material)
         if not self._guides:
             given = [*(name for name in _changed(self) if name == "--parameters"), *_changed(self.config)]
-            _expect_unchanged(given, "--prompt, --like or --like-material, and none of them is given")
+            _expect_unchanged(given, "--prompt, --like or --like-material")
         if self.prompt is None:
             own = [name for name in _changed(self) if name in _OF_THE_MODEL]
-            _expect_unchanged([*own, *_changed(self.distillation)], "--prompt, which is not given")
+            _expect_unchanged([*own, *_changed(self.distillation)], "--prompt")
             return
         expect_prompt(self.prompt)
         if self.clap is not None and self.config.preview_every == 0:
-            raise EditError("--clap takes scores of the previews, and --preview-every 0 makes none: give 50, say")
+            raise EditError(
+                "--clap: expected --preview-every 1 or more with it, such as 50, got 0", name="--clap", value=0
+            )
         if self.model_seconds is not None and not 0 < self.model_seconds < math.inf:
-            raise EditError(f"--model-seconds {self.model_seconds:g}: expected more than 0, such as 3")
+            raise EditError(
+                f"--model-seconds: expected more than 0, such as 3, got {self.model_seconds:g}",
+                name="--model-seconds",
+                value=self.model_seconds,
+            )
 
     def apply(self, field: SoundField, *, output: Path, old: Material | None) -> SoundField:
         """Return the edited field; `output` is where it will be written, and its state and preview lie beside it.
@@ -142,7 +150,9 @@ def _changed(options: Any) -> list[str]:
 
 def _expect_unchanged(given: list[str], wanted: str) -> None:
     if given:
-        raise EditError(f"{' and '.join(given)} {'goes' if len(given) == 1 else 'go'} with {wanted}")
+        raise EditError(
+            f"{' and '.join(given)}: expected {wanted} as well, got none", name=given[0], value=tuple(given)
+        )
 
 
 class SteerBar:
@@ -180,7 +190,7 @@ class SteerBar:
         factor = _PREVIEW.factor(progress.preview[None])
         write_sound(self.preview, factor * progress.preview, sample_rate=self.sample_rate, coding="float32")
         if not self.live:
-            say(f"step {progress.step} of {progress.steps}: loss {loss}, pitch x {pitch}; listen: {self.preview}")
+            say(f"step {progress.step} of {progress.steps}: loss {loss}, pitch x {pitch}; preview in {self.preview}")
 
 
 def beside(output: Path, ending: str) -> Path:

@@ -97,13 +97,16 @@ class StageFolder:
 
     @contextmanager
     def _explaining(self, name: str) -> Iterator[None]:
-        """Let an OSError become a CaptureError that says what to do."""
+        """Turn an OSError into a CaptureError with advice."""
         try:
             yield
         except OSError as error:
+            reason = error.strerror or str(error)
+            path = self.path(name)
             raise CaptureError(
-                f"{self.path(name)}: cannot be read or replaced ({error.strerror or error}): {way_out(error)}, as by "
-                "--cache"
+                f"{path}: expected a readable and writable path, got {reason!r}; {way_out(error)} by --cache",
+                file=path,
+                value=reason,
             ) from error
 
 

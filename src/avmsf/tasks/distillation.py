@@ -1,4 +1,4 @@
-"""Pull a sound towards words: noise it, let a text-to-audio diffusion model clean it up, take that for the target.
+"""Targets from a text prompt: add noise to a sound, let a text-to-audio diffusion model denoise it.
 
 Noise level t from 0 to 1 turns latents z by the angle a = pi t / 2: z_t = cos(a) z + sin(a) noise. A deterministic
 (DDIM) step estimates the clean latents and the noise from z_t and puts them together again at a lower level; partial
@@ -117,7 +117,9 @@ def partial_denoising(
 def expect_prompt(prompt: str) -> str:
     """Return a prompt without the blanks around it. Raises `EditError` for an empty one."""
     if not prompt.strip():
-        raise EditError('expected a prompt, found an empty one: describe the sound, such as "a wooden bowl is hit"')
+        raise EditError(
+            'expected a prompt, such as "a wooden bowl is struck", got an empty one', name="prompt", value=prompt
+        )
     return prompt.strip()
 
 
@@ -182,8 +184,10 @@ class DecoderDistillation:
                 except torch.OutOfMemoryError as error:
                     if self.batch == 1:
                         raise EditError(
-                            f"{self.model.name} runs out of memory on {self.model.device} with one sound at a time: "
-                            "give it fewer seconds to work at, free memory there, or choose the device cpu"
+                            f"{self.model.name}: out of memory on {self.model.device} with a batch of 1; use fewer "
+                            "seconds, free memory, or choose the device cpu",
+                            name="batch",
+                            value=1,
                         ) from error
                 # Not before the error is gone: its traceback holds the tensors that filled the memory.
                 self._halve()
@@ -218,7 +222,10 @@ class DecoderDistillation:
         if self.model.device.type == "cuda":
             torch.cuda.empty_cache()
         warnings.warn(
-            f"{self.model.name} runs out of memory on {self.model.device}: going on with batches of {self.batch}",
-            AvmsfWarning,
+            AvmsfWarning(
+                f"{self.model.name}: out of memory on {self.model.device}; continuing with batches of {self.batch}",
+                name="batch",
+                value=self.batch,
+            ),
             stacklevel=3,
         )

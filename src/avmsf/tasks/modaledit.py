@@ -1,4 +1,4 @@
-"""What an edit of an object's modes is: its pitch and damping as a whole, a little for each mode, never for a place."""
+"""An edit of an object's modes: common factors and one set of factors a mode, the same at all contacts."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -84,7 +84,11 @@ class ModalEdit:
         makes a mode's frequency, damping or gain no number.
         """
         if len(self.shift) != len(field.bank):
-            raise EditError(f"expected an edit of the field's {len(field.bank)} modes, found one of {len(self.shift)}")
+            raise EditError(
+                f"expected an edit of the field's {len(field.bank)} modes, got one of {len(self.shift)}",
+                name="shift",
+                value=len(self.shift),
+            )
         bank = self.bank(field.bank)
         return edited(
             field,

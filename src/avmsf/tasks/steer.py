@@ -1,4 +1,4 @@
-"""The descent: a field's modes are moved until it sounds like what a guide asks for, the same wherever it is struck."""
+"""Guided editing: a field's modes are optimized towards a guide's target sounds, with one edit for all contacts."""
 
 import math
 import time
@@ -118,8 +118,9 @@ class _Steering:
     ) -> None:
         if guide.sample_rate != field.sample_rate:
             raise EditError(
-                f"a guide of sounds at {guide.sample_rate:g} Hz and a field at {field.sample_rate:g} Hz: make the "
-                f"guide with sample_rate = {field.sample_rate:g}, of sounds at that rate"
+                f"guide: expected the field's sample rate of {field.sample_rate:g} Hz, got {guide.sample_rate:g} Hz",
+                name="sample_rate",
+                value=guide.sample_rate,
             )
         self.field, self.guide, self.config, self.parameters = field, guide, config, parameters
         self.checkpoint, self.device, self.saved_at = checkpoint, torch.device(device), time.monotonic()
@@ -192,8 +193,10 @@ class _Steering:
             self.spoilt += 1
             if self.spoilt >= _SPOILT:
                 raise EditError(
-                    f"the targets of {self.spoilt} steps in a row hold samples that are not finite numbers: lower the "
-                    "guidance, or compute in float32"
+                    f"expected finite target sounds, got NaN or inf in {self.spoilt} consecutive steps; lower the "
+                    "guidance, or compute in float32",
+                    name="targets",
+                    value=self.spoilt,
                 )
         self.step += 1
         self.whole = True
@@ -204,8 +207,11 @@ class _Steering:
         error = spectral_loss(sounds, target) / len(self.sizes)
         if not (self.variables.differentiate(error) and bool(torch.isfinite(error))):
             raise EditError(
-                f"the edit diverged, its loss at step {self.step} is {float(error)} or its slope is no number: lower "
-                "the rates of its parameters"
+                f"step {self.step}: expected a finite loss and gradient, got a loss of {float(error)}; lower the "
+                "learning rates",
+                row=self.step,
+                name="loss",
+                value=float(error),
             )
         self.whole = False
         self.variables.move(done=self.step / self.config.steps)
@@ -233,7 +239,9 @@ class _Steering:
     def _expect_sound(self) -> Float[Tensor, " contacts"]:
         sounds = self.probes.sounds(ModalEdit.none(self.probes.bank))
         if not bool(torch.isfinite(sounds).all()) or float(sounds.abs().max()) == 0.0:
-            raise EditError("expected a field whose modes sound, found silence at all places: fit it again")
+            raise EditError(
+                "field: expected audible modes, got silence at all contacts; fit it again", name="field", value=0.0
+            )
         return level(sounds, sample_rate=self.field.sample_rate)
 
     def _save(self) -> None:
@@ -248,5 +256,7 @@ class _Steering:
             write_checkpoint(self.checkpoint, state, self.asked, raising=EditError)
         except EditError as error:
             # A full disk costs the checkpoint, not the edit.
-            warnings.warn(f"the edit goes on without a new checkpoint: {error}", AvmsfWarning, stacklevel=2)
+            warnings.warn(
+                AvmsfWarning(f"the edit continues without a checkpoint: {error}", **error.attributes), stacklevel=2
+            )
         self.saved_at = time.monotonic()
