@@ -76,9 +76,13 @@ def measure(options: Options) -> Report:
     report = Report(CONVENTIONS)
     making = "sonicgauss-training" in options.parts
     if making and options.weights is None:
-        raise EvaluationError("sonicgauss-training: expected --weights FILE, where the weights are to be written")
+        raise EvaluationError("sonicgauss-training: expected --weights FILE to write, got none", name="weights")
     if options.weights is not None and not making and not options.weights.is_file():
-        raise EvaluationError(f"{options.weights}: expected weights, found no file: add the part sonicgauss-training")
+        raise EvaluationError(
+            f"{options.weights}: expected weights, found no file; add the part sonicgauss-training",
+            file=options.weights,
+            name="weights",
+        )
     with tempfile.TemporaryDirectory() as folder:
         objects = _Objects(options, Path(folder))
         for part in options.parts:

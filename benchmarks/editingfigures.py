@@ -62,8 +62,9 @@ def write_figures(record: Path, folder: Path) -> list[Path]:
                 curves.setdefault(each["method"], []).append([(step, score) for step, score in each["clap_curve"]])
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise EvaluationError(
-            f"{record}: expected a record of python -m benchmarks.editingprotocol --record, got something else "
-            f"({type(error).__name__}: {error}); run the protocol again"
+            f"{record}: expected a record of python -m benchmarks.editingprotocol --record, got "
+            f"{type(error).__name__}: {error}; run the protocol again",
+            file=record,
         ) from error
     if curves:
         figures["clap.png"] = draw_clap_curves(curves, title="CLAP score of the previews and the prompt")

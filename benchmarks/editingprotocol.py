@@ -120,8 +120,11 @@ def recorded_cast(folder: Path, *, words: bool, seed: int = 0, paper: tuple[str,
     missing = sorted(set(REALIMPACT_26) - set(dataset.objects()))
     if len(REALIMPACT_26) - len(missing) < LEAST:
         raise EvaluationError(
-            f"{folder} holds {len(REALIMPACT_26) - len(missing)} of the {len(REALIMPACT_26)} objects whose materials "
-            f"are known, expected at least {LEAST}: download more of them, such as {', '.join(missing[:3])}"
+            f"{folder}: expected {LEAST} objects of known materials or more, got {len(REALIMPACT_26) - len(missing)}; "
+            f"download more, such as {', '.join(missing[:3])}",
+            file=folder,
+            name=dataset.name,
+            value=len(REALIMPACT_26) - len(missing),
         )
     tell(f"editing: extracting modes of {len(REALIMPACT_26) - len(missing)} objects")
     objects = recorded_objects(dataset, paper=None if paper is None else _paper_fields(dataset, *paper))
@@ -130,13 +133,17 @@ def recorded_cast(folder: Path, *, words: bool, seed: int = 0, paper: tuple[str,
     tasks = prompted_tasks(objects, transitions, seed=seed) if words else tuple(referred_tasks(objects, seed=seed))
     if not tasks:
         pairs = ", ".join(f"{each.source} to {each.target}" for each in RECORDED_TRANSITIONS)
-        raise EvaluationError(f"{folder} holds no pair of materials that the protocol leads from and to ({pairs})")
+        raise EvaluationError(
+            f"{folder}: expected objects of a material to edit, {pairs}, found {', '.join(sorted(present))}",
+            file=folder,
+            value=tuple(sorted(present)),
+        )
     fields = "fields by kernels of positions" if paper is None else f"modes and fields of the paper, encoder {paper[0]}"
     what = (
         f"{len(objects)} objects of RealImpact, the nearest microphone, modes extracted from all recordings, {fields} "
     )
     what += "(which 26 objects and which prompts the paper took is not said there, so that these are ours)"
-    left_out = f"not there, and left out: {', '.join(missing) or 'none'}."
+    left_out = f"missing and left out: {', '.join(missing) or 'none'}."
     return Cast("realimpact", objects, tasks, what, known=False, remarks=(left_out,))
 
 

@@ -169,7 +169,7 @@ def _draw_capture(browser: Any, address: str, recorded: Path, folder: Path) -> P
             page.set_input_files("#sheet-capture input[type=file]", _well_recorded(recorded / f"{number:03d}.wav"))
             page.wait_for_selector("#sheet-capture dl")
             if number < 3:
-                page.click("text=Keep it")
+                page.click("text=Save recording")
                 page.wait_for_function(f"document.querySelectorAll('#sheet-capture .listing li').length === {number}")
         return _shoot(page, folder / "capture.png")
 

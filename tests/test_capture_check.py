@@ -54,22 +54,16 @@ def test_it_goes_on_past_everything_that_is_broken(tmp_path: Path) -> None:
     assert not report.readable
     assert [row.line for row in report.recordings] == [2, 3, 4, 5, 6, 7, 8, 9]
     assert [row.readable for row in report.recordings] == [True, True, True, False, False, False, False, True]
+    assert [len(row.problems) for row in report.recordings] == [0, 1, 1, 1, 1, 1, 1, 0]
     problems = {row.file: "; ".join(row.problems) for row in report.recordings}
-    for name, part in {
-        "a.wav": "",
-        "b.wav": f"{report.recordings[1].clipped} clipped samples",
-        "c.wav": "a second blow at 0.39",
-        "gone.wav": "no such file",
-        "d.wav": "silent",
-        "e.wav": "not a sound file",
-        "f.wav": "line 8: y is 'left'",
-    }.items():
-        assert part in problems[name], name
-        assert bool(part) == bool(problems[name]), name
+    assert str(report.recordings[1].clipped) in problems["b.wav"]
+    assert "0.39" in problems["c.wav"]
+    assert "'left'" in problems["f.wav"]
     assert report.recordings[2].double_hit_seconds == pytest.approx(0.4, abs=0.01)
-    everything = "; ".join(report.problems)
-    assert "different sample rates: 8000 Hz (3 files" in everything
-    assert "1 wav file has no row in impacts.csv: stray.wav" in everything
+    rates, repeated, unlisted = report.problems
+    assert "8000 Hz" in rates
+    assert "5, 6" in repeated
+    assert "stray.wav" in unlisted
     # What the command line prints as JSON.
     assert json.loads(json.dumps(asdict(report), allow_nan=False))["recordings"][1]["clipped"] > 3
 
@@ -79,7 +73,9 @@ def test_wav_files_in_hidden_folders_are_none_of_the_captures(tmp_path: Path) ->
     for name in (".avmsf/removed/002-ac4f8f352f81.wav", "takes/.trash/001.wav", "._a.wav", "takes/1.wav", "more.wav"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         soundfile.write(folder / name, ring(), RATE)
-    assert check(folder).problems == ("2 wav files have no row in impacts.csv: more.wav, takes/1.wav",)
+    (unlisted,) = check(folder).problems
+    assert "more.wav, takes/1.wav" in unlisted
+    assert "002-ac4f8f352f81.wav" not in unlisted
 
 
 BROKEN = [

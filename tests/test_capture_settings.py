@@ -1,11 +1,14 @@
 """`capture.toml`: what is accepted, and that every mistake names its key."""
 
+import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from avmsf.capture import CaptureSettings
 from avmsf.errors import CaptureError
+from raising import raises
 
 
 def read(folder: Path, text: str) -> CaptureSettings:
@@ -33,37 +36,37 @@ def test_units_are_the_international_ones(unit: str, meters: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "name", "value"),
     [
-        ("second = 2.0", "unknown key 'second' .did you mean seconds"),
-        ("color = 2.0", "unknown key 'color'; expected some of name, unit"),
-        ('seconds = "3"', "seconds is '3'; expected a number"),
-        ("seconds = true", "seconds is True; expected a number"),
-        ("response_channel = 1.5", "response_channel is 1.5; expected a whole number"),
-        ("response_channel = true", "response_channel is True; expected a whole number"),
-        ("align = 1", "align is 1; expected true or false"),
-        ("name = 3", "name is 3; expected text"),
-        ("seconds = 0", "seconds is 0.0; expected a number above 0"),
-        ("seconds = nan", "seconds is nan; expected a number above 0"),
-        ("playback_speed = -1", "playback_speed is -1.0; expected a number above 0"),
-        ("regularization = 0.0", "regularization is 0.0; expected a number above 0"),
-        ("force_scale = 0", "force_scale is 0.0; expected newtons"),
-        ('unit = "km"', "unit is 'km'; expected one of m, cm, mm, in, ft"),
-        ('surface_unit = "yd"', "surface_unit is 'yd'"),
-        ("force_channel = 0", "force_channel is 0; channels count from 1"),
-        ("force_channel = 2\nresponse_channel = 2", "are both 2"),
-        ('normalize = "rms"', "normalize is 'rms'; expected one of auto, peak, deconvolve, none, done"),
-        ('normalize = "deconvolve"', "say which force_channel"),
-        ("seconds = ", "not a TOML file"),
+        ("second = 2.0", "second", "seconds"),
+        ("color = 2.0", "color", None),
+        ('seconds = "3"', "seconds", "3"),
+        ("seconds = true", "seconds", True),
+        ("response_channel = 1.5", "response_channel", 1.5),
+        ("response_channel = true", "response_channel", True),
+        ("align = 1", "align", 1),
+        ("name = 3", "name", 3),
+        ("seconds = 0", "seconds", 0.0),
+        ("seconds = nan", "seconds", pytest.approx(math.nan, nan_ok=True)),
+        ("playback_speed = -1", "playback_speed", -1.0),
+        ("regularization = 0.0", "regularization", 0.0),
+        ("force_scale = 0", "force_scale", 0.0),
+        ('unit = "km"', "unit", "km"),
+        ('surface_unit = "yd"', "surface_unit", "yd"),
+        ("force_channel = 0", "force_channel", 0),
+        ("force_channel = 2\nresponse_channel = 2", "force_channel", 2),
+        ('normalize = "rms"', "normalize", "rms"),
+        ('normalize = "deconvolve"', "force_channel", None),
+        ("seconds = ", None, None),
     ],
 )
-def test_a_mistake_names_file_and_key(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(CaptureError, match=rf"(?s)capture\.toml: .*{message}"):
+def test_a_mistake_names_file_and_key(tmp_path: Path, text: str, name: str | None, value: Any) -> None:
+    with raises(CaptureError, file="capture.toml", name=name, value=value):
         read(tmp_path, text)
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match=r"nowhere\.toml: there is no such file"):
+    with raises(CaptureError, file="nowhere.toml"):
         CaptureSettings.read(tmp_path / "nowhere.toml")
 
 

@@ -1,13 +1,18 @@
 """What the user can get wrong at the command line: exit code 2 and one line that says what to do."""
 
+import math
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from avmsf.cli import main
+from avmsf.errors import AvmsfError
 from plate_capture import TINY, fill_plate
+from raising import raises
 
 Streams = pytest.CaptureFixture[str]
 
@@ -32,43 +37,47 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 AT = "--position 0.1 0.05 0"
-WRONG = {
-    "check plate --settings wrong.toml": "unit is 'miles'",
-    "modes nowhere": "nowhere: expected a capture folder",
-    "modes plate --settings nowhere.toml": "nowhere.toml: expected a capture.toml",
-    "modes plate --picture modes.gif": "ends in .png, .pdf or .svg, found .gif",
-    "modes plate --modes 0": "modes = 0: expected 1 or more",
-    "fit nowhere -o f.safetensors": "nowhere: expected a capture folder",
-    "fit plate --output plate": "is a folder",
-    "fit plate --output words.csv/f.safetensors": "is a file, so there can be no folder",
-    "fit plate --output f.safetensors --train-count 8": "8 recordings at 8 places",
-    "fit plate --output f.safetensors --train-fraction 1.5": "must lie between 0 and 1",
-    "fit plate --output f.safetensors --train-count 4 --start 8": "0 to 7, got 8",
-    "fit plate --output f.safetensors --train-count 4 --train-fraction 0.5": "leave one of them out",
-    "fit plate --output f.safetensors --validation 2": "validation = 2.0: expected 0 to 0.5",
-    "render nowhere.safetensors --position 0 0 0 -o s": "nowhere.safetensors: expected a field file",
-    f"render not-ours.safetensors {AT} --output s": "a file of another kind",
-    "render field.safetensors --output s": "expected contacts either by --position",
-    f"render field.safetensors {AT} --contact-table no-z.csv --output s": "expected contacts either by --position",
-    "render field.safetensors --position 50 60 0 --output s": "--unit says",
-    "render field.safetensors --position nan 0 0 --output s": "expected finite numbers",
-    f"render field.safetensors {AT} {AT} --output two.wav": "is one file and there are 2 contacts",
-    f"render field.safetensors {AT} --output words.csv": "words.csv is a file",
-    f"render field.safetensors {AT} --output s --seconds 0": "expected a time above 0",
-    f"render field.safetensors {AT} --output s --seconds nan": "expected a time above 0",
-    f"render field.safetensors {AT} --output s --level-db nan": "--level-db is nan",
-    f"render field.safetensors {AT} --output s --force inf": "--force is inf",
-    "render field.safetensors --contact-table nowhere.csv --output s": "nowhere.csv: expected a table of contacts",
-    "render field.safetensors --contact-table no-z.csv --output s": "the column z is missing",
-    "render field.safetensors --contact-table empty.csv --output s": "there is no row",
-    "render field.safetensors --contact-table words.csv --output s": "line 3: y is 'left'",
-    "render field.safetensors --contact-table short.csv --output s": "line 2: z is ''",
-    "render field.safetensors --contact-table twice.csv --output s": "more than one row is to become a.wav",
-    "render field.safetensors --contact-table outside.csv --output s": "line 2: file is '../a.wav'",
-    "info nowhere.safetensors": "nowhere.safetensors: expected a field, Gaussians or features",
-    "info field.safetensors --capture fast": "9000 Hz",
-    "demo plate": "files that no demo wrote",
-    "demo words.csv": "expected a folder, got a file",
+TABLE = "render field.safetensors --output s --contact-table"
+WRONG: dict[str, dict[str, Any]] = {
+    "check plate --settings wrong.toml": {"file": "wrong.toml", "name": "unit", "value": "miles"},
+    "modes nowhere": {"file": "nowhere"},
+    "modes plate --settings nowhere.toml": {"file": "nowhere.toml"},
+    "modes plate --picture modes.gif": {"file": "modes.gif", "value": ".gif"},
+    "modes plate --modes 0": {"name": "modes", "value": 0},
+    "fit nowhere -o f.safetensors": {"file": "nowhere"},
+    "fit plate --output plate": {"file": "plate", "value": "folder"},
+    "fit plate --output words.csv/f.safetensors": {"file": "words.csv", "value": "file"},
+    "fit plate --output f.safetensors --train-count 8": {"value": 8},
+    "fit plate --output f.safetensors --train-fraction 1.5": {"name": "fraction", "value": 1.5},
+    "fit plate --output f.safetensors --train-count 4 --start 8": {"name": "start", "value": 8},
+    "fit plate --output f.safetensors --train-count 4 --train-fraction 0.5": {"name": "--train-count"},
+    "fit plate --output f.safetensors --validation 2": {"name": "validation", "value": 2.0},
+    "fit plate --output f.safetensors --material glass --train-count 4": {"name": "--train-count"},
+    "render nowhere.safetensors --position 0 0 0 -o s": {"file": "nowhere.safetensors"},
+    f"render not-ours.safetensors {AT} --output s": {"file": "not-ours.safetensors"},
+    "render field.safetensors --output s": {"name": "--position", "value": 0},
+    f"{TABLE} no-z.csv {AT}": {"name": "--position", "value": 1},
+    "render field.safetensors --position 50 60 0 --output s": {"name": "001.wav", "row": 0, "value": [50.0, 60.0, 0.0]},
+    "render field.safetensors --position nan 0 0 --output s": {"name": "--position", "row": 0},
+    f"render field.safetensors {AT} {AT} --direction 0 0 1 -o s": {"name": "--direction", "value": 1},
+    f"render field.safetensors {AT} {AT} --output two.wav": {"file": "two.wav", "value": 2},
+    f"render field.safetensors {AT} --output words.csv": {"file": "words.csv", "value": "file"},
+    f"render field.safetensors {AT} --output s --seconds 0": {"name": "--seconds", "value": 0.0},
+    f"render field.safetensors {AT} --output s --seconds nan": {"name": "--seconds"},
+    f"render field.safetensors {AT} --output s --contact-time 2": {"name": "--contact-time", "value": 2.0},
+    f"render field.safetensors {AT} --output s --level-db nan": {"name": "--level-db"},
+    f"render field.safetensors {AT} --output s --force inf": {"name": "--force", "value": math.inf},
+    f"{TABLE} nowhere.csv": {"file": "nowhere.csv"},
+    f"{TABLE} no-z.csv": {"file": "no-z.csv", "row": 1, "name": "z"},
+    f"{TABLE} empty.csv": {"file": "empty.csv", "name": None},
+    f"{TABLE} words.csv": {"file": "words.csv", "row": 3, "name": "y", "value": "left"},
+    f"{TABLE} short.csv": {"file": "short.csv", "row": 2, "name": "z", "value": ""},
+    f"{TABLE} twice.csv": {"file": "twice.csv", "row": 3, "name": "file", "value": "a.wav"},
+    f"{TABLE} outside.csv": {"file": "outside.csv", "row": 2, "name": "file", "value": "../a.wav"},
+    "info nowhere.safetensors": {"file": "nowhere.safetensors"},
+    "info field.safetensors --capture fast": {"name": "sample_rate"},
+    "demo plate": {"file": "plate"},
+    "demo words.csv": {"file": "words.csv", "value": "file"},
 }
 
 
@@ -76,12 +85,16 @@ WRONG = {
 def test_one_line_says_what_is_wrong(words: str, place: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place)
     before = {path.name for path in place.iterdir()}
+    verb, *arguments = words.split()
+    with raises(AvmsfError, **WRONG[words]) as caught:
+        options = import_module(f"avmsf.cli.options.{verb}").parse(arguments)
+        options.check_inputs()
+        import_module(f"avmsf.cli.{verb}").run(options)
+    capsys.readouterr()
     assert main(words.split()) == 2
     err = capsys.readouterr().err
     # Progress may come before.
-    line = err.splitlines()[-1]
-    assert line.startswith(f"avmsf {words.split()[0]}: ")
-    assert WRONG[words] in line
+    assert err.splitlines()[-1] == f"avmsf {verb}: {' '.join(str(caught.value).split())}"
     assert "Traceback" not in err
     assert {path.name for path in place.iterdir()} == before
 

@@ -16,6 +16,7 @@ from avmsf.capture.datasets.numbering import (
 )
 from avmsf.capture.datasets.subsets import ABLATION, NON_SYMMETRIC
 from avmsf.errors import DatasetError
+from raising import raises
 
 FOLDERS = (set(range(1, 104)) - set(UNUSED)) - {98}
 
@@ -84,22 +85,26 @@ def test_numbers_beyond_the_list_are_the_folders_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "message"),
+    ("name", "text", "row", "value", "cause"),
     [
-        ("a.csv", "number,name\n1,Tray\n", "a.csv line 2: found the columns number, name; expected a CSV file"),
-        ("a.csv", "id,name\nfour,Tray\n", "line 2: id is 'four' and name 'Tray'; expected a whole number"),
-        ("a.csv", "id,name\n4,Tray\n4,Cup\n", "object 4 stands there twice"),
-        ("a.csv", "id,name\n", "the list is empty"),
-        ("a.json", '{"1": "Tray"}', "not a list of objects that can be read"),
-        ("a.json", "[", "not a list of objects that can be read"),
-        ("b.csv", None, "b.csv: there is no such list of objects"),
+        ("a.csv", "number,name\n1,Tray\n", 2, ("number", "name"), type(None)),
+        ("a.csv", "id,name\nfour,Tray\n", 2, ("four", "Tray"), type(None)),
+        ("a.csv", "id,name\n4,Tray\n4,Cup\n", 3, 4, type(None)),
+        ("a.csv", "id,name\n", None, 0, type(None)),
+        ("a.json", '{"1": "Tray"}', None, None, ValueError),
+        ("a.json", '[{"id": 1, "name": "Tray"}, {"id": 0, "name": "Cup"}]', 1, ("0", "Cup"), type(None)),
+        ("a.json", "[", None, None, json.JSONDecodeError),
+        ("b.csv", None, None, None, FileNotFoundError),
     ],
 )
-def test_lists_of_another_form_are_refused(tmp_path: Path, name: str, text: str | None, message: str) -> None:
+def test_lists_of_another_form_are_refused(
+    tmp_path: Path, name: str, text: str | None, row: int | None, value: object, cause: type[Exception]
+) -> None:
     if text is not None:
         (tmp_path / name).write_text(text)
-    with pytest.raises(DatasetError, match=message):
+    with raises(DatasetError, file=name, row=row, value=value) as caught:
         read_names(tmp_path / name, FOLDERS)
+    assert type(caught.value.__cause__) is cause
 
 
 def test_the_paper_s_subsets_are_folders_that_exist() -> None:

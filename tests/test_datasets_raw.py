@@ -15,6 +15,7 @@ from avmsf.capture.datasets.annotations import Gains, read_gains, read_newtons
 from avmsf.capture.datasets.contactlists import read_contacts
 from avmsf.errors import DatasetError
 from dataset_folders import AUDIO_CONTACTS, RATE, place, records, transfer, write_mesh, write_raw, write_strike
+from raising import raises
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +102,7 @@ def test_lists_of_contacts_serve_as_arrays_do(folder: Path, tmp_path: Path, line
     for contact in AUDIO_CONTACTS:
         assert np.array_equal(read_contacts(path).place("2", contact), place("2", contact))
     assert listed.check().objects[0].recordings == 4
-    assert listed.check().objects[1].problems[0] == "contact 0 stands in none of objectfolder_real_train.json"
+    assert "contact 0 in objectfolder_real_train.json" in listed.check().objects[1].problems[0]
 
 
 def test_contacts_beside_the_folder_are_found(tmp_path: Path) -> None:
@@ -113,24 +114,26 @@ def test_contacts_beside_the_folder_are_found(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("record", "message"),
+    ("record", "row", "name", "value"),
     [
-        ({"location": "x/5.wav", "contact": [0, 0, 0]}, "line 1: location is 'x/5.wav'; expected a path that ends in"),
-        ({"location": "3_5_3sec.wav", "contact": [0, 0]}, "contact is \\[0, 0\\]; expected three numbers"),
-        ({"location": "3_5_3sec.wav", "contact": [0, 0, "1"]}, "expected three numbers"),
-        ([1, 2], "location is None"),
+        ({"location": "x/5.wav", "contact": [0, 0, 0]}, 1, "location", "x/5.wav"),
+        ({"location": "3_5_3sec.wav", "contact": [0, 0]}, 1, "contact", [0, 0]),
+        ({"location": "3_5_3sec.wav", "contact": [0, 0, "1"]}, 1, "contact", [0, 0, "1"]),
+        ([1, 2], 0, "location", None),
     ],
 )
-def test_lists_that_cannot_be_meant_are_refused(tmp_path: Path, record: object, message: str) -> None:
+def test_lists_that_cannot_be_meant_are_refused(
+    tmp_path: Path, record: object, row: int, name: str, value: object
+) -> None:
     (tmp_path / "list.json").write_text(json.dumps(record) if isinstance(record, dict) else f"\n{json.dumps([record])}")
-    with pytest.raises(DatasetError, match=message):
+    with raises(DatasetError, file="list.json", row=row, name=name, value=value):
         read_contacts(tmp_path / "list.json")
 
 
 def test_one_contact_in_two_places_is_refused(tmp_path: Path) -> None:
     first, second = records("3", ("5", "6"))
     (tmp_path / "list.json").write_text(json.dumps([first, {**second, "location": first["location"]}]))
-    with pytest.raises(DatasetError, match=r"record 2: contact 5 of object 3 lies at .* and at .* by another row"):
+    with raises(DatasetError, file="list.json", row=1, name="5", value=tuple(second["contact"])):
         read_contacts(tmp_path / "list.json")
 
 
@@ -146,17 +149,17 @@ def test_both_ways_to_write_the_notes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "name", "value"),
     [
-        ("gain: [12]\npad: [1, 1]\n", "two numbers called gain"),
-        ("gain:\n- 12\n- 18\n- 3\npad: [1, 1]\n", "two numbers called gain"),
-        ("gain: [12, 18]\n", "two numbers called pad"),
-        ("gain: [12, 18]\npad: [0.5, 1]\n", "pad is 0.5 and 1; expected 0 or 1"),
+        ("gain: [12]\npad: [1, 1]", "gain", "gain: [12]\npad: [1, 1]"),
+        ("gain:\n- 12\n- 18\n- 3\npad: [1, 1]", "gain", "gain:\n- 12\n- 18\n- 3\npad: [1, 1]"),
+        ("gain: [12, 18]", "pad", "gain: [12, 18]"),
+        ("gain: [12, 18]\npad: [0.5, 1]", "pad", (0.5, 1.0)),
     ],
 )
-def test_notes_that_cannot_be_meant_are_refused(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "metadata.yaml").write_text(text)
-    with pytest.raises(DatasetError, match=message):
+def test_notes_that_cannot_be_meant_are_refused(tmp_path: Path, text: str, name: str, value: object) -> None:
+    (tmp_path / "metadata.yaml").write_text(f"{text}\n")
+    with raises(DatasetError, file="metadata.yaml", name=name, value=value):
         read_gains(tmp_path / "metadata.yaml")
 
 
@@ -179,19 +182,20 @@ def test_what_cannot_be_used_is_left_out_and_named(tmp_path: Path) -> None:
     (report,) = dataset.check().objects
     assert report.recordings == 3
     expected = (
-        "7/audio/1/Force.wav is missing",
-        "7/audio/2/striking_force.yaml is missing",
-        "expected one striking_force_newtons above 0, found 0",
-        "contacts/7/4.npy is missing",
-        "contacts/7/5.npy holds float32 (3,), expected float64 (3,)",
-        "7/audio/6/mic.wav has 44100 Hz, published with 48000 Hz",
-        "7/audio/7/mic.wav is cut short, 200000 of 288000 frames",
+        ("7/audio/1/Force.wav", "missing"),
+        ("7/audio/2/striking_force.yaml", "missing"),
+        ("7/audio/3/striking_force.yaml", "got 0"),
+        ("contacts/7/4.npy", "missing"),
+        ("contacts/7/5.npy", "got float32 (3,)"),
+        ("7/audio/6/mic.wav", "got 44100"),
+        ("7/audio/7/mic.wav", "got 200000"),
     )
-    for sentence, problem in zip(expected, report.problems, strict=True):
-        assert sentence in problem
+    for (file, found), problem in zip(expected, report.problems, strict=True):
+        assert file in problem
+        assert found in problem
     capture, remarks = read_silently(dataset, "7")
     assert capture.impacts.names == ("0.wav", "8.wav", "9.wav")
-    assert expected[0] in remarks
+    assert expected[0][0] in remarks
     assert "and 2 more" in remarks
 
 
@@ -200,7 +204,7 @@ def test_a_silent_force_is_found_on_reading(tmp_path: Path) -> None:
     soundfile.write(tmp_path / "41/audio/1/Force.wav", np.zeros(288_000, dtype=np.int16), RATE, subtype="PCM_16")
     capture, remarks = read_silently(ObjectFolderRaw(tmp_path), "41")
     assert capture.impacts.names == ("0.wav", "2.wav")
-    assert "left out: 41/audio/1/mic.wav: the force channel" in remarks
+    assert "left out: 41/audio/1/mic.wav" in remarks
 
 
 def test_without_contacts_check_says_where_to_get_them(tmp_path: Path) -> None:
@@ -208,7 +212,7 @@ def test_without_contacts_check_says_where_to_get_them(tmp_path: Path) -> None:
     report = dataset.check()
     assert report.objects[0].recordings == 0
     assert report.missing[0].startswith("contact coordinates, which the audio archives do not hold: put contacts/")
-    with pytest.raises(DatasetError, match="object 7: expected at least 2 recordings with contacts, found 0"):
+    with raises(DatasetError, name="ObjectFolder Real, object 7", value=0):
         dataset.capture("7")
 
 
@@ -216,9 +220,7 @@ def test_check_names_archives_and_shared_objects(folder: Path) -> None:
     report = ObjectFolderRaw(folder).check()
     assert [part.split(":")[0] for part in report.missing][:2] == ["objects 11 to 20", "objects 21 to 30"]
     assert "audio/audio_data_11_20.tar.gz" in report.missing[0]
-    assert any(
-        "1 objects have a number of RealImpact's and may be the same things, 10:" in each for each in report.remarks
-    )
+    assert any("1 objects have numbers of RealImpact" in each and ": 10;" in each for each in report.remarks)
 
 
 def test_check_reads_no_sound(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,5 +230,6 @@ def test_check_reads_no_sound(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize(("asked", "meant"), [("3", "2 or 10"), ("2_Bowl", "2")])
 def test_an_unknown_object_lists_near_ones(folder: Path, asked: str, meant: str) -> None:
-    with pytest.raises(DatasetError, match=f"has no object '{asked}' here.*did you mean {meant}\\?"):
+    with raises(DatasetError, name="object", value=asked) as caught:
         ObjectFolderRaw(folder).capture(asked)
+    assert f" {meant}?" in str(caught.value)

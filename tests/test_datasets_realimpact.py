@@ -13,6 +13,7 @@ from avmsf.capture.datasets.listeners import closest_rows
 from avmsf.capture.datasets.numbering import REALIMPACT_NAMES, number_of
 from avmsf.errors import DatasetError
 from dataset_folders import ROWS, microphones, write_realimpact
+from raising import raises, warns
 
 NAME = "43_IronMortar"
 
@@ -70,8 +71,9 @@ def test_one_place_for_all_blows_goes_before_a_closer_one_for_some() -> None:
 
 def test_blows_heard_from_nowhere_in_common_are_told(tmp_path: Path) -> None:
     write_realimpact(tmp_path, NAME, turned=(0, 5, 0, 0, 0))
-    with pytest.warns(CaptureWarning, match="no microphone stood in one place for all blows"):
+    with warns(CaptureWarning, name=f"RealImpact, {NAME}") as caught:
         capture = RealImpact(tmp_path).capture(NAME)
+    assert any("no microphone position is common" in remark for remark in caught[0].message.value)
     assert len(capture.impacts) == 5
 
 
@@ -107,60 +109,66 @@ def test_check_counts_blows_and_names_what_is_not_here(whole: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("deconvolved_0db.npy", "deconvolved_0db.npy is missing"),
-        ("vertexXYZ.npy", "vertexXYZ.npy is missing"),
-        ("transformed.obj", "transformed.obj is missing, from which the closest microphone is found"),
-    ],
+    "name",
+    ["deconvolved_0db.npy", "vertexXYZ.npy", "transformed.obj"],
 )
-def test_a_missing_file_is_named(folder: Path, name: str, message: str) -> None:
+def test_a_missing_file_is_named(folder: Path, name: str) -> None:
     (folder / NAME / "preprocessed" / name).unlink()
     dataset = RealImpact(folder)
-    assert any(message in problem for problem in dataset.check().objects[0].problems)
+    assert any(name in problem for problem in dataset.check().objects[0].problems)
     assert dataset.check().objects[0].recordings == 0
-    with pytest.raises(DatasetError, match=message):
+    with raises(DatasetError, file=f"preprocessed/{name}", name=None):
         dataset.capture(NAME)
 
 
 @pytest.mark.parametrize(
-    ("name", "array", "message"),
+    ("file", "array", "name", "value"),
     [
-        ("vertexID.npy", np.zeros(3000, dtype=np.int32), r"holds int32 \(3000,\), expected int64 \(3000,\)"),
-        ("listenerXYZ.npy", np.zeros((2999, 3)), r"holds float64 \(2999, 3\), expected float64 \(3000, 3\)"),
-        ("vertexXYZ.npy", np.zeros((3000, 3), order="F"), "is stored by columns, expected by rows"),
-        ("deconvolved_0db.npy", np.zeros((3000, 2)), r"holds float64 \(3000, 2\), expected float32 \(3000, any\)"),
-        ("vertexXYZ.npy", np.ones((3000, 3)), "lies up to .* m off the vertices of transformed.obj"),
+        ("vertexID.npy", np.zeros(3000, dtype=np.int32), "shape", ("int32", 3000)),
+        ("listenerXYZ.npy", np.zeros((2999, 3)), "shape", ("float64", 2999, 3)),
+        ("vertexXYZ.npy", np.zeros((3000, 3), order="F"), "order", "F"),
+        ("deconvolved_0db.npy", np.zeros((3000, 2)), "shape", ("float64", 3000, 2)),
     ],
 )
-def test_arrays_of_another_form_are_refused(folder: Path, name: str, array: np.ndarray, message: str) -> None:
-    np.save(folder / NAME / "preprocessed" / name, array)
-    with pytest.raises(DatasetError, match=message):
+def test_arrays_of_another_form_are_refused(
+    folder: Path, file: str, array: np.ndarray, name: str, value: object
+) -> None:
+    np.save(folder / NAME / "preprocessed" / file, array)
+    with raises(DatasetError, file=f"preprocessed/{file}", name=name, value=value):
         RealImpact(folder).capture(NAME)
+
+
+def test_contacts_off_the_mesh_are_refused(folder: Path) -> None:
+    contacts = np.load(folder / NAME / "preprocessed/vertexXYZ.npy")
+    np.save(folder / NAME / "preprocessed/vertexXYZ.npy", np.ones_like(contacts))
+    with raises(DatasetError, file="preprocessed/vertexXYZ.npy", name=None) as caught:
+        RealImpact(folder).capture(NAME)
+    corners = np.asarray(trimesh.load(folder / NAME / "preprocessed/transformed.obj", process=False).vertices)
+    assert caught.value.value == pytest.approx(np.linalg.norm(corners - 1, axis=1).min(), rel=1e-5)
 
 
 def test_sounds_cut_short_are_told_without_reading_them(folder: Path) -> None:
     path = folder / NAME / "preprocessed/deconvolved_0db.npy"
     with open(path, "r+b") as file:
         file.truncate(1_000_000)
-    assert (
-        "deconvolved_0db.npy is cut short, 1000000 of 28800128 bytes"
-        in RealImpact(folder).check().objects[0].problems[0]
-    )
-    with pytest.raises(DatasetError, match="is cut short"):
+    problem = RealImpact(folder).check().objects[0].problems[0]
+    assert "deconvolved_0db.npy: expected 28800128 bytes, got 1000000" in problem
+    with raises(DatasetError, file="deconvolved_0db.npy", name="size", value=1_000_000):
         RealImpact(folder).capture(NAME)
 
 
 def test_samples_that_are_no_numbers_are_refused(folder: Path) -> None:
     path = folder / NAME / "preprocessed/deconvolved_0db.npy"
     np.lib.format.open_memmap(path, mode="r+")[:, 7] = np.nan
-    with pytest.raises(DatasetError, match="holds samples that are not finite numbers"):
+    with raises(DatasetError, file="deconvolved_0db.npy", name=None) as caught:
         RealImpact(folder).capture(NAME)
+    assert caught.value.row is not None
 
 
 def test_a_number_alone_is_told_whose_it_is(whole: Path) -> None:
-    with pytest.raises(DatasetError, match="did you mean 43_IronMortar"):
+    with raises(DatasetError, name="object", value="43") as caught:
         RealImpact(whole).look("43")
+    assert "43_IronMortar?" in str(caught.value)
 
 
 def test_names_stand_in_the_order_of_their_numbers() -> None:

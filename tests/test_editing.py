@@ -62,6 +62,7 @@ from plate_field import plate_impacts
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import editing as benchmark
 from benchmarks import editingprotocol as protocol
+from raising import raises, warns
 
 RATE = 16000.0
 QUICK = {"steps": 3, "contacts": 2, "fft_sizes": (512, 128)}
@@ -158,7 +159,7 @@ def test_only_modes_that_are_heard_count():
     # A quarter of the damping is four times the energy.
     slow = replace(bank, damping=torch.tensor([5.0, 1.25, 5.0, 5.0], dtype=torch.float64))
     assert heard_modes(slow, amplitudes, sample_rate=RATE).frequency.tolist() == [100.0, 200.0, 300.0]
-    with pytest.raises(EvaluationError, match="none of 4 modes is heard"):
+    with raises(EvaluationError, name="bank", value=4):
         heard_modes(bank, amplitudes, sample_rate=100.0)
 
 
@@ -203,7 +204,7 @@ def test_recorded_objects_are_those_there_are():
     found = recorded_objects(Recorded("68_WoodBoard", "94_GlassGoblet", "59_stand"))
     assert [(each.name, each.material) for each in found] == [("68_WoodBoard", "wood"), ("94_GlassGoblet", "glass")]
     assert len(found[0].bank) > 3
-    with pytest.raises(EvaluationError, match="plates holds none of the 26 objects whose materials are known"):
+    with raises(EvaluationError, name="plates", value=0):
         recorded_objects(Recorded("59_stand"))
 
 
@@ -253,7 +254,7 @@ def test_the_protocol_of_recorded_objects_runs_without_words(tmp_path, monkeypat
     assert report.figures["realimpact.spectral_before"] > report.figures["realimpact.spectral_hierarchical"] > 0
     assert "94_GlassGoblet" in report.conventions[1]
     monkeypatch.setattr(protocol, "open_dataset", lambda folder: Recorded(*names[:3]))
-    with pytest.raises(EvaluationError, match="holds 3 of the 26 objects whose materials are known, expected at least"):
+    with raises(EvaluationError, name="plates", value=3):
         protocol.recorded_cast(tmp_path, words=False)
 
 
@@ -334,8 +335,9 @@ def test_the_simulated_protocol_without_a_model_goes_by_recordings(plates_alone,
     ],
 )
 def test_options_of_the_protocol_that_make_no_sense(words, message, capsys):
-    with pytest.raises(SystemExit, match="2"):
+    with pytest.raises(SystemExit) as ended:
         protocol.main(words)
+    assert ended.value.code == 2
     assert message in capsys.readouterr().err
 
 
@@ -345,12 +347,12 @@ def test_what_is_generated_without_modes_has_no_score(space):
             return torch.zeros(8000)
 
     task = EditTask(struck("ceramic"), "glass", prompt="glass")
-    with pytest.warns(AvmsfWarning, match="plate-ceramic towards glass, generation: .* is silent.* this has no score"):
+    with warns(AvmsfWarning, name="plate-ceramic to glass, generation"):
         scores = judge([task], (Untouched(), Generation(Silence())), {"flat": space})
     assert [each.method for each in scores] == ["before"]
 
 
-@pytest.mark.parametrize("error", [EditError("it diverged"), EvaluationError("none of 9 modes is heard")])
+@pytest.mark.parametrize("error", [EditError("diverged", value=3), EvaluationError("no audible mode", value=9)])
 def test_an_edit_that_fails_costs_its_own_score_alone(space, error):
     class Failing:
         name = "failing"
@@ -359,7 +361,7 @@ def test_an_edit_that_fails_costs_its_own_score_alone(space, error):
             raise error
 
     task = EditTask(struck("ceramic"), "glass", prompt="glass")
-    with pytest.warns(AvmsfWarning, match=f"plate-ceramic towards glass, failing: {error}; this has no score"):
+    with warns(AvmsfWarning, name="plate-ceramic to glass, failing", value=error.value):
         scores = judge([task], (Failing(), Untouched()), {"flat": space})
     assert [each.method for each in scores] == ["before"]
 
@@ -377,7 +379,7 @@ def test_every_transition_has_two_prompts_for_every_object():
         for source, target in (("ceramic", "wood"), ("glass", "steel"))
         for prompt in PROMPTS[target]
     ]
-    with pytest.raises(EvaluationError, match="no prompts for 'cheese'; there are for wood"):
+    with raises(EvaluationError, name="target", value="cheese"):
         _ = Transition("wood", "cheese").prompts
 
 
@@ -389,7 +391,7 @@ def test_physics_reaches_the_object_of_the_new_material(space):
     assert torch.allclose(made.bank.damping, wanted.bank.damping[: len(made.bank)], rtol=1e-6)
     assert after.octaves["flat"] < 0.5 * before.octaves["flat"]
     assert after.umap["flat"] == pytest.approx(5.0)
-    with pytest.raises(EvaluationError, match="no constants are known of 'metal'"):
+    with raises(EvaluationError, name="material", value="metal"):
         Recast().edit(EditTask(struck("ceramic"), "metal"))
 
 
@@ -401,7 +403,7 @@ def test_the_spectral_distance_is_free_of_level():
     assert spectral_distance(made, reference_to(known)) == pytest.approx(0.0, abs=1e-5)
     assert spectral_distance(replace(made, sounds=0.0 * sounds), reference_to(known)) == pytest.approx(1.0)
     assert spectral_distance(made, reference_to(struck("wood"))) > 0.5
-    with pytest.raises(EvaluationError, match="sounds at 8000 Hz and a reference at 16000 Hz"):
+    with raises(EvaluationError, name="reference", value=16000.0):
         spectral_distance(replace(made, sample_rate=8000.0), reference_to(known))
 
 
@@ -473,9 +475,9 @@ def test_words_have_the_papers_methods(space, monkeypatch):
     assert [score.clap for score in scores] == pytest.approx([0.3] * 4)
     assert heard == [["a glass is struck"]] * 4
     assert all(score.spectral is None for score in scores)
-    with pytest.raises(EvaluationError, match="plate-ceramic towards glass: expected a prompt, found none"):
+    with raises(EvaluationError, name="prompt"):
         methods[1].edit(replace(task, prompt=None))
-    with pytest.raises(EvaluationError, match="expected a reference, found none"):
+    with raises(EvaluationError, name="reference"):
         towards_reference(QUICK)[1].edit(task)
 
 

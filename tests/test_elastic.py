@@ -18,6 +18,7 @@ from avmsf.simulate.elastic import ElasticModes, elastic_modes
 from avmsf.simulate.elements import SecondOrder, mass, stiffness
 from avmsf.simulate.material import GLASS, STEEL, Material
 from avmsf.simulate.solid import Solid
+from raising import raises
 
 BRACKET = ((0.07, 0.05, 0.011), (3, 2, 1))
 """A block with three different sides, so that no two modes share a frequency."""
@@ -289,28 +290,32 @@ def test_highest_leaves_out_what_lies_above(bracket, modes):
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"),
+    ("settings", "name", "row", "value"),
     [
-        ({"count": 0}, "count = 0: expected 1 mode or more"),
-        ({"count": 310}, "too coarse, expected .* nodes or more; ask for fewer modes"),
-        ({"highest": 10.0}, r"no mode up to 10 Hz, the lowest is at \d+"),
-        ({"stiffness_factor": torch.ones(3)}, "stiffness_factor has 3 numbers for 36 cells"),
-        ({"density_factor": -torch.ones(36)}, r"density_factor\[0\] = -1: expected more than 0"),
-        ({"springs": [(torch.zeros(3), 0.0)]}, "spring 0 has 0 N/m"),
+        ({"count": 0}, "count", None, 0),
+        ({"highest": 10.0}, "highest", None, 10.0),
+        ({"stiffness_factor": torch.ones(3)}, "stiffness_factor", None, 3),
+        ({"density_factor": -torch.ones(36)}, "density_factor", 0, -1.0),
+        ({"springs": [(torch.zeros(3), 0.0)]}, "springs", 0, 0.0),
     ],
 )
-def test_settings_that_cannot_be(bracket, settings, words):
-    with pytest.raises(SimulationError, match=words):
+def test_settings_that_cannot_be(bracket, settings, name, row, value):
+    with raises(SimulationError, name=name, row=row, value=value):
         elastic_modes(bracket, STEEL, **settings)
 
 
-def test_places_that_are_no_numbers(modes):
-    with pytest.raises(SimulationError, match=r"place 1 is \[nan, 0.0, 0.0\]: expected finite"):
+def test_more_modes_than_nodes_allow(bracket):
+    with raises(SimulationError, name="nodes", value=len(SecondOrder.of(bracket).nodes)):
+        elastic_modes(bracket, STEEL, count=310)
+
+
+def test_positions_that_are_no_numbers(modes):
+    with raises(SimulationError, name="places", row=1, value=pytest.approx([math.nan, 0.0, 0.0], nan_ok=True)):
         modes.at(torch.tensor([[0.0, 0.0, 0.0], [math.nan, 0.0, 0.0]]))
 
 
 def test_bodies_in_parts_are_refused(bracket):
     count = len(bracket.points)
     apart = torch.cat([bracket.points, bracket.points + 1.0])
-    with pytest.raises(SimulationError, match="the body has 2 parts that share no side"):
+    with raises(SimulationError, name="parts", value=2):
         elastic_modes(Solid.build(apart, torch.cat([bracket.cells, bracket.cells + count])), STEEL, count=4)

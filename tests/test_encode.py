@@ -5,6 +5,7 @@ import torch
 
 from avmsf.errors import SceneError
 from avmsf.scene.encode import continue_outside, unit_image
+from raising import raises
 
 
 def disc(size: int = 64, radius: float = 20.0) -> torch.Tensor:
@@ -22,7 +23,7 @@ def test_bytes_and_numbers_give_the_same_image():
     "image", [torch.full((4, 4, 3), 200.0), torch.full((4, 4, 3), torch.nan), torch.zeros(0, 4, 3)]
 )
 def test_numbers_that_are_no_image_are_refused(image):
-    with pytest.raises(SceneError, match="expected an image of bytes or of numbers from 0 to 1"):
+    with raises(SceneError, name="image"):
         unit_image(image)
 
 

@@ -9,6 +9,7 @@ from safetensors.torch import load_file, save_file
 from avmsf.errors import SceneError
 from avmsf.scene.features import FeatureField
 from avmsf.scene.featurestore import load_features, read_report, save_features
+from raising import raises
 
 
 def field() -> FeatureField:
@@ -42,13 +43,13 @@ def test_a_failed_save_leaves_the_old_file(tmp_path):
     save_features(field(), path)
     before = path.read_bytes()
     spoilt = FeatureField(field().points, torch.full((20, 5), torch.nan), "anyone")
-    with pytest.raises(SceneError, match="expected features to be finite numbers"):
+    with raises(SceneError, file=path, name="features"):
         save_features(spoilt, path)
     for report in ({"a": float("nan")}, {"a": torch.zeros(1)}):
-        with pytest.raises(SceneError, match="expected a report of finite numbers, words, lists and dicts"):
+        with raises(SceneError, file=path, name="report"):
             save_features(field(), path, report=report)
     assert path.read_bytes() == before
-    with pytest.raises(SceneError, match="cannot be written"):
+    with raises(SceneError, file=path / "below"):
         save_features(field(), path / "below")
 
 
@@ -62,6 +63,7 @@ def rewritten(path, *, tensors=None, **changes):
 
 
 TENSORS = {"points": torch.zeros(20, 3), "features": torch.zeros(20, 5)}
+SHAPES = {"points": [20, 3], "features": [20, 5]}
 
 
 def test_a_file_as_the_record_says_is_read(tmp_path):
@@ -69,39 +71,41 @@ def test_a_file_as_the_record_says_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("changes", "name", "value"),
     [
-        ({"format": 2, "version": "9.9"}, r"expected features of format 1, found format 2, written by avmsf 9\.9"),
-        ({"sizes": {"points": 20}}, "damaged one"),
-        ({"sizes": {"points": 20, "dim": 0}}, "damaged one"),
-        ({"sizes": {"points": 20, "dim": True}}, "damaged one"),
-        ({"encoder": 3}, "damaged one"),
-        ({"report": []}, "damaged one"),
-        ({"sizes": {"points": 20, "dim": 6}}, "expected the float32 tensors"),
-        ({"tensors": TENSORS | {"more": torch.zeros(1)}}, "expected the float32 tensors"),
-        ({"tensors": {"points": torch.zeros(20, 3)}}, "expected the float32 tensors"),
-        ({"tensors": TENSORS | {"features": torch.zeros(20, 5).double()}}, "expected the float32 tensors"),
-        ({"tensors": TENSORS | {"features": torch.full((20, 5), torch.inf)}}, "features to be finite"),
+        ({"format": 2, "version": "9.9"}, "format", 2),
+        ({"sizes": {"points": 20}}, "header", None),
+        ({"sizes": {"points": 20, "dim": 0}}, "header", None),
+        ({"sizes": {"points": 20, "dim": True}}, "header", None),
+        ({"encoder": 3}, "header", None),
+        ({"report": []}, "header", None),
+        ({"sizes": {"points": 20, "dim": 6}}, "tensors", SHAPES),
+        ({"tensors": TENSORS | {"more": torch.zeros(1)}}, "tensors", SHAPES | {"more": [1]}),
+        ({"tensors": {"points": torch.zeros(20, 3)}}, "tensors", {"points": [20, 3]}),
+        ({"tensors": TENSORS | {"features": torch.zeros(20, 5).double()}}, "tensors", SHAPES),
+        ({"tensors": TENSORS | {"features": torch.full((20, 5), torch.inf)}}, "features", None),
     ],
 )
-def test_a_changed_file_is_refused(tmp_path, changes, words):
+def test_a_changed_file_is_refused(tmp_path, changes, name, value):
     path = rewritten(tmp_path / "f", **changes)
-    with pytest.raises(SceneError, match=words) as told:
+    with raises(SceneError, file=path, name=name, value=value) as caught:
         load_features(path)
-    assert str(path) in str(told.value)
+    assert str(path) in str(caught.value)
 
 
 def test_other_files_are_refused(tmp_path):
     path = tmp_path / "f"
-    with pytest.raises(SceneError, match="found no such file"):
+    with raises(SceneError, file=path, value=None):
         load_features(path)
     path.write_bytes(b"ply\n")
-    with pytest.raises(SceneError, match="of another kind"):
+    with raises(SceneError, file=path, name=None) as caught:
         load_features(path)
+    assert "ply" in caught.value.value
     save_file(TENSORS, path)
-    with pytest.raises(SceneError, match="safetensors file of something else"):
+    with raises(SceneError, file=path, name="avmsf_features", value=[]):
         load_features(path)
     save_features(field(), path)
     path.write_bytes(path.read_bytes()[:-10])
-    with pytest.raises(SceneError, match="cut short"):
+    with raises(SceneError, file=path, name=None) as caught:
         load_features(path)
+    assert "truncated" in caught.value.value

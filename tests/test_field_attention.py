@@ -181,8 +181,9 @@ def test_modes_put_in_another_order_are_the_same_modes(spatial):
 
 
 def test_more_clusters_than_points_are_refused_with_the_most_that_there_can_be():
-    with pytest.raises(FitError, match="61 clusters were asked of points at 60 different places; ask for 1 to 60"):
+    with pytest.raises(FitError) as caught:
         network(replace(SHAPE, clusters=61))
+    assert all(each in str(caught.value) for each in ("clusters", "61", "60"))
 
 
 def test_encoding_in_closed_form():

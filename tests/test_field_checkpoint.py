@@ -10,13 +10,14 @@ import pytest
 import torch
 
 from avmsf._utils.state import read_checkpoint, write_checkpoint
-from avmsf.errors import FieldFileError
+from avmsf.errors import AvmsfWarning, FieldFileError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import Progress, fit
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
 from avmsf.field.training import AdamW, TrainingRun
 from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
+from raising import raises, warns
 
 CONFIG = replace(
     QUICK, damping="validated", warmup_steps=3, steps=11, clusters=4, hidden=16, width=8, fft_sizes=(256,), early=256
@@ -173,10 +174,10 @@ def test_a_path_may_be_a_word(tmp_path):
 
 def test_a_full_disk_costs_the_checkpoint_and_not_the_fit(tmp_path, monkeypatch):
     def full(path: Path, *arguments: object, **named: object) -> None:
-        raise FieldFileError(f"{path}: cannot be written (No space left on device)")
+        raise FieldFileError(f"{path}: no space", file=path, value="No space left on device")
 
     monkeypatch.setattr("avmsf.field.fit.write_checkpoint", full)
-    with pytest.warns(UserWarning, match="goes on without a new checkpoint: .*No space left"):
+    with warns(AvmsfWarning, file="fit.checkpoint", value="No space left on device"):
         expect_same(fitted(tmp_path / "fit.checkpoint"), uninterrupted())
 
 
@@ -219,7 +220,7 @@ def test_a_checkpoint_of_other_arguments_is_refused_and_kept(tmp_path, other):
     with pytest.raises(KeyboardInterrupt):
         fitted(checkpoint, Interruption((STAGES[0], 1)))
     before = checkpoint.read_bytes()
-    with pytest.raises(FieldFileError, match=r"fit\.checkpoint: this checkpoint belongs to a fit with another input"):
+    with raises(FieldFileError, file="fit.checkpoint", value=["input, configuration or version"]):
         fit(*other(impacts, plate_features(60), plate_extraction(impacts)), gains=Attention(), checkpoint=checkpoint)
     assert checkpoint.read_bytes() == before
 
@@ -236,7 +237,7 @@ def test_what_is_no_checkpoint_is_refused_and_kept(tmp_path, kind):
         whole = checkpoint.read_bytes()
         checkpoint.write_bytes({"empty": b"", "text": b"hello there", "cut": whole[:-40]}[kind])
     before = checkpoint.read_bytes()
-    with pytest.raises(FieldFileError, match="expected a checkpoint of a fit, found something else") as caught:
+    with raises(FieldFileError, file="fit.checkpoint", value=None) as caught:
         fitted(checkpoint)
     # Torch's own words advise to switch its safety off.
     assert "weights_only" not in str(caught.value)
@@ -248,5 +249,5 @@ def test_no_checkpoint_is_none(tmp_path):
 
 
 def test_a_folder_is_no_checkpoint(tmp_path):
-    with pytest.raises(FieldFileError, match="expected a checkpoint of a fit"):
+    with raises(FieldFileError, file=tmp_path, value=None):
         read_checkpoint(tmp_path, {"fit": "x"}, what="a fit", raising=FieldFileError)

@@ -22,6 +22,7 @@ from avmsf.modal.synthesis import synthesize_phased
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import plate_modes
 from plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
+from raising import raises
 
 LONG = replace(QUICK, width=32, hidden=128, warmup_steps=300, steps=60, correction_rate=3e-3)
 SHORT = replace(QUICK, warmup_steps=4, steps=4)
@@ -300,35 +301,37 @@ def test_a_silent_recording_and_a_mode_that_is_never_excited_do_no_harm():
 
 def test_recordings_that_cannot_be_fitted_are_refused():
     impacts, modes = plate_impacts(), plate_extraction(plate_impacts())
-    with pytest.raises(FitError, match="expected recordings to fit a field to, found none"):
+    with raises(FitError, name="train", row=None):
         fitted(SHORT, train=impacts.take([]), modes=modes)
-    with pytest.raises(FitError, match="extracted from 12 recordings, the field is to be fitted to 7"):
+    with raises(FitError, name="modes", value=12):
         fitted(SHORT, train=impacts.take(range(7)), modes=modes)
-    with pytest.raises(FitError, match="all recordings are silent"):
+    with raises(FitError, name="train", value="silence"):
         fitted(SHORT, train=replace(impacts, sounds=torch.zeros_like(impacts.sounds)))
     broken = impacts.sounds.clone()
     broken[3, 17] = math.inf
-    with pytest.raises(FitError, match="plate/004: expected finite samples"):
+    with raises(FitError, name="plate/004", row=3):
         fitted(SHORT, train=replace(impacts, sounds=broken))
-    with pytest.raises(FitError, match=r"highest mode is at 2302\.\d* Hz, the recordings reach 2000 Hz"):
+    with raises(FitError, name="modes", value=pytest.approx(2302.0, abs=1.0)):
         fitted(SHORT, train=replace(impacts, sample_rate=4000.0))
     none = torch.zeros(0, dtype=torch.float64)
     empty = Extraction(ModalBank(none, none), torch.zeros(12, 0), modes.residual, torch.zeros(12, 0))
-    with pytest.raises(FitError, match="expected modes, found none"):
+    with raises(FitError, name="modes", value=0):
         fitted(SHORT, modes=empty)
 
 
 def test_too_many_clusters_are_refused_with_how_many_there_can_be():
     few = FeatureField.from_points(plate_impacts().contacts)
-    with pytest.raises(FitError, match="16 clusters were asked of points at 12 different places; ask for 1 to 12"):
+    with pytest.raises(FitError) as caught:
         fitted(FitConfig(), features=few)
+    assert all(each in str(caught.value) for each in ("clusters", "16", "12"))
     assert fitted(replace(SHORT, clusters=12), features=few).gain_field.shape.clusters == 12
 
 
 def test_a_fit_that_diverges_says_so():
     config = replace(QUICK, learning_rate=1e30, warmup_steps=0)
-    with pytest.raises(FitError, match=r"the fit diverged, its loss at step \d+ is (nan|inf): lower learning_rate"):
+    with raises(FitError, name="fit") as caught:
         fitted(config)
+    assert not math.isfinite(caught.value.value)
 
 
 @pytest.mark.parametrize(("every", "turns"), [(1, [0, 0, 0, 0]), (2, [0, 1, 0, 1]), (3, [1, 2, 0, 1])])

@@ -19,6 +19,7 @@ from avmsf.tasks.locator import Locator
 from avmsf.tasks.retune import retune
 from avmsf.tasks.ringing import Ringing
 from made_fields import BANK, positional
+from raising import raises
 
 RATE = 8000.0
 STRUCK = (68, 60, 102, 8, 107)
@@ -198,19 +199,19 @@ def test_nothing_is_heard_for_longer_than_the_fields_own_sounds() -> None:
 
 
 def test_streams_that_cannot_be_listened_to_are_refused() -> None:
-    with pytest.raises(LocationError, match="comes at 44100 Hz and the field is of 8000 Hz"):
+    with raises(LocationError, name="sample_rate", value=44100.0):
         Listener(locator(), sample_rate=44100.0)
-    with pytest.raises(LocationError, match="window = 0 s"):
+    with raises(LocationError, name="window", value=0.0):
         Listener(locator(), window=0.0)
-    with pytest.raises(LocationError, match=r"window = 0\.01 s is 80 samples: expected 160 or more"):
+    with raises(LocationError, name="window", value=0.01):
         Listener(locator(), window=0.01)
-    with pytest.raises(LocationError, match=r"none of the object's .* modes lies below half of 8000 Hz"):
+    with raises(LocationError, name="field", value=0):
         Listener(replace(locator(), field=retune(locator().field, pitch=1000.0)))
-    with pytest.raises(LocationError, match=r"later = 0\.05"):
+    with raises(LocationError, name="later", value=0.05):
         Listener(locator(), window=0.06, later=0.05)
-    with pytest.raises(LocationError, match="rumble = 4000 Hz"):
+    with raises(LocationError, name="rumble", value=4000.0):
         Listener(locator(), rumble=4000.0)
     listener = Listener(locator())
-    with pytest.raises(LocationError, match="not finite"):
+    with raises(LocationError, name="block"):
         listener.hear(torch.tensor([0.0, float("nan")]))
     assert listener.ears.clock + len(listener.ears.rest) == 0

@@ -1,5 +1,4 @@
 import math
-import re
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import ClassVar
@@ -25,6 +24,7 @@ from avmsf.tasks.posterior import Force
 from avmsf.tasks.retune import retune
 from avmsf.tasks.slack import contacts_of
 from believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
+from raising import raises
 from unsaved_gains import Unsaved
 
 PLATE = Plate()
@@ -200,10 +200,12 @@ def test_a_known_force_tells_places_apart_that_sound_alike():
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
 def test_a_force_that_cannot_be_is_refused(value):
-    with pytest.raises(LocationError, match=f"a force with expected = {value:g}: expected a number above 0"):
+    with raises(LocationError, name="force.expected") as caught:
         Force(value)
-    with pytest.raises(LocationError, match=f"a force with spread_db = {value:g}: expected a number above 0"):
+    assert caught.value.value is value
+    with raises(LocationError, name="force.spread_db") as caught:
         Force(1.0, spread_db=value)
+    assert caught.value.value is value
 
 
 def test_the_region_grows_with_the_noise():
@@ -258,8 +260,8 @@ def test_another_plate_is_refused_with_the_number(length):
     for sound in impacts.sounds:
         assert locator.locate(sound).misfit > 1.5 * STRANGE
         found = locate(true_field(), sound, locator=locator)
-        assert re.search(r"explain \d+ % of the sound and, .*a misfit of \d\.\d\d; its own", found.refusal)
-        with pytest.raises(LocationError):
+        assert f"a misfit of {found.misfit:.2f}" in found.refusal
+        with raises(LocationError, name="position", value=found.misfit):
             _ = found.position
 
 
@@ -276,9 +278,9 @@ def test_what_falls_between_is_doubted_in_words():
     found = locator_of().locate(struck(1, seed=6).sounds[0])
     assert judged(found) is found
     (note,) = judged(replace(found, modal=0.8, detuned=0.5)).notes
-    assert re.search(r"explain 80 % of the sound and, put out of tune, 50 %, a misfit of 0\.40: it may be", note)
+    assert all(each in note for each in ("80 %", "50 %", "a misfit of 0.40"))
     (note,) = judged(replace(found, explained=0.9 * UNLIKE)).notes
-    assert "a blow at the likeliest place 9 %" in note
+    assert " 9 %" in note
     # Where modes out of tune explain all as well, a rounding is no misfit.
     assert judged(replace(found, modal=1.0 - 1e-4, detuned=1.0 - 1e-5)).notes == ()
 
@@ -324,16 +326,16 @@ def test_the_evidence_depends_on_neither_level_nor_force():
 
 
 @pytest.mark.parametrize(
-    ("sound", "message"),
+    ("sound", "name", "value"),
     [
-        (torch.zeros(5000), "silent"),
-        (torch.randn(300, generator=torch.Generator().manual_seed(0)), "too short: 300 samples"),
-        (torch.full((5000,), torch.nan), "5000 samples of the sound are not finite"),
-        (torch.randn(7200, generator=torch.Generator().manual_seed(0)), "43 modes are .* as chance makes them"),
+        (torch.zeros(5000), "sound", "silence"),
+        (torch.randn(300, generator=torch.Generator().manual_seed(0)), "samples", 300),
+        (torch.full((5000,), torch.nan), "finite", 5000),
+        (torch.randn(7200, generator=torch.Generator().manual_seed(0)), "noise", pytest.approx(1.0, abs=0.5)),
     ],
 )
-def test_what_holds_no_blow_is_refused(sound, message):
-    with pytest.raises(LocationError, match=message):
+def test_sounds_without_an_impact_are_refused(sound, name, value):
+    with raises(LocationError, name=name, value=value):
         locator_of().locate(sound)
 
 
@@ -371,29 +373,26 @@ def test_lengths_that_are_used_are_kept():
 
 def test_a_locator_is_of_its_own_field_and_points():
     sound = struck(1, seed=46).sounds[0]
-    with pytest.raises(LocationError, match="given with points or directions"):
+    with raises(LocationError, name="locator", value="points or directions"):
         locate(true_field(), sound, points=torch.zeros(5, 3), locator=locator_of())
-    with pytest.raises(LocationError, match="given with another field"):
+    with raises(LocationError, name="locator", value="another field"):
         locate(true_field(100), sound, locator=locator_of())
 
 
 def test_points_without_sense_are_refused():
-    with pytest.raises(LocationError, match="expected points"):
-        Locator.of(true_field(), points=torch.zeros(0, 3))
-    with pytest.raises(LocationError, match=r"expected points .* found the shape \(3, 2\) and 0 numbers"):
-        Locator.of(true_field(), points=torch.zeros(3, 2))
-    with pytest.raises(LocationError, match=r"expected points .* and 9 numbers that are not finite"):
-        Locator.of(true_field(), points=torch.full((3, 3), torch.nan))
-    with pytest.raises(LocationError, match=r"directions of the shape \(2, 3\) do not go with points of \(3, 3\)"):
+    for points in (torch.zeros(0, 3), torch.zeros(3, 2), torch.full((3, 3), torch.nan)):
+        with raises(LocationError, name="points", value=list(points.shape)):
+            Locator.of(true_field(), points=points)
+    with raises(LocationError, name="directions", value=[2, 3]):
         Locator.of(true_field(), points=torch.zeros(3, 3), directions=torch.zeros(2, 3))
-    for row, said in ((torch.nan, r"nan\], of length nan"), (0.0, r"0\.0\], of length 0"), (2.0, r"of length 3\.46")):
+    for value, length in ((torch.nan, torch.nan), (0.0, 0.0), (2.0, 12**0.5)):
         directions = torch.eye(3)
-        directions[1] = row
-        with pytest.raises(LocationError, match=rf"direction 1 is \[.*{said}.*: expected unit"):
+        directions[1] = value
+        with raises(LocationError, name="directions", row=1, value=pytest.approx(length, nan_ok=True)):
             Locator.of(true_field(), points=torch.zeros(3, 3), directions=directions)
-    with pytest.raises(LocationError, match="positive area for each of 3 points"):
+    with raises(LocationError, name="areas"):
         Locator.of(true_field(), points=torch.zeros(3, 3), areas=torch.zeros(3))
-    with pytest.raises(LocationError, match="none of the object's 43 modes lies below 50 Hz"):
+    with raises(LocationError, name="modes", value=50.0):
         locator_of().locate(struck(1, seed=0).sounds[0], highest=50.0)
 
 

@@ -10,6 +10,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.severalblows import find_blows, locate_blows, still_ringing
+from raising import raises
 from test_locate import PLATE, RATE, locator_of, missed, struck, true_field
 
 
@@ -62,7 +63,7 @@ def test_a_faint_blow_before_a_loud_one_is_found():
 
 def test_noise_holds_no_blows(locator):
     noise = torch.from_numpy(np.random.default_rng(0).standard_normal(18000))
-    with pytest.raises(LocationError, match="noise"):
+    with raises(LocationError, name="noise"):
         locate_blows(true_field(), noise, locator=locator)
 
 
@@ -75,15 +76,15 @@ def test_blows_on_another_object_are_left_out_and_refused_where_there_are_no_oth
     mixed[begin : begin + len(other)] = (other / other.abs().max())[: len(mixed) - begin]
     ((seconds, found),) = locate_blows(true_field(), mixed, locator=locator)
     assert round(seconds, 2) == 0.1
-    assert re.match(r"the recording holds 1 more, at 0\.5\d\d s, left out: .* a misfit of", found.notes[-1])
-    with pytest.raises(LocationError, match=r"the blow at 0\.\d+ s: the modes of this object explain \d+ %"):
+    assert re.search(r"the recording: 1 .*, at 0\.5\d\d s, .* a misfit of", found.notes[-1])
+    with raises(LocationError, name="impact", value=pytest.approx(3000 / RATE, abs=0.01)):
         locate_blows(true_field(), torch.cat([torch.zeros(3000), mixed[begin:]]).numpy(), locator=locator)
 
 
 def test_a_channel_that_is_silent_is_refused_as_such(locator):
     sound, _ = overlapping([0.1], [1.0], seed=33)
     two = Recording("two.wav", np.stack([np.zeros(len(sound)), sound.double().numpy()]), RATE, "FLOAT")
-    with pytest.raises(LocationError, match=r"two\.wav: the sound is silent"):
+    with raises(LocationError, file="two.wav", value=0.0):
         locate_blows(true_field(), two, settings=CaptureSettings(response_channel=1), locator=locator)
 
 
@@ -96,7 +97,7 @@ def test_settings_count_as_for_one_blow(locator):
     for (_, each), contact in zip(found, contacts, strict=True):
         assert missed(each, each.most_probable, contact) < 0.05
     both = Recording("session.wav", np.stack([0.1 * mono.channels[0][::-1], mono.channels[0]]), RATE, "FLOAT")
-    with pytest.raises(LocationError, match=r"session\.wav: normalize = .deconvolve. divides one push"):
+    with raises(LocationError, file="session.wav", name="normalize", value="deconvolve"):
         locate_blows(true_field(), both, settings=settings, locator=locator)
     plain = replace(settings, normalize="auto")
     assert len(locate_blows(true_field(), both, settings=plain, locator=locator)) == 2

@@ -12,6 +12,7 @@ from avmsf.errors import LocationError
 from avmsf.tasks.hearing import at_field_rate, hear
 from avmsf.tasks.locate import locate
 from avmsf.tasks.locator import Locator
+from raising import raises
 from test_locate import RATE, locator_of, missed, struck, true_field
 
 
@@ -77,55 +78,68 @@ def test_how_hard_a_blow_was_is_heard_where_its_push_was_recorded():
 
 def test_a_rate_that_holds_no_mode_is_refused():
     sound = torch.from_numpy(recorded(struck(1, seed=1).sounds[0]).channels[0][::40].copy())
-    with pytest.raises(LocationError, match=r"at 450 Hz and holds sound up to 202\.5 Hz, and the lowest .* record at"):
+    with raises(LocationError, name="sample_rate", value=450.0):
         hear(sound, true_field(), sample_rate=450.0)
 
 
 def test_clipping_is_said_with_its_share(locator):
     recording = recorded(struck(1, seed=23).sounds[0])
     clipped = Recording("hit.wav", np.clip(8 * recording.channels, -1, 1), RATE, "PCM_16")
-    assert "hit.wav is clipped:" in locate(true_field(), clipped, locator=locator).notes[0]
+    note = locate(true_field(), clipped, locator=locator).notes[0]
+    assert note.startswith("hit.wav")
+    assert "clipped" in note
 
 
 def test_a_second_blow_is_said_and_not_heard(locator):
     impacts = struck(2, seed=24)
     both = torch.cat([impacts.sounds[0][:5400], impacts.sounds[1]])
     found = locate(true_field(), recorded(both), locator=locator)
-    assert "more than one blow, at 0.100 s and at 0.4" in found.notes[0]
+    assert "at 0.100 s and at 0.4" in found.notes[0]
     assert "locate_blows" in found.notes[0]
     assert missed(found, found.most_probable, impacts.contacts[0]) < 0.03
 
 
 @pytest.mark.parametrize(
-    ("samples", "message"),
+    ("samples", "name", "value"),
     [
-        (torch.zeros(9000), "the recording is silent"),
-        (torch.full((9000,), torch.inf), "9000 samples are not finite"),
-        (torch.ones(100), "too short, 100 samples"),
-        (torch.randn(9000, generator=torch.Generator().manual_seed(1)), "holds no blow"),
-        (torch.sin(0.3 * torch.arange(9000)), "holds no blow"),
+        (torch.zeros(9000), "sound", "silence"),
+        (torch.full((9000,), torch.inf), "finite", 9000),
+        (torch.ones(100), "samples", 100),
     ],
 )
-def test_what_holds_no_blow_is_refused(samples, message):
-    with pytest.raises(LocationError, match=message):
+def test_samples_without_a_sound_are_refused(samples, name, value):
+    with raises(LocationError, name=name, value=value):
         hear(samples, true_field())
 
 
-def test_samples_that_are_none_are_refused():
+@pytest.mark.parametrize(
+    "samples",
+    [torch.randn(9000, generator=torch.Generator().manual_seed(1)), torch.sin(0.3 * torch.arange(9000))],
+    ids=["noise", "hum"],
+)
+def test_sounds_that_neither_rise_nor_fall_are_refused(samples):
+    with raises(LocationError, file="the recording") as caught:
+        hear(samples, true_field())
+    # Decibels between the loudest and the quietest part.
+    assert 0.0 <= caught.value.value < 6.0
+
+
+def test_samples_of_several_channels_and_impossible_rates_are_refused():
     sound = recorded(struck(1, seed=25).sounds[0]).channels
-    with pytest.raises(LocationError, match=r"samples of one channel, found the shape \(1, 9000\): give one row"):
+    with raises(LocationError, name="recording", value=[1, 9000]):
         locate(true_field(), sound)
-    with pytest.raises(LocationError, match=r"samples of one channel, found the shape \(\)"):
+    with raises(LocationError, name="recording", value=[]):
         hear(torch.tensor(1.0), true_field())
     for rate in (math.nan, math.inf, 0.0, -8000.0):
-        with pytest.raises(LocationError, match=f"the recording is at {rate:g} Hz: expected a sample rate above 0"):
+        with raises(LocationError, name="sample_rate") as caught:
             locate(true_field(), sound[0], sample_rate=rate)
+        assert caught.value.value is rate
 
 
 def test_channels_follow_the_capture_where_the_recording_has_them():
     one = recorded(struck(1, seed=25).sounds[0]).channels[0]
     two = Recording("hit.wav", np.stack([0.1 * one[::-1], one]), RATE, "FLOAT")
-    with pytest.raises(LocationError, match="2 different channels"):
+    with raises(LocationError, file="hit.wav", name="response_channel", value=2):
         hear(two, true_field())
     settings = CaptureSettings(response_channel=2, highpass=30.0)
     assert abs(hear(two, true_field(), settings=settings).onset - 1800) <= 8
@@ -137,7 +151,7 @@ def test_channels_follow_the_capture_where_the_recording_has_them():
     hammered = CaptureSettings(force_channel=1, response_channel=2, highpass=30.0, normalize="deconvolve")
     pushless = hear(Recording("hit.wav", one[None], RATE, "FLOAT"), true_field(), settings=hammered)
     torch.testing.assert_close(pushless.sound, alone.sound)
-    with pytest.raises(LocationError, match="sample_rate says 8000 Hz"):
+    with raises(LocationError, file="hit.wav", name="sample_rate", value=8000.0):
         hear(two, true_field(), sample_rate=8000.0)
 
 

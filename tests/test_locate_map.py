@@ -10,6 +10,7 @@ from avmsf.simulate.plate import plate_surface_points
 from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.counterparts import name_counterpart
 from avmsf.tasks.locator import Locator
+from raising import raises
 from test_locate import PLATE, TrueGains, field_of, struck
 
 
@@ -39,7 +40,7 @@ def test_region_is_the_smallest_set_of_that_probability():
     assert found.region(0.9).tolist() == [False, True, True, False, True]
     assert found.region(0.5).tolist() == [False, True, False, False, False]
     assert found.region(0.97).sum() == 5
-    with pytest.raises(LocationError, match=r"level = 1\.5: expected a probability"):
+    with raises(LocationError, name="level", value=1.5):
         found.region(1.5)
 
 

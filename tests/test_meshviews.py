@@ -16,6 +16,7 @@ from avmsf.capture.cameras import Camera
 from avmsf.capture.meshviews import FOCAL, UNLIT, Lighting, MeshTracer, orbit_cameras, render_views
 from avmsf.capture.texturedmesh import GRAY, TexturedMesh, read_textured_mesh
 from avmsf.errors import CaptureError
+from raising import raises, warns
 
 RADIUS, DISTANCE = 0.1, 0.5
 
@@ -296,7 +297,7 @@ def test_vertex_and_face_colors_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["stl", "ply", "obj"])
 def test_without_colors_a_mesh_is_gray_and_says_so(tmp_path: Path, kind: str) -> None:
     trimesh.Trimesh(*box_arrays(0.2), process=False).export(tmp_path / f"box.{kind}")
-    with pytest.warns(CaptureWarning, match=rf"box\.{kind}: has neither texture nor colors; it is taken as gray"):
+    with warns(CaptureWarning, file=f"box.{kind}", name="colors"):
         read = read_textured_mesh(tmp_path / f"box.{kind}")
     assert bool((read.colors == GRAY).all())
     assert (len(read.vertices), len(read.faces)) == (8, 12)
@@ -313,14 +314,14 @@ def write_card(folder: Path, *, image: bytes | None, library: str = "map_Kd skin
 
 
 def test_a_missing_texture_file_is_named(tmp_path: Path) -> None:
-    with pytest.warns(CaptureWarning, match=r"card\.obj: its texture skin\.png is missing; .* gray"):
+    with warns(CaptureWarning, file="card.obj", name="texture", value="skin.png"):
         assert bool((read_textured_mesh(write_card(tmp_path, image=None)).colors == GRAY).all())
 
 
-def test_a_corrupt_texture_file_is_told(tmp_path: Path) -> None:
+def test_a_corrupt_texture_file_is_warned_of(tmp_path: Path) -> None:
     Image.fromarray(noise(64)).save(tmp_path / "whole.png")
     cut = (tmp_path / "whole.png").read_bytes()[:3000]
-    with pytest.warns(CaptureWarning, match=r"card\.obj: its texture .* gray"):
+    with warns(CaptureWarning, file="card.obj", name="texture", value=None):
         assert bool((read_textured_mesh(write_card(tmp_path, image=cut)).colors == GRAY).all())
 
 
@@ -330,35 +331,35 @@ def test_a_material_without_image_has_its_color(tmp_path: Path) -> None:
 
 
 def test_bad_meshes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match=r"none\.obj: there is no such mesh file"):
+    with raises(CaptureError, file="none.obj", name=None):
         read_textured_mesh(tmp_path / "none.obj")
     for name, content in (("text.ply", b"ply\nnonsense"), ("noise.glb", bytes(range(200))), ("mesh.docx", b"PK")):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(CaptureError, match=name):
+        with raises(CaptureError, file=name):
             read_textured_mesh(tmp_path / name)
     (tmp_path / "nan.obj").write_text("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n")
-    with pytest.raises(CaptureError, match=r"nan\.obj: 1 of 3 vertices are not finite numbers, the first vertex 1 "):
+    with raises(CaptureError, file="nan.obj", row=1, name="vertices"):
         read_textured_mesh(tmp_path / "nan.obj")
     trimesh.PointCloud(np.eye(3)).export(tmp_path / "cloud.ply")
-    with pytest.raises(CaptureError, match=r"cloud\.ply: holds no triangles"):
+    with raises(CaptureError, file="cloud.ply", name="faces", value=0):
         read_textured_mesh(tmp_path / "cloud.ply")
-    with pytest.raises(CaptureError, match="found 3 points and no triangles"):
+    with raises(CaptureError, name="faces", value=0):
         TexturedMesh.plain(Surface(torch.eye(3), torch.zeros(0, 3, dtype=torch.int64)))
-    with pytest.raises(CaptureError, match="none of the 1 triangles has an area"):
+    with raises(CaptureError, name="area", value=0.0):
         TexturedMesh.build(torch.arange(9.0).reshape(3, 3), torch.tensor([[0, 1, 2]]))
-    with pytest.raises(CaptureError, match="a face names vertex 3"):
+    with raises(CaptureError, name="faces", value=3):
         TexturedMesh.build(torch.eye(3), torch.tensor([[0, 1, 3]]))
 
 
 def test_bad_requests_are_refused() -> None:
     ball = sphere(1)
-    with pytest.raises(CaptureError, match="found none"):
+    with raises(CaptureError, name="cameras", value=0):
         render_views(ball, [])
-    with pytest.raises(CaptureError, match=r"supersample of at least 1 .* found 0"):
+    with raises(CaptureError, name="supersample", value=0):
         render_views(ball, [facing(8)], supersample=0)
-    with pytest.raises(CaptureError, match="background of numbers from 0 to 1"):
+    with raises(CaptureError, name="background", value=(255.0, 255.0, 255.0)):
         render_views(ball, [facing(8)], background=(255.0, 255.0, 255.0))
-    with pytest.raises(CaptureError, match="an object with an extent"):
+    with raises(CaptureError, name="surface", value=0.0):
         orbit_cameras(Surface(torch.zeros(2, 3), torch.zeros(0, 3, dtype=torch.int64)))
     with pytest.raises((CaptureError, TypeCheckError)):
         TexturedMesh.build(torch.zeros(3, 2), torch.tensor([[0, 1, 2]]))

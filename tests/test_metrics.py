@@ -24,6 +24,7 @@ from avmsf.errors import EvaluationError
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.spectra import magnitude_stft
 from corpus import make as corpus
+from raising import raises
 
 RATE = 24000.0
 CORPUS = Path(__file__).parent / "corpus"
@@ -209,33 +210,35 @@ def test_objectfolders_convention_has_its_own_two():
 @every_metric
 def test_what_cannot_be_compared_is_refused(metric):
     good = clips()
-    with pytest.raises(EvaluationError, match="3 predicted sounds cannot be compared with 2 true"):
+    with raises(EvaluationError, name="predicted", value=3):
         metric(good, good[:2])
-    with pytest.raises(EvaluationError, match="have 4000 samples and true ones 4800; are both at one sample rate"):
+    with raises(EvaluationError, name="predicted", value=[3, 4000]):
         metric(good[:, :4000], good)
-    with pytest.raises(EvaluationError, match=r"shape \(4800,\); give a single sound as one row"):
+    with raises(EvaluationError, name="predicted", value=[4800]):
         metric(good[0], good[0])
-    with pytest.raises(EvaluationError, match="predicted sounds are empty: 0 contacts"):
+    with raises(EvaluationError, name="predicted", value=[0, 4800]):
         metric(good[:0], good[:0])
-    with pytest.raises(EvaluationError, match="true sounds are empty: 3 contacts of 0 samples"):
+    with raises(EvaluationError, name="truth", value=[3, 0]):
         metric(good, good[:, :0])
     broken = good.clone()
     broken[1, 7] = math.nan
-    with pytest.raises(EvaluationError, match="the predicted sound of row 1 is nan at sample 7"):
+    with raises(EvaluationError, name="predicted", row=1) as caught:
         metric(broken, good)
-    with pytest.raises(EvaluationError, match="the true sound of row 1 is nan"):
+    assert math.isnan(caught.value.value)
+    with raises(EvaluationError, name="truth", row=1):
         metric(good, broken)
 
 
 def test_a_bad_row_is_called_by_its_name():
     broken = clips()
     broken[2, 0] = math.inf
-    with pytest.raises(EvaluationError, match=r"the predicted sound of taps/c\.wav is inf at sample 0"):
+    with raises(EvaluationError, name="predicted", row=2, value=math.inf) as caught:
         validate(broken, clips(), names=("a", "b", "taps/c.wav"))
+    assert "taps/c.wav" in str(caught.value)
 
 
 def test_different_sample_rates_are_refused():
-    with pytest.raises(EvaluationError, match="predicted sounds are at 48000 Hz and true ones at 44100 Hz; resample"):
+    with raises(EvaluationError, name="sample_rates", value=(48000.0, 44100.0)):
         validate(clips(), clips(), sample_rates=(48000.0, 44100.0))
     validate(clips(), clips(), sample_rates=(RATE, RATE))
 
@@ -274,12 +277,12 @@ def test_every_metric_of_the_corpus_says_what_it_said():
 
 
 def test_nothing_is_relative_to_silence():
-    with pytest.raises(EvaluationError, match="all true sounds are silence"):
+    with raises(EvaluationError, name="truth", value=0.0):
         relative_stft_error(clips(), 0 * clips(), fft_sizes=(256,))
 
 
 def test_rates_without_sense_are_refused():
-    with pytest.raises(EvaluationError, match=r"end at 200 Hz; evaluate them in the convention PAPER"):
+    with raises(EvaluationError, name="sample_rate", value=400.0):
         objectfolder_distance(clips(), clips(), sample_rate=400.0)
-    with pytest.raises(ValueError, match="must be positive, got -1 Hz"):
+    with pytest.raises(ValueError):
         scaled_fft_size(1024, sample_rate=-1.0)

@@ -12,6 +12,7 @@ from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.residual import Residual
 from avmsf.tasks.modaledit import ModalEdit, Struck
+from raising import raises
 
 RATE = 8000.0
 
@@ -142,11 +143,11 @@ def test_louder_scales_the_sound():
 def test_an_edit_of_another_bank_is_refused():
     other = replace(made_field(), bank=made_fields.BANK)
     edit = ModalEdit(*(torch.zeros(size, dtype=torch.float64) for size in ((), (3,), (), (3,), (3,))))
-    with pytest.raises(EditError, match="expected an edit of the field's 5 modes, found one of 3"):
+    with raises(EditError, name="shift", value=3):
         edit.of(other)
 
 
 def test_a_frequency_that_is_no_number_is_refused():
     field = made_field()
-    with pytest.raises(EditError, match=r"mode 0 .* the frequency inf"):
+    with raises(EditError, name="frequency", row=0, value=math.inf):
         ModalEdit.none(field.bank, pitch=800.0).of(field)

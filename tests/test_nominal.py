@@ -1,7 +1,6 @@
 """Geometry to elastic shapes: which bodies a surface may hide, and what is said of surfaces that hide none."""
 
 import math
-import re
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from avmsf.simulate import nominal, nominalsolid
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import elastic_modes
 from avmsf.simulate.nominal import NOMINAL, NominalBody, nominal_bodies, refined
+from raising import raises
 
 
 def surface_of(mesh: trimesh.Trimesh) -> Surface:
@@ -56,8 +56,8 @@ def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkey
         [part * math.hypot(0.24, 0.17) for part in nominal.WALLS]
     )
     assert not any(body.fine for body in found.bodies)
-    assert any("42 of the mesh's edges are open" in words for words in told)
-    assert "42 of the mesh's edges are open" in found.refused[None]
+    assert any("42 open edges" in message for message in told)
+    assert "42 open edges" in found.refused[None]
     body = found.bodies[1]
     fine = refined(sheet(), body, freedoms=4000)
     assert fine.fine
@@ -72,7 +72,7 @@ def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path
     told: list[str] = []
     inwards = Surface(ball().vertices, ball().faces.flip(1))
     found = nominal_bodies(inwards, walls=[None], count=20, freedoms=10000, cache=tmp_path, tell=told.append).bodies[0]
-    assert any(f"{len(inwards.faces)} of its {len(inwards.faces)} triangles were turned" in words for words in told)
+    assert any(f"{len(inwards.faces)} of {len(inwards.faces)} triangles" in message for message in told)
     # Lamb: the torsional oscillation of degree 2, whose wave number times radius is 2.501, belongs to five modes.
     shear = math.sqrt(NOMINAL.young / (2 * (1 + NOMINAL.poisson)) / NOMINAL.density)
     # Fillings differ from run to run, and their frequencies by 2 % at this size.
@@ -97,7 +97,7 @@ def test_a_damaged_kept_file_is_made_again(tmp_path: Path):
     kept.write_bytes(whole[: len(whole) // 2])
     told: list[str] = []
     assert torch.equal(made(told), first)
-    assert any("computing again what cannot be read" in words for words in told)
+    assert any(str(kept) in message for message in told)
     assert kept.read_bytes() == whole
 
 
@@ -112,7 +112,7 @@ def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
     assert found.bodies[0].elastic.mass == pytest.approx(mass, rel=0.06)
     reasons = [reason for wall, reason in found.refused.items() if wall is not None]
     assert len(reasons) == 6
-    assert all("both sides of what is 6 mm thick" in reason or "2 parts" in reason for reason in reasons)
+    assert all("6 mm" in reason or "2 parts" in reason for reason in reasons)
 
 
 def test_boxes_that_overlap_are_one_body():
@@ -123,7 +123,7 @@ def test_boxes_that_overlap_are_one_body():
     assert [body.name for body in found.bodies] == ["filled"]
     volume = 0.3 * 0.05 * 0.02 + (0.2 - 0.05) * 0.05 * 0.015
     assert found.bodies[0].elastic.mass == pytest.approx(NOMINAL.density * volume, rel=0.05)
-    assert "2 parts that share no vertex" in found.refused[0.001]
+    assert "2 parts" in found.refused[0.001]
 
 
 @pytest.mark.slow
@@ -139,43 +139,57 @@ def test_parts_that_do_not_touch_are_refused_with_all_reasons():
     one, other = trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.1, 0.1, 0.1))
     other.apply_translation((0.3, 0.0, 0.0))
     apart = surface_of(trimesh.util.concatenate([one, other]))
-    with pytest.raises(SimulationError, match=r"filled: .*2 parts that do not touch.*wall of 1 mm: .*2 parts.*mend"):
+    with raises(SimulationError, name="surface") as caught:
         nominal_bodies(apart, walls=[None, 0.001], count=6, freedoms=3000)
+    filled, walled = caught.value.value
+    for name, reason in (("filled", filled), ("wall of 1 mm", walled)):
+        assert reason.startswith(f"{name}: ")
+        assert "2 parts" in reason
 
 
 def test_a_wall_thicker_than_the_object_is_refused():
-    with pytest.raises(SimulationError, match="a wall of 200 mm is thicker than the object, which is 170 mm wide"):
+    with raises(SimulationError, name="surface") as caught:
         nominal_bodies(sheet(), walls=[0.2])
-    with pytest.raises(SimulationError, match=r"wall of 40 mm: .* more than the closed surface holds"):
+    [reason] = caught.value.value
+    assert reason.startswith("wall of 2e+02 mm: ")
+    assert "170 mm" in reason
+    assert "200 mm" in reason
+    with raises(SimulationError, name="surface") as caught:
         nominal_bodies(ball(), walls=[0.04])
+    [reason] = caught.value.value
+    assert reason.startswith("wall of 40 mm: thickness: ")
 
 
 def test_points_alone_have_no_body():
     cloud = Surface(ball().vertices, torch.zeros((0, 3), dtype=torch.int64))
-    with pytest.raises(SimulationError, match="expected a mesh, found 642 points and no triangles"):
+    with raises(SimulationError, name="faces", value=0) as caught:
         nominal_bodies(cloud)
+    assert "642" in str(caught.value)
 
 
 def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 2 * 377e6)
-    with pytest.raises(SimulationError, match=r"80000 degrees of freedom take about 1\.6 GB.*freedoms=40000 fits"):
+    with raises(SimulationError, name="surface") as caught:
         nominal_bodies(sheet(), walls=[0.004], freedoms=80_000)
+    [reason] = caught.value.value
+    assert all(number in reason for number in ("80000", "1.6 GB", "freedoms=40000"))
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: None)
     assert nominal_bodies(sheet(), walls=[0.004], count=4, freedoms=2000).bodies
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"),
+    ("settings", "row", "value"),
     [
-        ({"count": 0}, "count = 0: expected 1"),
-        ({"freedoms": 10}, "freedoms = 10: expected 1000"),
-        ({"walls": []}, "walls is empty"),
-        ({"walls": [-0.001]}, "wall = -0.001 m: expected more than 0"),
-        ({"walls": [math.nan]}, "wall = nan m"),
+        ({"count": 0}, None, 0),
+        ({"freedoms": 10}, None, 10),
+        ({"walls": []}, None, []),
+        ({"walls": [None, -0.001]}, 1, -0.001),
+        ({"walls": [math.nan]}, 0, math.nan),
     ],
 )
-def test_settings_that_make_no_sense_are_named(settings: dict, words: str):
-    with pytest.raises(SimulationError, match=words):
+def test_settings_that_make_no_sense_are_named(settings: dict, row: int | None, value: object):
+    [name] = settings
+    with raises(SimulationError, name=name, row=row, value=pytest.approx(value, nan_ok=True)):
         nominal_bodies(sheet(), **settings)
 
 
@@ -191,19 +205,16 @@ def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory(
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 1e9)
     told: list[str] = []
     assert refined(sheet(), coarse, freedoms=400_000, tell=told.append) is coarse
-    assert "wall of 4 mm stays coarse: 400000 degrees of freedom take about" in told[-1]
+    assert told[-1].startswith("wall of 4 mm: ")
+    assert "400000" in told[-1]
     assert refined(sheet(), coarse, freedoms=400_000) is coarse
 
 
 @pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (MemoryError(), r"stays coarse: the modes of \d+ degrees of freedom do not fit .*freedoms=1500"),
-        (SimulationError("badly shaped"), "stays coarse: badly shaped"),
-    ],
+    ("error", "reason"), [(MemoryError(), "freedoms=1500"), (SimulationError("badly shaped"), "badly shaped")]
 )
 def test_a_body_stays_coarse_where_a_finer_one_fails(
-    monkeypatch: pytest.MonkeyPatch, coarse: NominalBody, error: Exception, words: str
+    monkeypatch: pytest.MonkeyPatch, coarse: NominalBody, error: Exception, reason: str
 ):
     def fail(*solid: object, **settings: object) -> None:
         raise error
@@ -211,7 +222,8 @@ def test_a_body_stays_coarse_where_a_finer_one_fails(
     monkeypatch.setattr(nominal, "elastic_modes", fail)
     told: list[str] = []
     assert refined(sheet(), coarse, freedoms=3000, tell=told.append) is coarse
-    assert re.search(words, told[-1])
+    assert told[-1].startswith("wall of 4 mm: ")
+    assert reason in told[-1]
 
 
 def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(monkeypatch: pytest.MonkeyPatch):
@@ -229,13 +241,15 @@ def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(m
     monkeypatch.setattr(nominal, "TRIAL", 2000)
     found = nominal_bodies(sheet(), walls=[0.004, 0.012], count=4, freedoms=4000, tell=told.append)
     assert [(body.wall, body.fine) for body in found.bodies] == [(0.004, False)]
-    assert any("wall of 4 mm stays coarse" in words for words in told)
+    assert any(message.startswith("wall of 4 mm: ") and "freedoms=2000" in message for message in told)
     assert list(found.refused) == [0.012]
 
 
 def test_walls_whose_names_are_alike_are_refused_each():
-    with pytest.raises(SimulationError, match="wall of 2e\\+02 mm, wall of 2e\\+02 mm: a wall of") as caught:
+    with raises(SimulationError, name="surface") as caught:
         nominal_bodies(sheet(), walls=[0.2, 0.2001])
+    [reason] = caught.value.value
+    assert reason.startswith("wall of 2e+02 mm, wall of 2e+02 mm: ")
     assert "0.2001" not in str(caught.value)
     found = nominal_bodies(sheet(), walls=[0.2, 0.2001, 0.004], count=4, freedoms=2000)
     assert list(found.refused) == [0.2, 0.2001]
@@ -246,8 +260,10 @@ def test_modes_that_do_not_fit_into_the_memory_after_all_are_refused(monkeypatch
         raise MemoryError
 
     monkeypatch.setattr(nominal, "elastic_modes", fail)
-    with pytest.raises(SimulationError, match=r"the modes of \d+ degrees of freedom do not fit .* as freedoms=1500"):
+    with raises(SimulationError, name="surface") as caught:
         nominal_bodies(sheet(), walls=[0.004], freedoms=3000)
+    [reason] = caught.value.value
+    assert "freedoms=1500" in reason
 
 
 def test_the_memory_is_asked_for_what_is_computed_and_for_nothing_that_is_kept(
@@ -262,15 +278,17 @@ def test_the_memory_is_asked_for_what_is_computed_and_for_nothing_that_is_kept(
     monkeypatch.setattr(nominalsolid, "_free_memory", lambda: 0.0)
     again = nominal_bodies(sheet(), walls=walls, **settings)
     assert torch.equal(again.bodies[1].elastic.shapes, found.bodies[1].elastic.shapes)
-    with pytest.raises(SimulationError, match=r"degrees of freedom take about .* 0 GB of memory are free"):
+    with raises(SimulationError, name="surface") as caught:
         nominal_bodies(sheet(), walls=[0.005, 0.007], **settings)
+    assert all("got 0 GB" in reason for reason in caught.value.value)
 
 
 @pytest.mark.parametrize(
-    ("walls", "words"), [(None, "state its wall in meters if it has one$"), ([0.2], "state another wall, or none$")]
+    ("walls", "advice"), [(None, "give the wall thickness"), ([0.2], "give another wall thickness")]
 )
-def test_what_helps_depends_on_who_stated_the_wall(walls: list[float] | None, words: str):
+def test_what_helps_depends_on_who_stated_the_wall(walls: list[float] | None, advice: str):
     one = sheet()
     apart = Surface(torch.cat([one.vertices, one.vertices + 1]), torch.cat([one.faces, one.faces + len(one.vertices)]))
-    with pytest.raises(SimulationError, match=f"no body can be made .*: mend the mesh, or {words}"):
+    with raises(SimulationError, name="surface") as caught:
         nominal_bodies(apart if walls is None else sheet(), walls=walls, freedoms=1000)
+    assert f"or {advice}" in str(caught.value)

@@ -13,6 +13,7 @@ from avmsf.geometry.closest import ClosestPoints
 from avmsf.simulate.nominalcheck import CheckedSurface, checked
 from avmsf.simulate.nominalsmooth import ROUGH, denoised, roughness
 from avmsf.simulate.skin import Skin
+from raising import raises
 
 
 def surface_of(mesh: trimesh.Trimesh) -> Surface:
@@ -38,7 +39,8 @@ def test_an_inverted_part_is_turned_and_the_wall_of_a_void_is_not():
     told: list[str] = []
     found = checked(surface_of(trimesh.util.concatenate([outer, inner, beside])), tell=told.append)
     assert found.skin.volume == pytest.approx(truth, rel=1e-5)
-    assert told == ["the mesh faced inwards: 320 of its 960 triangles were turned"]
+    assert len(told) == 1
+    assert told[0].startswith("320 of 960 triangles")
     # All of it inside out: the void goes with the body around it.
     every = trimesh.util.concatenate([outer, inner])
     every.invert()
@@ -55,7 +57,7 @@ def test_an_open_vessel_that_faces_inwards_is_told_and_stays(below: float, vesse
         told: list[str] = []
         found = checked(surface, tell=told.append).skin
         # A dish a twentieth as deep as its radius has no inside worth the name.
-        assert any("faces the inside of what it encloses" in words for words in told) == expected
+        assert any("inwards" in message for message in told) == expected
         assert (found.volume > 0) == (Skin.of(surface).volume > 0)
 
 
@@ -63,7 +65,7 @@ def test_lids_are_measured_as_they_would_close_the_holes():
     half = CheckedSurface(cup(0.05))
     # The disc on a dome of height h on a ball of radius 1 is (2 - h) / (4 - h) of all.
     assert half.lids == pytest.approx((2 - 1.05) / (4 - 1.05), abs=0.005)
-    with pytest.raises(SimulationError, match=r"edges are open, and lids over its holes would be 3\d% of the surface"):
+    with raises(SimulationError, name="mesh", value=half.lids):
         half.expect_filling()
     assert half.mean_thickness is None
     nearly = CheckedSurface(cup(0.9))
@@ -77,7 +79,7 @@ def test_no_wall_is_guessed_where_the_surface_holds_little_more_than_it():
     whole = CheckedSurface(skin_of(trimesh.creation.icosphere(4)))
     # Twice the volume over the area is two thirds of the radius, of which a wall may be a sixth.
     whole.expect_hollow(0.110)
-    with pytest.raises(SimulationError, match=r"shows both sides of .* it is filled"):
+    with raises(SimulationError, name="wall", value=0.112):
         whole.expect_hollow(0.112)
     CheckedSurface(cup(0.05)).expect_hollow(0.3)
 
@@ -123,4 +125,4 @@ def test_smoothing_is_told():
     rough = Surface(torch.from_numpy(clean.points + noise).float(), torch.from_numpy(clean.faces))
     checked(rough, tell=told.append)
     assert len(told) == 1
-    assert "the mesh is noisy" in told[0]
+    assert f"{roughness(Skin.of(rough)):.0f} degrees" in told[0]

@@ -43,8 +43,9 @@ def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
         nominal_bodies(surface_of(skin), walls=[0.002], count=4, freedoms=8000, tell=told.append).bodies[0].elastic
         for skin in (dense, coarse)
     )
-    assert told[:2] == [f"checking a mesh of {len(dense.faces)} triangles", "the mesh was thinned to 6000 triangles"]
-    assert sum("thinned" in words for words in told) == 1
+    assert f"{len(dense.faces)} triangles" in told[0]
+    assert "6000 triangles" in told[1]
+    assert sum("6000 triangles" in message for message in told) == 1
     # Without thinning, elements that differ change frequencies by 1.5 % at this size.
     assert found.frequency.numpy() == pytest.approx(known.frequency.numpy(), rel=0.03)
     assert found.mass == pytest.approx(known.mass, rel=0.01)
@@ -62,7 +63,7 @@ def test_a_noisy_mesh_is_thinned_without_its_noise_and_stays_a_skin(monkeypatch:
     before = np.sqrt((surface(clean.points + noise).distances ** 2).mean())
     assert np.sqrt((surface(found.points).distances ** 2).mean()) < 0.35 * before
     assert found.volume == pytest.approx(clean.volume, rel=0.01)
-    assert told[-1].endswith("degrees from one to the next averaged out")
+    assert told[-1].endswith("degrees")
 
 
 def test_a_thinned_sheet_keeps_its_rim(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,7 @@ from avmsf.pipeline.sources import find_source
 from avmsf.scene.features import FeatureField
 from avmsf.scene.ply import read_splats
 from avmsf.scene.splatconfig import SplatConfig
+from raising import raises
 from small_scene import slab_views, write_surface_file
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*neither texture nor colors")
@@ -109,7 +110,7 @@ def test_an_object_that_nothing_shows_has_positions_alone(tmp_path: Path) -> Non
     points = looks("slab", "positions").points
     assert points.amin(0).tolist() == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
     assert points.amax(0).tolist() == pytest.approx([0.1, 0.2, 0.1], abs=0.02)
-    with pytest.raises(SceneError, match="slab: the dataset holds neither a mesh nor pictures"):
+    with raises(SceneError, name="slab"):
         looks("slab", "visual")
 
 
@@ -123,5 +124,5 @@ def test_a_mesh_may_be_preferred_to_the_photographs_beside_it(tmp_path: Path) ->
 
 
 def test_a_negative_number_of_views_is_refused() -> None:
-    with pytest.raises(SceneError, match="count = -1: expected 0 for all views"):
+    with raises(SceneError, name="count", value=-1):
         ViewsConfig(count=-1)

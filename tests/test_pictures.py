@@ -12,6 +12,7 @@ from avmsf.bench.evaluation import Scores
 from avmsf.bench.pictures import draw_gains, draw_modes, draw_scores, draw_spectrograms, save_picture
 from avmsf.errors import EvaluationError
 from avmsf.modal.bank import ModalBank
+from raising import raises
 
 BANK = ModalBank(
     torch.tensor([200.0, 1000.0, 1010.0], dtype=torch.float64), torch.tensor([2.0, 10.0, 20.0], dtype=torch.float64)
@@ -25,8 +26,8 @@ def test_stems_stand_at_the_modes_as_high_as_their_levels_and_decay_times() -> N
         (stems,) = (drawn for drawn in axes.collections if isinstance(drawn, LineCollection))
         assert np.allclose([segment[1] for segment in stems.get_segments()], np.c_[[200.0, 1000.0, 1010.0], heights])
     assert figure.get_suptitle() == "a bowl"
-    assert upper.get_ylabel() == "level (dB re strongest)"
-    assert (lower.get_xlabel(), lower.get_ylabel()) == ("frequency (Hz)", "decay by 60 dB (s)")
+    assert upper.get_ylabel() == "level (dB re strongest mode)"
+    assert (lower.get_xlabel(), lower.get_ylabel()) == ("frequency (Hz)", "decay time T60 (s)")
     # The doublet's labels would overlap: only the stronger is named.
     assert [text.get_text() for text in upper.texts] == ["1000", "200"]
 
@@ -103,5 +104,5 @@ def test_a_picture_has_the_format_that_its_name_says(tmp_path: Path) -> None:
     for name, start in (("a.png", b"\x89PNG"), ("a.PDF", b"%PDF"), ("deep/a.svg", b"<?xml")):
         save_picture(figure, tmp_path / name)
         assert (tmp_path / name).read_bytes().startswith(start)
-    with pytest.raises(EvaluationError, match=r"ends in .png, .pdf or .svg, found .jpeg"):
+    with raises(EvaluationError, value=".jpeg"):
         save_picture(figure, tmp_path / "a.jpeg")

@@ -11,6 +11,7 @@ from avmsf.capture import CaptureSettings, Surface, read_surface
 from avmsf.capture.placement import FACTORS, judge_placement, surface_points
 from avmsf.capture.table import read_rows, understand
 from avmsf.errors import CaptureError
+from raising import raises
 
 Y_UP = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
 """Takes (x, y, z) of a file with y upwards to one with z upwards."""
@@ -75,7 +76,7 @@ def test_a_surface_in_millimeters_is_told_even_if_all_contacts_lie_near_one_of_i
     placement = judge_placement(CONTACTS - CLOUD[0], cloud)
     assert not placement.off
     assert not placement.on_surface
-    assert "multiplied by 1000 they lie" in placement.describe()
+    assert "multiplied by 1000" in placement.describe()
     assert "is the surface's unit mm?" in placement.describe()
 
 
@@ -84,8 +85,8 @@ def test_y_up_for_z_up_is_told_either_way() -> None:
         placement = judge_placement(CONTACTS @ axes, CLOUD)
         assert placement.mistake is not None
         assert torch.equal(placement.mistake.axes, axes)
-        assert f"with (x, y, z) taken as {written} they lie" in placement.describe()
-        assert "does another axis point up?" in placement.describe()
+        assert written in placement.describe()
+        assert "mirrored" not in placement.describe()
 
 
 def test_other_names_of_the_axes_are_undone() -> None:
@@ -104,14 +105,14 @@ def test_other_names_of_the_axes_are_undone() -> None:
     assert missed == []
 
 
-def test_another_origin_is_told_to_the_spacing_of_the_points() -> None:
+def test_another_origin_is_found_to_the_spacing_of_the_points() -> None:
     shift = torch.tensor([0.7, -0.2, 0.4], dtype=torch.float64)
     placement = judge_placement(CONTACTS - shift, CLOUD)
     assert placement.mistake is not None
     assert torch.equal(placement.mistake.axes, torch.eye(3, dtype=torch.float64))
     assert placement.mistake.factor == 1
     assert float((placement.mistake.shift - shift).norm()) < 0.005
-    assert "is the origin another?" in placement.describe()
+    assert "moved by" in placement.describe()
 
 
 def test_unit_axes_and_origin_together() -> None:
@@ -129,10 +130,11 @@ def test_one_wrong_row_is_no_mistake_of_all() -> None:
     placement = judge_placement(contacts, CLOUD)
     assert placement.mistake is None
     assert placement.off == (7,)
-    assert "1 of 20 contacts lie up to" in placement.describe()
+    assert placement.off == (7,)
+    assert "1 of 20 contacts" in placement.describe()
     assert placement.describe().endswith("check row 7")
-    names = [f"line {row + 2}" for row in range(20)]
-    assert placement.describe(names).endswith("check line 9")
+    names = [f"impact {row + 2}" for row in range(20)]
+    assert placement.describe(names).endswith("check impact 9")
 
 
 def test_contacts_of_another_object_are_not_explained() -> None:
@@ -164,11 +166,11 @@ def test_a_surface_is_covered_by_points_always_the_same() -> None:
 
 
 def test_nothing_to_judge_is_refused() -> None:
-    with pytest.raises(CaptureError, match="found 0 contacts"):
+    with raises(CaptureError, name="contacts", value=0):
         judge_placement(torch.zeros(0, 3), CLOUD)
-    with pytest.raises(CaptureError, match="numbers that are not finite"):
+    with raises(CaptureError, name="contacts", value=2):
         judge_placement(torch.full((2, 3), torch.nan), CLOUD)
-    with pytest.raises(CaptureError, match="found 5 in one place"):
+    with raises(CaptureError, name="points", value=0.0):
         judge_placement(CONTACTS, torch.ones(5, 3))
 
 

@@ -6,6 +6,7 @@ import torch
 from avmsf.errors import SceneError
 from avmsf.scene.features import FeatureField
 from avmsf.scene.reduction import reduce, resize, with_positions
+from raising import raises
 
 
 def field(count: int = 400) -> FeatureField:
@@ -55,18 +56,20 @@ def test_signs_do_not_depend_on_the_solver():
 
 def test_features_that_tell_nothing_are_refused():
     alike = FeatureField(torch.rand(9, 3), torch.full((9, 4), 2.5), "anyone")
-    with pytest.raises(SceneError, match="all 9 features of the encoder 'anyone' are alike"):
+    with raises(SceneError, name="anyone", value=9):
         reduce(alike, 2)
-    for dim, whitening in ((0, 1.0), (3, 1.5), (3, float("nan"))):
-        with pytest.raises(SceneError, match="expected dim of at least 1 and whitening from 0 to 1"):
-            reduce(field(), dim, whitening=whitening)
+    with raises(SceneError, name="dim", value=0):
+        reduce(field(), 0)
+    for whitening in (1.5, float("nan")):
+        with raises(SceneError, name="whitening"):
+            reduce(field(), 3, whitening=whitening)
 
 
 def test_a_size_is_the_root_mean_square_length():
     sized = resize(field(), 0.3).features.double()
     assert float(sized.square().sum(1).mean().sqrt()) == pytest.approx(0.3, rel=1e-6)  # float32's rounding
     torch.testing.assert_close(sized / sized.norm(), field().features.double() / field().features.double().norm())
-    with pytest.raises(SceneError, match="are zero"):
+    with raises(SceneError, name="anyone", value=0.0):
         resize(FeatureField(torch.rand(9, 3), torch.zeros(9, 4), "anyone"), 1.0)
 
 

@@ -22,6 +22,7 @@ from avmsf.capture.similarity import align_similarity, move_views
 from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.capture.views import read_views
 from avmsf.errors import CaptureError
+from raising import raises
 
 VIEWS, SIZE = 10, 256
 
@@ -122,15 +123,15 @@ def test_cameras_agree_with_the_true_ones_up_to_a_similarity(
 def test_images_without_a_camera_are_named(found: tuple[Path, EstimatedCameras, list]) -> None:
     _, result, reports = found
     assert result.missing == ("wall.png", "zero.jpg")
-    remarks = [str(report.message) for report in reports if isinstance(report, warnings.WarningMessage)]
-    assert any("1 images cannot be read and are left out: zero.jpg" in remark for remark in remarks)
-    assert any("1 images got no camera: wall.png" in remark for remark in remarks)
+    given = [report.message for report in reports if isinstance(report, warnings.WarningMessage)]
+    remarks = {each.name: each.value for each in given if isinstance(each, CaptureWarning)}
+    assert remarks == {"unreadable images": ["zero.jpg"], "cameras": ["wall.png"]}
 
 
 def test_progress_tells_the_stages(found: tuple[Path, EstimatedCameras, list]) -> None:
     stages = [report for report in found[2] if isinstance(report, MotionProgress)]
     names = list(dict.fromkeys(stage.stage for stage in stages))
-    # A stage shorter than the time between two looks goes unseen.
+    # A stage shorter than the time between two checks is not reported.
     assert set(names) <= {"starting", "features", "matches", "cameras"}
     assert "features" in names
     assert max(stage.done for stage in stages if stage.stage == "features") > 0
@@ -145,7 +146,7 @@ def test_only_the_model_is_left(found: tuple[Path, EstimatedCameras, list]) -> N
 
 def test_cameras_that_are_there_are_not_overwritten(found: tuple[Path, EstimatedCameras, list]) -> None:
     folder, _, _ = found
-    with pytest.raises(CaptureError, match="exists; cameras are there already"):
+    with raises(CaptureError, file="sparse/0"):
         estimate_cameras(folder / "images", folder)
 
 
@@ -203,9 +204,8 @@ def test_of_several_models_the_largest_is_kept(tmp_path: Path, monkeypatch: pyte
     pretend(tmp_path, monkeypatch, write_models(("a.png", "b.png", "c.png"), ("c.png", "d.png", "e.png", "f.png")))
     with pytest.warns(CaptureWarning) as caught:
         result = estimate_cameras(folder / "images", folder)
-    remarks = [str(warning.message) for warning in caught]
-    assert any("fall into 2 groups" in remark and remark.endswith("the rest: a.png, b.png") for remark in remarks)
-    assert any("2 images got no camera: g.png, h.png" in remark for remark in remarks)
+    remarks = {warning.message.name: warning.message.value for warning in caught}
+    assert remarks == {"groups": [["a.png", "b.png"]], "cameras": ["g.png", "h.png"]}
     assert result.registered == ("c.png", "d.png", "e.png", "f.png")
     assert (folder / "sparse/0/names").read_text() == "c.png d.png e.png f.png"
 
@@ -216,7 +216,9 @@ def test_too_few_cameras_are_refused_by_name(
 ) -> None:
     folder = pictures(tmp_path / "cup", "abcdefgh")
     pretend(tmp_path, monkeypatch, write_models(*groups))
-    with pytest.raises(CaptureError, match=r"only \d of 8 photographs got a camera.*without one: .*h\.png"):
+    registered = groups[0] if groups else ()
+    lacking = [f"{name}.png" for name in "abcdefgh" if f"{name}.png" not in registered]
+    with raises(CaptureError, file="images", name="cameras", value=lacking):
         estimate_cameras(folder / "images", folder)
     assert [path.name for path in folder.iterdir()] == ["images"]
 
@@ -224,11 +226,13 @@ def test_too_few_cameras_are_refused_by_name(
 def test_a_crash_shows_the_workers_last_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = pictures(tmp_path / "cup", "abc")
     pretend(tmp_path, monkeypatch, 'print("stage matches")\nprint("no memory left", flush=True)\nos.abort()')
-    with pytest.raises(CaptureError, match=r"broke off while it sought matches \(SIGABRT\)[^$]*no memory left"):
+    with raises(CaptureError, name="matches", value="SIGABRT") as caught:
         estimate_cameras(folder / "images", folder)
+    assert "no memory left" in str(caught.value)
     pretend(tmp_path, monkeypatch, "raise RuntimeError('odd images')")
-    with pytest.raises(CaptureError, match=r"exit status 1[^$]*RuntimeError: odd images"):
+    with raises(CaptureError, name="starting", value="exit status 1") as caught:
         estimate_cameras(folder / "images", folder)
+    assert "RuntimeError: odd images" in str(caught.value)
     assert [path.name for path in folder.iterdir()] == ["images"]
 
 
@@ -266,7 +270,7 @@ def test_time_and_interruption_end_the_worker_and_its_children(
             raise KeyboardInterrupt
 
     if how == "time":
-        with pytest.raises(CaptureError, match="took more than 3 s, while it sought features"):
+        with raises(CaptureError, name="features", value=3.0):
             estimate_cameras(folder / "images", folder, timeout=3.0)
     else:
         with pytest.raises(KeyboardInterrupt):
@@ -304,19 +308,19 @@ def test_the_worker_ends_when_its_parent_does(taken: tuple[View, ...], tmp_path:
 
 def test_what_cannot_begin_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = pictures(tmp_path / "cup", "ab")
-    with pytest.raises(CaptureError, match=r"at least 3 photographs \(\.png, .*\), found 2"):
+    with raises(CaptureError, file="images", name="photographs", value=2):
         estimate_cameras(folder / "images", folder)
-    with pytest.raises(CaptureError, match="there is no such folder of photographs"):
+    with raises(CaptureError, file="pictures"):
         estimate_cameras(folder / "pictures", folder)
     cv2.imwrite(str(folder / "images/c.png"), np.zeros((8, 8, 3), dtype=np.uint8))
     cv2.imwrite(str(folder / "images/d.png"), np.zeros((8, 12, 3), dtype=np.uint8))
-    with pytest.raises(CaptureError, match=r"most have 8 x 8 pixels, but not d\.png: .*shared_camera=False"):
+    with raises(CaptureError, file="images", name="shared_camera", value=["d.png"]):
         estimate_cameras(folder / "images", folder)
-    with pytest.raises(CaptureError, match="camera_model is 'FISHEYE'; expected one of SIMPLE_PINHOLE"):
+    with raises(CaptureError, name="camera_model", value="FISHEYE"):
         estimate_cameras(folder / "images", folder, camera_model="FISHEYE")
-    with pytest.raises(CaptureError, match="timeout is 0 s"):
+    with raises(CaptureError, name="timeout", value=0.0):
         estimate_cameras(folder / "images", folder, timeout=0.0)
     monkeypatch.setattr("avmsf.capture.sfm.importlib.util.find_spec", lambda _: None)
-    with pytest.raises(CaptureError, match=r"pip install 'avmsf\[sfm\]'"):
+    with raises(CaptureError, name="pycolmap"):
         estimate_cameras(folder / "images", folder)
     assert sorted(path.name for path in folder.iterdir()) == ["images"]

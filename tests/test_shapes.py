@@ -14,6 +14,7 @@ from avmsf.simulate.shapes import KINDS, Shape, make_shape, textured
 from avmsf.simulate.shapes.body import Body
 from avmsf.simulate.shapes.profile import Profile
 from avmsf.simulate.shapes.turned import Turned
+from raising import raises
 
 HANDLES = {"mug": 1, "jug": 1, "bracket": 2, "tube": 1}
 """Holes through a shape, as through a ring."""
@@ -256,13 +257,14 @@ def test_pictures_show_the_colors() -> None:
 
 
 def test_what_cannot_be_made() -> None:
-    with pytest.raises(SimulationError, match=r"unknown kind of shape 'cup': expected one of bell, blob, .*, tube"):
+    with raises(SimulationError, name="kind", value="cup") as caught:
         make_shape("cup")
-    with pytest.raises(SimulationError, match="seed = -1: expected 0 or more"):
+    assert ", ".join(sorted(KINDS)) in str(caught.value)
+    with raises(SimulationError, name="seed", value=-1):
         make_shape("mug", seed=-1)
-    with pytest.raises(SimulationError, match="mug: size = 0 m: expected more than 0"):
+    with raises(SimulationError, name="size", value=0.0):
         make_shape("mug", size=0.0)
-    with pytest.raises(SimulationError, match="bowl: wall = nan m: expected more than 0"):
+    with raises(SimulationError, name="wall", value=pytest.approx(math.nan, nan_ok=True)):
         make_shape("bowl", wall=math.nan)
-    with pytest.raises(SimulationError, match=r"mug of seed 0, walls 80 mm: the walls fold .* take thinner walls"):
+    with raises(SimulationError, name="wall", value=pytest.approx(0.08)):
         make_shape("mug", wall=0.08)

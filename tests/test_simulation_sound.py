@@ -22,6 +22,7 @@ from avmsf.simulate.roomnoise import room_noise
 from avmsf.simulate.soundingbody import SoundingBody
 from avmsf.simulate.vibration import damped, rayleigh
 from made_modes import breathing_sphere, sliding_plate
+from raising import raises
 
 LEGS = torch.tensor([[0.11, 0.03, -0.002], [-0.05, 0.07, -0.002], [-0.03, -0.08, -0.002]], dtype=torch.float64)
 
@@ -70,7 +71,7 @@ def test_modes_that_hardly_ring_are_left_out_and_none_left_is_an_error():
     damping = torch.diag(omega * torch.tensor([0.06, 0.12, 2.5]))
     vibration = damped(frequency, damping, highest=20000.0)
     assert vibration.frequency.tolist() == pytest.approx([500.0 * math.sqrt(1 - 0.03**2)])
-    with pytest.raises(SimulationError, match=r"none of 3 modes sounds up to 400 Hz.*lowest lies at 500 Hz"):
+    with raises(SimulationError, name="frequency", value=pytest.approx(500.0)):
         damped(frequency, damping, highest=400.0)
 
 
@@ -133,23 +134,18 @@ def test_flat_tip_is_a_mass_on_a_spring():
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"mass": 0.0}, "mass = 0 kg: expected more than 0"),
-        ({"poisson": 0.5}, r"poisson = 0\.5"),
-        ({"contact_time": 1.0}, r"contact_time = 1 s.*up to 0\.02"),
-        ({"speed": math.nan}, "speed = nan"),
-    ],
+    ("name", "value"), [("mass", 0.0), ("poisson", 0.5), ("contact_time", 1.0), ("speed", math.nan)]
 )
-def test_impossible_hammers_are_refused(changes, words):
-    with pytest.raises(SimulationError, match=words):
-        replace(Hammer(), **changes)
+def test_impossible_hammers_are_refused(name, value):
+    with raises(SimulationError, name=f"hammer.{name}", value=pytest.approx(value, nan_ok=True)):
+        replace(Hammer(), **{name: value})
 
 
 def test_a_cushion_is_no_hammer():
     speeds = torch.ones(1, dtype=torch.float64)
-    with pytest.raises(SimulationError, match=r"stays on the body for .* s; a blow takes less than 0.02"):
+    with raises(SimulationError, name="hammer") as caught:
         contact_times(Hammer(young=1e3, mass=1.0), CERAMIC, mass=1.0, speeds=speeds)
+    assert caught.value.value > 0.02
 
 
 def test_a_small_breathing_ball_is_a_monopole():
@@ -189,7 +185,7 @@ def test_a_thin_wall_sounds_though_its_faces_move_together():
 def test_a_microphone_in_the_object_is_refused():
     modes = breathing_sphere(0.05, 500.0)
     vibration = damped(modes.frequency, torch.tensor([[2.0]], dtype=torch.float64), highest=20000.0)
-    with pytest.raises(SimulationError, match=r"put it 0.01 m or more away"):
+    with raises(SimulationError, name="microphone", value=pytest.approx(0.005, abs=0.001)):
         radiated(modes, vibration, torch.tensor([0.0, 0.0, 0.055], dtype=torch.float64))
 
 
@@ -335,18 +331,18 @@ def test_an_object_stands_on_three_low_places_around_its_middle():
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("name", "value"),
     [
-        ({"coupling": 1.5}, "coupling = 1.5: expected 0 to switch it off, or up to 1"),
-        ({"stiffness": -0.1}, "stiffness = -0.1"),
-        ({"support": math.inf}, "support = inf.*finite"),
-        ({"thickness": math.nan}, "thickness = nan"),
-        ({"pretrigger": 11.0}, "pretrigger = 11: expected 0 to switch it off, or up to 10"),
-        ({"jitter": -0.001}, r"jitter = -0\.001"),
-        ({"propagation": 1.5}, r"propagation = 1\.5: expected 0 to switch it off, or up to 1"),
-        ({"contact_time": math.nan}, "contact_time = nan"),
+        ("coupling", 1.5),
+        ("stiffness", -0.1),
+        ("support", math.inf),
+        ("thickness", math.nan),
+        ("pretrigger", 11.0),
+        ("jitter", -0.001),
+        ("propagation", 1.5),
+        ("contact_time", math.nan),
     ],
 )
-def test_impossible_imperfections_are_refused(changes, words):
-    with pytest.raises(SimulationError, match=words):
-        Imperfections(**changes)
+def test_impossible_imperfections_are_refused(name, value):
+    with raises(SimulationError, name=f"imperfections.{name}", value=pytest.approx(value, nan_ok=True)):
+        Imperfections(**{name: value})

@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from avmsf.capture.cameras import View
 from avmsf.capture.warning import CaptureWarning
-from avmsf.errors import SceneError
+from avmsf.errors import AvmsfWarning, SceneError
 from avmsf.scene.cpu import NumbaRasterizer
 from avmsf.scene.densify import rotation_matrices
 from avmsf.scene.gaussians import GaussianCloud
@@ -18,6 +19,7 @@ from avmsf.scene.splatconfig import SplatConfig
 from avmsf.scene.ssim import psnr
 from avmsf.scene.start import StartPoints, photographed_colors, starting_cloud
 from ball_views import MIDDLE, RADIUS, ball_color, ball_view, ball_views
+from raising import raises, warns
 
 QUICK = SplatConfig(steps=60, start_points=400, gaussians=600, densify_every=15)
 NAMES = ("centers", "rotations", "log_scales", "logit_opacities", "harmonics")
@@ -87,21 +89,21 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(tmp_path: Path, background:
     # The finished run is kept too: what comes after it may fail.
     assert _same(splat(views, config, checkpoint=place, progress=lambda progress: steps.append(0)), resumed)
     assert steps == [50, 60]
-    with pytest.raises(SceneError, match=r"splat\.ckpt: this checkpoint belongs to a splatting with another view"):
+    with raises(SceneError, file=place, value=["view, initial point or setting"]):
         splat(views, replace(config, seed=5), checkpoint=place)
-    with pytest.raises(SceneError, match="this checkpoint belongs to a splatting with another view"):
+    with raises(SceneError, file=place, value=["view, initial point or setting"]):
         splat(views[1:], config, checkpoint=place)
 
 
 def test_a_file_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
     (tmp_path / "splat.ckpt").write_text("half of one")
-    with pytest.raises(SceneError, match="expected a checkpoint of a splatting, found something else"):
+    with raises(SceneError, file="splat.ckpt", value=None):
         splat(ball_views(5), QUICK, checkpoint=tmp_path / "splat.ckpt")
 
 
 def test_a_checkpoint_that_cannot_be_written_costs_no_result(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    with pytest.warns(UserWarning, match="splatting goes on without a new checkpoint"):
+    with warns(AvmsfWarning, file="file/splat.ckpt"):
         cloud = splat(ball_views(5), replace(QUICK, steps=5), checkpoint=tmp_path / "file" / "splat.ckpt")
     assert len(cloud)
 
@@ -122,7 +124,7 @@ def test_photographs_without_masks_start_from_points() -> None:
     start = StartPoints(torch.tensor(MIDDLE) + RADIUS * normals, ball_color(normals))
     cloud = splat(views, replace(QUICK, steps=100), start=start)
     assert _mean_psnr(cloud, views, background=0.6) > 26.0
-    with pytest.raises(SceneError, match="0 of 16"):
+    with raises(SceneError, name="views", value=0):
         splat(views, QUICK)
 
 
@@ -156,7 +158,7 @@ def test_the_backdrop_is_the_plain_color_around_the_object() -> None:
     given = choose_backdrop(ball_views(4), SplatConfig(background=(0.1, 0.2, 0.3))).color
     assert given is not None
     assert given.tolist() == pytest.approx([0.1, 0.2, 0.3])
-    with pytest.raises(SceneError, match="background = random takes masks"):
+    with raises(SceneError, name="background", value="random"):
         choose_backdrop(ball_views(4, masked=False), SplatConfig(background="random"))
 
 
@@ -165,10 +167,10 @@ def test_views_that_cannot_be_compared_are_passed_over() -> None:
     empty = replace(views[0], mask=torch.zeros(64, 64, dtype=torch.uint8))
     backdrop = choose_backdrop(views, replace(QUICK, background="random"))
     bare = replace(views[1], mask=None)
-    with pytest.warns(CaptureWarning, match=r"01\.png: without a mask, and the background is not plain"):
+    with warns(CaptureWarning, name="masks", value=["01.png"]):
         kept = prepare_photographs([empty, bare, *views[2:]], backdrop, halvings=1)
     assert [each.name for each in kept] == ["02.png", "03.png", "04.png", "05.png"]
-    with pytest.raises(SceneError, match="2 of 2 views can be fitted; expected 3 or more"):
+    with raises(SceneError, name="views", value=2):
         prepare_photographs(views[:2], choose_backdrop(views, QUICK), halvings=0)
 
 
@@ -221,34 +223,35 @@ def test_points_take_the_colors_that_photographs_show_of_their_side() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("name", "value"),
     [
-        ({"steps": 0}, "steps = 0: expected 1 or more"),
-        ({"center_rate": 0.0}, "center_rate = 0.0: expected more than 0"),
-        ({"start_opacity": 1.0}, "start_opacity = 1.0: expected more than 0 and less than 1"),
-        ({"densify_until": 1.5}, "densify_until = 1.5: expected 0 to 1"),
-        ({"gaussians": 5}, "gaussians = 5: expected 100 or more"),
-        ({"background": (0.0, 0.0, 255.0)}, "expected red, green and blue from 0 to 1"),
-        ({"seed": 2**63}, "expected less than 2"),
+        ("steps", 0),
+        ("center_rate", 0.0),
+        ("start_opacity", 1.0),
+        ("densify_until", 1.5),
+        ("gaussians", 5),
+        ("background", (0.0, 0.0, 255.0)),
+        ("seed", 2**63),
     ],
 )
-def test_settings_without_a_meaning_are_refused(change: dict, message: str) -> None:
-    with pytest.raises(SceneError, match=message):
-        SplatConfig(**change)
+def test_settings_without_a_meaning_are_refused(name: str, value: Any) -> None:
+    with raises(SceneError, name=name, value=value):
+        SplatConfig(**{name: value})
 
 
 def test_points_that_nothing_can_start_at_are_refused() -> None:
-    with pytest.raises(SceneError, match="2 points to start from"):
+    with raises(SceneError, name="points", value=2):
         StartPoints(torch.zeros(2, 3), torch.zeros(2, 3))
-    with pytest.raises(SceneError, match="or some that are not finite"):
+    with raises(SceneError, name="points", value=9):
         StartPoints(torch.full((9, 3), torch.nan), torch.zeros(9, 3))
-    with pytest.raises(SceneError, match="all 9 points to start from are one place"):
+    with raises(SceneError, name="points", value=9):
         starting_cloud(StartPoints(torch.zeros(9, 3), torch.zeros(9, 3)), degree=0, scale=1.0, opacity=0.5)
 
 
 def test_a_run_that_diverges_says_which_rates_to_lower() -> None:
-    with pytest.raises(SceneError, match=r"lower center_rate, scale_rate and opacity_rate|contradict one another"):
+    with raises(SceneError) as caught:
         splat(ball_views(5), replace(QUICK, center_rate=1e20, color_rate=1e30))
+    assert caught.value.name in ("loss", "gaussians")
 
 
 def test_clouds_move_join_and_part() -> None:

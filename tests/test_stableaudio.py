@@ -22,6 +22,7 @@ from avmsf.tasks.stableaudio import StableAudio
 from avmsf.tasks.stableaudiofiles import _expect_weights
 from avmsf.tasks.steer import SteerProgress, steer
 from made_audio import DIM, FRAMES, RATE, save_audio, tiny_pipeline
+from raising import raises
 from ringing_field import ringing_field, sound_of
 
 with warnings.catch_warnings():
@@ -190,17 +191,17 @@ def test_models_of_one_name_are_told_apart(model):
 
 
 def test_devices_that_cannot_be_used(folder, monkeypatch):
-    with pytest.raises(EditError, match=r"device = gpu: expected one that PyTorch can use here.*: choose cpu"):
+    with raises(EditError, name="device", value="gpu"):
         StableAudio.load(folder, device="gpu")
     if not torch.cuda.is_available():
-        with pytest.raises(EditError, match="device = cuda: expected one that PyTorch can use here"):
+        with raises(EditError, name="device", value="cuda"):
             StableAudio.load(folder, device="cuda")
 
     def full(self, place):
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(StableAudioPipeline, "to", full)
-    with pytest.raises(EditError, match="tiny-audio does not fit into the memory of cpu"):
+    with raises(EditError, name="device", value="cpu"):
         StableAudio.load(folder, device="cpu")
 
 
@@ -209,22 +210,22 @@ def test_a_sound_from_words_alone(model):
     assert first.shape == (round(0.3 * RATE),)
     assert torch.equal(first, again)
     assert not torch.allclose(first, other)
-    with pytest.raises(EditError, match="expected a prompt"):
+    with raises(EditError, name="prompt", value=" "):
         model.generate(" ", seconds=0.3, seed=0)
 
 
 def test_sounds_from_words_that_cannot_be_made(model, monkeypatch):
     for seconds in (0.6, 0.0, math.nan):
-        with pytest.raises(
-            EditError, match=f"seconds = {seconds:g}: expected more than 0 and at most 0.512, which tiny"
-        ):
+        with raises(EditError, name="seconds") as caught:
             model.generate("wood", seconds=seconds, seed=0)
+        assert caught.value.value is seconds
+        assert "0.512" in str(caught.value)
 
     def full(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(model.pipeline.transformer, "forward", full)
-    with pytest.raises(EditError, match="tiny-audio runs out of memory on cpu while it makes a sound"):
+    with raises(EditError, name="device", value="cpu"):
         model.generate("wood", seconds=0.3, seed=0, steps=2)
 
 
@@ -232,9 +233,9 @@ def test_seconds_bound_the_window(folder):
     short = StableAudio.load(folder, seconds=0.25, device="cpu")
     assert short.describe()["frames"] == 250
     assert short.encode(torch.zeros(1, 2, 1600)).shape[2] == 250
-    with pytest.raises(EditError, match=r"works at 0\.25 s, the sounds last 0\.5 s"):
+    with raises(EditError, name="seconds", value=0.5):
         short.encode(torch.zeros(1, 2, 4000))
-    with pytest.raises(EditError, match=r"seconds = 1: expected more than 0 and at most 0\.512"):
+    with raises(EditError, name="seconds", value=1.0):
         StableAudio.load(folder, seconds=1.0, device="cpu")
 
 
@@ -256,11 +257,11 @@ def test_bfloat16_keeps_the_autoencoder_exact(folder):
 
 def test_weights_that_are_not_here(monkeypatch, tmp_path):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(
-        EditError, match=f"accept the licence at https://huggingface.co/{STABLE_AUDIO}, .*hf auth login"
-    ):
+    with raises(EditError, name="source", value=STABLE_AUDIO) as caught:
         StableAudio.load()
-    with pytest.raises(EditError, match="found no such folder: check the path"):
+    assert f"https://huggingface.co/{STABLE_AUDIO}" in str(caught.value)
+    assert "hf auth login" in str(caught.value)
+    with raises(EditError, file=tmp_path / "nowhere", name="source"):
         StableAudio.load(tmp_path / "nowhere")
 
 
@@ -291,9 +292,9 @@ def test_a_refusal_of_the_hub_is_told_with_the_way_in(monkeypatch, tmp_path):
         here = f"http://127.0.0.1:{server.server_port}"
         monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", here)
         monkeypatch.setattr("huggingface_hub.hf_api.api.endpoint", here)
-        words = f"accept the licence at https://huggingface.co/{STABLE_AUDIO}, make a token .* and run: hf auth login"
-        with pytest.raises(EditError, match=words):
+        with raises(EditError, name="source", value=STABLE_AUDIO) as caught:
             StableAudio.load()
+        assert "hf auth login" in str(caught.value)
         server.shutdown()
     # The client's own question was refused, after ours.
     own = [path for path in asked if STABLE_AUDIO in path]
@@ -309,13 +310,14 @@ def test_a_folder_of_another_class(folder, tmp_path):
     place = copied(folder, tmp_path)
     index = json.loads((place / "model_index.json").read_text())
     (place / "model_index.json").write_text(json.dumps({**index, "_class_name": "AudioLDM2Pipeline"}))
-    with pytest.raises(EditError, match="expected a StableAudioPipeline, found a AudioLDM2Pipeline"):
+    with raises(EditError, file=place, name="_class_name", value="AudioLDM2Pipeline"):
         StableAudio.load(place)
     (place / "model_index.json").write_text("{")
-    with pytest.raises(EditError, match="cannot be read as JSON"):
+    with raises(EditError, file=place / "model_index.json"):
         StableAudio.load(place)
     (place / "model_index.json").unlink()
-    with pytest.raises(EditError, match=r"with model_index\.json .*; found projection_model, scheduler, "):
+    parts = tuple(sorted(path.name for path in place.iterdir()))
+    with raises(EditError, file=place, name="model_index.json", value=parts):
         StableAudio.load(place)
 
 
@@ -327,20 +329,21 @@ def test_a_folder_without_weights_or_with_a_part_of_them(folder, model, tmp_path
     weights = load_file(path)
     save_file({name: each for name, each in weights.items() if name != "proj_in.weight"}, path)
     _expect_weights(folder / "transformer", model.pipeline.transformer)
-    with pytest.raises(EditError, match=r"lacks 1 of the model's weights, proj_in\.weight among them"):
+    with raises(EditError, file=place / "transformer", name="weights", value=("proj_in.weight",)):
         _expect_weights(place / "transformer", model.pipeline.transformer)
     path.write_bytes(b"broken")
-    with pytest.raises(EditError, match="the pipeline cannot be loaded"):
+    with raises(EditError, file=place, name=None):
         StableAudio.load(place)
     path.unlink()
-    with pytest.raises(EditError, match=r"no weights .* in transformer: accept the licence"):
+    with raises(EditError, file=place, name="weights", value=("transformer",)):
         StableAudio.load(place)
     shutil.rmtree(place / "vae")
-    with pytest.raises(EditError, match="the model lacks its vae"):
+    with raises(EditError, file=place, name="parts", value=("vae",)):
         StableAudio.load(place)
 
 
 def test_without_the_extra(monkeypatch, folder):
     monkeypatch.setattr("avmsf.tasks.stableaudiofiles.find_spec", lambda name: None)
-    with pytest.raises(EditError, match=r"pip install 'avmsf\[text\]'"):
+    with raises(EditError, name="diffusers") as caught:
         StableAudio.load(folder)
+    assert "pip install 'avmsf[text]'" in str(caught.value)

@@ -14,6 +14,7 @@ from avmsf.tasks.parameters import HIERARCHICAL, INDEPENDENT, PUBLISHED, SEARCHE
 from avmsf.tasks.reference import Reference
 from avmsf.tasks.retune import retune
 from avmsf.tasks.steer import Guide, steer
+from raising import raises
 from ringing_field import RATE, SameGains, ringing_field, sound_of
 
 QUICK = SteerConfig(steps=12, contacts=2, preview_every=5, seconds=0.25, fft_sizes=(2048, 512))
@@ -202,16 +203,16 @@ def test_seeds_reproduce_and_differ():
 def test_a_checkpoint_of_another_edit_is_refused_by_name(tmp_path):
     place, guide = tmp_path / "state", towards(pitch=1.02)
     steer(ringing_field(), guide, config=QUICK, checkpoint=place)
-    with pytest.raises(EditError, match="belongs to an edit with another field: delete it"):
+    with raises(EditError, file=place, value=["field"]):
         steer(ringing_field(pitch=1.1), guide, config=QUICK, checkpoint=place)
-    with pytest.raises(EditError, match="another guide"):
+    with raises(EditError, file=place, value=["guide"]):
         steer(ringing_field(), towards(pitch=1.03), config=QUICK, checkpoint=place)
     # How often previews come changes nothing.
     steer(ringing_field(), guide, config=replace(QUICK, preview_every=3), checkpoint=place)
-    with pytest.raises(EditError, match="another settings"):
+    with raises(EditError, file=place, value=["settings"]):
         steer(ringing_field(), guide, config=replace(QUICK, steps=13), checkpoint=place)
     place.write_bytes(place.read_bytes()[:100])
-    with pytest.raises(EditError, match="expected a checkpoint of an edit, found something else"):
+    with raises(EditError, file=place, value=None):
         steer(ringing_field(), guide, config=QUICK, checkpoint=place)
 
 
@@ -224,37 +225,30 @@ def test_spoilt_targets_are_left_out():
 
 def test_nothing_but_spoilt_targets_ends_the_edit():
     guide = Towards(torch.full((1, 4000), math.nan))
-    with pytest.raises(EditError, match=r"targets of 20 steps in a row .* lower the guidance"):
+    with raises(EditError, name="targets", value=20):
         steer(ringing_field(), guide, config=replace(QUICK, steps=40))
 
 
 @pytest.mark.parametrize("parameters", [HIERARCHICAL, INDEPENDENT], ids=lambda each: each.name)
 def test_a_guide_at_another_rate_is_refused(parameters):
     reference = Reference.of(sound_of(ringing_field()), sample_rate=2 * RATE, name="bell.wav")
-    with pytest.raises(EditError, match=r"a guide of sounds at 16000 Hz and a field at 8000 Hz: .* sample_rate = 8000"):
+    with raises(EditError, name="sample_rate", value=2 * RATE):
         steer(ringing_field(), reference, config=QUICK, parameters=parameters)
 
 
 def test_a_silent_field_is_refused():
     field = replace(ringing_field(), gain_field=SameGains(torch.zeros(6)))
-    with pytest.raises(EditError, match="silence at all places"):
+    with raises(EditError, name="field", value=0.0):
         steer(field, towards(), config=QUICK)
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"steps": 0}, "steps = 0: expected 1 or more"),
-        ({"modes": 0}, "modes = 0"),
-        ({"seconds": -1.0}, "seconds = -1"),
-        ({"fft_sizes": (1023,)}, "fft_sizes"),
-        ({"seed": 2**70}, f"seed = {2**70}: expected at most {2**40}"),
-        ({"seconds": 0.04}, r"seconds = 0\.04: expected at least 0\.046, what a window of 2048 samples"),
-    ],
+    ("name", "value"),
+    [("steps", 0), ("modes", 0), ("seconds", -1.0), ("fft_sizes", (1023,)), ("seed", 2**70), ("seconds", 0.04)],
 )
-def test_settings_that_cannot_be_meant(settings, words):
-    with pytest.raises(EditError, match=words):
-        SteerConfig(**settings)
+def test_settings_that_cannot_be_meant(name, value):
+    with raises(EditError, name=name, value=value):
+        SteerConfig(**{name: value})
 
 
 def test_what_the_package_has_are_guides():

@@ -15,6 +15,7 @@ from avmsf.capture.views import background_color, find_foreground
 from avmsf.capture.views.hull import carve
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
+from raising import raises, warns
 
 WIDTH, HEIGHT = 120, 90
 RING, TUBE = 0.1, 0.03
@@ -181,7 +182,7 @@ def test_given_masks_stay() -> None:
 def test_views_without_object_are_named_and_left_out() -> None:
     views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
     views[3] = painted(views[3], np.ones((HEIGHT, WIDTH), dtype=bool), (2.0, 2.0, 2.0))
-    with pytest.warns(CaptureWarning, match=r"1 views show no object and are left out: 03\.png"):
+    with warns(CaptureWarning, name="object", value=["03.png"]):
         assert len(find_foreground(views)) == len(views) - 1
 
 
@@ -193,8 +194,9 @@ def test_a_busy_background_is_refused() -> None:
         shelf = np.kron(generator.integers(0, 256, (9, 12, 3)), np.ones((10, 10, 1)))
         there = ~seen(row)[0]
         busy.append(painted(view, there, shelf[there]))
-    with pytest.raises(CaptureError, match=r"expected a plain background, found that \d+% of the images' borders"):
+    with raises(CaptureError, name="background") as caught:
         find_foreground(busy)
+    assert 0.1 < caught.value.value <= 1
 
 
 def test_cameras_that_do_not_fit_are_warned_of_and_colors_decide_alone() -> None:
@@ -204,19 +206,19 @@ def test_cameras_that_do_not_fit_are_warned_of_and_colors_decide_alone() -> None
         pose = view.camera.world_to_camera.clone()
         pose[:3, 3] += torch.tensor([0.4 * (-1) ** row, 0.3 * (-1) ** (row // 2), 0.1 * row])
         turned.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
-    with pytest.warns(CaptureWarning, match="agree on no shape"):
+    with warns(CaptureWarning, name="masks"):
         found = find_foreground(turned)
     assert min(overlap(view, row) for row, view in enumerate(found)) > 0.9
 
 
 def test_few_views_and_masks_without_background_are_refused() -> None:
     views = photographs((2.0, 2.0, 2.0), (220.0, 215.0, 205.0))
-    with pytest.raises(CaptureError, match="at least 3 views, found 2"):
+    with raises(CaptureError, name="views", value=2):
         find_foreground(views[:2])
-    with pytest.raises(CaptureError, match="masks leave some background"):
+    with raises(CaptureError, name="background", value=0):
         background_color(views)
     blank = [painted(view, np.ones((HEIGHT, WIDTH), dtype=bool), (9.0, 9.0, 9.0)) for view in views]
-    with pytest.raises(CaptureError, match="expected an object before a plain background in at least 3 views"):
+    with raises(CaptureError, name="object", value=0):
         find_foreground(blank)
 
 

@@ -9,6 +9,7 @@ from avmsf.capture.cameras import Camera, View
 from avmsf.capture.views.read import read_views
 from avmsf.capture.views.write import write_views
 from avmsf.errors import CaptureError
+from raising import raises
 
 
 def some_views(*, masked: bool = True) -> tuple[View, ...]:
@@ -44,13 +45,13 @@ def test_views_are_read_back_as_they_were(tmp_path: Path, masked: bool) -> None:
 
 def test_views_of_one_name_are_refused_and_nothing_is_left(tmp_path: Path) -> None:
     views = some_views()
-    with pytest.raises(CaptureError, match=r"more than one view would become side/0\.png"):
+    with raises(CaptureError, file="views", name="side/0.png"):
         write_views([views[0], views[0]], tmp_path / "views")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(CaptureError, match="not an empty folder"):
+    with raises(CaptureError, file=tmp_path):
         write_views(some_views(), tmp_path)
     assert [each.name for each in tmp_path.iterdir()] == ["mine.txt"]

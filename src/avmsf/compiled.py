@@ -53,7 +53,7 @@ def _without_disk_errors(step: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextmanager
 def announced(tell: Callable[[str], None]) -> Iterator[None]:
-    """Tell, in words, what is compiled meanwhile: once for each part of the package. Nothing where all is kept."""
+    """Report what is compiled meanwhile: once for each part of the package. Nothing where all is cached."""
     with event.install_listener("numba:compile", _Announcer(tell)):
         yield
 
@@ -67,7 +67,7 @@ class _Announcer(event.Listener):
         part = rest.partition(".")[0]
         if package == __package__ and part not in self.told:
             self.told.add(part)
-            self.tell(f"compiling {_PARTS.get(part, part)} for this processor (once: the result is kept)")
+            self.tell(f"compiling {_PARTS.get(part, part)} for this processor (once; the result is cached)")
 
     def on_end(self, event: event.Event) -> None:
         pass

@@ -30,6 +30,11 @@ class _Located(Exception):  # noqa: N818 - warnings have it too
         self.value = value
         """What was found in place of what was expected: a number, a text, a shape, a list of names."""
 
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """The four attributes by name, for an error that passes this one on."""
+        return {"file": self.file, "row": self.row, "name": self.name, "value": self.value}
+
 
 class AvmsfError(_Located):
     """Something the user gave cannot be used; the message says what was expected, what was found and what to do.

@@ -10,23 +10,23 @@ from pathlib import Path
 from avmsf.errors import AvmsfError, FieldFileError
 
 _WAYS_OUT: Mapping[int | None, str] = {
-    errno.ENOSPC: "free some space or choose another place",
-    errno.EDQUOT: "free some space or choose another place",
-    errno.EACCES: "make the folder one that you may write to, or choose another place",
-    errno.EPERM: "make the folder one that you may write to, or choose another place",
-    errno.EROFS: "choose another place, on a disk that can be written to",
+    errno.ENOSPC: "free some space or choose another folder",
+    errno.EDQUOT: "free some space or choose another folder",
+    errno.EACCES: "get write permission for the folder or choose another folder",
+    errno.EPERM: "get write permission for the folder or choose another folder",
+    errno.EROFS: "choose a folder on a writable disk",
     errno.ENAMETOOLONG: "choose a shorter name",
-    errno.ENOENT: "no file can be made there, choose another place",
-    errno.EEXIST: "a file is where a folder has to be, choose another place",
-    errno.ENOTDIR: "a file is where a folder has to be, choose another place",
-    errno.EISDIR: "a folder of this name is there, name a file in it or choose another place",
+    errno.ENOENT: "choose another folder",
+    errno.EEXIST: "a parent folder is a file; choose another folder",
+    errno.ENOTDIR: "a parent folder is a file; choose another folder",
+    errno.EISDIR: "name a file in this folder or choose another name",
 }
 """What to do where a file or a folder cannot be written, by what the system says."""
 
 
 def way_out(error: OSError) -> str:
     """Return what a user can do where a file or a folder could not be written."""
-    return _WAYS_OUT.get(error.errno, "choose another place")
+    return _WAYS_OUT.get(error.errno, "choose another folder")
 
 
 def temporary_path(path: Path) -> Path:
@@ -51,8 +51,11 @@ def write_whole(path: Path, write: Callable[[Path], object], *, raising: type[Av
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
+        reason = error.strerror or str(error)
         raise raising(
-            f"{path}: cannot be written ({error.strerror or error}); what was there is untouched: {way_out(error)}"
+            f"{path}: expected a writable path, got {reason!r}; an old file is unchanged; {way_out(error)}",
+            file=path,
+            value=reason,
         ) from error
     finally:
         if temporary is not None:

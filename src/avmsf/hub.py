@@ -1,4 +1,4 @@
-"""Folders of other people's models: names that the hub has them under, whether it answers, and their settings."""
+"""Published models: their names on the hub, whether the hub answers, and their settings."""
 
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from avmsf._utils.text_files import read_json
 from avmsf.errors import AvmsfError
 
 HUB_SECONDS = 5.0
-"""How long to wait for the hub's first word."""
+"""How long to wait for the hub's answer."""
 
 
 def is_hub_name(source: str | Path) -> bool:
@@ -41,7 +41,8 @@ def read_settings(path: Path, *, raising: type[AvmsfError]) -> dict[str, Any]:
     try:
         record = read_json(path)
     except (OSError, ValueError) as error:
-        raise raising(f"{path}: cannot be read as JSON ({error}): copy it again") from error
+        raise raising(f"{path}: expected a JSON file, got {error}; copy it again", file=path) from error
     if not isinstance(record, dict):
-        raise raising(f"{path}: expected a JSON object, found {type(record).__name__}: copy it again")
+        found = type(record).__name__
+        raise raising(f"{path}: expected a JSON object, got {found}; copy it again", file=path, value=found)
     return record

@@ -19,6 +19,7 @@ from avmsf.files import write_whole
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from plate_capture import TINY, fill_plate
+from raising import raises, warns
 
 Streams = pytest.CaptureFixture[str]
 
@@ -37,7 +38,7 @@ def test_bodies_are_used_where_they_cannot_be_kept_and_the_cause_is_told_once(tm
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
     surface = Surface(torch.from_numpy(ball.vertices).float(), torch.from_numpy(ball.faces).long())
     blocked = a_file(tmp_path / "bodies")
-    with pytest.warns(AvmsfWarning, match=f"{blocked}.*File exists"):
+    with warns(AvmsfWarning, file=blocked, value="File exists"):
         [body] = candidate_bodies(surface, BodyConfig(wall=0.0, shapes=6, freedoms=1200), cache=blocked).bodies.bodies
     assert len(body.elastic) == 6
     # A second warning would be an error here.
@@ -106,12 +107,12 @@ def test_what_is_made_once_gives_its_result_or_its_failure_again() -> None:
 
     def fail() -> None:
         calls.append(None)
-        raise FitError(f"call {len(calls)}")
+        raise FitError("failed", value=len(calls))
 
     made, failed = caching.once(make), caching.once(fail)
     assert (made(), made()) == (1, 1)
     for _ in range(2):
-        with pytest.raises(FitError, match="call 2"):
+        with raises(FitError, value=2):
             failed()
     assert len(calls) == 2
 

@@ -17,23 +17,27 @@ def test_length_is_bounded_whatever_the_file_says_of_it(tmp_path: Path) -> None:
     path = tmp_path / "x.txt"
     path.write_text("x" * 10)
     assert read_text(path, max_bytes=10) == "x" * 10
-    with pytest.raises(ValueError, match="9"):
+    with pytest.raises(ValueError) as caught:
         read_text(path, max_bytes=9)
+    assert "9" in str(caught.value)
     # A device has no size, and no end.
-    with pytest.raises(ValueError, match="16,777,216"):
+    with pytest.raises(ValueError) as caught:
         read_text(Path("/dev/zero"))
+    assert "16,777,216" in str(caught.value)
 
 
 def test_json_and_toml_have_bounded_depth(tmp_path: Path) -> None:
     assert parse_json("[" * 100 + "]" * 100)
-    with pytest.raises(ValueError, match="nested"):
-        parse_json("[" * 100_000)
     (tmp_path / "x.json").write_text('{"a":' * 100_000)
-    with pytest.raises(ValueError, match="nested"):
-        read_json(tmp_path / "x.json")
     (tmp_path / "x.toml").write_text("a = " + "[" * 3000 + "]" * 3000)
-    with pytest.raises(ValueError, match="nested"):
-        read_toml(tmp_path / "x.toml")
+    for read in (
+        lambda: parse_json("[" * 100_000),
+        lambda: read_json(tmp_path / "x.json"),
+        lambda: read_toml(tmp_path / "x.toml"),
+    ):
+        with pytest.raises(ValueError) as caught:
+            read()
+        assert isinstance(caught.value.__cause__, RecursionError)
     (tmp_path / "x.toml").write_text("#" * (MAX_TOML_BYTES + 1))
-    with pytest.raises(ValueError, match=f"{MAX_TOML_BYTES:,}"):
+    with pytest.raises(ValueError):
         read_toml(tmp_path / "x.toml")

@@ -2,10 +2,11 @@
 
 import math
 
-import pytest
 import torch
 
 from avmsf.capture.impacts import Impacts
+from avmsf.errors import ArrayError
+from raising import raises
 
 RATE = 8000.0
 
@@ -55,5 +56,5 @@ def test_the_rows_keep_their_margins() -> None:
 
 
 def test_delays_are_numbers() -> None:
-    with pytest.raises(ValueError, match="nan"):
+    with raises(ArrayError, row=0, name="delays"):
         impacts(torch.ones(1, 100)).delayed(torch.tensor([math.nan], dtype=torch.float64))

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from avmsf.capture import CaptureSettings, read_capture
@@ -11,6 +10,7 @@ from avmsf.capture.audio import Recording
 from avmsf.capture.prepare import prepare
 from avmsf.errors import CaptureError
 from plate_capture import fill_plate
+from raising import raises
 
 RATE = 8000.0
 
@@ -43,5 +43,5 @@ def test_recordings_from_their_peaks_are_final(tmp_path: Path) -> None:
 
 
 def test_another_start_is_refused() -> None:
-    with pytest.raises(CaptureError, match="time_zero"):
+    with raises(CaptureError, name="time_zero", value="middle"):
         CaptureSettings(time_zero="middle")

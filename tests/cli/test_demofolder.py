@@ -9,6 +9,7 @@ import pytest
 from avmsf.cli.demofolder import RECORD, record, replaced_whole
 from avmsf.cli.writing import OutputError
 from avmsf.errors import FolderInUseError
+from raising import raises
 
 
 def fill(folder: Path, names: dict[str, str]) -> None:
@@ -53,7 +54,7 @@ def test_a_demo_takes_the_place_of_an_earlier_one(demo: Path) -> None:
 @pytest.mark.parametrize("words", ["{}", "[1]", "not JSON", '{"format": "another", "files": ["demo.json"]}'])
 def test_a_folder_with_a_record_of_another_kind_is_refused_and_left_alone(tmp_path: Path, words: str) -> None:
     fill(tmp_path, {RECORD: words, "thesis.txt": "years of work"})
-    with pytest.raises(OutputError, match="thesis"), replaced_whole(tmp_path):
+    with raises(OutputError, file=tmp_path, value=[RECORD, "thesis.txt"]), replaced_whole(tmp_path):
         pytest.fail("the folder was given away")
     assert content(tmp_path) == {RECORD: words, "thesis.txt": "years of work"}
 
@@ -62,7 +63,7 @@ def test_a_folder_with_a_record_of_another_kind_is_refused_and_left_alone(tmp_pa
 def test_a_demo_with_files_of_others_is_refused_and_left_alone(demo: Path, name: str) -> None:
     fill(demo, {name: "mine"})
     before = content(demo)
-    with pytest.raises(OutputError, match=name.split("/")[-1]), replaced_whole(demo):
+    with raises(OutputError, file=demo, value=[name]), replaced_whole(demo):
         pytest.fail("the folder was given away")
     assert content(demo) == before
 
@@ -74,7 +75,7 @@ def test_files_that_come_meanwhile_are_not_touched(demo: Path) -> None:
         finish(begun, NEW)
         fill(demo, {"mine.txt": "mine"})
 
-    with pytest.raises(OutputError, match="mine"), replaced_whole(demo) as begun:
+    with raises(OutputError, file=demo, value=["mine.txt"]), replaced_whole(demo) as begun:
         go_on(begun)
     assert content(demo) == before | {"mine.txt": "mine"}
 
@@ -156,6 +157,6 @@ def test_a_first_demo_that_fails_leaves_no_folder(tmp_path: Path) -> None:
 
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "demo").write_text("mine")
-    with pytest.raises(OutputError, match="got a file"), replaced_whole(tmp_path / "demo"):
+    with raises(OutputError, file=tmp_path / "demo", value="file"), replaced_whole(tmp_path / "demo"):
         pytest.fail("the file was given away")
     assert (tmp_path / "demo").read_text() == "mine"

@@ -21,6 +21,7 @@ from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize
 from avmsf.tasks.locator import Locator
 from made_fields import BANK, positional
+from raising import raises
 
 RATE, SAMPLES, STRUCK, OTHER = 8000, 4000, 68, 102
 
@@ -90,5 +91,5 @@ def test_the_distance_is_printed_without_pictures(
 @pytest.mark.parametrize("wrong", [("120", "40", "0"), (str(math.nan), "0", "0")])
 def test_a_contact_in_another_unit_is_refused(hit: tuple[str, str, torch.Tensor], wrong: tuple[str, ...]) -> None:
     field, recording, _ = hit
-    with pytest.raises(OutputError, match="--true-contact"):
+    with raises(OutputError, name="--true-contact", row=0):
         run(parse([field, recording, "--true-contact", *wrong]))

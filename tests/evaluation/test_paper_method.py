@@ -16,6 +16,7 @@ from avmsf.pipeline.config import DESCRIPTORS, DINO, PRESETS, LiftConfig
 from avmsf.pipeline.features import DinoEncoder
 from avmsf.pipeline.record import finder_of
 from plate_field import QUICK, plate_features, plate_impacts
+from raising import raises
 
 PAPER = METHODS["paper"]
 
@@ -55,7 +56,7 @@ def test_a_method_may_find_modes_in_its_own_way() -> None:
 @pytest.fixture
 def no_dino(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(*_: Any, **__: Any) -> DinoEncoder:
-        raise SceneError("facebook/dinov2-base: no weights")
+        raise SceneError("facebook/dinov2-base: no weights", value="facebook/dinov2-base")
 
     monkeypatch.setattr(DinoEncoder, "load", missing)
 
@@ -64,7 +65,7 @@ def no_dino(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_encoder_that_is_not_there_is_refused_by_the_paper_and_said_elsewhere(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    with pytest.raises(SceneError, match="dinov2"):
+    with raises(SceneError, value="facebook/dinov2-base"):
         settled_lifts(LiftConfig(), [METHODS["knn3"], PAPER])
     usual, paper = settled_lifts(LiftConfig(), [METHODS["knn3"], METHODS["field"]])
     assert (usual.encoder, paper.encoder) == (DESCRIPTORS, DINO)

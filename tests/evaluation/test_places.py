@@ -13,6 +13,7 @@ from avmsf.capture import CaptureSettings, CaptureWarning, read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.scores import parts_words
 from avmsf.errors import EvaluationError
+from raising import raises
 
 COUNT = 20
 
@@ -66,21 +67,23 @@ def test_a_choice_may_start_from_any_recording_of_a_place() -> None:
     names = {row: split(impacts, count=5, start=row)[0].names for row in (7, 27, 47)}
     assert names[7] == names[27] == names[47]
     assert names[7][0] == "07.wav"
-    with pytest.raises(EvaluationError, match="got 60"):
+    with raises(EvaluationError, name="start", value=60):
         split(impacts, count=5, start=60)
-    with pytest.raises(EvaluationError, match="60 recordings at 20 places"):
+    with raises(EvaluationError, name="count", value=20) as caught:
         split(impacts, count=20)
+    assert "60 recordings at 20 contacts" in str(caught.value)
 
 
 def test_no_impacts_have_no_places() -> None:
-    with pytest.raises(EvaluationError, match="0 recordings at 0 places"):
+    with raises(EvaluationError, name="count") as caught:
         split(repeated().take([]))
+    assert "0 recordings at 0 contacts" in str(caught.value)
 
 
 def test_places_and_recordings_are_told_apart() -> None:
-    assert parts_words(*split(repeated(times=1), count=5)) == "15 places not trained on, 5 trained on"
+    assert parts_words(*split(repeated(times=1), count=5)) == "15 positions not trained on, 5 trained on"
     words = parts_words(*split(repeated(apart=0.002), count=5))
-    assert words == "15 places not trained on, 5 trained on (45 and 15 recordings)"
+    assert words == "15 positions not trained on, 5 trained on (45 and 15 recordings)"
 
 
 @pytest.mark.parametrize(("fraction", "places"), [(0.5, 22), (0.3, 13)])

@@ -21,6 +21,7 @@ from avmsf.export.sampledfield import SampledField
 from avmsf.export.webpage import write_webpage
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import write_splats
+from raising import raises
 from struck_table import RATE, struck_table
 
 
@@ -72,7 +73,8 @@ def test_sines_alone_need_no_cosines(tmp_path: Path) -> None:
 def test_fewer_contacts_are_kept_with_a_word(tmp_path: Path) -> None:
     written = write_bundle(struck_table(shared=False, points=50), tmp_path / "page", limit=10)
     assert tensors(tmp_path / "page")["damping"].shape == (10, 40)
-    assert written.remarks == ("10 of the field's 50 contacts are kept, spread evenly",)
+    (remark,) = written.remarks
+    assert "10 of the field's 50" in remark
 
 
 def test_strikes_are_heard_as_they_were_recorded(tmp_path: Path) -> None:
@@ -94,7 +96,7 @@ def test_strikes_are_heard_as_they_were_recorded(tmp_path: Path) -> None:
 
 def test_strikes_of_another_rate_are_refused() -> None:
     strikes = Impacts(torch.zeros(1, 3), torch.zeros(1, 5), 8000.0, ("a.wav",))
-    with pytest.raises(ExportError, match="expected strikes at the field's 16000 Hz, found 8000 Hz"):
+    with raises(ExportError, name="strikes", value=8000.0):
         make_bundle(struck_table(shared=True), strikes=strikes)
 
 
@@ -105,7 +107,7 @@ def test_a_bundle_is_replaced_and_nothing_else_is(tmp_path: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == ["field.bin", "manifest.json"]
     assert tensors(folder)["damping"].ndim == 2
     (folder / "mine.txt").write_text("kept")
-    with pytest.raises(ExportError, match="expected a free name or an earlier export"):
+    with raises(ExportError, file=folder, name="--overwrite"):
         write_bundle(struck_table(shared=True), folder)
     assert (folder / "mine.txt").read_text() == "kept"
     assert [path.name for path in tmp_path.iterdir()] == ["page"]
@@ -120,7 +122,7 @@ def test_a_field_of_which_nothing_is_heard_is_refused() -> None:
         sine=table.sine[:, :0],
         cosine=table.cosine[:, :0],
     )
-    with pytest.raises(ExportError, match="expected a mode that can be heard"):
+    with raises(ExportError, name="modes", value=0):
         make_bundle(silent)
 
 
@@ -153,7 +155,7 @@ def test_a_mesh_file_in_millimeters_is_shown_in_meters(tmp_path: Path, ending: s
     (tmp_path / "shown.glb").write_bytes(shown.content)
     loaded = trimesh.load_mesh(tmp_path / "shown.glb", process=False)
     np.testing.assert_allclose(np.linalg.norm(loaded.vertices, axis=1), 0.1, rtol=1e-5)
-    with pytest.raises(ExportError, match=r"found one \d+ times as large: say what its coordinates count"):
+    with raises(ExportError, file=path, name="size", value=pytest.approx(1000.0, rel=0.1)):
         read_object(path, ball_points())
 
 
@@ -172,9 +174,9 @@ def test_a_mesh_of_too_many_triangles_is_reduced_with_a_word() -> None:
     (mesh,) = trimesh.load_scene(trimesh.util.wrap_as_stream(shown.content), file_type="glb").dump()
     assert 500 < len(mesh.faces) <= 1000
     assert float(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.1).max()) < 0.005
-    assert shown.remarks == (
-        f"the surface has 5,120 triangles, too many for a browser: {len(mesh.faces):,} are shown, without its textures",
-    )
+    (remark,) = shown.remarks
+    assert "5,120" in remark
+    assert f"{len(mesh.faces):,}" in remark
 
 
 def test_gaussians_are_kept_as_they_are(tmp_path: Path) -> None:
@@ -193,8 +195,9 @@ def test_gaussians_are_kept_as_they_are(tmp_path: Path) -> None:
     manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
     assert manifest["object"] == {"kind": "gaussians", "file": "object.ply"}
     (tmp_path / "short.ply").write_bytes((tmp_path / "ball.ply").read_bytes()[:-100])
-    with pytest.raises(AvmsfError, match=r"short\.ply"):
+    with pytest.raises(AvmsfError) as caught:
         read_object(tmp_path / "short.ply", points)
+    assert "short.ply" in str(caught.value)
 
 
 def test_a_surface_is_carried_beside_the_object_by_a_page_in_one_file(tmp_path: Path) -> None:
@@ -221,17 +224,16 @@ def test_points_without_triangles_are_the_fields_own(tmp_path: Path) -> None:
 
 def test_objects_that_are_none_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points = ball_points()
-    with pytest.raises(ExportError, match="found no such file"):
+    with raises(ExportError, file=tmp_path / "none.obj"):
         read_object(tmp_path / "none.obj", points)
     (tmp_path / "notes.txt").write_text("hello")
-    with pytest.raises(ExportError, match=r"expected a mesh \(.obj"):
-        read_object(tmp_path / "notes.txt", points)
     (tmp_path / "torn.glb").write_bytes(b"glTF\x02\x00")
-    with pytest.raises(ExportError, match="not a mesh"):
-        read_object(tmp_path / "torn.glb", points)
-    with pytest.raises(ExportError, match="found its middle 5 m away"):
+    for name, attribute in (("notes.txt", "suffix"), ("torn.glb", None)):
+        with raises(ExportError, file=tmp_path / name, name=attribute):
+            read_object(tmp_path / name, points)
+    with raises(ExportError, name="center", value=pytest.approx(5.0, rel=1e-2)):
         read_object(replace(ball_surface(), vertices=ball_surface().vertices + torch.tensor([5.0, 0, 0])), points)
     (tmp_path / "huge.stl").touch()
     monkeypatch.setattr("avmsf.export.objectfile.MAX_BYTES", -1)
-    with pytest.raises(ExportError, match="expected a mesh of at most"):
+    with raises(ExportError, file=tmp_path / "huge.stl", name="size", value=0):
         read_object(tmp_path / "huge.stl", points)

@@ -14,6 +14,7 @@ from avmsf.errors import CaptureError, ExportError
 from avmsf.export.gltf import write_gltf
 from avmsf.export.look import Look, read_look
 from made_tables import MODES, POINTS, apart, summed, table
+from raising import raises
 
 KINDS = {5126: "<f4", 5125: "<u4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3}
@@ -166,20 +167,20 @@ def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colors(tmp_path, m
     monkeypatch.setattr("avmsf.export.look.MOST_FACES", 1000)
     few, (remark,) = read_look(tmp_path / "ball.ply", table())
     assert 500 < len(few.faces) <= 1000
-    assert "5,120 triangles, too many for a browser" in remark
+    assert "5,120" in remark
     np.testing.assert_allclose(few.vertices.norm(dim=1), 0.6, atol=0.02)
     high = few.vertices[:, 2] > 0.05
     np.testing.assert_allclose(few.colors[high], torch.tensor([[1.0, 0.0, 0.0]]).expand(int(high.sum()), 3), atol=0.01)
     monkeypatch.setattr("avmsf.capture.mesh_file.MAX_FACES", 5000)
-    with pytest.raises(CaptureError, match="expected at most 5,000 triangles, got 5,120"):
+    with raises(CaptureError, file="ball.ply", value=5120):
         read_look(tmp_path / "ball.ply", table())
 
 
 def test_another_ending_and_anothers_file_are_refused(tmp_path):
-    with pytest.raises(ExportError, match=r"ends in \.glb, found '\.obj'"):
+    with raises(ExportError, file="thing.obj", name="suffix", value=".obj"):
         write_gltf(table(), tmp_path / "thing.obj")
     (tmp_path / "theirs.glb").write_bytes(b"glTF of someone else")
-    with pytest.raises(ExportError, match="add --overwrite"):
+    with raises(ExportError, file="theirs.glb", name="--overwrite"):
         write_gltf(table(), tmp_path / "theirs.glb")
     assert (tmp_path / "theirs.glb").read_bytes() == b"glTF of someone else"
     write_gltf(table(), tmp_path / "theirs.glb", force=True)
@@ -193,5 +194,5 @@ def test_a_field_without_modes_is_refused(tmp_path):
         field.points, field.normals, field.frequency[:0], field.damping[:0], field.sine[:, :0], field.cosine[:, :0],
         field.noise, field.sample_rate,
     )  # fmt: skip
-    with pytest.raises(ExportError, match="found none to export"):
+    with raises(ExportError, file="thing.glb", name="modes", value=0):
         write_gltf(empty, tmp_path / "thing.glb")

@@ -14,6 +14,7 @@ from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.pulse import ForcePulse
 from avmsf.modal.residual import Residual
 from made_fields import BANK, FIELDS, elastic, places, plate, positional
+from raising import raises
 
 RATE, SAMPLES = 8000.0, 3000
 
@@ -128,15 +129,15 @@ def test_two_points_have_normals_away_from_their_middle():
 
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.tensor([[0.0, 0.0, torch.nan]])])
 def test_points_that_are_none_are_refused(points):
-    with pytest.raises(ExportError, match="expected points of the object's surface"):
+    with raises(ExportError, name="points", value=len(points)):
         SampledField.of(sounding("positional"), points)
 
 
 def test_normals_of_other_points_are_refused():
-    with pytest.raises(ExportError, match="a normal for each of 5 points, found 4"):
+    with raises(ExportError, name="normals", value=4):
         SampledField.of(sounding("positional"), places(5, seed=9), torch.ones(4, 3))
 
 
 def test_a_limit_of_none_is_refused():
-    with pytest.raises(ExportError, match="limit of 0"):
+    with raises(ExportError, name="limit", value=0):
         SampledField.of(sounding("positional"), limit=0)

@@ -5,11 +5,10 @@ import json
 import re
 from pathlib import Path
 
-import pytest
-
 from avmsf.errors import ExportError
 from avmsf.export.bundle import make_bundle
 from avmsf.export.webpage import page_files, single_file, write_webpage
+from raising import raises
 from struck_table import struck_table
 
 PAGE = {
@@ -53,7 +52,7 @@ def test_one_file_holds_all_that_lay_beside_the_page() -> None:
 
 def test_a_page_without_its_import_map_is_told() -> None:
     torn = {**PAGE, "index.html": b"<p>"}
-    with pytest.raises(ExportError, match="expected one import map, found 0"):
+    with raises(ExportError, file="index.html", name="import map", value=0):
         single_file(make_bundle(struck_table(shared=True)), torn)
 
 
@@ -68,6 +67,6 @@ def test_both_forms_are_written_whole_and_kept_from_others(tmp_path: Path) -> No
         assert write_webpage(table, single).sizes == {single: single.stat().st_size}
     other = tmp_path / "mine.html"
     other.write_text("mine")
-    with pytest.raises(ExportError, match="expected a free name or an earlier export"):
+    with raises(ExportError, file=other, name="--overwrite"):
         write_webpage(table, other)
     assert other.read_text() == "mine"

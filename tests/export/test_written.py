@@ -12,6 +12,7 @@ from avmsf.export.universal import write_universal
 from avmsf.export.webpage import write_webpage
 from avmsf.export.written import Written, write_file, write_folder
 from made_tables import table
+from raising import raises
 
 
 def fill(*names):
@@ -46,7 +47,7 @@ def test_an_earlier_export_is_replaced_as_a_whole(tmp_path):
 def test_a_strangers_file_in_it_protects_a_folder(tmp_path):
     write_folder(tmp_path / "out", fill("a.txt"), {})
     (tmp_path / "out" / "notes.txt").write_text("mine")
-    with pytest.raises(ExportError, match="a folder with files that no export wrote: choose another name, or add"):
+    with raises(ExportError, file=tmp_path / "out", name="--overwrite"):
         write_folder(tmp_path / "out", fill("b.txt"), {})
     assert listed(tmp_path / "out") == ["a.txt", "manifest.json", "notes.txt"]
     write_folder(tmp_path / "out", fill("b.txt"), {}, force=True)
@@ -67,7 +68,7 @@ def test_what_fails_half_way_leaves_all_as_it_was(tmp_path):
         (place / "b.txt").write_text("half")
         raise OSError(28, "No space left on device")
 
-    with pytest.raises(ExportError, match="No space left on device"):
+    with raises(ExportError, file=tmp_path / "out", value="No space left on device"):
         write_folder(tmp_path / "out", fail, {})
     assert listed(tmp_path) == ["out/a.txt", "out/manifest.json"]
 
@@ -92,7 +93,7 @@ def test_the_old_folder_comes_back_where_the_new_one_cannot_take_its_place(tmp_p
         plain(source, target)
 
     monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(ExportError, match="Input/output error"):
+    with raises(ExportError, file=tmp_path / "out", value="Input/output error"):
         write_folder(tmp_path / "out", fill("b.txt"), {})
     assert listed(tmp_path) == ["out/a.txt", "out/manifest.json"]
 
@@ -108,7 +109,7 @@ def test_ours_are_known_again_and_what_speaks_of_us_is_not_ours(tmp_path, name, 
     for seed in (0, 1):
         write(table(seed=seed), path)
     path.write_text("// my own program, with tables that avmsf 0.7.0 made\n<!-- from avmsf 0.7.0 -->\n")
-    with pytest.raises(ExportError, match="found a file that no export wrote"):
+    with raises(ExportError, file=path, name="--overwrite"):
         write(table(), path)
     write(table(), path, force=True)
 
@@ -116,21 +117,21 @@ def test_ours_are_known_again_and_what_speaks_of_us_is_not_ours(tmp_path, name, 
 def test_what_is_there_already_may_be_written(tmp_path):
     (tmp_path / "a.ply").write_bytes(b"theirs")
     write_file(tmp_path / "a.ply", b"theirs")
-    with pytest.raises(ExportError, match="found a file that no export wrote"):
+    with raises(ExportError, file="a.ply", name="--overwrite"):
         write_file(tmp_path / "a.ply", b"other")
     assert (tmp_path / "a.ply").read_bytes() == b"theirs"
 
 
 def test_files_and_folders_are_told_apart(tmp_path):
     (tmp_path / "file").write_text("avmsf")
-    with pytest.raises(ExportError, match="expected a folder, or a name that is free, found a file"):
+    with raises(ExportError, file=tmp_path / "file", value="file"):
         write_folder(tmp_path / "file", fill("a.txt"), {}, force=True)
-    with pytest.raises(ExportError, match="expected the name of a file, found a folder"):
+    with raises(ExportError, file=tmp_path, value="folder"):
         write_file(tmp_path, b"avmsf", force=True)
 
 
 @pytest.mark.parametrize("text", ["", "not json", "[]", '{"files": ["a.txt"]}', '{"generator": "other", "files": []}'])
 def test_anothers_manifest_is_no_licence(tmp_path, text):
     (tmp_path / "manifest.json").write_text(text)
-    with pytest.raises(ExportError, match="no export wrote"):
+    with raises(ExportError, file=tmp_path, name="--overwrite"):
         write_folder(tmp_path, fill("a.txt"), {})

@@ -18,6 +18,7 @@ from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.residual import Residual
 from made_fields import BANK, FIELDS
+from raising import raises
 
 
 def field() -> SoundField:
@@ -49,7 +50,7 @@ def write_changed(path: Path, *, words: str | None = None, noise: float = 1e-3, 
     ids=lambda changes: str(changes)[:30],
 )  # fmt: skip
 def test_headers_beyond_all_sounds_are_refused(tmp_path: Path, changes: dict) -> None:
-    with pytest.raises(FieldFileError, match=r"x\.safetensors"):
+    with raises(FieldFileError, file="x.safetensors"):
         load(write_changed(tmp_path / "x.safetensors", **changes))
 
 
@@ -63,7 +64,7 @@ def test_no_sound_that_is_not_finite_is_written(tmp_path: Path) -> None:
     for value in (float("nan"), float("inf")):
         sound = torch.zeros(100)
         sound[7] = value
-        with pytest.raises(OutputError, match="1 of 100"):
+        with raises(OutputError, file="x.wav", name="finite", value=1):
             write_sound(tmp_path / "x.wav", sound, sample_rate=8000.0, coding="float32")
     assert not list(tmp_path.iterdir())
 

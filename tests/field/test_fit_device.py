@@ -16,6 +16,7 @@ from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.record import with_record
 from avmsf.scene import features
 from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
+from raising import raises
 
 CONFIG = replace(QUICK, warmup_steps=2, steps=2, damping="per-contact", fft_sizes=(256, 128), early=256)
 CUDA = torch.cuda.is_available()
@@ -90,7 +91,7 @@ def fitted(device: str | None, recipe: GainRecipe | None = None):
 
 @pytest.mark.parametrize("device", ["nonesuch", "meta", *([] if CUDA else ["cuda"])])
 def test_a_device_that_is_not_there_is_refused(device: str, tmp_path, capsys) -> None:
-    with pytest.raises(FitError, match=device):
+    with raises(FitError, name="device", value=device):
         fitted(device)
     for verb in ("fit", "reconstruct"):
         assert main([verb, str(tmp_path), "--device", device, "--output", str(tmp_path / "f.safetensors")]) == 2

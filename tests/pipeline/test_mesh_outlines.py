@@ -17,6 +17,7 @@ from avmsf.cli import main
 from avmsf.errors import CaptureError
 from avmsf.pipeline.silhouettes import compare_outlines, expect_contacts_in_outlines, judge_outlines
 from plate_capture import fill_plate
+from raising import raises
 from small_scene import slab, slab_views
 
 Streams = pytest.CaptureFixture[str]
@@ -57,18 +58,19 @@ def test_a_tenth_of_wrong_masks_does_not_matter() -> None:
 
 @pytest.mark.parametrize("surface", [scaled(1.1), scaled(0.9), Surface(slab().vertices + 0.02, slab().faces)])
 def test_a_mesh_of_another_size_or_place_is_told(surface: Surface) -> None:
-    words = judge_outlines(surface, VIEWS, CaptureSettings())
-    assert words is not None
-    assert "differ by" in words
+    warning = judge_outlines(surface, VIEWS, CaptureSettings())
+    assert warning is not None
+    assert warning.name == "surface"
+    assert 0.05 < warning.value < 1.0
 
 
 @pytest.mark.parametrize("unit", ["mm", "cm", "in"])
 def test_cameras_in_another_unit_are_refused_with_it(unit: str) -> None:
     """A mesh and contacts in meters, cameras in another unit that the settings do not name; and the other way round."""
-    with pytest.raises(CaptureError) as caught:
+    with raises(CaptureError, name="surface_unit", value=pytest.approx(1 / METRES[unit])) as caught:
         judge_outlines(scaled(METRES[unit]), VIEWS, CaptureSettings())
     assert f'views_unit = "{unit}"' in str(caught.value)
-    with pytest.raises(CaptureError) as caught:
+    with raises(CaptureError, name="surface_unit", value=pytest.approx(METRES[unit])) as caught:
         judge_outlines(scaled(1 / METRES[unit]), VIEWS, CaptureSettings())
     assert f'unit = "{unit}" and surface_unit = "{unit}"' in str(caught.value)
 
@@ -78,7 +80,7 @@ def test_contacts_in_another_unit_than_the_cameras_are_refused_with_it(unit: str
     contacts, settings = slab().vertices, CaptureSettings()
     expect_contacts_in_outlines(contacts, VIEWS, settings)
     expect_contacts_in_outlines(contacts / METRES[unit], [replace(view, mask=None) for view in VIEWS], settings)
-    with pytest.raises(CaptureError) as caught:
+    with raises(CaptureError, name="unit", value=pytest.approx(METRES[unit])) as caught:
         expect_contacts_in_outlines(contacts / METRES[unit], VIEWS, settings)
     assert f'unit = "{unit}"' in str(caught.value)
 

@@ -14,7 +14,7 @@ import soundfile
 import torch
 
 from avmsf.capture import check, read_capture
-from avmsf.errors import AvmsfError, CaptureError
+from avmsf.errors import CaptureError
 from avmsf.studio import judgements, strikefiles
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.place import Place
@@ -23,6 +23,7 @@ from avmsf.studio.strikefiles import StrikeFiles
 from avmsf.studio.striketable import StrikeTable
 from capture_folder import fill, ring
 from opened_plate import blow, wav
+from raising import raises
 
 DOWN = (0.0, 0.0, -2.0)
 
@@ -107,8 +108,9 @@ def test_what_broke_off_is_finished_by_the_retry(
 
     with monkeypatch.context() as patched:
         patched.setattr(*broken, fail)
-        with pytest.raises(OSError, match="power"):
+        with pytest.raises(OSError) as caught:
             strikes.add(blow(), place(0.1), key=key(0))
+        assert caught.value.args == ("the power went",)
     assert len(table(tmp_path)) == 2
     again = StrikeBook(tmp_path).add(blow(), place(0.1), key=key(0))
     assert again["file"] == "002.wav"
@@ -120,12 +122,13 @@ def test_one_key_is_one_strike(tmp_path: Path) -> None:
     strikes = book(tmp_path)
     strikes.add(blow(), place(0.1), key=key(0))
     for content, where in ((blow(1), place(0.1)), (blow(), place(0.2))):
-        with pytest.raises(RefusedError, match="used for another strike") as refused:
+        with raises(RefusedError, name="Idempotency-Key", value=key(0)) as refused:
             strikes.add(content, where, key=key(0))
         assert refused.value.status == 409
     for bad in ("", "short", "x" * 200, "with spaces and\n"):
-        with pytest.raises(RefusedError, match="Idempotency-Key: expected 8 to 128"):
+        with raises(RefusedError, name="Idempotency-Key", value=bad) as refused:
             strikes.add(blow(), place(0.1), key=bad)
+        assert refused.value.status == 400
     assert len(table(tmp_path)) == 2
 
 
@@ -140,7 +143,7 @@ def test_redoing_keeps_the_row_and_the_recording_before(tmp_path: Path) -> None:
     assert table(tmp_path) == rows
     [kept] = (tmp_path / ".avmsf" / "removed").iterdir()
     assert kept.read_bytes() == blow(0)
-    with pytest.raises(CaptureError, match="not a sound file"):
+    with pytest.raises(CaptureError):
         strikes.redo("001.wav", b"hello")
     assert (tmp_path / "001.wav").read_bytes() == blow(7)
 
@@ -154,10 +157,10 @@ def test_what_is_taken_out_is_kept_aside_and_its_number_not_given_again(tmp_path
     assert not (tmp_path / "003.wav").exists()
     [kept] = (tmp_path / ".avmsf" / "removed").iterdir()
     assert kept.read_bytes() == blow(2)
-    with pytest.raises(RefusedError, match=r"003\.wav was taken out again"):
+    with raises(RefusedError, file="003.wav"):
         strikes.add(blow(2), place(0.2), key=key(2))
     strikes.remove("001.wav")
-    with pytest.raises(RefusedError, match=r"003\.wav was taken out again"):
+    with raises(RefusedError, file="003.wav"):
         strikes.add(blow(2), place(0.2), key=key(2))
     assert strikes.add(blow(3), place(0.3), key=key(3))["file"] == "004.wav"
     for file in ("002.wav", "004.wav"):
@@ -171,8 +174,9 @@ def test_only_recordings_of_the_table_can_be_touched(tmp_path: Path, file: str) 
     folder = fill(tmp_path / "filled", settings="seconds = 0.3")
     (tmp_path / "a.wav").write_bytes(blow())
     for act in (lambda: book(folder).remove(file), lambda: book(folder).redo(file, blow())):
-        with pytest.raises(RefusedError, match=r"expected a recording of impacts\.csv"):
+        with raises(RefusedError, file="impacts.csv", value=file) as refused:
             act()
+        assert refused.value.status == 404
     assert (tmp_path / "a.wav").read_bytes() == blow()
 
 
@@ -185,11 +189,11 @@ def test_a_link_out_of_the_folder_is_neither_read_nor_written(tmp_path: Path) ->
     strikes = book(folder)
     told = strikes.describe()["strikes"][0]
     assert not told["readable"]
-    assert "outside the capture folder" in told["warnings"][0]
+    assert told["warnings"][0].startswith("a.wav: ")
     assert [strike.file for strike in strikes.strikes()] == ["b.wav", "c.wav"]
     for change in (lambda: strikes.redo("a.wav", blow()), lambda: strikes.remove("a.wav")):
         before = (folder / "impacts.csv").read_bytes()
-        with pytest.raises(RefusedError, match="expected the recording itself, found a link"):
+        with raises(RefusedError, file="a.wav", value="link"):
             change()
         assert (folder / "impacts.csv").read_bytes() == before
     assert [each.name for each in (folder / ".avmsf").iterdir()] == ["capture.lock"]
@@ -218,51 +222,52 @@ def test_a_table_of_the_users_own_keeps_its_unit_columns_and_order(tmp_path: Pat
 def test_every_row_has_what_the_table_has_columns_for(tmp_path: Path) -> None:
     strikes = book(tmp_path)
     strikes.add(blow(), place(0.1), key=key(0))
-    with pytest.raises(RefusedError, match="every row has a direction and this strike has none"):
+    with raises(RefusedError, file=tmp_path / "impacts.csv", name="direction"):
         strikes.add(blow(), place(0.2, direction=None), key=key(1))
     forced = book(tmp_path / "forced")
     forced.add(blow(), Place((0.1, 0.0, 0.0), None, 12.5), key=key(0))
-    with pytest.raises(RefusedError, match="every row has a force"):
+    with raises(RefusedError, file=tmp_path / "forced" / "impacts.csv", name="force"):
         forced.add(blow(), place(0.2, direction=None), key=key(1))
     assert table(tmp_path / "forced")[1] == ["001.wav", "0.1", "0.0", "0.0", "12.5"]
 
 
 @pytest.mark.parametrize(
-    ("query", "message"),
+    ("query", "name", "value"),
     [
-        ({}, "expected the contact as x, y and z"),
-        ({"x": "1", "y": "2"}, "z: expected a number, found 'none'"),
-        ({"x": "=HYPERLINK()", "y": "0", "z": "0"}, "x: expected a number, found '=HYPERLINK"),
-        ({"x": "nan", "y": "0", "z": "0"}, "x: expected a number, found 'nan'"),
-        ({"x": "1e9", "y": "0", "z": "0"}, "within 100 m of the origin"),
-        ({"x": "0", "y": "0", "z": "0", "nx": "1"}, "ny: expected a number"),
-        ({"x": "0", "y": "0", "z": "0", "nx": "0", "ny": "0", "nz": "0"}, "found the zero vector"),
-        ({"x": "0", "y": "0", "z": "0", "newtons": "-3"}, "a peak force above 0, found -3"),
+        ({}, "contact", None),
+        ({"x": "1", "y": "2"}, "z", None),
+        ({"x": "=HYPERLINK()", "y": "0", "z": "0"}, "x", "=HYPERLINK()"),
+        ({"x": "nan", "y": "0", "z": "0"}, "x", "nan"),
+        ({"x": "1e9", "y": "0", "z": "0"}, "contact", (1e9, 0.0, 0.0)),
+        ({"x": "0", "y": "0", "z": "0", "nx": "1"}, "ny", None),
+        ({"x": "0", "y": "0", "z": "0", "nx": "0", "ny": "0", "nz": "0"}, "direction", (0.0, 0.0, 0.0)),
+        ({"x": "0", "y": "0", "z": "0", "newtons": "-3"}, "newtons", -3.0),
     ],
 )
-def test_places_are_numbers_and_nothing_else(query: dict[str, str], message: str) -> None:
-    with pytest.raises(RefusedError, match=message) as refused:
+def test_places_are_numbers_and_nothing_else(query: dict[str, str], name: str, value: object) -> None:
+    with raises(RefusedError, name=name, value=value) as refused:
         Place.read(query)
     assert refused.value.status == 400
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    "content",
     [
-        (b"", "not a sound file"),
-        (b"RIFF\x00\x00\x00\x00WAVE", "not a sound file"),
-        (b"<html>", "not a sound file"),
-        (wav(np.zeros(4000)), "silent"),
-        (wav(ring(0.01)), "too short"),
-        (wav(np.full(4000, np.nan)), "not finite"),
-        (wav(np.stack([ring(seed=0), ring(seed=1)], axis=1)), "2 different channels"),
-        (blow()[:60], "no samples|not a sound file|too short"),
+        b"",
+        b"RIFF\x00\x00\x00\x00WAVE",
+        b"<html>",
+        wav(np.zeros(4000)),
+        wav(ring(0.01)),
+        wav(np.full(4000, np.nan)),
+        wav(np.stack([ring(seed=0), ring(seed=1)], axis=1)),
+        blow()[:60],
     ],
+    ids=["empty", "header", "page", "silent", "short", "NaN", "channels", "truncated"],
 )
-def test_a_recording_that_cannot_be_used_is_refused_in_words(tmp_path: Path, content: bytes, message: str) -> None:
+def test_a_recording_that_cannot_be_used_is_refused(tmp_path: Path, content: bytes) -> None:
     strikes = book(tmp_path)
     for act in (lambda: strikes.judge(content), lambda: strikes.add(content, place(0.1), key=key(0))):
-        with pytest.raises(CaptureError, match=message):
+        with pytest.raises(CaptureError):
             act()
     assert [each.name for each in tmp_path.rglob("*") if each.is_file()] == ["capture.lock"]
 
@@ -297,8 +302,9 @@ def test_a_strike_whose_removal_was_killed_is_there_for_its_key(
 def test_another_rate_is_refused_at_once(tmp_path: Path) -> None:
     strikes = book(tmp_path)
     strikes.add(blow(), place(0.1), key=key(0))
-    with pytest.raises(CaptureError, match="expected 8000 Hz, as the 1 recording before, found 16000 Hz"):
+    with raises(CaptureError, name="sample_rate", value=16000.0) as caught:
         strikes.judge(wav(ring(rate=16000), rate=16000))
+    assert "8000 Hz" in str(caught.value)
     # Where it is the only one it may change.
     assert strikes.redo("001.wav", wav(ring(rate=16000), rate=16000))["sample_rate"] == 16000
 
@@ -321,7 +327,7 @@ def test_a_broken_table_is_left_alone(tmp_path: Path) -> None:
         lambda: book(folder).add(blow(), place(0.1), key=key(0)),
         lambda: book(folder).remove("a.wav"),
     ):
-        with pytest.raises(AvmsfError, match="3 cells where the header has 4"):
+        with raises(CaptureError, file=folder / "impacts.csv", row=2, value=3):
             act()
     assert (folder / "impacts.csv").read_bytes() == before
 
@@ -346,7 +352,7 @@ def test_a_link_to_another_strike_is_read_and_never_written_through(tmp_path: Pa
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     for file in ("003.wav", "sub/001.wav"):
         for change in (lambda: strikes.redo(file, blow(5)), lambda: strikes.remove(file)):  # noqa: B023
-            with pytest.raises(RefusedError, match="found a link to it: copy it there first") as refused:
+            with raises(RefusedError, file=file, value="link") as refused:
                 change()
             assert refused.value.status == 409
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
@@ -358,7 +364,7 @@ def test_a_recording_of_two_rows_is_changed_in_neither(tmp_path: Path) -> None:
     (tmp_path / "impacts.csv").write_text("file,x,y,z\n001.wav,0,0,0\n001.wav,1,0,0\n")
     before = (tmp_path / "impacts.csv").read_bytes()
     for change in (lambda: strikes.redo("001.wav", blow(5)), lambda: strikes.remove("001.wav")):
-        with pytest.raises(RefusedError, match=r"stands in lines 2, 3 of impacts\.csv"):
+        with raises(RefusedError, file="impacts.csv", row=3, name="001.wav", value=[2, 3]):
             change()
     assert (tmp_path / "impacts.csv").read_bytes() == before
     assert (tmp_path / "001.wav").read_bytes() == blow(1)
@@ -374,7 +380,7 @@ def test_another_tabs_recording_is_neither_overwritten_nor_taken_out(tmp_path: P
         lambda: strikes.redo("001.wav", blow(3), key=key(3), match=added["digest"]),
         lambda: strikes.remove("001.wav", match=added["digest"]),
     ):
-        with pytest.raises(RefusedError, match=r"001\.wav is another recording by now") as refused:
+        with raises(RefusedError, file="001.wav", value=added["digest"]) as refused:
             change()
         assert refused.value.status == 409
     # The page has not heard that it was done, and sends it again.
@@ -435,6 +441,6 @@ def test_an_unchanged_folder_is_judged_once(tmp_path: Path, monkeypatch: pytest.
 
 def test_a_recording_that_is_long_beyond_use_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("avmsf.capture.audio.MAX_SAMPLES", 1000)
-    with pytest.raises(RefusedError, match="expected at most 1,000 samples") as refused:
+    with pytest.raises(RefusedError) as refused:
         book(tmp_path).add(blow(), place(0.1), key=key(0))
     assert refused.value.status == 413

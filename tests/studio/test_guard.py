@@ -77,7 +77,7 @@ def test_tokens_are_long_and_never_the_same() -> None:
 def test_a_name_that_was_bent_to_this_machine_is_refused(server: Served, host: str) -> None:
     answer = server.ask("GET", "manifest.json", headers={"Host": host.format(port=server.port)})
     assert answer.status == 403
-    assert "expected this machine's own name" in answer.words["error"]
+    assert answer.words["error"].startswith("host: ")
 
 
 @pytest.mark.parametrize("name", LOOPBACK)
@@ -91,7 +91,7 @@ def test_another_sites_page_is_refused(server: Served, origin: str, method: str)
     headers = {"Origin": origin.format(port=server.port)}
     answer = server.ask(method, "manifest.json" if method == "GET" else "undo", {"base": 1}, headers=headers)
     assert answer.status == 403
-    assert "another site's" in answer.words["error"]
+    assert answer.words["error"].startswith("origin: ")
     assert server.ask("GET", "manifest.json", headers={"Origin": f"http://127.0.0.1:{server.port}"}).status == 200
 
 
@@ -140,8 +140,9 @@ def test_a_link_leads_nowhere_else(tmp_path: Path) -> None:
     (tmp_path / "in" / "fine.bin").write_text("fine")
     assert contained(tmp_path / "in", "fine.bin").read_text() == "fine"
     for name in ("out.bin", "loop.bin", "pipe.bin", "../out.bin", "/etc/passwd", "", ".", "x" * 5000):
-        with pytest.raises(RefusedError, match="nothing at this address"):
+        with pytest.raises(RefusedError) as refused:
             contained(tmp_path / "in", name)
+        assert (refused.value.status, str(refused.value)) == (404, NOTHING_HERE)
 
 
 def test_a_huge_upload_is_refused_by_its_length_alone(server: Served) -> None:

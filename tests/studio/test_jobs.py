@@ -16,6 +16,7 @@ from avmsf.studio.jobs import Job, Jobs
 from avmsf.studio.refusal import RefusedError
 from avmsf.studio.worker import Voice
 from event_loop import run_async
+from raising import raises
 
 # A loop that a test closes right after a process was killed leaves pipes for the collector, which warns of them.
 pytestmark = [
@@ -79,10 +80,9 @@ def test_a_job_that_fails_says_why() -> None:
 @pytest.mark.parametrize(("number", "name"), [(9, "SIGKILL"), (6, "SIGABRT"), (40, "signal 40")])
 def test_a_job_that_was_killed_says_by_what_and_not_what_its_process_said(number: int, name: str) -> None:
     [last] = run(f"print('<no Python frame>', file=sys.stderr, flush=True)\nos.kill(os.getpid(), {number})")
-    assert last["error"] == (
-        f"test: the work was ended from outside or crashed ({name}): try it again, and close other programs first "
-        "where memory is short"
-    )
+    assert last["error"].startswith("test ")
+    assert f"({name})" in last["error"]
+    assert "Python frame" not in last["error"]
 
 
 def test_a_stage_is_named_once(tmp_path: Path) -> None:
@@ -244,15 +244,15 @@ def test_one_job_runs_at_a_time() -> None:
     async def start_two() -> None:
         jobs = Jobs()
         first = jobs.start("reconstruct", {}, same, script("time.sleep(60)"))
-        with pytest.raises(RefusedError, match="reconstruct is under way") as refused:
-            jobs.start("lead the sound", {}, same, script(""))
+        with raises(RefusedError, name="job", value="reconstruct") as refused:
+            jobs.start("guided edit", {}, same, script(""))
         assert (refused.value.status, refused.value.more) == (409, {"job": first.identifier})
         assert jobs.current is first
         await first.cancel()
-        second = jobs.start("lead the sound", {}, same, script("say(result={})"))
+        second = jobs.start("guided edit", {}, same, script("say(result={})"))
         assert [event async for _, event in second.listen()] == [{"taken": {}}]
         assert jobs.current is None
-        with pytest.raises(RefusedError, match="no such job"):
+        with raises(RefusedError, name="job", value="another"):
             jobs.named("another")
 
     run_async(start_two())

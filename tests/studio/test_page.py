@@ -181,7 +181,7 @@ def test_a_dropped_recording_is_located_and_painted(visit: Open) -> None:
         assert words in text
     # Labels are put in their places when the next picture is drawn.
     page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    box = page.locator(".mark .label", has_text="or here").bounding_box()
+    box = page.locator(".mark .label", has_text="equivalent").bounding_box()
     x, y = on_screen(page, table.points[300])
     assert box is not None
     assert abs(box["y"] + box["height"] / 2 - y) < 3
@@ -254,29 +254,29 @@ def test_a_capture_is_made_redone_and_reconstructed(visit: Open) -> None:
     page = visit(live=LIVE_CAPTURE, before=lambda page: servers.append(CaptureServer(page)))
     (server,) = servers
     assert page.is_disabled("text=● Record")
-    assert page.is_disabled("text=Make the sound field")
+    assert page.is_disabled("text=Reconstruct the field")
     take_strike(page, (0.04, 0.04, 0.01))
     text = page.inner_text("#sheet-capture dl")
     for words in ("-6.0 dB", "the loudest samples are cut off", "at 4.00 ms", "500 ms"):
         assert words in text
     assert server.asked == [], "nothing is written before it is kept"
-    page.click("text=Keep it")
-    page.wait_for_selector("text=1 strike")
+    page.click("text=Save recording")
+    page.wait_for_selector("text=1 impact")
     query = dict(part.split("=") for part in server.asked[0][0].split("&"))
     assert [float(query[axis]) for axis in "xyz"] == pytest.approx([0.04, 0.04, 0.01], abs=SPACING)
     assert [float(query[f"n{axis}"]) for axis in "xyz"] == pytest.approx([0, 0, -1]), "blows go into the surface"
     take_strike(page, (-0.04, 0.0, 0.01))
-    page.click("text=Keep it")
-    page.wait_for_selector("text=2 strikes")
+    page.click("text=Save recording")
+    page.wait_for_selector("text=2 impacts")
     page.click("[aria-label='Record 001.wav again']")
     page.set_input_files("#sheet-capture input[type=file]", upload())
-    page.click("text=Put it in place")
+    page.click("button:text-is('Replace')")
     until(page, lambda: server.asked[-1] == ("PUT", "001.wav"))
-    page.click("text=Make the sound field")
+    page.click("text=Reconstruct the field")
     page.wait_for_selector("text=avmsf studio /captures/plate/field")
     page.on("dialog", lambda dialog: dialog.accept())
-    page.click("[aria-label='Take 002.wav out']")
-    page.wait_for_selector("text=1 strike")
+    page.click("[aria-label='Remove 002.wav']")
+    page.wait_for_selector("text=1 impact")
     assert server.asked[-1] == ("DELETE", "002.wav")
 
 
@@ -286,15 +286,15 @@ def test_a_recording_outlives_a_broken_connection_and_a_reload(visit: Open) -> N
     (server,) = servers
     server.broken = True
     take_strike(page, (0.04, 0.04, 0.01))
-    page.click("text=Keep it")
+    page.click("text=Save recording")
     page.wait_for_selector("text=The recording is not lost")
-    assert page.locator("text=A recording waits for the server").count() == 1
+    assert page.locator("text=waits for the server").count() == 1
     page.reload()
-    page.wait_for_selector("text=A recording waits for the server")
+    page.wait_for_selector("text=waits for the server")
     server.broken = False
     page.click("text=Send again")
-    page.wait_for_selector("text=1 strike")
-    until(page, lambda: page.locator("text=A recording waits for the server").count() == 0)
+    page.wait_for_selector("text=1 impact")
+    until(page, lambda: page.locator("text=waits for the server").count() == 0)
     assert len({key for _, key in server.asked}) == 1, "sent again under the same key"
     assert len(server.asked) >= 2
     assert len(server.strikes) == 1
@@ -341,10 +341,10 @@ def test_the_microphone_records_what_is_heard(visit: Open) -> None:
     page = visit(live=LIVE, before=before)
     page.click("#tab-find")
     page.click("text=● Record")
-    page.wait_for_selector("text=blow heard")
+    page.wait_for_selector("text=impact detected")
     page.wait_for_timeout(300)
     page.click("text=■ Stop")
-    page.wait_for_selector("text=No blow was heard in it")
+    page.wait_for_selector("text=No impact detected")
     samples, rate = soundfile.read(io.BytesIO(sent[0]))
     assert samples.ndim == 1
     assert len(samples) > 0.2 * rate
@@ -363,13 +363,13 @@ def test_only_a_studios_page_is_told_of_one_that_was_stopped(visit: Open, live: 
     load = """import(new URL("page/bundle.js", location.href))
         .then(({ loadBundle }) => loadBundle()).catch((error) => error.message)"""
     for hinder, said in (
-        (lambda route: route.abort(), "manifest.json cannot be reached: is the server still running?"),
+        (lambda route: route.abort(), "manifest.json cannot be loaded: check that the server runs"),
         (lambda route: route.fulfill(status=404), "manifest.json cannot be read (404)"),
     ):
         page.route("**/manifest.json", hinder)
         told = page.evaluate(load)
         assert told.startswith(said)
-        assert ("a studio that was stopped" in told) == (live is not None)
+        assert ("a restarted studio" in told) == (live is not None)
         page.unroute("**/manifest.json")
 
 
@@ -390,15 +390,15 @@ def block_audio(page: "Page") -> None:
     ("before", "said"),
     [
         (block_webgl, "This browser shows no 3D"),
-        (lambda page: page.route("**/modules/**", lambda route: route.abort()), "The 3D library could not be loaded"),
-        (block_audio, "There is no sound"),
+        (lambda page: page.route("**/modules/**", lambda route: route.abort()), "three and spark"),
+        (block_audio, "No sound"),
     ],
     ids=["webgl", "three", "audio"],
 )
 def test_what_the_browser_lacks_is_said_and_the_rest_works(visit: Open, before: Any, said: str) -> None:
     page = visit(before=before)
     assert said in words_on(page, ".bad")
-    page.click("text=Strike somewhere")
+    page.click("text=Strike at random")
     assert page.evaluate("avmsf.studio.last.force") == 1
     page.click("#tab-modes")
     assert page.locator("tbody tr").count() == 6
@@ -418,7 +418,7 @@ def test_what_goes_wrong_with_a_recording_is_told(visit: Open) -> None:
     page.set_input_files("#sheet-find input[type=file]", upload())
     page.wait_for_selector("text=The server does not answer")
     page.click("text=● Record")
-    page.wait_for_selector("text=does not let this page use the microphone")
+    page.wait_for_selector("text=blocks the microphone")
 
 
 def test_a_field_without_geometry_is_told_and_offers_no_blow(visit: Open) -> None:
@@ -437,9 +437,9 @@ def test_a_field_without_geometry_is_told_and_offers_no_blow(visit: Open) -> Non
     page = visit(before=empty)
     assert "This field has no geometry" in words_on(page, ".bad")
     assert page.is_disabled("text=Strike again")
-    assert page.is_disabled("text=Strike somewhere")
+    assert page.is_disabled("text=Strike at random")
     page.evaluate("avmsf.strike(0)")
-    assert "no contact that could be struck" in words_on(page, ".bad")
+    assert "no contacts to strike" in words_on(page, ".bad")
     assert broken == []
     page.click("#tab-modes")
     assert page.locator("tr[data-mode='3'] td").all_inner_texts() == ["3", "1600.0", "0.432", "–"]
@@ -516,11 +516,11 @@ def test_what_was_found_goes_when_another_recording_is_looked_for(visit: Open) -
 
     def expect_found(name: str) -> None:
         page.set_input_files("#sheet-find input[type=file]", upload(name))
-        page.wait_for_selector(f"text={name}: one blow")
+        page.wait_for_selector(f"text={name}: 1 impact")
         assert page.evaluate("avmsf.painted() !== null && avmsf.studio.view.marks.has('found')")
 
     def expect_nothing() -> None:
-        assert "one blow" not in page.inner_text("#sheet-find")
+        assert "1 impact" not in page.inner_text("#sheet-find")
         assert page.evaluate("avmsf.painted() === null && !avmsf.studio.view.marks.has('found')")
 
     expect_found("first.wav")

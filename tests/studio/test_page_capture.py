@@ -135,26 +135,26 @@ def attach(page: "Page") -> None:
 
 def strike_once(page: "Page") -> None:
     take(page, HERE)
-    page.click("text=Keep it")
-    page.wait_for_selector("text=1 strike")
+    page.click("text=Save recording")
+    page.wait_for_selector("text=1 impact")
 
 
 def test_a_recording_that_was_not_kept_waits_when_the_next_is_made(capturing: Any) -> None:
     page, server = capturing(ADDRESSES)
     take(page, HERE)
     take(page, THERE)
-    page.wait_for_selector("text=is not kept yet")
+    page.wait_for_selector("text=is not saved yet")
     assert "waits below" in words_on(page)
     assert page.evaluate(STORED) == [[FOLDER, False]] * 2, "under a name that outlives the server and its secret"
     for _ in range(2):
         page.click("text=Listen >> nth=0")
     page.wait_for_function("addresses.size === 0")
-    page.click(".main:has-text('Keep it')")
-    page.wait_for_selector("text=1 strike")
+    page.click(".main:has-text('Save recording')")
+    page.wait_for_selector("text=1 impact")
     page.reload()
     page.wait_for_selector("#sheet-capture dl")
-    page.click(".main:has-text('Keep it')")
-    page.wait_for_selector("text=2 strikes")
+    page.click(".main:has-text('Save recording')")
+    page.wait_for_selector("text=2 impacts")
     for strike, place in zip(server.strikes, (THERE, HERE), strict=True):
         assert strike["contact"] == pytest.approx(place, abs=SPACING)
     assert page.evaluate(STORED) == []
@@ -169,9 +169,9 @@ def test_a_recording_belongs_where_it_was_begun_and_ends_by_itself(capturing: An
     assert page.locator("#sheet-capture dl").count() == 0, "what was stopped before it began is no recording"
 
     page.click("text=● Record")
-    page.wait_for_selector("text=blow heard")
+    page.wait_for_selector("text=impact detected")
     page.mouse.click(*on_screen(page, THERE))
-    page.wait_for_selector("text=The place stays as it is")
+    page.wait_for_selector("text=The contact cannot change")
     assert page.is_disabled("#sheet-capture .place input >> nth=0")
     page.wait_for_selector("text=Clipped")
     page.wait_for_selector("#sheet-capture dl")
@@ -179,18 +179,18 @@ def test_a_recording_belongs_where_it_was_begun_and_ends_by_itself(capturing: An
     seconds = float(page.inner_text("#sheet-capture small >> nth=0").split()[0])
     assert 3.0 <= seconds < 3.5, "it goes on for three seconds after the blow"
     assert 0.8 * 50 * seconds < page.evaluate("messages") < 1.2 * 50 * seconds
-    page.click("text=Keep it")
-    page.wait_for_selector("text=1 strike")
+    page.click("text=Save recording")
+    page.wait_for_selector("text=1 impact")
     assert server.strikes[0]["contact"] == pytest.approx(HERE, abs=SPACING)
 
     page.click("[aria-label='Record 001.wav again']")
-    page.wait_for_selector("text=Leave it as it is")
+    page.wait_for_selector("text=Cancel")
     page.click("text=● Record")
-    page.wait_for_selector("text=blow heard")
-    assert page.is_hidden("text=Leave it as it is")
+    page.wait_for_selector("text=impact detected")
+    assert page.is_hidden("text=Cancel")
     page.click("text=■ Stop")
     with page.expect_response("**/capture/strikes/001.wav"):
-        page.click("text=Put it in place")
+        page.click("button:text-is('Replace')")
     assert server.asked == [("PUT", "001.wav", "d1")]
 
 
@@ -200,22 +200,22 @@ def test_another_tabs_strike_is_neither_overwritten_nor_taken_out(capturing: Any
     page.click("[aria-label='Record 001.wav again']")
     attach(page)
     server.strikes[0] |= {"digest": "theirs", "peak_db": -12.3}
-    page.click("text=Put it in place")
-    page.wait_for_selector("text=was not taken: 001.wav: expected theirs, found d1")
+    page.click("button:text-is('Replace')")
+    page.wait_for_selector("text=was rejected: 001.wav: expected theirs, found d1")
     page.wait_for_selector("text=001.wav -12.3 dB")
     assert server.strikes[0]["digest"] == "theirs"
     with page.expect_response("**/capture"):
-        page.click("text=Put mine in its place")
-    page.wait_for_function("!document.body.textContent.includes('was not taken')")
+        page.click("text=Replace it with mine")
+    page.wait_for_function("!document.body.textContent.includes('was rejected')")
     assert server.asked[-1] == ("PUT", "001.wav", "theirs")
 
     server.strikes[0] |= {"digest": "theirs again", "peak_db": -23.4}
     page.on("dialog", lambda dialog: dialog.accept())
-    page.click("[aria-label='Take 001.wav out']")
+    page.click("[aria-label='Remove 001.wav']")
     page.wait_for_selector("text=expected theirs again, found theirs+")
     page.wait_for_selector("text=001.wav -23.4 dB")
-    page.click("[aria-label='Take 001.wav out']")
-    page.wait_for_selector("text=0 strikes")
+    page.click("[aria-label='Remove 001.wav']")
+    page.wait_for_selector("text=0 impacts")
 
 
 def test_the_outbox_promises_only_what_is_written(visit: Open) -> None:
@@ -271,13 +271,13 @@ def test_a_blow_is_recorded_without_the_server_and_what_fails_is_said(visit: Ope
     assert page.evaluate("asked") == 1, "before a blow is recorded, while the server surely is there"
     page.click("#tab-find")
     page.click("#sheet-find >> text=● Record")
-    page.wait_for_selector("text=The recorder could not be fetched")
+    page.wait_for_selector("text=The recorder could not be loaded")
     page.wait_for_selector("#sheet-find >> text=● Record")
     assert page.evaluate("streams[0].getTracks()[0].readyState") == "ended"
     page.evaluate("gone = false")
     for number in (1, 2):
         page.click("#sheet-find >> text=● Record")
-        page.wait_for_selector("text=blow heard")
+        page.wait_for_selector("text=impact detected")
         page.click("text=■ Stop")
         page.wait_for_selector("text=The server does not answer")
         page.evaluate("document.querySelectorAll('#words .word').forEach((word) => word.remove())")
@@ -317,21 +317,21 @@ def test_a_place_found_on_another_field_is_not_painted_and_searches_do_not_meet(
     assert len(asked) == 1
     answer(held[0], found(1, 1))
     wait_for(2)
-    assert "one blow" not in page.inner_text("#sheet-find"), "nobody waits for the first any more"
+    assert "1 impact" not in page.inner_text("#sheet-find"), "nobody waits for the first any more"
     answer(held[1], found(2, 1))
-    page.wait_for_selector("text=third.wav: one blow")
+    page.wait_for_selector("text=third.wav: 1 impact")
     assert len(asked) == 2
 
     look_for("late.wav")
     wait_for(3)
     page.evaluate("avmsf.studio.revision = 2")
     answer(held[2], found(3, 1))
-    page.wait_for_selector("text=The field was changed while late.wav was looked for")
-    assert "one blow" not in page.inner_text("#sheet-find"), "what was found before is not what was looked for"
-    page.click("text=Look for it again")
+    page.wait_for_selector("text=The field changed while late.wav was located")
+    assert "1 impact" not in page.inner_text("#sheet-find"), "what was found before is not what was looked for"
+    page.click("text=Locate again")
     wait_for(4)
     answer(held[3], found(4, 2))
-    page.wait_for_selector("text=late.wav: one blow")
+    page.wait_for_selector("text=late.wav: 1 impact")
 
 
 def test_a_file_that_is_no_recording_ends_the_search_before_it(visit: Open) -> None:
@@ -355,7 +355,7 @@ def test_a_file_that_is_no_recording_ends_the_search_before_it(visit: Open) -> N
     page.wait_for_selector(busy)
     page.wait_for_timeout(100)
     answer(held.pop(), {"blows": []})
-    page.wait_for_selector("text=No blow was heard in it")
+    page.wait_for_selector("text=No impact detected")
     assert "newer.wav" in page.inner_text("#sheet-find")
 
 
@@ -365,8 +365,8 @@ def test_a_recording_that_the_server_refuses_is_not_offered_to_be_kept(capturing
     page.route("**/capture/check", lambda route: answer(route, silent, 422))
     page.mouse.click(*on_screen(page, HERE))
     page.set_input_files("#sheet-capture input[type=file]", upload())
-    page.wait_for_selector("text=It cannot be kept: the recording: expected a blow, found silence")
-    keep, redo = (page.locator("#sheet-capture button", has_text=words).first for words in ("Keep it", "Redo"))
+    page.wait_for_selector("text=It cannot be saved: the recording: expected a blow, found silence")
+    keep, redo = (page.locator("#sheet-capture button", has_text=words).first for words in ("Save recording", "Redo"))
     assert keep.is_disabled()
     assert "main" not in (keep.get_attribute("class") or "")
     assert "main" in (redo.get_attribute("class") or "")
@@ -388,9 +388,9 @@ def test_what_the_check_refuses_may_still_be_put_in_place_of_what_it_does_not_kn
     page.wait_for_selector("text=expected 48000 Hz as the other strikes, found 16000 Hz")
     told = page.inner_text("#sheet-capture .group:has(> .waveform) .warning")
     assert "cannot be kept" not in told
-    assert "in place of 001.wav" in told
+    assert "replace 001.wav" in told
     with page.expect_response("**/capture/strikes/001.wav"):
-        page.click("text=Put it in place")
+        page.click("button:text-is('Replace')")
     assert server.asked == [("PUT", "001.wav", "d1")]
 
 
@@ -403,13 +403,13 @@ def test_a_studio_that_was_started_again_is_told_to_be_elsewhere(capturing: Any,
     page.wait_for_selector("text=Measure again")
     told = page.inner_text("#sheet-capture .group:has(> .waveform) .warning")
     assert "prints a new address" in told
-    assert "kept in this browser" in told
-    assert "under the same port" in told, "a browser keeps what it stores by host and port"
-    page.click("text=Keep it")
+    assert "stored in this browser" in told
+    assert "at the same port" in told, "a browser keeps what it stores by host and port"
+    page.click("text=Save recording")
     page.wait_for_selector("text=The recording is not lost, and is sent again until the server answers")
     assert "prints a new address" in words_on(page)
     assert page.evaluate(STORED) == [[FOLDER, True]]
     page.unroute("**/capture/**")
     page.reload()
-    page.wait_for_selector("text=1 strike")
+    page.wait_for_selector("text=1 impact")
     assert len(server.strikes) == 1, "a page of the same host and port sends it by itself, for nobody has refused it"

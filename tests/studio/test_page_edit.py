@@ -22,6 +22,7 @@ from avmsf.tasks.steer import SteerProgress
 from opened_plate import open_plate, plate_field
 from page_plate import lay_out, plate_table
 from plate_page import LIVE, Open, Serve, answer, upload, words_on
+from raising import raises
 from served import Served, served
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.page
 
 
-KEPT = "the field was changed while its sound was led, so that is kept beside it: open "
+KEPT = "the field was changed during the guided edit, whose result was saved to "
 STALE = "expected a change of revision 2, found one of revision 1: another tab has changed the field"
 
 
@@ -270,10 +271,10 @@ def test_another_tabs_edit_is_not_overwritten_in_silence(edits: Any) -> None:
     page, server = edits()
     server.change(size=2.0)
     page.select_option("#sheet-edit select >> nth=1", "glass")
-    page.wait_for_selector("text=Another tab changed this field meanwhile")
+    page.wait_for_selector("text=Another tab has changed this field")
     assert [words["base"] for _, words in server.asked] == [1]
     assert server.revision == 2
-    page.click("text=Put mine in its place")
+    page.click("text=Replace it with mine")
     page.wait_for_function("avmsf.studio.revision === 3")
     assert server.asked[-1][1]["base"] == 2
     assert server.asked[-1][1]["material"] == {"from": None, "to": "glass"}
@@ -283,7 +284,7 @@ def test_another_tabs_edit_is_shown_when_it_is_chosen(edits: Any) -> None:
     page, server = edits()
     server.change(size=2.0)
     move(page, "Pitch")
-    page.click("text=Show its change")
+    page.click("text=Show that change")
     page.wait_for_function("avmsf.studio.revision === 2")
     assert shown(page, "Size", "Pitch") == ["× 2.00", "× 1.00"]
     assert pitch_of_page(page) == pytest.approx(500.0, abs=3)
@@ -296,7 +297,7 @@ def test_saving_after_another_tabs_edit_saves_ones_own(edits: Any) -> None:
     server.change(size=2.0)
     page.fill("#sheet-edit input[type=text]", "mine")
     page.click("text=Save as")
-    page.click("text=Put mine in its place")
+    page.click("text=Replace it with mine")
     page.wait_for_selector("text=Saved: mine")
     assert [(what, words["base"]) for what, words in server.asked] == [("save", 1), ("edit", 2), ("save", 3)]
     assert server.asked[1][1]["size"] == 1.0
@@ -321,7 +322,7 @@ def test_a_slider_that_moves_on_does_not_adopt_another_tabs_revision(edits: Any)
     wait_until(page, lambda: len(server.asked) == 1)
     move(page, "Decay time")
     server.let_go()
-    page.wait_for_selector("text=Another tab changed this field meanwhile")
+    page.wait_for_selector("text=Another tab has changed this field")
     assert [words["base"] for _, words in server.asked] == [1, 2]
     assert server.state[0] == {"size": 2.0}
 
@@ -359,7 +360,7 @@ def test_leading_takes_the_sliders_along_and_holds_them_meanwhile(edits: Any) ->
     assert (server.asked[-1][1]["pitch"], server.asked[-1][1]["base"]) == (1.0, 3)
 
 
-@pytest.mark.parametrize("live", [{}, {"jobKind": "lead the sound", "abilities": ["edit", "like", "reconstruct"]}])
+@pytest.mark.parametrize("live", [{}, {"jobKind": "guided edit", "abilities": ["edit", "like", "reconstruct"]}])
 def test_a_lead_under_way_is_followed_by_a_page_opened_later(edits: Any, live: dict[str, Any]) -> None:
     page, server = edits(job="j9", **live)
     assert page.locator("#sheet-edit button:visible", has_text="Stop").count() == 1
@@ -388,8 +389,8 @@ def test_an_answer_that_is_cut_is_no_success(edits: Any) -> None:
     move(page, "Pitch")
     page.wait_for_selector("text=The server does not answer")
     page.click("text=Try again")
-    page.wait_for_selector("text=The change whose answer was lost was made, or another tab")
-    page.click("text=Show its change")
+    page.wait_for_selector("text=Another tab changed this field, or your last change was made")
+    page.click("text=Show that change")
     page.wait_for_function("avmsf.studio.revision === 2")
     assert shown(page, "Pitch") == ["× 1.01"]
 
@@ -404,7 +405,7 @@ def test_an_edit_that_is_refused_is_taken_back(edits: Any) -> None:
     page.click("text=Save as")
     page.wait_for_timeout(200)
     assert server.taken == set(), "what is not heard is not saved"
-    page.click("text=Take it back")
+    page.click("text=Revert it")
     assert shown(page, "Pitch") == ["× 1.00"]
 
 
@@ -423,7 +424,7 @@ def test_a_measured_strike_is_compared_with_the_model(visit: Open) -> None:
     assert min(abs(peak - 400 * order) for order in range(1, 7)) < 0.02 * peak
     assert page.locator(".mark .dot[data-strike]").count() == 2
     assert page.locator(".mark .dot[data-strike].chosen").count() == 1
-    page.uncheck("text=Mark them on the object")
+    page.uncheck("text=Show them on the object")
     assert page.locator(".mark .dot[data-strike]").count() == 0
 
 
@@ -521,10 +522,10 @@ def test_the_heading_says_which_field_is_heard(browser: "Browser", modules: Path
 def test_remarks_speak_of_the_pages_own_controls(browser: "Browser", modules: Path, tmp_path: Path) -> None:
     with edited_plate(browser, modules, tmp_path) as (page, server):
         page.get_by_label("New material").select_option("glass")
-        said = page.locator("#words, #sheet-edit [aria-live]", has_text='"Material it is of"')
+        said = page.locator("#words, #sheet-edit [aria-live]", has_text='"Present material"')
         said.first.wait_for()
         assert '"from"' not in page.inner_text("body")
-        page.get_by_label("Material it is of").select_option("wood")
+        page.get_by_label("Present material").select_option("wood")
         page.get_by_label("New material").select_option("")
         move(page, "Size")
         page.wait_for_function("avmsf.studio.live.sliders.size > 1")
@@ -535,17 +536,17 @@ def test_remarks_speak_of_the_pages_own_controls(browser: "Browser", modules: Pa
 
 def test_what_an_object_is_of_changes_nothing_by_itself(edits: Any) -> None:
     page, server = edits()
-    page.get_by_label("Material it is of").select_option("wood")
+    page.get_by_label("Present material").select_option("wood")
     page.wait_for_timeout(500)
     assert server.asked == []
     move(page, "Pitch")
     page.wait_for_function("avmsf.studio.revision === 2")
-    page.get_by_label("Material it is of").select_option("iron")
+    page.get_by_label("Present material").select_option("iron")
     page.wait_for_timeout(500)
     assert [words["material"] for _, words in server.asked] == [None], "the pitch is the same of any material"
     move(page, "Size")
     page.wait_for_function("avmsf.studio.revision === 3")
-    page.get_by_label("Material it is of").select_option("steel")
+    page.get_by_label("Present material").select_option("steel")
     page.wait_for_function("avmsf.studio.revision === 4")
     assert [words["material"] for _, words in server.asked[1:]] == [
         {"from": "iron", "to": None},
@@ -557,10 +558,10 @@ def test_a_lead_says_at_once_that_it_begins_and_at_its_end_what_changed(edits: A
     page, server = edits()
     server.led = led_by((math.nan, 1.0), (0.92, 1.01), (0.75, 1.1), (0.31, 1.249), (math.nan, 1.249))
     page.set_input_files("#sheet-edit input[type=file]", upload())
-    page.wait_for_selector("text=It has begun")
+    page.wait_for_selector("text=Started")
     server.let_go()
-    page.wait_for_selector("text=The sound was led: its pitch is × 1.25, and how far it is off fell from 0.92 to 0.31")
-    assert "Undo takes it back" in words_on(page)
+    page.wait_for_selector("text=Guided edit finished: pitch × 1.25, loss from 0.92 to 0.31")
+    assert "Undo reverts it" in words_on(page)
 
 
 def led_by(*steps: tuple[float, float]) -> list[SteerProgress]:
@@ -571,15 +572,15 @@ def led_by(*steps: tuple[float, float]) -> list[SteerProgress]:
 
 def test_a_lead_that_another_tab_forestalled_is_told_to_be_kept_beside(edits: Any) -> None:
     page, server = edits()
-    server.led, server.beside = led_by((0.92, 1.01), (0.31, 1.249)), "/home/plate led.safetensors"
+    server.led, server.beside = led_by((0.92, 1.01), (0.31, 1.249)), "/home/plate edited.safetensors"
     page.set_input_files("#sheet-edit input[type=file]", upload())
-    page.wait_for_selector("text=It has begun")
+    page.wait_for_selector("text=Started")
     server.change(size=2.0)
     server.let_go()
-    page.wait_for_selector(f"#words >> text={KEPT}/home/plate led.safetensors")
+    page.wait_for_selector(f"#words >> text={KEPT}/home/plate edited.safetensors")
     assert page.evaluate("avmsf.studio.revision") == 2
     assert shown(page, "Size") == ["× 2.00"]
-    assert "was led:" not in words_on(page)
+    assert "Guided edit finished" not in words_on(page)
     assert "Undo" not in words_on(page)
 
 
@@ -588,11 +589,11 @@ def test_a_lead_that_is_no_longer_heard_is_not_said_to_be(edits: Any) -> None:
     server.led = led_by((0.92, 1.01), (0.31, 1.249))
     server.then = lambda: server.change(size=2.0)
     page.set_input_files("#sheet-edit input[type=file]", upload())
-    page.wait_for_selector("text=It has begun")
+    page.wait_for_selector("text=Started")
     server.let_go()
     page.wait_for_selector("text=Another tab changed this field after your change")
     page.wait_for_selector("#sheet-edit button:text-is('Undo'):enabled")
-    assert "The sound was led" not in words_on(page)
+    assert "Guided edit finished" not in words_on(page)
 
 
 def test_an_undo_that_another_tab_forestalls_shows_what_there_is(edits: Any) -> None:
@@ -601,7 +602,7 @@ def test_an_undo_that_another_tab_forestalls_shows_what_there_is(edits: Any) -> 
     page.wait_for_function("avmsf.studio.revision === 2")
     server.change(size=2.0)
     page.click("#sheet-edit >> text=Undo")
-    page.wait_for_selector("text=Another tab changed this field meanwhile. You see and hear what it is now: do it")
+    page.wait_for_selector("text=Another tab has changed this field. The page shows its current state: repeat")
     assert shown(page, "Size", "Pitch") == ["× 2.00", "× 1.00"]
     assert (server.revision, [what for what, _ in server.asked]) == (3, ["edit", "undo"])
 
@@ -610,8 +611,8 @@ def test_words_on_another_tabs_change_hold_no_numbers_of_revisions(edits: Any) -
     page, server = edits()
     server.change(size=2.0)
     move(page, "Pitch")
-    page.wait_for_selector("text=Nothing was overwritten: show its change and make yours again")
+    page.wait_for_selector("text=Nothing was overwritten: show that change")
     assert "revision" not in words_on(page)
-    with pytest.raises(RefusedError, match="make the change again") as refused:
+    with raises(RefusedError, name="base", value=1) as refused:
         Session(Path(), lambda revision: None).expect_current(1)
     assert "revision" not in str(refused.value)

@@ -52,10 +52,10 @@ def test_pictures_that_show_nothing_are_said_to_and_can_be_tried_again(
     for number in range(3):
         Image.fromarray(np.full((24, 32, 3), 128, dtype=np.uint8)).save(home / "images" / f"{number}.png")
     with opened_page(browser, open_target(home), tmp_path / "scratch", wait_for_jobs=True) as page:
-        said = page.locator("#words .bad", has_text="none could be made of its pictures")
+        said = page.locator("#words .bad", has_text="the reconstruction from the images failed")
         assert "images" in said.inner_text()
         said.locator("text=Try again").click()
-        page.wait_for_selector("#words .word:has-text('appears here')")
+        page.wait_for_selector("#words .word:has-text('being reconstructed')")
         assert page.evaluate("avmsf.studio.live.job") is not None
 
 
@@ -109,8 +109,8 @@ def test_a_capture_of_a_mesh_is_made_by_clicks(browser: "Browser", home: Path, t
                 "#sheet-capture input[type=file]", file_of(wav(blow / abs(blow).max() * 0.5, rate=RATE))
             )
             page.wait_for_selector("#sheet-capture dl")
-            page.click("text=Keep it")
-            page.wait_for_selector(f"#sheet-capture h2:has-text('{number} strike')")
+            page.click("text=Save recording")
+            page.wait_for_selector(f"#sheet-capture h2:has-text('{number} impact')")
     capture = read_capture(mesh.with_suffix(""))
     torch.testing.assert_close(capture.impacts.contacts, torch.tensor(clicked).double(), atol=0.005, rtol=0)
     directions = capture.impacts.directions

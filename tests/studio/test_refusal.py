@@ -18,6 +18,7 @@ from avmsf.studio.refusal import echo
 from avmsf.studio.server import serve
 from capture_folder import fill
 from opened_plate import blow, open_plate, wav
+from raising import raises
 from served import Answer, Served, served
 
 KEY = {"Idempotency-Key": "k" * 16}
@@ -116,7 +117,7 @@ def test_a_full_temporary_folder_is_named_as_the_cause(plate: Served, monkeypatc
 def test_a_server_without_a_temporary_folder_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened = open_plate(tmp_path / "opened")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
-    with pytest.raises(StudioError, match="TMPDIR"):
+    with raises(StudioError, name="TMPDIR"):
         serve(opened, port=0, browser=False, tell=print)
 
 

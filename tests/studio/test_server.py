@@ -51,6 +51,7 @@ from avmsf.tasks.severalblows import locate_blows
 from capture_folder import fill, ring
 from opened_plate import RATE, blow, open_plate, plate_field, wav
 from plate_capture import fill_plate
+from raising import raises
 from served import Served, served
 
 
@@ -121,7 +122,7 @@ def test_a_recorded_blow_is_located_as_the_task_does(plate: Served) -> None:
 def test_what_is_no_recording_is_said_to_be_none(plate: Served, content: bytes) -> None:
     answer = plate.ask("POST", "locate", content)
     assert answer.status == 422
-    assert re.search("not a sound file|silent|too short", answer.words["error"])
+    assert answer.words["error"].startswith("the recording")
     assert plate.get("manifest.json").status == 200
 
 
@@ -149,7 +150,7 @@ def test_an_edit_is_heard_undone_and_saved(plate: Served) -> None:
     assert torch.equal(load(saved.words["file"]).bank.frequency, expected.bank.frequency)
     again = plate.ask("POST", "save", {"base": 3, "name": "wooden"})
     assert again.status == 409
-    assert "stays" in again.words["error"]
+    assert again.words["error"].startswith("wooden.safetensors: ")
     undone = plate.ask("POST", "undo", {"base": 3}).words
     assert undone["revision"] == 4
     assert np.array_equal(tensor(plate, plate.manifest(), "frequency"), plate_field("elastic").bank.frequency)
@@ -170,7 +171,7 @@ def test_two_tabs_hear_of_each_other(plate: Served) -> None:
     late = plate.ask("POST", "edit", {"base": 1, "pitch": 0.5})
     assert late.status == 409
     assert late.words["revision"] == 2
-    assert "another tab has changed the field meanwhile, and nothing was overwritten" in late.words["error"]
+    assert "nothing was overwritten" in late.words["error"]
     assert plate.manifest()["live"]["sliders"]["pitch"] == 1.5
 
 
@@ -225,7 +226,7 @@ def test_a_descent_that_another_tab_has_overtaken_is_kept(
     (tmp_path / "go").touch()
     last = plate.events(job)[-1]
     assert last["revision"] == 2
-    assert "so that is kept beside it" in last["remarks"][0]
+    assert last["file"] in last["remarks"][0]
     assert Path(last["file"]).parent == plate.studio.opened.home
     assert torch.equal(load(last["file"]).bank.frequency, led.bank.frequency)
     assert plate.manifest()["live"]["sliders"]["pitch"] == 1.5
@@ -292,7 +293,7 @@ def test_the_capture_is_guarded_by_the_recordings_digest(capture: Served) -> Non
     for method, content in (("PUT", blow(2)), ("DELETE", None)):
         late = capture.ask(method, file, content, headers=quoted)
         assert late.status == 409
-        assert "001.wav is another recording by now" in late.words["error"]
+        assert late.words["error"].startswith("001.wav: ")
     assert capture.get(file).content == blow(1)
     [strike] = capture.get("capture").words["strikes"]
     assert capture.ask("DELETE", file, headers={"If-Match": strike["digest"]}).status == 200
@@ -352,7 +353,7 @@ def test_a_connection_lost_during_a_recording_leaves_nothing_behind(capture: Ser
 def test_a_reconstruction_needs_two_strikes(capture: Served) -> None:
     answer = capture.ask("POST", "reconstruct", {})
     assert answer.status == 409
-    assert "strike more places first" in answer.words["error"]
+    assert "recordings" in answer.words["error"]
     assert capture.get("jobs/unknown/events").status == 404
     assert capture.ask("DELETE", "jobs/unknown").status == 404
 
@@ -366,7 +367,7 @@ def test_a_reconstruction_that_fails_says_why_and_one_can_be_stopped(tmp_path: P
         assert running.manifest()["live"]["job"] == job
         assert running.ask("POST", "reconstruct", {}).status == 409
         last = running.events(job)[-1]
-        assert "missing.wav: there is no such file" in last["error"]
+        assert "missing.wav" in last["error"]
         assert running.events(job, after="0") == running.events(job)[1:]
         again = running.ask("POST", "reconstruct", {}).words["job"]
         assert running.ask("DELETE", f"jobs/{again}").words == {"cancelled": again}
@@ -446,7 +447,7 @@ def test_a_field_without_geometry_says_so(tmp_path: Path) -> None:
     bare = replace(field, gain_field=Nowhere(field.gain_field))
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(studio, "load", lambda path: bare)
-        with pytest.raises(StudioError, match="expected the object's geometry, found none: give a mesh"):
+        with raises(StudioError, name="object"):
             studio.Studio(opened, tmp_path)
         mesh = tmp_path / "lid.ply"
         trimesh.creation.box((0.24, 0.17, 0.004)).export(mesh)
@@ -461,22 +462,22 @@ def test_what_can_be_opened_and_what_not(tmp_path: Path, monkeypatch: pytest.Mon
     (tmp_path / "note.txt").write_text("hello")
     mesh = tmp_path / "bowl.stl"
     trimesh.creation.box((0.1, 0.1, 0.1)).export(mesh)
-    for target, message in (("nothing", "found nothing"), ("empty", "found none of these: put one there")):
-        with pytest.raises(StudioError, match=message):
+    for target, name in (("nothing", "target"), ("empty", "impacts.csv")):
+        with raises(StudioError, file=tmp_path / target, name=name):
             open_target(tmp_path / target)
-    with pytest.raises(StudioError, match="to show, found no such file"):
+    with raises(StudioError, file=tmp_path / "none.ply", name="object"):
         open_target(mesh, object=tmp_path / "none.ply")
-    with pytest.raises(AvmsfError, match="a file of another kind"):
+    with raises(AvmsfError, file=tmp_path / "note.txt", value="a file that starts with b'hello'"):
         studio.Studio(open_target(tmp_path / "note.txt"), tmp_path)
     opened = open_target(mesh)
     assert opened == Opened("bowl", (tmp_path / "bowl").resolve(), None, (tmp_path / "bowl").resolve())
     assert open_target(mesh) == opened
     assert (tmp_path / "bowl" / "surface.stl").read_bytes() == mesh.read_bytes()
     trimesh.creation.box((0.2, 0.1, 0.1)).export(mesh)
-    with pytest.raises(StudioError, match=r"has another object, surface\.stl"):
+    with raises(StudioError, file=tmp_path / "bowl", name="capture", value="surface.stl"):
         open_target(mesh)
     monkeypatch.setattr("avmsf.studio.opening.LARGEST_MESH", 10)
-    with pytest.raises(StudioError, match="expected a mesh of at most"):
+    with raises(StudioError, file=mesh, value=mesh.stat().st_size):
         open_target(mesh)
 
 
@@ -510,7 +511,7 @@ def test_a_mesh_brings_its_pictures_and_overwrites_none(tmp_path: Path) -> None:
     mesh, other = wavefront(tmp_path / "mesh"), tmp_path / "other"
     other.mkdir()
     (other / "pic.png").write_bytes(b"the user's own picture")
-    with pytest.raises(StudioError, match=r"pic\.png: expected no file, or the pic\.png that the mesh names"):
+    with raises(StudioError, file=other / "pic.png", name="capture"):
         open_target(mesh, capture=other)
     assert [path.name for path in other.iterdir()] == ["pic.png"]
     assert (other / "pic.png").read_bytes() == b"the user's own picture"
@@ -560,8 +561,9 @@ def test_a_picture_that_could_not_be_written_can_be_tried_again(
 
     with monkeypatch.context() as patched:
         patched.setattr("avmsf.studio.showing.json.loads", full)
-        with pytest.raises(OSError, match="No space"):
+        with pytest.raises(OSError) as caught:
             fresh.session.open(None)
+        assert caught.value.errno == 28
     assert fresh.session.open(None).number == 2
     assert fresh.manifest()["modes"] == 0
 
@@ -575,7 +577,7 @@ def test_a_failure_nobody_has_foreseen_is_told_here_and_in_the_terminal(
     monkeypatch.setattr(plate.studio.session, "undo", break_down)
     answer = plate.ask("POST", "undo", {"base": 1})
     assert answer.status == 500
-    assert "failed at this (KeyError): its terminal shows more" in answer.words["error"]
+    assert "(KeyError)" in answer.words["error"]
     assert "nothing was changed" not in answer.words["error"]
     assert "KeyError: 'unforeseen'" in capsys.readouterr().err
 
@@ -585,13 +587,13 @@ def test_a_port_in_use_is_named_with_a_way_out(tmp_path: Path, monkeypatch: pyte
         other.bind(("127.0.0.1", 0))
         other.listen()
         taken = other.getsockname()[1]
-        with pytest.raises(StudioError, match=f"port {taken}: expected a free one, .* give --port 0"):
+        with raises(StudioError, name="port", value=taken):
             serve(open_plate(tmp_path), port=taken, browser=False, tell=print)
         monkeypatch.setattr(server, "PORT", taken)
         with server._listening(None) as listener:
             assert listener.getsockname()[1] != taken
             assert listener.getsockname()[0] == "127.0.0.1"
-    with pytest.raises(StudioError, match="expected 0 to 65535"):
+    with raises(StudioError, name="port", value=70_000):
         server._listening(70_000)
 
 
@@ -632,12 +634,13 @@ def test_the_page_takes_its_libraries_from_here_where_they_are(tmp_path: Path, m
     (found / "three" / "package.json").write_text(json.dumps({"version": "0.1.0"}))
     assert find_modules() is None
     monkeypatch.setenv(modules.MODULES_VARIABLE, str(found))
-    with pytest.raises(StudioError, match=r"expected the folder node_modules with three 0\.187\.0"):
+    with raises(StudioError, file=found, name=modules.MODULES_VARIABLE, value=["three"]):
         find_modules()
-    with pytest.raises(StudioError, match="expected the page to ask for three"):
+    with raises(StudioError, name="importmap") as caught:
         with_local_modules(page.replace("three@0.187.0", "three@0.1.0"))
+    assert "three@0.1.0" in caught.value.value
     monkeypatch.setattr("shutil.which", lambda name: None)
-    with pytest.raises(StudioError, match="expected npm"):
+    with raises(StudioError, name="npm"):
         modules.fetch_modules()
 
 

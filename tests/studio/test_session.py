@@ -13,6 +13,7 @@ from avmsf.errors import EditError, FieldFileError, SimulationError, StudioError
 from avmsf.export.sampledfield import SampledField
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
+from avmsf.files import way_out
 from avmsf.simulate.material import CERAMIC, WOOD
 from avmsf.studio.editing import REST, Sliders
 from avmsf.studio.refusal import RefusedError
@@ -22,6 +23,7 @@ from avmsf.tasks.recast import recast
 from avmsf.tasks.retune import retune
 from made_fields import FIELDS
 from opened_plate import plate_field
+from raising import raises
 
 WOODEN = {"material": {"from": "ceramic", "to": "wood"}, "size": 1.5, "pitch": 0.8, "decay": 2.0, "brightness": 1.0}
 
@@ -67,28 +69,29 @@ def test_sliders_are_read_back_from_what_the_page_is_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("words", "name", "value"),
     [
-        ({"pitch": "high"}, "pitch: expected a number, found 'high'"),
-        ({"pitch": float("nan")}, "pitch: expected a number, found nan"),
-        ({"size": True}, "size: expected a number, found True"),
-        ({"modes": {"0": 1}}, "modes: expected a list"),
-        ({"modes": [{"mode": -1}]}, "mode: expected a row counted from 0, found -1"),
-        ({"modes": [{"mode": 0, "level": 3}]}, "a mode: expected mode, db, pitch, decay, found .*level"),
-        ({"material": "wood"}, "material: expected an object with from, to"),
-        ({"material": {"to": 3}}, 'material "to": expected a name, found 3'),
-        ({"law": "paper"}, "law: expected one of displacement"),
-        ({"pitch": 10**400}, "pitch: expected a number, found 1000"),
-        ({"law": [1]}, r"law: expected one of displacement.*found \[1\]"),
-        ({"modes": [{"mode": 0, "db": -900}]}, "db: expected -120 to 120, found -900"),
-        ({"brightness": 400}, "brightness: expected -40 to 40, found 400"),
-        ({"louder": 2}, "an edit: expected base, material, .* found .*louder"),
+        ({"pitch": "high"}, "pitch", "high"),
+        ({"pitch": float("nan")}, "pitch", pytest.approx(math.nan, nan_ok=True)),
+        ({"size": True}, "size", True),
+        ({"modes": {"0": 1}}, "modes", {"0": 1}),
+        ({"modes": [{"mode": -1}]}, "mode", -1),
+        ({"modes": [{"mode": 0, "level": 3}]}, "a mode", ["level"]),
+        ({"material": "wood"}, "material", "wood"),
+        ({"material": {"to": 3}}, "material.to", 3),
+        ({"law": "paper"}, "law", "paper"),
+        ({"pitch": 10**400}, "pitch", 10**400),
+        ({"law": [1]}, "law", [1]),
+        ({"modes": [{"mode": 0, "db": -900}]}, "db", -900.0),
+        ({"brightness": 400}, "brightness", 400.0),
+        ({"louder": 2}, "an edit", ["louder"]),
     ],
 )
-def test_what_is_no_slider_is_named(words: dict[str, Any], message: str) -> None:
-    with pytest.raises(RefusedError, match=message) as refused:
+def test_what_is_no_slider_is_named(words: dict[str, Any], name: str, value: object) -> None:
+    with raises(RefusedError, name=name, value=value) as refused:
         Sliders.read(words)
     assert refused.value.status == 400
+    assert len(str(refused.value)) < 300
 
 
 def test_edits_that_cannot_be_leave_everything_as_it_was(tmp_path: Path) -> None:
@@ -120,7 +123,7 @@ def test_undo_goes_back_under_a_new_number(tmp_path: Path) -> None:
     assert (undone.number, undone.sliders, undone.field) == (4, first.sliders, first.field)
     assert session.undo(4).sliders == REST
     assert not session.can_undo
-    with pytest.raises(RefusedError, match="nothing to undo"):
+    with raises(RefusedError, name="undo"):
         session.undo(5)
 
 
@@ -133,7 +136,7 @@ def test_two_tabs_never_overwrite_one_another(tmp_path: Path) -> None:
         lambda: session.save(1, "late"),
         lambda: session.lead(1, plate_field(), ()),
     ):
-        with pytest.raises(RefusedError, match="another tab has changed the field") as refused:
+        with raises(RefusedError, name="base", value=1) as refused:
             late()
         assert (refused.value.status, refused.value.more) == (409, {"revision": 2})
     assert session.current.sliders.pitch == 2.0
@@ -147,8 +150,9 @@ def test_a_failing_picture_of_a_revision_leaves_the_one_before(tmp_path: Path) -
 
     session = Session(tmp_path, refuse)
     session.open(plate_field())
-    with pytest.raises(OSError, match="full"):
+    with pytest.raises(OSError) as caught:
         session.edit(1, Sliders(pitch=2.0))
+    assert caught.value.args == ("the disk is full",)
     assert session.current.number == 1
     assert not session.can_undo
 
@@ -171,7 +175,7 @@ def test_a_file_that_is_there_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "bowl.safetensors").write_text("precious")
     (tmp_path / "link.safetensors").symlink_to(tmp_path / "elsewhere")
     for name in ("bowl", "bowl.safetensors", "link"):
-        with pytest.raises(RefusedError, match="is there already") as refused:
+        with raises(RefusedError, file=f"{name.removesuffix('.safetensors')}.safetensors") as refused:
             session.save(1, name)
         assert refused.value.status == 409
     assert (tmp_path / "bowl.safetensors").read_text() == "precious"
@@ -182,7 +186,7 @@ def test_a_field_that_cannot_be_written_leaves_no_file(tmp_path: Path) -> None:
     session = Session(tmp_path, lambda revision: None)
     field = plate_field()
     session.open(replace(field, origin=replace(field.origin, report={"loss": math.nan})))
-    with pytest.raises(FieldFileError, match="finite"):
+    with pytest.raises(FieldFileError):
         session.save(1, "new")
     assert list(tmp_path.iterdir()) == []
 
@@ -208,7 +212,7 @@ def test_a_field_that_cannot_be_written_leaves_no_file(tmp_path: Path) -> None:
     ],
 )
 def test_names_that_lead_elsewhere_are_refused(name: str) -> None:
-    with pytest.raises(RefusedError, match="expected a name of letters") as refused:
+    with raises(RefusedError, name="name", value=name) as refused:
         file_name(name)
     assert refused.value.status == 400
 
@@ -216,14 +220,14 @@ def test_names_that_lead_elsewhere_are_refused(name: str) -> None:
 def test_a_name_is_as_long_as_files_names_may_be(tmp_path: Path) -> None:
     session, _ = opened(tmp_path)
     assert session.save(1, "音" * 66)[0].is_file()
-    with pytest.raises(RefusedError, match="at most 200 bytes, found 201: choose a shorter one") as refused:
+    with raises(RefusedError, name="name", value=201) as refused:
         session.save(2, "音" * 67)
     assert refused.value.status == 400
 
 
-@pytest.mark.parametrize(("number", "way_out"), [(13, "may write to"), (28, "free some space"), (30, "another")])
+@pytest.mark.parametrize("number", [13, 28, 30])
 def test_a_file_that_cannot_be_made_says_what_helps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, way_out: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     session, _ = opened(tmp_path)
 
@@ -231,8 +235,9 @@ def test_a_file_that_cannot_be_made_says_what_helps(
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr("avmsf.studio.session.os.open", refuse)
-    with pytest.raises(StudioError, match=f"{os.strerror(number)}.*{way_out}".replace("another", "can be written")):
+    with raises(StudioError, file="bowl.safetensors", value=os.strerror(number)) as caught:
         session.save(1, "bowl")
+    assert str(caught.value).endswith(way_out(OSError(number, "")))
 
 
 def test_a_field_that_is_not_heard_is_kept_under_a_free_name(tmp_path: Path) -> None:
@@ -248,7 +253,7 @@ def test_a_field_that_is_not_heard_is_kept_under_a_free_name(tmp_path: Path) -> 
 def test_before_there_is_a_field_nothing_can_be_edited(tmp_path: Path) -> None:
     session = Session(tmp_path, lambda revision: None)
     session.open(None)
-    with pytest.raises(RefusedError, match="expected a field, found none yet"):
+    with raises(RefusedError, name="field"):
         session.edit(1, Sliders(pitch=2.0))
     first = plate_field()
     session.open(first)

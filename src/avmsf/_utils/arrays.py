@@ -22,8 +22,9 @@ def as_vectors(values: ArrayLike, name: str, *, count: int | None = None) -> Flo
     found = as_floats(values, name)
     rows = "contacts" if count is None else str(count)
     if found.ndim != 2 or found.shape[1] != 3 or (count is not None and len(found) != count):
-        single = f": put a single one into a list, {name}=[[x, y, z]]" if found.shape == (3,) else ""
-        raise ArrayError(f"{name}: expected an array of shape [{rows}, 3], got {list(found.shape)}{single}", name=name)
+        single = f"; put a single one into a list, {name}=[[x, y, z]]" if found.shape == (3,) else ""
+        shape = list(found.shape)
+        raise ArrayError(f"{name}: expected an array [{rows}, 3], got {shape}{single}", name=name, value=shape)
     return _finite(found, name)
 
 
@@ -31,7 +32,8 @@ def as_numbers(values: float | int | ArrayLike, name: str, *, count: int) -> Flo
     """Return `count` numbers, or one that holds for all, as a tensor of `count`. Raises as `as_vectors`."""
     found = as_floats(values, name)
     if found.ndim > 1 or (found.ndim == 1 and len(found) != count):
-        raise ArrayError(f"{name}: expected one number or {count}, got shape {list(found.shape)}", name=name)
+        shape = list(found.shape)
+        raise ArrayError(f"{name}: expected one number or {count}, got shape {shape}", name=name, value=shape)
     return _finite(found.expand(count), name)
 
 
@@ -39,7 +41,8 @@ def as_rows(values: ArrayLike, name: str, *, count: int) -> Float[Tensor, "rows 
     """Return `count` rows of numbers. Raises as `as_vectors`."""
     found = as_floats(values, name)
     if found.ndim != 2 or len(found) != count:
-        raise ArrayError(f"{name}: expected an array of {count} rows, got shape {list(found.shape)}", name=name)
+        shape = list(found.shape)
+        raise ArrayError(f"{name}: expected an array of {count} rows, got shape {shape}", name=name, value=shape)
     return _finite(found, name)
 
 
@@ -50,7 +53,7 @@ def as_floats(values: float | int | ArrayLike, name: str) -> Float[Tensor, "*sha
     except (ValueError, TypeError) as error:
         raise ArrayError(f"{name}: expected numbers in an array or nested lists ({error})", name=name) from error
     if found.is_complex():
-        raise ArrayError(f"{name}: expected real numbers, got {found.dtype}", name=name)
+        raise ArrayError(f"{name}: expected real numbers, got {found.dtype}", name=name, value=str(found.dtype))
     kept = isinstance(values, Tensor) and found.is_floating_point()
     return found.detach().cpu() if kept else found.detach().cpu().double()
 
@@ -59,7 +62,8 @@ def _finite(found: Tensor, name: str) -> Tensor:
     wrong = torch.nonzero(~torch.isfinite(found.reshape(len(found), found[:1].numel())).all(1)).flatten()
     if len(wrong):
         row = int(wrong[0])
-        raise ArrayError(f"{name}: expected finite numbers, got {found[row].tolist()} (row {row})", name=name, row=row)
+        value = found[row].tolist()
+        raise ArrayError(f"{name}, row {row}: expected finite numbers, got {value}", name=name, row=row, value=value)
     return found
 
 

@@ -78,7 +78,10 @@ def once(make: Callable[Given, Result]) -> Callable[Given, Result]:
 @cache
 def _warn_once(folder: Path, reason: str) -> None:
     warnings.warn(
-        f"{folder}: nothing can be kept there ({reason}), so the next run computes it again; the result is the same",
-        AvmsfWarning,
+        AvmsfWarning(
+            f"{folder}: expected a folder for cached results, got {reason!r}; the next run computes them again",
+            file=folder,
+            value=reason,
+        ),
         stacklevel=3,
     )

@@ -22,12 +22,14 @@ def usable_device(
     try:
         place = torch.device(wanted)
         if kinds and place.type not in kinds:
-            raise RuntimeError(f"the kind {place.type}, where {' or '.join(kinds)} is needed")
+            raise RuntimeError(f"{place.type}; only {' or '.join(kinds)} is supported")
         torch.empty(1, device=place)
     except (RuntimeError, AssertionError) as error:  # AssertionError: PyTorch was built without it
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise raising(
-            f"device = {wanted}: expected one that PyTorch can use here, such as cpu, or cuda with an NVIDIA GPU, its "
-            f"driver and free memory; found {str(error).splitlines()[0] if str(error) else type(error).__name__}: "
-            "choose cpu"
+            f"device: expected one that PyTorch can use, such as cpu, or cuda with an NVIDIA GPU, its driver and free "
+            f"memory, got {wanted} ({reason}); choose cpu",
+            name="device",
+            value=str(wanted),
         ) from error
     return place

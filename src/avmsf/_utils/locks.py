@@ -73,8 +73,9 @@ def _expect_excused(error: OSError, path: Path) -> None:
     denied = error.errno in (errno.EACCES, errno.EPERM)
     if error.errno in (*_NO_PLACE, *_NO_LOCKS) or (denied and not os.access(path.parent, os.W_OK)):
         return
-    advice = "delete it when nobody uses the folder" if denied else way_out(error)
-    raise AvmsfError(f"{path}: cannot be locked ({error.strerror or error}): {advice}") from error
+    advice = "delete it if no process uses the folder" if denied else way_out(error)
+    reason = error.strerror or str(error)
+    raise AvmsfError(f"{path}: expected a lock, got {reason!r}; {advice}", file=path, value=reason) from error
 
 
 def _holder_of(path: Path) -> Path:

@@ -1,6 +1,6 @@
 """Which errors mean that there is not enough memory: libraries do not all raise MemoryError."""
 
-NO_MEMORY = "there is not enough memory: close other programs, or use less data, fewer modes or smaller pictures"
+NO_MEMORY = "expected more free memory; close other programs, or use less data, fewer modes or smaller images"
 """What to tell a user then."""
 
 

@@ -21,36 +21,41 @@ def read_tensors(
     Raises `raising` for a file that is missing, damaged or of another kind: `what` it should be, and the `advice`.
     """
     if not path.exists():
-        raise raising(f"{path}: expected {what}, found no such file: check the name, or {advice}")
+        raise raising(f"{path}: expected {what}, got no such file; check the name, or {advice}", file=path)
     try:
         with safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get(key)
+            metadata = file.metadata() or {}
+            text = metadata.get(key)
             if text is None:
                 raise raising(
-                    f"{path}: expected {what}, found a safetensors file of something else (its metadata has no entry "
-                    f"{key!r}): name another, or {advice}"
+                    f"{path}: expected {what} with the metadata entry {key!r}, got another safetensors file; name "
+                    f"another, or {advice}",
+                    file=path,
+                    name=key,
+                    value=sorted(metadata),
                 )
             # Clones, for what the file maps into memory would change with it.
             return text, {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise raising(f"{path}: expected {what}, found {_guess(path, advice)}") from error
+        found, helps = _guess(path, advice)
+        raise raising(f"{path}: expected {what}, got {found}; {helps}", file=path, value=found) from error
 
 
-def _guess(path: Path, advice: str) -> str:
+def _guess(path: Path, advice: str) -> tuple[str, str]:
     """Return what a file is that safetensors cannot read, and what to do."""
     if path.is_dir():
-        return "a folder: name the file in it"
+        return "a folder", "name the file in it"
     try:
         with open(path, "rb") as file:
             start = file.read(9)
     except OSError as error:
-        return f"a file that cannot be read ({error.strerror}): check its permissions"
+        return f"an unreadable file ({error.strerror})", "check its permissions"
     if not start:
-        return f"an empty file: copy it again, or {advice}"
+        return "an empty file", f"copy it again, or {advice}"
     # Eight bytes of length, then the header's opening brace.
     if start[8:] == b"{":
-        return f"one that is cut short or damaged: copy it again, or {advice}"
-    return f"a file of another kind, which starts with {start[:8]!r}: name another, or {advice}"
+        return "a truncated or damaged file", f"copy it again, or {advice}"
+    return f"a file that starts with {start[:8]!r}", f"name another, or {advice}"
 
 
 def write_checkpoint(
@@ -80,11 +85,14 @@ def read_checkpoint(
     # torch.load raises whatever unpacking raises, with the advice to trust the file.
     except Exception as error:
         raise raising(
-            f"{path}: expected a checkpoint of {what}, found something else or a part of one: delete it or name another"
+            f"{path}: expected a checkpoint of {what}, got another or a damaged file; delete it or name another",
+            file=path,
         ) from error
     if other:
         raise raising(
-            f"{path}: this checkpoint belongs to {what} with another {' and another '.join(other)}: delete it to start "
-            "again from the beginning, or repeat its arguments to go on with it"
+            f"{path}: expected a checkpoint of this {what}, got one with another {' and another '.join(other)}; delete "
+            "it to start again, or repeat its arguments to continue it",
+            file=path,
+            value=other,
         )
     return dict(state)

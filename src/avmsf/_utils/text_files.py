@@ -34,7 +34,7 @@ def parse_json(text: str, *, max_characters: int = MAX_TEXT_BYTES) -> Any:
     try:
         return json.loads(text)
     except RecursionError as error:
-        raise ValueError("lists and objects nested hundreds deep; expected a few levels") from error
+        raise ValueError("expected a few levels of lists and objects, got hundreds") from error
 
 
 def read_json(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:
@@ -48,4 +48,4 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except RecursionError as error:
-        raise ValueError("tables nested hundreds deep; expected a few levels") from error
+        raise ValueError("expected a few levels of tables, got hundreds") from error

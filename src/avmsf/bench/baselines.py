@@ -177,5 +177,5 @@ def _render(
 def _expect_neighbors(train: Impacts, count: int) -> None:
     if not 1 <= count <= len(train):
         raise EvaluationError(
-            f"the mean of {count} nearest impacts was asked of {len(train)} training impacts; ask for 1 to {len(train)}"
+            f"expected a count of 1 to {len(train)} nearest training impacts, got {count}", name="count", value=count
         )

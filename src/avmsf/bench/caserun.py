@@ -150,7 +150,9 @@ class CaseRun:
 
     def _gaussians(self) -> GaussianCloud:
         if self.evaluation.clouds is None:
-            raise EvaluationError(f"{self.identifier}: it has no Gaussians: expected views of it, or its mesh")
+            raise EvaluationError(
+                f"{self.identifier}: expected Gaussians, views or a mesh, found none", name=self.identifier
+            )
         with self._sharing():
             return self.evaluation.clouds(self.identifier, self.case.views)
 

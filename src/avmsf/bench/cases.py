@@ -1,7 +1,7 @@
-"""Which contacts of an object are learnt from and which are judged by: the ways of choosing them, as data.
+"""Splits of an object's contacts into training and test contacts, as data.
 
-Places are chosen, counted and left out, not recordings: all recordings at a place go to one side. A test at a place
-that was trained on would be too easy.
+Contacts are chosen and counted, not recordings: all recordings at a contact are either training or test recordings. A
+test at a training contact would be too easy.
 """
 
 from collections.abc import Iterable
@@ -18,9 +18,9 @@ from avmsf.scene.points import closest_points, farthest_points
 from avmsf.wording import counted
 
 COUNTS = (3, 4, 6, 8, 12, 16, 24, 32, 48)
-"""Numbers of places learnt from, where no others are asked for."""
+"""Default numbers of training contacts."""
 _LEFT = 0.25
-"""Part of the places that is kept to be judged by, where counts are not asked for."""
+"""Fraction of the contacts to test on with the default numbers."""
 
 
 @dataclass(frozen=True)
@@ -28,37 +28,37 @@ class Case:
     """One choice of training and test impacts, by their rows in an object's `Impacts`."""
 
     label: str
-    """What tables call it; the cases of one label are parts of one experiment, and their figures are pooled."""
+    """Heading in tables; the cases of one label are folds of one experiment, and their values are pooled."""
     train: tuple[int, ...]
-    """Rows to learn from, in the order of their choice."""
+    """Indices of training recordings, in the order of their choice."""
     test: tuple[int, ...]
-    """Rows to be judged by, ascending."""
+    """Indices of test recordings, ascending."""
     fold: str = ""
-    """Which part of the experiment this is, where it has several."""
+    """Fold of the experiment, where it has several."""
     views: int | None = None
-    """Most views that looks may be drawn from; None for all."""
+    """Maximum number of views for visual features; None for all."""
 
     @property
     def key(self) -> str:
-        """A name that no other case of the object has."""
+        """Unique name among the cases of the object."""
         return f"{self.label}: {self.fold}" if self.fold else self.label
 
 
 @runtime_checkable
 class Choosing(Protocol):
-    """A way to choose training places, with all recordings there."""
+    """A choice of training contacts, with all recordings there."""
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return the cases of an object. Raises EvaluationError where its places are too few."""
+        """Return the cases of an object. Raises EvaluationError for too few contacts."""
         ...
 
 
 @dataclass(frozen=True)
 class Farthest:
-    """Training contacts as far apart as they go, from the first one on (paper, section 4.1)."""
+    """Training contacts by farthest-point sampling, from the first one on (paper, section 4.1)."""
 
     fraction: float = 0.2
-    """Part of the places to train on, at least 2 places."""
+    """Fraction of the contacts to train on, at least 2 contacts."""
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return the one case, the same as that of `avmsf.bench.evaluation.split`."""
@@ -72,7 +72,7 @@ class Closest:
     """Training contacts in one region: the first contact and those nearest to it (paper, supplement)."""
 
     fraction: float = 0.2
-    """Part of the places to train on, at least 2 places."""
+    """Fraction of the contacts to train on, at least 2 contacts."""
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return the one case."""
@@ -83,10 +83,10 @@ class Closest:
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """Every place is judged by once, after learning from all others."""
+    """Every contact is tested once, after training on all others."""
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return a case for each place, named by its first recording."""
+        """Return a case for each contact, named by its first recording."""
         places = Places.of(impacts)
         count = len(places.rows)
         places.expect(count - 1)
@@ -98,13 +98,13 @@ class LeaveOneOut:
 
 @dataclass(frozen=True)
 class Shots:
-    """Fewer and fewer training places, each choice within the one before, judged by the same places throughout."""
+    """Nested subsets of training contacts, all with the same test contacts."""
 
     counts: tuple[int, ...] = (16, 8, 4, 2, 1)
-    """Numbers of training places; those that would leave no place to judge by are left out."""
+    """Numbers of training contacts; those that would leave no test contact are omitted."""
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return a case for each number; all are judged by the places that the largest leaves over."""
+        """Return a case for each number; the test contacts are those left by the largest."""
         places = Places.of(impacts)
         counts = [count for count in self.counts if count < len(places.rows)] or [places.expect(min(self.counts))]
         order = farthest_points(places.contacts, max(counts)).tolist()
@@ -115,25 +115,28 @@ class Shots:
 
 @dataclass(frozen=True)
 class Growing:
-    """More and more places to learn from, spread as far apart as they go, from several first ones.
+    """Growing subsets of training contacts by farthest-point sampling, from several first contacts.
 
-    Each choice holds the smaller ones of its start, and all of a start are judged by the same places: those that the
-    largest leaves over.
+    The subsets of one start are nested, and have the same test contacts: those left by the largest.
     """
 
     counts: tuple[int, ...] = ()
-    """Numbers of places to learn from; of `COUNTS` those that leave a quarter to judge by, where there is none."""
+    """Numbers of training contacts; by default those of `COUNTS` that leave a quarter of the contacts."""
     starts: int = 3
-    """First places, spread evenly over the table."""
+    """Number of first contacts, evenly spaced in the table."""
 
     def __post_init__(self) -> None:
         if any(count < 1 for count in self.counts):
-            raise EvaluationError(f"expected numbers of places of 1 or more, got {list(self.counts)}")
+            raise EvaluationError(
+                f"expected numbers of contacts of 1 or more, got {list(self.counts)}",
+                name="counts",
+                value=list(self.counts),
+            )
         if self.starts < 1:
-            raise EvaluationError(f"starts = {self.starts}: expected 1 or more")
+            raise EvaluationError(f"expected 1 start or more, got {self.starts}", name="starts", value=self.starts)
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return a case for each start and number. Raises EvaluationError where a number leaves nothing to judge by."""
+        """Return a case for each start and number. Raises EvaluationError for a number that leaves no test contact."""
         places = Places.of(impacts)
         total = len(places.rows)
         counts = self._counts(total)
@@ -157,19 +160,22 @@ class Growing:
             if counts:
                 return counts
             raise EvaluationError(
-                f"expected more places than {places} to learn from {min(COUNTS)} and be judged by a quarter: record "
-                "more, or name the numbers of places"
+                f"expected more contacts than {places} to train on {min(COUNTS)} and test on a quarter; record more, "
+                "or give the numbers of contacts",
+                name="contacts",
+                value=places,
             )
         if max(self.counts) >= places:
             raise EvaluationError(
-                f"expected fewer places to learn from than all {places}, got {max(self.counts)}: ask for {places - 1} "
-                "at most"
+                f"expected at most {places - 1} of {places} contacts to train on, got {max(self.counts)}",
+                name="counts",
+                value=max(self.counts),
             )
         return tuple(sorted(set(self.counts)))
 
 
 def label_of(count: int) -> str:
-    """Return what a number of places is called."""
+    """Return the label of a number of contacts."""
     return counted(count, "place")
 
 
@@ -193,50 +199,54 @@ class FewerViews:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """The places at which an object was struck, by `places_of`, in the order of their first recordings.
+    """The distinct contacts of an object, by `places_of`, in the order of their first recordings.
 
-    Repeated recordings are of one place even if their contacts were measured anew each time.
+    Repeated recordings are of one contact even if its position was measured each time.
     """
 
     contacts: Float64[Tensor, "places 3"]
-    """Contact of the first recording at each, meters."""
+    """Position of the first recording at each, meters."""
     rows: tuple[tuple[int, ...], ...]
-    """The recordings at each."""
+    """Indices of the recordings at each."""
 
     @classmethod
     def of(cls, impacts: Impacts) -> "Places":
-        """Find the places of an object's impacts."""
+        """Find the distinct contacts of an object's impacts."""
         rows = rows_by_place(impacts.contacts)
         return cls(impacts.contacts.double()[[each[0] for each in rows]], rows)
 
     @property
     def recordings(self) -> int:
-        """How many recordings there are at all places."""
+        """Number of recordings at all contacts."""
         return sum(map(len, self.rows))
 
     def number_of(self, row: int) -> int:
-        """Return the place of a recording. Raises EvaluationError for a row that is none."""
+        """Return the contact of a recording. Raises EvaluationError for an index out of range."""
         for place, rows in enumerate(self.rows):
             if row in rows:
                 return place
-        raise EvaluationError(f"expected a recording to start from, 0 to {self.recordings - 1}, got {row}")
+        raise EvaluationError(
+            f"expected the index of a recording, 0 to {self.recordings - 1}, got {row}", name="start", value=row
+        )
 
     def expect(self, wanted: int, *, least: int = 1) -> int:
-        """Return `wanted`, or raise EvaluationError where so many places to train on are too few or leave no other."""
+        """Return `wanted`, or raise EvaluationError for fewer training contacts than `least` or no test contact."""
         if not least <= wanted < len(self.rows):
             raise EvaluationError(
-                f"expected a number of places to train on from {least} to {len(self.rows) - 1}, so that one is left to "
-                f"test, got {wanted}: there are {counted(self.recordings, 'recording')} at "
-                f"{counted(len(self.rows), 'place')}; choose another number or record more places"
+                f"expected {least} to {len(self.rows) - 1} training contacts of "
+                f"{counted(self.recordings, 'recording')} at {counted(len(self.rows), 'contact')}, got {wanted}; "
+                "choose another number or record more contacts",
+                name="count",
+                value=wanted,
             )
         return wanted
 
     def expect_part(self, fraction: float) -> int:
-        """Return how many places a fraction of them is, at least 2. Raises EvaluationError as `expect`."""
+        """Return the number of a fraction of the contacts, at least 2. Raises EvaluationError as `expect`."""
         return self.expect(max(2, round(fraction * len(self.rows))), least=2)
 
     def case(self, label: str, chosen: Iterable[int] | Tensor, *, fold: str = "") -> Case:
-        """Return the case that trains on the chosen places: first recordings first, then the repeated ones."""
+        """Return the case that trains on the chosen contacts: first recordings first, then the repeated ones."""
         taken = [self.rows[int(place)] for place in chosen]
         train = [rows[0] for rows in taken] + sorted(row for rows in taken for row in rows[1:])
         heard = set(train)

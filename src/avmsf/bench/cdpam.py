@@ -1,4 +1,4 @@
-"""CDPAM: how different two sounds are to the ear, as a network learnt it from listeners' judgements.
+"""CDPAM: how different two sounds are perceived, by a network trained on listeners' answers.
 
 Manocha, Jin, Zhang and Finkelstein, "CDPAM: Contrastive learning for perceptual audio similarity", ICASSP 2021; the
 network and its weights are those of their package `cdpam`, at 22,050 Hz. It is not free of level, and two scalings of
@@ -129,8 +129,9 @@ class Cdpam(Convention):
             features = self.network.features(heard.float(), workspace)
         if not bool(torch.isfinite(features).all()):
             raise EvaluationError(
-                f"a sound with a peak of {float(sound.abs().max()):g} is too loud for CDPAM; sounds are fractions of "
-                "full scale, 1"
+                f"expected sounds as fractions of full scale, 1, got a peak of {float(sound.abs().max()):g}",
+                name="sounds",
+                value=float(sound.abs().max()),
             )
         return features.clone()
 

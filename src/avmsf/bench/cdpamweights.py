@@ -17,6 +17,7 @@ from avmsf.errors import EvaluationError
 LAYERS = 16
 """Convolutions of the encoder."""
 _FILE = Path("CDPAM_trained", "scratchJNDdefault_best_model.pth")
+_INSTALL = "install them again: pip install --force-reinstall 'cdpam==0.0.6'"
 _PLAIN = {
     ("torch._utils", "_rebuild_tensor_v2"),
     ("torch", "FloatStorage"),
@@ -28,7 +29,7 @@ _PLAIN = {
 
 @dataclass(frozen=True, eq=False)
 class CdpamWeights:
-    """What the authors' training left, by its names in their code."""
+    """The authors' trained weights, by their names in their code."""
 
     tensors: Mapping[str, Tensor]
     digest: str
@@ -38,10 +39,12 @@ class CdpamWeights:
         """Return a tensor in float64. Raises EvaluationError where there is none of this name and shape."""
         tensor = self.tensors.get(name)
         if not isinstance(tensor, Tensor) or tuple(tensor.shape) != shape:
-            found = f"the shape {tuple(tensor.shape)}" if isinstance(tensor, Tensor) else "none"
+            found = list(tensor.shape) if isinstance(tensor, Tensor) else None
             raise EvaluationError(
-                f"the weights of the package cdpam: expected a tensor {name} of the shape {shape}, found {found}; "
-                "install the version that is known here: pip install --force-reinstall 'cdpam==0.0.6'"
+                f"weights of the package cdpam: expected a tensor {name} of the shape {list(shape)}, got {found}; "
+                f"{_INSTALL}",
+                name=name,
+                value=found,
             )
         return tensor.double()
 
@@ -52,8 +55,8 @@ def find_weights() -> Path:
     found = importlib.util.find_spec("cdpam")
     if found is None or not found.submodule_search_locations:
         raise EvaluationError(
-            "CDPAM is computed by the trained weights that come with the package cdpam, which is not installed: "
-            "pip install 'avmsf[eval]', or leave CDPAM out with --no-cdpam"
+            "CDPAM: expected the package cdpam, found none; pip install 'avmsf[eval]', or omit CDPAM with --no-cdpam",
+            name="cdpam",
         )
     return Path(found.submodule_search_locations[0]) / _FILE
 
@@ -80,14 +83,14 @@ def read_weights(path: Path) -> CdpamWeights:
     ) as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise EvaluationError(
-            f"{path}: cannot be read as the trained weights of CDPAM ({reason}); "
-            "install them again: pip install --force-reinstall 'cdpam==0.0.6'"
+            f"{path}: expected the trained weights of CDPAM, got {reason}; {_INSTALL}", file=path
         ) from error
     tensors = stored.get("state") if isinstance(stored, Mapping) else None
     if not isinstance(tensors, Mapping):
         raise EvaluationError(
-            f"{path}: expected the trained weights of CDPAM under the name 'state', found none; install them again: "
-            "pip install --force-reinstall 'cdpam==0.0.6'"
+            f"{path}: expected the trained weights of CDPAM under 'state', found none; {_INSTALL}",
+            file=path,
+            name="state",
         )
     return CdpamWeights(tensors, digest)
 
@@ -95,7 +98,7 @@ def read_weights(path: Path) -> CdpamWeights:
 class _TensorUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _PLAIN:
-            raise pickle.UnpicklingError(f"it holds {module}.{name}, which is not part of a tensor")
+            raise pickle.UnpicklingError(f"{module}.{name} in place of tensors")
         return super().find_class(module, name)
 
 

@@ -1,4 +1,4 @@
-"""CLAP score: how well a sound fits words, as a network learnt it from captioned recordings (transformers, `eval`).
+"""CLAP score: how well a sound fits a text prompt, by a network trained on captioned recordings (extra `eval`).
 
 The score is the cosine of the sound's and the words' embeddings, -1 to 1, higher is better; the paper gives it without
 a convention, and without the network's name. Here: sounds are resampled to the network's own rate, 48 kHz for all that
@@ -76,7 +76,9 @@ class Clap:
         said = self.embed_words(prompts)
         if len(said) not in (1, len(heard)):
             raise EvaluationError(
-                f"{len(said)} prompts for {len(heard)} sounds; expected one prompt for each, or one for all"
+                f"expected one prompt, or one for each of {len(heard)} sounds, got {len(said)}",
+                name="prompts",
+                value=len(said),
             )
         return (heard * said).sum(dim=1).clamp(-1.0, 1.0)
 
@@ -87,7 +89,10 @@ class Clap:
         silent = torch.nonzero(heard.abs().amax(dim=1) == 0).flatten()
         if len(silent):
             raise EvaluationError(
-                f"the given sound of row {int(silent[0])} is silence, which no words describe; render it again"
+                f"sounds, row {int(silent[0])}: expected a sound, got silence",
+                row=int(silent[0]),
+                name="sounds",
+                value=0.0,
             )
         keys = [self._key(sound, sample_rate) for sound in heard]
         missing = [row for row, key in enumerate(keys) if not self._remembered(key)]
@@ -105,12 +110,16 @@ class Clap:
     def embed_words(self, prompts: Sequence[str]) -> Float64[Tensor, "prompts dim"]:
         """Return the prompts' embeddings, of length one. Raises EvaluationError for an empty prompt."""
         if isinstance(prompts, str) or not prompts:
-            raise EvaluationError(f"expected a list of prompts, found {prompts!r}; give one as [prompt]")
+            raise EvaluationError(
+                f"expected a list of prompts, got {prompts!r}; give one as [prompt]", name="prompts", value=prompts
+            )
         return _unit(torch.stack([self._embed_prompt(prompt) for prompt in prompts]))
 
     def _embed_prompt(self, prompt: str) -> Float[Tensor, " dim"]:
         if not prompt.strip():
-            raise EvaluationError("the prompt is empty; expected words, such as 'striking a wooden bowl'")
+            raise EvaluationError(
+                "expected a prompt, such as 'striking a wooden bowl', got an empty one", name="prompt", value=prompt
+            )
         key = f"words {prompt}"
         if key not in self._made:
             # One by one: padding would make the last digits depend on the other prompts.

@@ -1,4 +1,4 @@
-"""Where CLAP's weights come from: the hub or its cache, or a local folder; what else lies there is refused by name."""
+"""CLAP's weights, from the hub or its cache, or a local folder; other models are reported by name."""
 
 import hashlib
 from pathlib import Path
@@ -29,8 +29,11 @@ def find_clap(source: str | Path) -> Path:
     name = str(source)
     if not is_hub_name(source):
         raise EvaluationError(
-            f"{name}: expected a folder that holds a CLAP model, or a name such as {', '.join(MODELS)}; found no such "
-            "folder: check the path"
+            f"{name}: expected a folder with a CLAP model, or a name such as {', '.join(MODELS)}, found no "
+            "folder; check the path",
+            file=folder,
+            name="source",
+            value=name,
         )
     return _from_hub(name)
 
@@ -47,14 +50,17 @@ def transformers_clap(folder: Path) -> tuple[nn.Module, Any, str]:
         processor = transformers.ClapProcessor.from_pretrained(folder, local_files_only=True)
     except Exception as error:  # whatever is wrong with a file, transformers and safetensors have their own errors
         raise EvaluationError(
-            f"{folder}: cannot be loaded as a CLAP model ({error}): copy the model's files again"
+            f"{folder}: expected a CLAP model, got files that cannot be loaded ({error}); copy them again", file=folder
         ) from error
     # Any weight that is not there would be left random.
     missing = sorted(name for name in report["missing_keys"] if not name.endswith("position_ids"))
     if missing:
         raise EvaluationError(
-            f"{weights}: lacks {len(missing)} of the model's weights, {missing[0]} among them: it belongs to another "
-            f"{_CONFIG}; copy both from one model"
+            f"{weights}: expected all weights of the model, {len(missing)} are missing such as {missing[0]}; copy it "
+            f"and {_CONFIG} from one model",
+            file=weights,
+            name="weights",
+            value=tuple(missing),
         )
     digest = hashlib.sha256()
     for path in (folder / _CONFIG, *(folder / name for name in _EXTRACTORS if (folder / name).is_file()), weights):
@@ -68,20 +74,29 @@ def _expect_clap(folder: Path) -> Path:
     if (folder / "model_index.json").is_file():
         kind = read_settings(folder / "model_index.json", raising=EvaluationError).get("_class_name")
         raise EvaluationError(
-            f"{folder}: expected a CLAP model, found a pipeline of diffusers, {kind}: that one makes sounds, and what "
-            f"judges them is another model, such as {MODELS[0]}"
+            f"{folder}: expected a CLAP model, got a pipeline of diffusers, {kind}; give a model such as {MODELS[0]}",
+            file=folder,
+            name="_class_name",
+            value=kind,
         )
     lacking = [] if (folder / _CONFIG).is_file() else [_CONFIG]
     if not lacking:
         kind = read_settings(folder / _CONFIG, raising=EvaluationError).get("model_type")
         if kind != "clap":
-            raise EvaluationError(f"{folder / _CONFIG}: expected a model of type 'clap' (ClapModel), found {kind!r}")
+            raise EvaluationError(
+                f"{folder / _CONFIG}: expected a model of type 'clap' (ClapModel), got {kind!r}",
+                file=folder / _CONFIG,
+                name="model_type",
+                value=kind,
+            )
     lacking += [
         " or ".join(each) for each in (_EXTRACTORS, _WEIGHTS) if not any((folder / name).is_file() for name in each)
     ]
     if lacking:
         raise EvaluationError(
-            f"{folder}: expected a CLAP model, found no {' and no '.join(lacking)}: {_how_to_download(MODELS[0])}"
+            f"{folder}: expected a CLAP model, found no {' and no '.join(lacking)}; {_how_to_download(MODELS[0])}",
+            file=folder,
+            value=tuple(lacking),
         )
     return next(folder / name for name in _WEIGHTS if (folder / name).is_file())
 
@@ -104,18 +119,19 @@ def _from_hub(name: str) -> Path:
             folder = Path(snapshot_download(name, allow_patterns=[*settings, weights], etag_timeout=HUB_SECONDS))
             if (folder / weights).is_file():
                 return folder
-        raise FileNotFoundError(f"it holds neither {' nor '.join(_WEIGHTS)}")
+        raise FileNotFoundError(f"no {' and no '.join(_WEIGHTS)}")
     except Exception as error:  # the hub's client raises whatever the network beneath it does
         raise EvaluationError(
-            f"{name}: not in the cache of downloaded models, and it cannot be downloaded ({type(error).__name__}: "
-            f"{error}). {_how_to_download(name)}"
+            f"{name}: the model is not in the cache, and its download failed ({type(error).__name__}: {error}); "
+            f"{_how_to_download(name)}",
+            name="source",
+            value=name,
         ) from error
 
 
 def _how_to_download(name: str) -> str:
     return (
-        f"Where there is a network, say: hf download {name} --local-dir FOLDER; copy FOLDER here, and give its path in "
-        "place of the name"
+        f"on a computer with a network run hf download {name} --local-dir FOLDER, copy FOLDER here, and give its path"
     )
 
 
@@ -125,7 +141,7 @@ def _transformers() -> Any:
         from transformers import ClapModel, ClapProcessor  # noqa: F401
     except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
         raise EvaluationError(
-            f"the CLAP score needs the package transformers, which cannot be imported ({error}): "
-            "pip install 'avmsf[eval]'"
+            f"CLAP score: expected the package transformers, got {error}; pip install 'avmsf[eval]'",
+            name="transformers",
         ) from error
     return transformers

@@ -1,11 +1,11 @@
-"""Named sets of metrics with all their parameters: figures of one convention may be compared, others not.
+"""Named sets of metrics with all their parameters: values of one convention may be compared, others not.
 
-The paper tells its metrics in words. `PAPER` is the reading that its own figures support. Sixty clips of Gaussian white
-noise, 3 s at 48 kHz with peak one, against silence score L1 3.74 and ENV .305 in it, one over the other 12.27 at any
+The paper describes its metrics in words. `PAPER` is the reading that its own values support. Sixty clips of Gaussian
+white noise, 3 s at 48 kHz with peak one, against silence score L1 3.74 and ENV .305 in it, a ratio of 12.27 at any
 level; the paper's rows for white noise have 3.774 and .305 (12.37), and 3.789 and .308 (12.30), where FFT sizes of 512
 and 2048 would give 8.67 and 17.33. For L1-log the paper's 6.859 lies between what such noise scores against eight
 ObjectFolder Real clips as recorded, 8.8, and scaled to peak one, 6.1, with triangles of height one on magnitudes; on
-squared magnitudes it would be 12 to 15. It remains an inference: set ratios beside the paper's, not absolute values.
+squared magnitudes it would be 12 to 15. It remains an inference: compare ratios with the paper's, not absolute values.
 """
 
 from abc import ABC, abstractmethod
@@ -129,8 +129,10 @@ class Together(Convention):
             for key, figures in part.scores(predicted, truth, sample_rate=sample_rate).items():
                 if key in values and not torch.equal(values[key], figures):
                     raise EvaluationError(
-                        f"{self.name}: two of these conventions have a metric {key!r} and differ about it; evaluate "
-                        "them one after the other"
+                        f"{self.name}: expected equal values of the metric {key!r}, got two different ones; evaluate "
+                        "the conventions separately",
+                        name=key,
+                        value=self.name,
                     )
                 values[key] = figures
         return values

@@ -1,8 +1,8 @@
-"""How well edits reach another material: the paper's protocol, its baselines, and one without words (supplement).
+"""Evaluation of material edits: the paper's protocol, its baselines, and one without prompts (supplement).
 
-An object of one material is led towards another, by words or by recordings of things of that material, and judged by
-where its modes lie afterwards among those of labelled objects (`avmsf.bench.modespace`), by how far its sounds are from
-the reference's, and, towards words, by the CLAP score. All scores of the object as it was stand beside them.
+An object of one material is edited towards another, by a prompt or by recordings of objects of that material. Scores
+are the distance of its modes from those of labelled objects (`avmsf.bench.modespace`), the distance of its sounds from
+the reference's, and, for prompts, the CLAP score; they are compared with those of the unedited object.
 """
 
 import json
@@ -28,7 +28,7 @@ from avmsf.tasks.reference import Reference
 
 @dataclass(frozen=True)
 class EditScore:
-    """What one method came to in one task."""
+    """Scores of one method in one task."""
 
     method: str
     object: str
@@ -45,11 +45,11 @@ class EditScore:
     clap: float | None
     """Mean cosine of the sounds and the prompt."""
     seconds: float
-    """That the edit took."""
+    """Time of the edit."""
     places: Mapping[str, tuple[float, float]]
-    """Where the modes lie, by the names of the spaces; in UMAP's units."""
+    """Position of the modes in each space, by the names of the spaces; in UMAP's units."""
     clap_curve: tuple[tuple[int, float], ...] = ()
-    """Steps of the edit and the CLAP score after each, at one place; step 0 is the object as it was."""
+    """Steps of the edit and the CLAP score after each, at one contact; step 0 is the unedited object."""
 
 
 def judge(
@@ -60,10 +60,10 @@ def judge(
     clap: Clap | None = None,
     progress: Callable[[EditScore], None] | None = None,
 ) -> tuple[EditScore, ...]:
-    """Return every method's scores in every task. An object's field is made beforehand and not counted as time.
+    """Return every method's scores in every task. The time of fitting an object's field does not count.
 
-    What a method makes that holds no blow or no modes, or cannot make, has no score, and a warning says so: a model may
-    make anything.
+    A sound without an impact or without modes, and a method that fails, have no score, and a warning says so: a
+    generative model may return anything.
     """
     scores = []
     for task in tasks:
@@ -74,8 +74,10 @@ def judge(
                 made = method.edit(task)
             except (CaptureError, ExtractionError, EditError, EvaluationError) as error:
                 warnings.warn(
-                    f"{task.object.name} towards {task.target}, {method.name}: {error}; this has no score",
-                    AvmsfWarning,
+                    AvmsfWarning(
+                        f"{task.object.name} to {task.target}, {method.name}: no score, since {error}",
+                        **{**error.attributes, "name": f"{task.object.name} to {task.target}, {method.name}"},
+                    ),
                     stacklevel=2,
                 )
                 continue
@@ -134,7 +136,9 @@ def spectral_distance(made: Edited, reference: Reference) -> float:
     """
     if made.sample_rate != reference.sample_rate:
         raise EvaluationError(
-            f"sounds at {made.sample_rate:g} Hz and a reference at {reference.sample_rate:g} Hz; resample one of them"
+            f"expected a reference at {made.sample_rate:g} Hz, got {reference.sample_rate:g} Hz; resample one of them",
+            name="reference",
+            value=reference.sample_rate,
         )
     clips = lasting(reference.clips, made.sounds.shape[1]).double()
     heard, wanted = (

@@ -58,24 +58,24 @@ REALIMPACT_26: Mapping[str, str] = MappingProxyType(
 )
 """Materials of 26 objects of RealImpact by their names. The paper evaluates on 26 and names none: the choice is ours.
 
-It is of those whose own name tells the material, the first seven of each by number, iron and metal as one, without the
-meshes that intersect themselves. Of glass there is one."""
+Those whose name contains the material, the first seven of each by number, iron and metal as one, without
+self-intersecting meshes. There is one of glass."""
 
 SHAPES = ("bowl", "mug", "plate", "pot")
-"""Kinds of the simulated objects that the clusters are made of."""
+"""Kinds of the simulated objects in the clusters."""
 STRANGERS = ("goblet", "tray")
-"""Kinds of those that are edited and referred to: no other object of the same shape is in any cluster."""
+"""Kinds of the edited objects and of the references: no cluster has an object of the same shape."""
 POISSON = 0.27
 _MODES = 40
 """Lowest elastic modes of each shape."""
 _CONTACTS, _POINTS = 16, 400
-"""Struck to be recorded, and all that an edit may strike."""
+"""Recorded contacts, and all contacts of an edit."""
 _MICROPHONE = (0.45, -0.35, 0.4)
 """From the middle of the object, meters."""
 _SMALLEST, _LARGEST = 0.7, 1.4
 """Factors on the size that a shape is drawn in."""
 _FAINTEST_DB = -60.0
-"""Energy of a mode over the loudest one's, decibels, below which nobody hears it."""
+"""Energy relative to the strongest mode's, decibels, below which a mode is inaudible."""
 DIRECT = FitConfig(steps=0, damping="shared", residual=False)
 """Settings of a field without training end to end and without residual noise, which no edit changes."""
 PUBLISHED = replace(PAPER, damping="shared")
@@ -99,7 +99,7 @@ class PaperFields:
 
 @dataclass(frozen=True, eq=False)
 class KnownObject:
-    """An object of a known material, what was heard of it, and its modes."""
+    """An object of a known material, its recordings, and its modes."""
 
     name: str
     material: str
@@ -115,7 +115,7 @@ class KnownObject:
 
     @property
     def bank(self) -> ModalBank:
-        """Those of its modes that are heard."""
+        """Its audible modes."""
         return heard_modes(self.modes.bank, torch.complex(self.modes.gains.double(), self.modes.quadrature.double()))
 
     @cached_property
@@ -129,13 +129,17 @@ def heard_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = mat
     """Return the modes below half the sample rate (Hz) that are within 60 dB of the loudest, in energy.
 
     `amplitudes` [contacts, modes] are complex or real; a mode's energy is their mean square over 4 d. A mode that an
-    edit has made silent or has moved out of reach tells nothing about a material. Raises EvaluationError where none is
-    heard.
+    edit has silenced or moved out of the band says nothing about a material. Raises EvaluationError where none is
+    audible.
     """
     energy = amplitudes.abs().double().square().mean(dim=0) / (4.0 * bank.damping)
     energy = torch.where(bank.frequency < 0.5 * sample_rate, energy, 0.0)
     if not bool(energy.max() > 0.0):
-        raise EvaluationError(f"none of {len(bank)} modes is heard: all are silent or lie beyond half the sample rate")
+        raise EvaluationError(
+            f"expected a mode with energy below half the sample rate, found none of {len(bank)}",
+            name="bank",
+            value=len(bank),
+        )
     kept = energy >= energy.max() * 10.0 ** (_FAINTEST_DB / 10.0)
     return ModalBank(bank.frequency[kept], bank.damping[kept])
 
@@ -152,8 +156,9 @@ def recorded_objects(
     held = [name for name in dataset.objects() if name in materials]
     if not held:
         raise EvaluationError(
-            f"{dataset.name} holds none of the {len(materials)} objects whose materials are known, such as "
-            f"{', '.join(list(materials)[:3])}; download some of them"
+            f"{dataset.name}: expected objects of known materials such as {', '.join(list(materials)[:3])}, found none",
+            name=dataset.name,
+            value=0,
         )
     found = []
     for name in held:

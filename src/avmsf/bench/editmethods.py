@@ -1,4 +1,4 @@
-"""Ways to come by an object's sound in another material: the paper's, its baselines, and the laws of elasticity."""
+"""Methods that change an object's material: the paper's, its baselines, and the laws of elasticity."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -27,33 +27,33 @@ from avmsf.tasks.recast import recast
 from avmsf.tasks.steer import Guide, SteerProgress, steer
 
 GENERATED = 3.0
-"""Seconds of a sound that is made from words alone."""
+"""Seconds of a sound that is generated from a prompt only."""
 
 
 @dataclass(frozen=True, eq=False)
 class Edited:
-    """What a method made of a task."""
+    """Result of a method for a task."""
 
     bank: ModalBank
-    """Modes that are heard."""
+    """Audible modes."""
     sounds: Float[Tensor, "contacts samples"]
     sample_rate: float
     """Hz."""
     previews: tuple[tuple[int, Float[Tensor, " samples"]], ...] = ()
-    """Steps of the edit and the sound after each, all at one place; step 0 is the object as it was."""
+    """Steps of the edit and the sound after each, all at one contact; step 0 is the unedited object."""
 
 
 @runtime_checkable
 class EditMethod(Protocol):
-    """A way to come by the sound of an object in another material."""
+    """A method that changes the material of an object's sound."""
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name in tables."""
         ...
 
     def edit(self, task: EditTask) -> Edited:
-        """Return the edited object, or what stands in its place. Raises AvmsfError where it cannot."""
+        """Return the edited object. Raises AvmsfError where it cannot."""
         ...
 
 
@@ -70,7 +70,7 @@ class Untouched:
 
 @dataclass(frozen=True)
 class Recast:
-    """The laws of elasticity with both materials' constants, which neither words nor recordings tell."""
+    """The laws of elasticity with both materials' constants, which the other methods do not have."""
 
     name: str = "physics"
 
@@ -78,14 +78,16 @@ class Recast:
         """Return the recast object. Raises EvaluationError for a material without constants."""
         for material in (task.object.material, task.target):
             if material not in MATERIALS:
-                raise EvaluationError(f"no constants are known of {material!r}; they are of {', '.join(MATERIALS)}")
+                raise EvaluationError(
+                    f"expected a material of {', '.join(MATERIALS)}, got {material!r}", name="material", value=material
+                )
         old, new = MATERIALS[task.object.material], MATERIALS[task.target]
         return heard(recast(task.object.sound_field, old, new), task)
 
 
 @dataclass(frozen=True, eq=False)
 class Steered:
-    """Descent towards what a guide asks for, in one parameterisation or another."""
+    """Guided editing with a parameterization."""
 
     name: str
     guide: Callable[[EditTask], Guide]
@@ -198,5 +200,7 @@ def heard(edited: SoundField, task: EditTask) -> Edited:
 
 def _reference(task: EditTask) -> Guide:
     if task.reference is None:
-        raise EvaluationError(f"{task.object.name} towards {task.target}: expected a reference, found none")
+        raise EvaluationError(
+            f"{task.object.name} to {task.target}: expected a reference, found none", name="reference"
+        )
     return task.reference

@@ -1,4 +1,4 @@
-"""What is asked for in the protocol of editing: transitions between materials, words for them, and single edits."""
+"""The protocol of editing: transitions between materials, their prompts, and single edits."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from avmsf.errors import EvaluationError
 from avmsf.tasks.reference import Reference
 
 _LISTENED = 8
-"""Contacts at which an edited object is heard."""
+"""Contacts at which an edited object is rendered."""
 PROMPTS: Mapping[str, tuple[str, str]] = {
     "wood": ("a single knock on a wooden object, short and dull", "tapping a hollow wooden bowl with a mallet"),
     "glass": ("a single tap on a wine glass, clear and bright", "a glass bottle is struck once and rings"),
@@ -37,9 +37,13 @@ class Transition:
 
     @property
     def prompts(self) -> tuple[str, str]:
-        """Words for the target. Raises EvaluationError for a material that has none here."""
+        """Prompts for the target. Raises EvaluationError for a material without prompts."""
         if self.target not in PROMPTS:
-            raise EvaluationError(f"there are no prompts for {self.target!r}; there are for {', '.join(PROMPTS)}")
+            raise EvaluationError(
+                f"expected a target with prompts, {', '.join(PROMPTS)}, got {self.target!r}",
+                name="target",
+                value=self.target,
+            )
         return PROMPTS[self.target]
 
 
@@ -51,7 +55,7 @@ RECORDED_TRANSITIONS = (
 )
 """Contrasting pairs for the 26 objects. The paper shows the first two and calls the others contrastive: ours."""
 SIMULATED_TRANSITIONS = (Transition("ceramic", "wood"), Transition("glass", "steel"), Transition("wood", "glass"))
-"""Those that are measured towards recordings with several seeds."""
+"""Those that are evaluated with recordings as target and several seeds."""
 _RING = ("ceramic", "wood", "glass", "steel", "plastic", "iron", "polycarbonate")
 SEVEN_TRANSITIONS = tuple(Transition(*pair) for pair in zip(_RING, (*_RING[1:], _RING[0]), strict=True))
 """Every one of the seven simulated materials is left once and reached once, by a neighbor that it contrasts with."""
@@ -59,26 +63,26 @@ SEVEN_TRANSITIONS = tuple(Transition(*pair) for pair in zip(_RING, (*_RING[1:], 
 
 @dataclass(frozen=True, eq=False)
 class EditTask:
-    """One edit that is asked for."""
+    """One requested edit."""
 
     object: KnownObject
     target: str
     """Material."""
     prompt: str | None = None
-    """Words to go by, for methods that do."""
+    """Text prompt, for methods that use it."""
     reference: Reference | None = None
-    """Sounds to go by, for methods that do; where there are any, the spectral distance is taken from them."""
+    """Target sounds, for methods that use them; the spectral distance is computed to them."""
     seed: int = 0
 
     @property
     def contacts(self) -> Float[Tensor, "contacts 3"]:
-        """Where the object is struck to be heard."""
+        """Contacts of the rendered sounds."""
         return self.object.impacts.contacts[:_LISTENED]
 
     def words(self) -> str:
         """Return the prompt. Raises EvaluationError where there is none."""
         if self.prompt is None:
-            raise EvaluationError(f"{self.object.name} towards {self.target}: expected a prompt, found none")
+            raise EvaluationError(f"{self.object.name} to {self.target}: expected a prompt, found none", name="prompt")
         return self.prompt
 
 

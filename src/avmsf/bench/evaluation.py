@@ -1,4 +1,4 @@
-"""Choosing what to learn from and what to be judged by, and the judgement: one line for whatever renders sounds."""
+"""Splits into training and test recordings, and the scores of any renderer on the test recordings."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -29,9 +29,9 @@ class Scores:
     convention: str
     """Name of the convention that the metrics follow, `relative_stft` apart, which is the same in all."""
     names: tuple[str, ...]
-    """What each scored impact is called."""
+    """Name of each scored recording."""
     values: Mapping[str, PerContact]
-    """For each metric, by name, one figure an impact."""
+    """For each metric, by name, one value a recording."""
 
     def mean(self) -> dict[str, float]:
         """Return each metric's mean over the impacts."""
@@ -48,16 +48,20 @@ class Scores:
 def split(
     impacts: Impacts, *, fraction: float = 0.2, count: int | None = None, start: int = 0
 ) -> tuple[Impacts, Impacts]:
-    """Return (train, test): all recordings at places spread as far apart as they go, and all the others.
+    """Return (train, test): all recordings at contacts chosen by farthest-point sampling, and all others.
 
-    Contacts nearer to each other than 1 % of the diagonal of the box around all are one place (`places_of`). `count`
-    places to train on, or else the nearest whole number to `fraction` of all places and at least 2. Training
-    recordings are in the order of their places' choice, from the place of row `start` on, one a place, and then the
-    repeated ones; so with more places the first ones stay the same. Raises EvaluationError where fewer than 2 places
-    would remain to train or none to test.
+    Contacts nearer to each other than 1 % of the bounding box's diagonal count as one (`places_of`). `count` contacts
+    to train on, or else the nearest whole number to `fraction` of all contacts and at least 2. Training recordings are
+    in the order of the choice, from the contact of row `start` on, one a contact, and then the repeated ones; so with
+    more contacts the first ones stay the same. Raises EvaluationError where fewer than 2 contacts would remain to train
+    or none to test.
     """
     if count is None and not 0.0 < fraction < 1.0:
-        raise EvaluationError(f"the fraction of places to train on must lie between 0 and 1, got {fraction:g}")
+        raise EvaluationError(
+            f"expected a fraction of training contacts between 0 and 1, got {fraction:g}",
+            name="fraction",
+            value=fraction,
+        )
     places = Places.of(impacts)
     wanted = places.expect_part(fraction) if count is None else places.expect(count, least=2)
     case = places.case("", farthest_points(places.contacts, wanted, start=places.number_of(start)))
@@ -81,8 +85,10 @@ def evaluate(
         impacts = renderer.aligned(impacts)
     if renderer.sample_rate != impacts.sample_rate:
         raise EvaluationError(
-            f"the renderer's sounds are at {renderer.sample_rate:g} Hz and the impacts at {impacts.sample_rate:g} Hz; "
-            "resample one of them, or train on a capture of this rate"
+            f"expected a renderer at the recordings' {impacts.sample_rate:g} Hz, got {renderer.sample_rate:g} Hz; "
+            "resample the recordings or train at their rate",
+            name="sample_rate",
+            value=renderer.sample_rate,
         )
     with torch.no_grad():
         sounds = renderer.render(impacts.contacts, directions=impacts.directions)

@@ -1,4 +1,4 @@
-"""All that is measured of one method's sounds: the convention's metrics, CDPAM, and modes against the truth."""
+"""The metrics of one method's sounds: the convention's, CDPAM, and those of its modes against the ground truth."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -21,34 +21,38 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What one method's sounds of the test contacts are worth."""
+    """Metrics of one method's sounds at the test contacts."""
 
     values: dict[str, tuple[float | None, ...]]
-    """Each metric's figure for every test contact; None where it was not taken."""
+    """Each metric's value for every test contact; None where it was not computed."""
     figures: dict[str, float | None]
-    """Figures that are of all test contacts at once."""
+    """Values over all test contacts."""
 
 
 @dataclass(frozen=True)
 class Judging:
-    """What is measured."""
+    """Which metrics are computed."""
 
     convention: Convention = PAPER
     level: Literal["full-scale", "raw"] = "full-scale"
-    """full-scale: all sounds of an object by one factor, so that its loudest recording peaks at one, the scale on which
-    L1, ENV and CDPAM of different objects can be averaged. A choice of unit that no
-    method sees. raw: in the unit of the recordings, such as pascals per newton."""
+    """full-scale: all sounds of an object times one factor, so that its loudest recording has a peak of one and L1, ENV
+    and CDPAM of different objects can be averaged; methods do not depend on it. raw: in the unit of the recordings,
+    such as pascals per newton."""
     cdpam: bool = True
-    """Whether CDPAM is among the metrics; it takes the longest of them."""
+    """Whether to compute CDPAM, the slowest metric."""
     cdpam_contacts: int = 8
-    """Test contacts of a case, spread evenly over them, that CDPAM is taken of; 0 for all."""
+    """Number of test contacts per case, evenly spaced, at which CDPAM is computed; 0 for all."""
 
     def __post_init__(self) -> None:
         if self.cdpam_contacts < 0:
-            raise EvaluationError(f"cdpam_contacts = {self.cdpam_contacts}: expected 0, for all, or more")
+            raise EvaluationError(
+                f"expected cdpam_contacts of 0 (all) or more, got {self.cdpam_contacts}",
+                name="cdpam_contacts",
+                value=self.cdpam_contacts,
+            )
 
     def prepare(self) -> None:
-        """Raise EvaluationError where something that is needed is not installed: before work of hours, not after."""
+        """Raise EvaluationError where a required package is not installed, before hours of computation."""
         if self.cdpam:
             _cdpam()
 
@@ -61,7 +65,7 @@ class Judging:
         *,
         loudest: float,
     ) -> Judgement:
-        """Measure what `renderer` made of the test contacts; `truth`, where known, has the rows of `test`.
+        """Compute the metrics of `renderer` at the test contacts; `truth`, if known, has the rows of `test`.
 
         Its time counts from the first sample of the recordings, as the renderer's does (`truth_from_first_sample`).
         `loudest` is the peak of the object's loudest recording, in the unit of the recordings. Raises as `score`, and
@@ -69,7 +73,9 @@ class Judging:
         """
         if renderer.sample_rate != test.sample_rate:
             raise EvaluationError(
-                f"the method's sounds are at {renderer.sample_rate:g} Hz and the recordings at {test.sample_rate:g} Hz"
+                f"expected a renderer at the recordings' {test.sample_rate:g} Hz, got {renderer.sample_rate:g} Hz",
+                name="sample_rate",
+                value=renderer.sample_rate,
             )
         if self.level == "full-scale" and loudest > 0:
             sounds, test = sounds / loudest, replace(test, sounds=test.sounds / loudest)

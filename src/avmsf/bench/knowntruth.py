@@ -38,7 +38,9 @@ def truth_at(truth: Truth, names: tuple[str, ...]) -> Truth:
     unknown = [name for name in names if name not in rows]
     if unknown:
         raise EvaluationError(
-            f"the truth knows {len(rows)} recordings and {unknown[0]} is not among them; simulate the object again"
+            f"expected ground truth of all recordings, found none of {', '.join(unknown[:3])}; simulate it again",
+            name="names",
+            value=tuple(unknown),
         )
     taken = [rows[name] for name in names]
     return replace(

@@ -1,4 +1,4 @@
-"""Learning curves: how the error falls with the number of training contacts, method by method, and their picture."""
+"""Learning curves: the error of each method by the number of training contacts, and their picture."""
 
 import math
 from collections.abc import Sequence
@@ -11,6 +11,7 @@ from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from avmsf.bench.results import ObjectRecord
 from avmsf.errors import EvaluationError
+from avmsf.plotting.style import series_color, styled
 
 _MARKS = "os^DvPX*<>hd"
 
@@ -28,7 +29,7 @@ class Curve:
     highest: tuple[float, ...]
     """Of the worst start."""
     starts: tuple[int, ...]
-    """How many starts have a figure."""
+    """How many starts have a value."""
 
     def values(self) -> dict[str, Any]:
         """Return the curve as plain values."""
@@ -36,7 +37,7 @@ class Curve:
 
 
 def curves(record: ObjectRecord, *, metric: str) -> tuple[Curve, ...]:
-    """Return each method's curve of one metric, as far as there are figures, in the order in which they came.
+    """Return each method's curve of one metric, as far as there are values, in the order of the record.
 
     Raises EvaluationError where no method has the metric.
     """
@@ -51,20 +52,23 @@ def curves(record: ObjectRecord, *, metric: str) -> tuple[Curve, ...]:
         known = sorted({name for outcome in record.outcomes for name in outcome.values})
         reason = next((each.failure for each in record.outcomes if each.failure), record.failure)
         raise EvaluationError(
-            f"{record.identifier}: no method has the metric {metric!r}; there are {', '.join(known)}"
+            f"{record.identifier}: expected a metric of {', '.join(known)}, got {metric!r}"
             if known
-            else f"{record.identifier}: {reason or 'nothing was measured'}"
+            else f"{record.identifier}: {reason or 'no value'}",
+            name="metric",
+            value=metric,
         )
     return tuple(_curve(method, by_count) for method, by_count in found.items())
 
 
+@styled
 def draw_learning_curve(found: Sequence[Curve], *, metric: str, title: str) -> Figure:
     """Draw the error over the number of training contacts, both logarithmic, with the range over starts as a band."""
     figure = Figure(figsize=(8, 5.2), layout="constrained")
     axes = figure.subplots()
     order = sorted(found, key=lambda curve: -curve.mean[-1])
     for number, curve in enumerate(order):
-        color = f"C{number % 10}"
+        color = series_color(number)
         axes.plot(curve.counts, curve.mean, marker=_MARKS[number % len(_MARKS)], color=color, label=curve.method)
         axes.fill_between(curve.counts, curve.lowest, curve.highest, color=color, alpha=0.12, linewidth=0)
     counts = sorted({count for curve in found for count in curve.counts})
@@ -76,10 +80,10 @@ def draw_learning_curve(found: Sequence[Curve], *, metric: str, title: str) -> F
     axes.set_yticks([tick for tick in _TICKS if low <= math.log10(tick) <= high])
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel("training contacts, spread as far apart as possible")
+    axes.set_xlabel("training contacts (farthest-point sampling)")
     axes.set_ylabel("relative STFT error (1 = silence)" if metric == "relative_stft" else metric)
-    axes.grid(which="major", alpha=0.25)
-    axes.legend(frameon=False)
+    axes.grid(which="major")
+    axes.legend()
     figure.suptitle(title)
     return figure
 

@@ -1,4 +1,4 @@
-"""Sounds that are kept to be listened to, and pictures of them."""
+"""Sounds that are stored for listening, and pictures of them."""
 
 import base64
 import io
@@ -17,6 +17,7 @@ from torch import Tensor
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
 from avmsf.plotting.spectrograms import RANGE_DB, log_spectrogram
+from avmsf.plotting.style import SEQUENTIAL
 
 _PEAK = 0.25
 """What recordings peak at, of full scale: louder sounds of a method have room above."""
@@ -28,7 +29,7 @@ _LOWEST = 60.0
 
 
 def listening_gain(recorded: Float[Tensor, " samples"]) -> float:
-    """Return what a recording, and all that is heard beside it, is multiplied by."""
+    """Return the gain of a recording and of the predictions next to it."""
     peak = float(recorded.abs().max())
     return _PEAK / peak if peak > 0 else 1.0
 
@@ -67,7 +68,7 @@ class Heard:
             samples, rate = soundfile.read(io.BytesIO(content), dtype="float64")
         except (OSError, soundfile.LibsndfileError) as error:
             raise EvaluationError(
-                f"{path}: cannot be read as a kept sound ({error}); delete the object's file to have it made again"
+                f"{path}: expected a stored sound, got {error}; delete the object's file to compute it again", file=path
             ) from error
         return cls(content, torch.from_numpy(samples), float(rate))
 
@@ -108,7 +109,7 @@ def _levels(heard: Heard, width: int, height: int) -> Float64[Tensor, "height wi
 
 def _png(shades: UInt8[np.ndarray, "height width"]) -> str:
     picture = Image.fromarray(shades).convert("P")
-    colors = (colormaps["magma"](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
+    colors = (colormaps[SEQUENTIAL](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
     picture.putpalette(colors.tobytes())
     memory = io.BytesIO()
     picture.save(memory, format="PNG", optimize=True)

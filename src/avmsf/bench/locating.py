@@ -1,18 +1,17 @@
-"""How near located contacts come to true ones, strike by strike, by several methods; and whether regions hold them.
+"""Localization errors of several methods for each recording, and the coverage of credible regions.
 
 Conventions. Errors are relative to the diagonal of the box around the object's points (`rmed`), once from the true
 contact and once from the nearest of its images under the object's symmetries (`rmed_modulo`), for a symmetric object
 may sound the same at all of them. The methods:
 
-- `random`: a point drawn evenly from the object's, and of it no draw but the expected error;
-- `nearest`: the contact of the training recording whose spectrum is most like the sound's;
+- `random`: a uniformly distributed point of the object, by its expected error;
+- `nearest`: the contact of the training recording with the most similar spectrum;
 - `cosine`: the point whose gains have the least cosine distance from the sound's (the paper);
 - `diffsound`: the point whose gains, simulated by DiffSound, have the least cosine distance from the sound's; where its
   locator is given;
-- `posterior`: the likeliest place by all that is known of noise and doubt, with the region that holds the truth with a
-  stated probability.
+- `posterior`: the most probable point under the noise and the predictive uncertainty, with a credible region.
 
-A recording that the locator refuses counts as a random point, and its row says why.
+A recording that the locator rejects counts as a random point, and its row has the reason.
 """
 
 import math
@@ -40,61 +39,63 @@ from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locator import Locator
 
 CANDIDATES = 2000
-"""Points among which `located` looks, spread out: 2 % of the diagonal apart, which is less than the best errors."""
+"""Candidate points of `located`: 2 % of the diagonal apart, which is less than the smallest errors."""
 METHODS = ("random", "nearest", "cosine", "posterior")
 DIFFSOUND = "diffsound"
 LEVEL = 0.9
-"""Probability of the region whose calibration is judged."""
+"""Probability of the region whose coverage is evaluated."""
 
 
 @dataclass(frozen=True)
 class StrikeRow:
-    """One held-out strike by one method."""
+    """One test recording by one method."""
 
     recording: str
     method: str
     place: tuple[float, float, float] | None
-    """Where it was located, meters; None where the error is that of a random point."""
+    """Located contact, meters; None where the error is that of a random point."""
     truth: tuple[float, float, float]
     rmed: float
     rmed_modulo: float
     covered: bool | None = None
-    """Whether the region holds the truth; None for methods that have none."""
+    """Whether the region contains the true contact; None for methods without a region."""
     covered_modulo: bool | None = None
-    """Whether it holds any of its images."""
+    """Whether it contains any of its images."""
     region: float | None = None
-    """The region's part of the surface, 0 to 1."""
+    """The region's fraction of the surface, 0 to 1."""
     explained: float | None = None
-    """Part of the sound's energy that the field explains."""
+    """Fraction of the sound's energy that the field explains."""
     refusal: str | None = None
-    """Why the recording could not be located."""
+    """Reason why the recording was not located."""
 
 
 @dataclass(frozen=True)
 class LocatingScores:
-    """How well the contacts of one object's held-out strikes were found."""
+    """Localization errors of one object's test recordings."""
 
     name: str
-    """What was judged."""
+    """Name of the object."""
     rows: tuple[StrikeRow, ...]
     """By recording, then in the order of the methods."""
     diagonal: float
     """Of the box around the object's points, meters."""
     scale: float
-    """Size that contact errors are relative to in the ObjectFolder benchmark, meters; the diagonal unless told."""
+    """Size that contact errors are relative to in the ObjectFolder benchmark, meters; by default the diagonal."""
     level: float
     """Probability of the regions."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Seed and settings that decided the figures, as plain values."""
+    """Seed and settings of the evaluation, as plain values."""
 
     def figures(self, method: str) -> dict[str, float]:
-        """Return a method's means: `rmed`, `rmed_modulo`, `contact_error`, `refused`, the part of the strikes that were
-        not located and count as placed at random, and, of the regions of the others, `covered`, `covered_modulo` and
-        `region`. Raises EvaluationError for a method that was not judged."""
+        """Return a method's means: `rmed`, `rmed_modulo`, `contact_error`, `refused`, the fraction of rejected recordings,
+        which count as random points, and, of the regions of the others, `covered`, `covered_modulo` and `region`.
+        Raises EvaluationError for a method without rows."""
         rows = [row for row in self.rows if row.method == method]
         if not rows:
             judged = ", ".join(dict.fromkeys(row.method for row in self.rows))
-            raise EvaluationError(f"{self.name}: no strike was located by {method!r}; judged were {judged}")
+            raise EvaluationError(
+                f"{self.name}: expected a method of {judged}, got {method!r}", name="method", value=method
+            )
         means = {name: _mean([getattr(row, name) for row in rows]) for name in ("rmed", "rmed_modulo")}
         means["contact_error"] = means["rmed"] * self.diagonal / self.scale
         means["refused"] = _mean([float(row.refusal is not None) for row in rows])
@@ -129,31 +130,41 @@ def judge_locating(
     scale: float | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> LocatingScores:
-    """Locate every strike of `test` by every method and compare.
+    """Locate every recording of `test` by every method and compute the errors.
 
-    `images` are those of the object's symmetries; `truth` is where the blows fell, meters, where that is known better
-    than by the recordings' table; `diffsound` is needed for the method of this name; `scale`, meters, is what contact
-    errors are relative to, the diagonal unless told.
+    `images` are those of the object's symmetries; `truth` are the true contacts, meters, if known better than by the
+    recordings' table; `diffsound` is needed for the method of this name; contact errors are relative to `scale`,
+    meters, by default the diagonal.
     Raises EvaluationError for unknown methods, sounds at another rate than the field's, and objects without a size.
     """
     known = METHODS if diffsound is None else (*METHODS, DIFFSOUND)
     unknown = [method for method in methods if method not in known]
     if unknown or not methods:
-        raise EvaluationError(f"expected methods of {', '.join(known)}, found {', '.join(unknown) or 'none'}")
+        raise EvaluationError(
+            f"expected methods of {', '.join(known)}, got {', '.join(unknown) or 'none'}",
+            name="methods",
+            value=tuple(unknown),
+        )
     if test.sample_rate != locator.field.sample_rate:
         raise EvaluationError(
-            f"{name}: recordings at {test.sample_rate:g} Hz cannot be located by a field of "
-            f"{locator.field.sample_rate:g} Hz: resample them"
+            f"{name}: expected recordings at the field's {locator.field.sample_rate:g} Hz, got {test.sample_rate:g} Hz",
+            name="sample_rate",
+            value=test.sample_rate,
         )
     if truth is not None and len(truth) != len(test):
-        raise EvaluationError(f"{name}: {len(truth)} true contacts for {len(test)} recordings: give one for each")
+        raise EvaluationError(
+            f"{name}: expected a true contact for each of {len(test)} recordings, got {len(truth)}",
+            name="truth",
+            value=len(truth),
+        )
     right = test.contacts if truth is None else truth
     ground = _Ground(locator.points.double(), Images.none() if images is None else images, level)
     size = ground.diagonal if scale is None else scale
     if not (ground.diagonal > 0.0 and math.isfinite(size) and size > 0.0):
         raise EvaluationError(
-            f"{name}: points {ground.diagonal:g} m across and an object of {size:g} m: errors are relative to both, "
-            "which must be positive"
+            f"{name}: expected a positive diagonal and scale, got {ground.diagonal:g} m and {size:g} m",
+            name="scale",
+            value=(ground.diagonal, size),
         )
     alike = NearestSpectrum(train)
     rows: list[StrikeRow] = []

@@ -1,4 +1,4 @@
-"""What localisation is judged beside: a place drawn at random, and the place of the recording that sounds alike."""
+"""Baselines of localization: a random point, and the contact of the recording with the most similar spectrum."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +19,7 @@ _FLOOR = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class NearestSpectrum:
-    """The contact of the training recording whose spectrum is most like a sound's, however loud either is."""
+    """The contact of the training recording with the most similar spectrum, independent of level."""
 
     train: Impacts
 
@@ -29,12 +29,12 @@ class NearestSpectrum:
         Training recordings that are silent are never the nearest. Raises EvaluationError for a sound that is silent.
         """
         if not bool(sound.any()):
-            raise EvaluationError("a silent recording has no spectrum to compare; leave it out")
+            raise EvaluationError("expected a recording, got silence; omit it", name="sound", value=0.0)
         alike = self._signatures @ self._signature(sound)
         return int(torch.where(self.train.sounds.any(dim=1), alike, -torch.inf).argmax())
 
     def place(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " 3"]:
-        """Return where that recording was struck, meters."""
+        """Return the contact of that recording, meters."""
         return self.train.contacts[self.row(sound)].double()
 
     @cached_property

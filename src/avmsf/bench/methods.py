@@ -1,4 +1,4 @@
-"""All methods by name: what turns an object's training blows into a renderer."""
+"""All methods by name; a method fits a renderer to an object's training recordings."""
 
 import difflib
 import hashlib
@@ -27,18 +27,18 @@ from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.finders import ShortTime
 
 NEIGHBORS = 3
-"""Nearest strikes that are averaged (the paper's KNN), or all where there are fewer."""
+"""Number of nearest recordings that are averaged (the paper's KNN), or all where there are fewer."""
 _RECORDED = "recorded:"
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """A method that needs no training worth the name."""
+    """A method without training."""
 
     name: str
-    """What tables call it."""
+    """Name in tables."""
     make: Callable[[Task], Renderer] = field(repr=False)
-    """Makes the renderer from the task's training blows."""
+    """Makes the renderer from the task's training recordings."""
 
     def fit(self, task: Task) -> Renderer:
         """Make the renderer. Raises AvmsfError where it cannot."""
@@ -47,7 +47,7 @@ class Baseline:
 
 @dataclass(frozen=True)
 class RecordedMethod:
-    """Another system, by the wav files that it made: FOLDER/OBJECT/RECORDING.wav, as `Recorded` reads them."""
+    """Another system, by its wav files: FOLDER/OBJECT/RECORDING.wav, as `Recorded` reads them."""
 
     folder: Path
     """Holds a folder of sounds for every object."""
@@ -169,8 +169,10 @@ def method_named(name: str) -> Method:
     near = difflib.get_close_matches(name, METHODS, n=1)
     guess = f"; did you mean {near[0]}?" if near else ""
     raise EvaluationError(
-        f"no method is called {name!r}: there are {', '.join(METHODS)}, {PUBLISHED}FOLDER, {SMALL}FILE and "
-        f"{_RECORDED}FOLDER{guess}"
+        f"expected a method of {', '.join(METHODS)}, {PUBLISHED}FOLDER, {SMALL}FILE and {_RECORDED}FOLDER, got "
+        f"{name!r}{guess}",
+        name="method",
+        value=name,
     )
 
 
@@ -178,7 +180,12 @@ def _given(name: str, prefix: str, kind: Literal["a folder", "a file"], use: str
     """Return the path in a method's name. Raises EvaluationError where nothing is there."""
     path = Path(name.removeprefix(prefix)).expanduser()
     if name in (prefix, prefix[:-1]) or not (path.is_dir() if kind == "a folder" else path.is_file()):
-        raise EvaluationError(f"{name}: expected {kind} after `{prefix}`, {use}; found none of this name")
+        raise EvaluationError(
+            f"{name}: expected {kind} after `{prefix}`, {use}, found none",
+            file=path if path.name else None,
+            name="method",
+            value=name,
+        )
     return path
 
 

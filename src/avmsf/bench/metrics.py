@@ -2,8 +2,8 @@
 
 Conventions. `predicted` and `truth` are sounds [contacts, samples] of one sample rate and one unit, row for row the
 same contact; nothing is aligned, scaled or trimmed. Every metric is zero for equal sounds, lower is better, and it
-returns one figure a contact, in float64: their mean is the score, and their scatter gives its standard error. Every
-metric calls `validate` first, which raises EvaluationError with the row that is to blame.
+returns one value a contact, in float64: their mean is the score, and their standard deviation gives its standard
+error. Every metric calls `validate` first, which raises EvaluationError with the row at fault.
 
 - `relative_stft_error`: differences of STFT magnitudes in proportion to the truth's. Free of unit and level: 0 is
   perfect, 1 is silence. The measure that objects and methods are compared by here.
@@ -28,7 +28,7 @@ from avmsf.errors import EvaluationError
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.spectra import envelope, htk_filters, log_mel, magnitude_stft, slaney_filters
 
-# Shapes that differ are what `validate` explains, so the annotations leave them open.
+# `validate` reports shapes that differ, so the annotations leave them open.
 Sounds = Float[Tensor, "..."]
 PerContact = Float64[Tensor, " contacts"]
 
@@ -45,46 +45,53 @@ def validate(
 ) -> None:
     """Raise EvaluationError unless both are [contacts, samples] of one shape, not empty, and finite throughout.
 
-    `names` are what the message calls the rows; they are numbered from 0 without them. Where both sample rates are
-    known (Hz, predicted and true) they have to be equal.
+    The message names a row by `names`, or else by its index. Where both sample rates are given (Hz, predicted and
+    true) they have to be equal.
     """
     if sample_rates is not None and sample_rates[0] != sample_rates[1]:
         raise EvaluationError(
-            f"predicted sounds are at {sample_rates[0]:g} Hz and true ones at {sample_rates[1]:g} Hz; resample one of "
-            "them"
+            f"expected predicted sounds at the true ones' {sample_rates[1]:g} Hz, got {sample_rates[0]:g} Hz; resample "
+            "one of them",
+            name="sample_rates",
+            value=sample_rates,
         )
-    for what, sounds in (("predicted", predicted), ("true", truth)):
+    for what, sounds in (("predicted", predicted), ("truth", truth)):
         _expect_rows(sounds, what)
     if len(predicted) != len(truth):
         raise EvaluationError(
-            f"{len(predicted)} predicted sounds cannot be compared with {len(truth)} true ones; render one for each "
-            "contact"
+            f"expected one predicted sound for each of {len(truth)} true ones, got {len(predicted)}",
+            name="predicted",
+            value=len(predicted),
         )
     if predicted.shape[1] != truth.shape[1]:
         raise EvaluationError(
-            f"predicted sounds have {predicted.shape[1]} samples and true ones {truth.shape[1]}; "
-            "are both at one sample rate, and rendered and recorded for the same time?"
+            f"expected predicted sounds of {truth.shape[1]} samples as the true ones, got {predicted.shape[1]}; check "
+            "sample rates and durations",
+            name="predicted",
+            value=list(predicted.shape),
         )
-    for what, sounds in (("predicted", predicted), ("true", truth)):
+    for what, sounds in (("predicted", predicted), ("truth", truth)):
         _expect_numbers(sounds, what, names)
 
 
-def validate_sounds(sounds: Sounds, *, what: str = "given") -> None:
-    """Raise EvaluationError unless they are [contacts, samples], not empty, and finite throughout."""
+def validate_sounds(sounds: Sounds, *, what: str = "sounds") -> None:
+    """Raise EvaluationError unless the argument `what` is [contacts, samples], not empty, and finite throughout."""
     _expect_rows(sounds, what)
     _expect_numbers(sounds, what, None)
 
 
 def resampled(sounds: Float64[Tensor, "contacts samples"], *, sample_rate: float, wanted: float) -> Sounds:
-    """Return sounds at another sample rate (Hz) by a polyphase filter; what the new rate cannot hold is taken away.
+    """Return sounds at another sample rate (Hz) by a polyphase filter, band-limited to the new rate.
 
     The ratio of the rates is the nearest with a denominator up to 20,000, exact for all rates in use. Raises
     EvaluationError for a rate that is not a positive number, or less than a thousandth of the wanted one.
     """
     if not (math.isfinite(sample_rate) and sample_rate >= 1e-3 * wanted):
         raise EvaluationError(
-            f"sounds at {sample_rate:g} Hz cannot be compared at {wanted:g} Hz; expected a positive sample rate of "
-            f"{1e-3 * wanted:g} Hz or more"
+            f"expected a sample rate of {1e-3 * wanted:g} Hz or more to resample to {wanted:g} Hz, got "
+            f"{sample_rate:g} Hz",
+            name="sample_rate",
+            value=sample_rate,
         )
     if sample_rate == wanted:
         return sounds
@@ -104,15 +111,17 @@ def relative_stft_error(predicted: Sounds, truth: Sounds, *, fft_sizes: Sequence
     """Return the sums of absolute differences of STFT magnitudes, over the truth's sum, mean over FFT sizes.
 
     Hann windows, hop a quarter of the FFT size, frames centered, silence beyond the ends. The truth's sum is the mean
-    over all contacts given, so that the mean of the result is the ratio of the sums over all contacts: loud blows weigh
-    more than faint ones, as they do to the ear. Raises EvaluationError where the truth is silence throughout.
+    over all contacts given, so that the mean of the result is the ratio of the sums over all contacts: loud impacts
+    weigh more than quiet ones. Raises EvaluationError where the truth is silent throughout.
     """
     validate(predicted, truth)
     error = torch.zeros(len(truth), dtype=torch.float64)
     for size in fft_sizes:
         difference, weight = _stft_sums(predicted, truth, fft_size=size, hop=max(1, size // 4))
         if weight.sum() == 0.0:
-            raise EvaluationError("all true sounds are silence, so that no error can be relative to them")
+            raise EvaluationError(
+                "truth: expected sounds that are not all silent, got silence", name="truth", value=0.0
+            )
         error += difference / weight.mean()
     return error / len(fft_sizes)
 
@@ -172,8 +181,10 @@ def objectfolder_distance(predicted: Sounds, truth: Sounds, *, sample_rate: floa
     validate(predicted, truth)
     if sample_rate < 2 * 7600.0:
         raise EvaluationError(
-            f"ObjectFolder's spectrogram reaches 7600 Hz, and sounds at {sample_rate:g} Hz end at {sample_rate / 2:g} "
-            "Hz; evaluate them in the convention PAPER"
+            f"expected a sample rate of 15200 Hz or more for ObjectFolder's spectrogram, got {sample_rate:g} Hz; "
+            "evaluate in the convention PAPER",
+            name="sample_rate",
+            value=sample_rate,
         )
     filters = slaney_filters(80, fft_size=1024, sample_rate=22050.0, lowest=125.0, highest=7600.0)
 
@@ -188,20 +199,30 @@ def objectfolder_distance(predicted: Sounds, truth: Sounds, *, sample_rate: floa
 def _expect_rows(sounds: Sounds, what: str) -> None:
     if sounds.ndim != 2:
         raise EvaluationError(
-            f"{what} sounds must be [contacts, samples], got the shape {tuple(sounds.shape)}; "
-            "give a single sound as one row, sound[None]"
+            f"{what}: expected sounds [contacts, samples], got the shape {tuple(sounds.shape)}; give a single sound as "
+            "one row, sound[None]",
+            name=what,
+            value=list(sounds.shape),
         )
     if sounds.numel() == 0:
-        raise EvaluationError(f"{what} sounds are empty: {sounds.shape[0]} contacts of {sounds.shape[1]} samples")
+        raise EvaluationError(
+            f"{what}: expected one contact and one sample or more, got the shape {tuple(sounds.shape)}",
+            name=what,
+            value=list(sounds.shape),
+        )
 
 
 def _expect_numbers(sounds: Sounds, what: str, names: Sequence[str] | None) -> None:
     bad = torch.nonzero(~torch.isfinite(sounds))
     if len(bad):
         row, sample = bad[0].tolist()
-        name = names[row] if names is not None else f"row {row}"
+        value = float(sounds[row, sample])
+        sound = f"row {row}" if names is None else f"row {row} ({names[row]})"
         raise EvaluationError(
-            f"the {what} sound of {name} is {float(sounds[row, sample])} at sample {sample}; all must be finite"
+            f"{what}, {sound}: expected finite samples, got {value} at sample {sample}",
+            row=row,
+            name=what,
+            value=value,
         )
 
 

@@ -32,8 +32,10 @@ class ModalBaseline(ABC):
     def __post_init__(self) -> None:
         if len(self.extraction.gains) != len(self.train):
             raise EvaluationError(
-                f"the extraction has gains of {len(self.extraction.gains)} recordings and there are {len(self.train)} "
-                "training impacts; extract the modes from these impacts"
+                f"expected gains of {len(self.train)} training impacts, got those of {len(self.extraction.gains)}; "
+                "extract the modes from these impacts",
+                name="extraction",
+                value=len(self.extraction.gains),
             )
 
     @property

@@ -104,12 +104,13 @@ def features_of(record: dict[str, Any]) -> ModeFeatures:
 def _logarithms(bank: ModalBank) -> tuple[Float64[np.ndarray, " modes"], Float64[np.ndarray, " modes"]]:
     """Return log2 of frequencies and dampings."""
     if not len(bank):
-        raise EvaluationError("the set of modes is empty; expected one mode at least")
+        raise EvaluationError("expected a bank of one mode or more, got none", name="bank", value=0)
     both = torch.stack([bank.frequency, bank.damping])
     wrong = torch.nonzero(~(torch.isfinite(both) & (both > 0)))
     if len(wrong):
         which, row = wrong[0].tolist()
         name = ("frequency", "damping")[which]
-        raise EvaluationError(f"mode {row} has the {name} {float(both[which, row]):g}; expected a number above 0")
+        value = float(both[which, row])
+        raise EvaluationError(f"mode {row}: expected a {name} above 0, got {value:g}", row=row, name=name, value=value)
     frequency, damping = torch.log2(both).numpy()
     return frequency, damping

@@ -1,12 +1,12 @@
-"""Where objects lie by their modes, and how far an edited one is from those of its new material (paper, supplement).
+"""An embedding of objects by their modes, and distances of edited ones from their new material (paper, supplement).
 
 The points are labelled objects' sets of modes, embedded by UMAP (umap-learn, extra `eval`); an edited object is placed
 among them, and its score is the distance to the mean of the points of its target material, in the embedding's units,
 lower is better. The paper gives neither UMAP's settings nor how a set becomes a vector (`avmsf.bench.modefeatures`), so
-that its figures and these are no two measurements of one thing.
+that its values and these cannot be compared.
 
-UMAP only ever places a new point near points that it knows, however far away it really is. The plain distance beside
-it has no such limit: that of the vectors themselves, in octaves, which needs no chance and no package.
+UMAP always places a new point near known points, however far away it is. The plain distance between the vectors, in
+octaves, has no such limit and needs no randomness and no package.
 """
 
 import json
@@ -85,20 +85,24 @@ class MaterialSpace:
         called = tuple(f"object {row}" for row in range(len(mode_sets))) if names is None else tuple(names)
         if not len(mode_sets) == len(materials) == len(called):
             raise EvaluationError(
-                f"{len(mode_sets)} sets of modes have {len(materials)} materials and {len(called)} names; expected one "
-                "of each for every set"
+                f"expected a material and a name for each of {len(mode_sets)} sets of modes, got {len(materials)} "
+                f"materials and {len(called)} names",
+                name="materials" if len(materials) != len(mode_sets) else "names",
+                value=len(materials) if len(materials) != len(mode_sets) else len(called),
             )
         if len(mode_sets) < _FEWEST or len(set(materials)) < 2:
             raise EvaluationError(
-                f"a space of {len(mode_sets)} objects and {len(set(materials))} materials; expected {_FEWEST} objects "
-                "or more, of two materials at least"
+                f"expected {_FEWEST} objects of two materials or more, got {len(mode_sets)} objects of "
+                f"{len(set(materials))} materials",
+                name="mode_sets",
+                value=(len(mode_sets), len(set(materials))),
             )
         vectors = []
         for name, bank in zip(called, mode_sets, strict=True):
             try:
                 vectors.append(chosen.vector(bank))
             except EvaluationError as error:
-                raise EvaluationError(f"{name}: {error}") from error
+                raise EvaluationError(f"{name}: {error}", **{**error.attributes, "name": name}) from error
         settings = UmapSettings(seed=seed) if settings is None else settings
         return cls(chosen, tuple(materials), called, np.stack(vectors), settings)
 
@@ -181,8 +185,11 @@ class MaterialSpace:
             found = record["format"]
             if found != FORMAT:
                 raise EvaluationError(
-                    f"{path}: expected a space of format {FORMAT}, found format {found}: read it with a version of "
-                    "avmsf that wrote it, or make it anew"
+                    f"{path}: expected a space of format {FORMAT}, got {found}; read it with the version of avmsf that "
+                    "wrote it, or compute it again",
+                    file=path,
+                    name="format",
+                    value=found,
                 )
             materials, vectors = tuple(map(str, record["materials"])), np.array(record["vectors"], dtype=np.float64)
             embedding = np.array(record["embedding"], dtype=np.float32)
@@ -201,14 +208,17 @@ class MaterialSpace:
             )
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise EvaluationError(
-                f"{path}: expected a space of objects by their modes, found something else ({type(error).__name__}: "
-                f"{error}): make it anew"
+                f"{path}: expected a space of objects by their modes, got {type(error).__name__}: {error}; compute it "
+                "again",
+                file=path,
             ) from error
 
     def _rows(self, material: str) -> list[int]:
         rows = [row for row, own in enumerate(self.materials) if own == material]
         if not rows:
-            raise EvaluationError(f"no object of this space is of {material!r}; there are {', '.join(self.known)}")
+            raise EvaluationError(
+                f"expected a material of {', '.join(self.known)}, got {material!r}", name="material", value=material
+            )
         return rows
 
     @cached_property
@@ -230,15 +240,16 @@ class MaterialSpace:
             apart = float(np.abs(np.asarray(model.embedding_) - self.stored).max())
             if not apart <= _TOLERANCE:
                 raise EvaluationError(
-                    f"made again, the stored embedding comes out {apart:.3g} away from itself: expected the packages "
-                    f"that made it, {', '.join(f'{name} {each}' for name, each in self.versions)}; install these, or "
-                    "make the space anew"
+                    f"expected the embedding within {_TOLERANCE:g} of the stored one, got {apart:.3g}; "
+                    f"install {', '.join(f'{name} {each}' for name, each in self.versions)}, or compute it again",
+                    name="embedding",
+                    value=apart,
                 )
         return model
 
 
 def _quieten() -> None:
-    """Ignore what umap-learn and those beneath it remark on their own affairs."""
+    """Ignore the warnings of umap-learn and its dependencies."""
     warnings.simplefilter("ignore")
 
 
@@ -250,7 +261,7 @@ def _import_umap() -> Any:
             import umap
     except ImportError as error:
         raise EvaluationError(
-            f"the UMAP distance needs the package umap-learn, which cannot be imported ({error}): "
-            "pip install 'avmsf[eval]'"
+            f"UMAP distance: expected the package umap-learn, got {error}; pip install 'avmsf[eval]'",
+            name="umap-learn",
         ) from error
     return umap

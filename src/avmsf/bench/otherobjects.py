@@ -32,7 +32,7 @@ def draw_stranger(dataset: Dataset, identifier: str, train: Impacts, *, seed: in
         samples = train.sounds.shape[1]
         return torch.nn.functional.pad(sound, (0, max(0, samples - len(sound))))[:samples].to(train.sounds.dtype)
     raise EvaluationError(
-        f"{dataset.name} holds no object besides {identifier} that can be read: there is no other to take a sound from"
+        f"{dataset.name}: expected another readable object than {identifier}, found none", name=identifier
     )
 
 

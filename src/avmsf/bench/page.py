@@ -1,4 +1,4 @@
-"""A report as one page that needs nothing but itself: tables, spectrograms to look at and sounds to play."""
+"""A report as one self-contained page: tables, spectrograms, and sounds to play."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from avmsf.bench.results import CaseRecord, ObjectRecord, Outcome
 from avmsf.export.policy import report_directives, with_policy
 
 LARGEST = 13_000_000
-"""Characters beyond which no further contact is put on the page."""
+"""Maximum number of characters; further contacts are omitted."""
 OBJECTS = 4
-"""Objects that can be listened to, spread evenly over all."""
-_FOLDED = "object by object"
-"""Tables whose titles end so are many, and are unfolded on demand."""
+"""Objects with sounds on the page, evenly spaced over all."""
+_FOLDED = "by object"
+"""Tables whose titles end so are collapsed."""
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -53,14 +53,14 @@ document.addEventListener("play", (event) => {
 
 
 def page(parts: Sequence[Section], records: Sequence[ObjectRecord], folder: Path) -> str:
-    """Return the whole page; sounds are read from the results' folder. Raises EvaluationError where one is gone."""
+    """Return the complete page; sounds are read from the results' folder. Raises EvaluationError for a missing one."""
     title, *others = parts
     blocks = [_section(part, f"part{number}") for number, part in enumerate(others, 1)]
     listening = _listening(records, folder)
     links = [(f"part{number}", part.title) for number, part in enumerate(others, 1) if not part.title.endswith(_FOLDED)]
     if listening:
         blocks.insert(1, listening)
-        links.insert(1, ("listen", "Look and listen"))
+        links.insert(1, ("listen", "Spectrograms and sounds"))
     entries = "".join(f'<li><a href="#{place}">{escape(words)}</a></li>' for place, words in links)
     opening = "".join(f"<p>{escape(words)}</p>" for words in title.words)
     whole = (
@@ -105,7 +105,7 @@ def _cell(words: str, *, best: bool) -> str:
 
 @dataclass(frozen=True, eq=False)
 class HeardContact:
-    """One test contact that can be listened to, with what every method made of it."""
+    """One test contact with stored sounds, and the predictions of all methods."""
 
     record: ObjectRecord
     name: str
@@ -116,7 +116,7 @@ class HeardContact:
 
 
 def _contacts(records: Sequence[ObjectRecord]) -> Iterator[HeardContact]:
-    """Yield contacts to listen to: one of each object first, then a second one, and so on."""
+    """Yield contacts with sounds: one of each object first, then a second one, and so on."""
     heard = [record for record in records if any(case.sounds for case in record.cases)]
     chosen = [list(heard_contacts(heard[row])) for row in spread(len(heard), OBJECTS)]
     for place in range(max(map(len, chosen), default=0)):
@@ -124,7 +124,7 @@ def _contacts(records: Sequence[ObjectRecord]) -> Iterator[HeardContact]:
 
 
 def heard_contacts(record: ObjectRecord) -> Iterator[HeardContact]:
-    """Yield an object's contacts that can be listened to."""
+    """Yield an object's contacts with stored sounds."""
     files = {name: file for case in reversed(record.cases) for name, file in case.sounds.items()}
     for name, file in files.items():
         made = tuple(
@@ -137,7 +137,7 @@ def heard_contacts(record: ObjectRecord) -> Iterator[HeardContact]:
 
 
 def _listening(records: Sequence[ObjectRecord], folder: Path) -> str:
-    """Return the part with pictures and sounds, as many contacts as a page of bearable size holds; or nothing."""
+    """Return the part with spectrograms and sounds, as many contacts as fit the page; or an empty text."""
     found: dict[str, list[str]] = {}
     size = 0
     for contact in _contacts(records):
@@ -152,12 +152,12 @@ def _listening(records: Sequence[ObjectRecord], folder: Path) -> str:
     if not found:
         return ""
     words = (
-        "Each contact was not trained on. The recording comes first; all sounds of a contact are turned up alike, but "
-        "for those that would clip, which are turned down to full scale. Pictures show time to the right and frequency "
-        "upwards on a logarithmic scale; colors span 80 dB below the recording's loudest point."
+        "Test contacts. The recording comes first; all sounds of a contact are scaled by the same gain, except those "
+        "that would clip, which are scaled to full scale. Spectrograms show time to the right and frequency upwards on "
+        "a logarithmic scale; colors span 80 dB below the recording's loudest point."
     )
     blocks = "".join(f"<h3>{escape(title)}</h3>{''.join(each)}" for title, each in found.items())
-    return f'<section id="listen"><h2>Look and listen</h2><p>{escape(words)}</p>{blocks}</section>'
+    return f'<section id="listen"><h2>Spectrograms and sounds</h2><p>{escape(words)}</p>{blocks}</section>'
 
 
 def _contact_block(contact: HeardContact, folder: Path) -> str:

@@ -1,4 +1,4 @@
-"""Many objects, one after the other or many at a time on ray: the same figures either way."""
+"""Evaluation of many objects, sequentially or in parallel on ray, with the same results."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -15,26 +15,26 @@ from avmsf.errors import EvaluationError
 
 @dataclass(frozen=True)
 class Workers:
-    """Who computes."""
+    """Processes that compute."""
 
     count: int = 1
-    """Objects at a time on this computer; with 1 and no address, ray is not needed."""
+    """Number of parallel objects on this computer; with 1 and no address, ray is not needed."""
     address: str | None = None
     """A ray cluster's address, or `auto`; its computers must see data and results under the same paths."""
 
     def __post_init__(self) -> None:
         if self.count < 1:
-            raise EvaluationError(f"workers = {self.count}: expected 1 or more")
+            raise EvaluationError(f"expected 1 worker or more, got {self.count}", name="workers", value=self.count)
 
 
 @dataclass(frozen=True)
 class RunProgress:
-    """How far an evaluation is."""
+    """Progress of an evaluation."""
 
     words: str
-    """What has begun or ended."""
+    """The stage that has begun or ended."""
     done: int
-    """Objects that are through."""
+    """Number of finished objects."""
     total: int
 
 
@@ -94,8 +94,9 @@ def _run_remotely(
                     if isinstance(cause, Exception) and not isinstance(cause, ray.exceptions.RayError):
                         raise cause from None
                     raise EvaluationError(
-                        f"{identifier}: its worker ended before its work did ({str(error).splitlines()[0]}); the same "
-                        "command goes on, with fewer --workers if memory ran out"
+                        f"{identifier}: the worker process ended early ({str(error).splitlines()[0]}); run the command "
+                        "again, with fewer --workers if memory ran out",
+                        name=identifier,
                     ) from error
                 heard(RunProgress(f"{identifier}: done", len(identifiers) - len(pending), len(identifiers)))
     finally:
@@ -119,7 +120,9 @@ def _cluster(ray: ModuleType, workers: Workers) -> Iterator[None]:
         ray.init(**settings)
     except (ConnectionError, RuntimeError, ValueError) as error:
         where = "this computer" if workers.address is None else f"--ray {workers.address}"
-        raise EvaluationError(f"ray cannot be started on {where}: {' '.join(str(error).split())}") from error
+        raise EvaluationError(
+            f"ray does not start on {where}: {' '.join(str(error).split())}", name="ray", value=workers.address
+        ) from error
     try:
         yield
     finally:
@@ -127,7 +130,7 @@ def _cluster(ray: ModuleType, workers: Workers) -> Iterator[None]:
 
 
 def _ray() -> ModuleType:
-    # On one computer there is nobody to keep out, and nothing is to be reported to ray's makers.
+    # One computer needs no authentication, and no usage is reported.
     for name, value in {
         "RAY_AUTH_MODE": "disabled",
         "RAY_USAGE_STATS_ENABLED": "0",
@@ -138,7 +141,7 @@ def _ray() -> ModuleType:
         import ray
     except ImportError as error:
         raise EvaluationError(
-            "several objects at a time need ray, which is not installed: pip install 'avmsf[scale]', or leave out "
-            "--workers and --ray"
+            "--workers and --ray: expected the package ray, found none; pip install 'avmsf[scale]', or omit them",
+            name="ray",
         ) from error
     return ray

@@ -10,9 +10,9 @@ Both count time from the same moment: the caller takes the truth to the first sa
 learned from (`bench.knowntruth.truth_from_first_sample`). A common delay by t would turn mode k by 2 pi f_k t, which is
 free, and scale it by exp(-d_k t), which is not.
 
-What nobody hears is free. A mode's phase, one for all contacts, is: the paper's fields have sines only. So is a
-contact's polarity, one sign for all its modes: fields turn the signs of blows from opposite sides to agree. Both are
-chosen so that `gain_error` is least.
+What is inaudible is free: a mode's phase, one for all contacts, since the paper's fields have sines only, and a
+contact's polarity, one sign for all its modes, since fields flip the signs of impacts from opposite sides to agree.
+Both are chosen so that `gain_error` is least.
 """
 
 import math
@@ -55,7 +55,7 @@ class ModalRenderer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ModalScores:
-    """A method's modes beside the true ones, mode for mode of the truth."""
+    """A method's modes compared with the true ones, one entry a true mode."""
 
     weight: Float64[Tensor, " modes"]
     """Part of the true energy, 0 to 1."""
@@ -113,15 +113,19 @@ def judge_modes(
     bank, true = renderer.bank, truth.amplitudes
     predicted = renderer.complex_gains(contacts, directions=directions).detach().cpu().to(torch.complex128)
     _expect_amplitudes(predicted, bank.frequency, "predicted")
-    _expect_amplitudes(true, truth.frequency, "true")
+    _expect_amplitudes(true, truth.frequency, "truth")
     if len(predicted) != len(true):
         raise EvaluationError(
-            f"gains at {len(predicted)} contacts cannot be compared with true ones at {len(true)}; take the truth of "
-            "these recordings alone, in their order"
+            f"expected true gains at {len(predicted)} contacts, got {len(true)}; take the ground truth of these "
+            "recordings, in their order",
+            name="truth",
+            value=len(true),
         )
     energy = true.abs().square().sum(dim=0) / (4 * truth.damping)
     if not float(energy.sum()) > 0.0:
-        raise EvaluationError("the true modes are silent at all contacts, so that no error can be relative to them")
+        raise EvaluationError(
+            "truth: expected modes with energy, got zero gains at all contacts", name="truth", value=0.0
+        )
     match = match_modes(bank, ModalBank(truth.frequency, truth.damping), widths=widths, relative=relative)
     found = match >= 0
     partner = match[found]
@@ -161,8 +165,9 @@ def match_modes(
     """
     if not (widths >= 0.0 and relative >= 0.0 and math.isfinite(widths + relative) and widths + relative > 0.0):
         raise EvaluationError(
-            f"a tolerance of {widths:g} half-power widths and {relative:g} of the frequency; expected numbers of 0 or "
-            "more, not both 0"
+            f"expected widths and relative of 0 or more, not both 0, got {widths:g} and {relative:g}",
+            name="widths",
+            value=(widths, relative),
         )
     allowed = torch.maximum(widths * true.damping / math.pi, relative * true.frequency)
     distance = (found.frequency.detach()[None] - true.frequency[:, None]).abs() / allowed[:, None]
@@ -203,12 +208,17 @@ def _signs(values: Float64[Tensor, " contacts"]) -> Float64[Tensor, " contacts"]
 def _expect_amplitudes(amplitudes: Complex128[Tensor, "..."], frequency: Float[Tensor, " modes"], what: str) -> None:
     if amplitudes.ndim != 2 or amplitudes.shape[1] != len(frequency) or not len(amplitudes):
         raise EvaluationError(
-            f"{what} gains must be [contacts, modes] for one contact or more and {len(frequency)} modes, got the shape "
-            f"{tuple(amplitudes.shape)}"
+            f"{what}: expected gains [contacts, {len(frequency)} modes] at one contact or more, got the shape "
+            f"{tuple(amplitudes.shape)}",
+            name=what,
+            value=list(amplitudes.shape),
         )
     bad = torch.nonzero(~torch.isfinite(amplitudes.abs()))
     if len(bad):
         row, mode = bad[0].tolist()
         raise EvaluationError(
-            f"the {what} gain of mode {mode} at contact {row} is {amplitudes[row, mode].item()}; all must be finite"
+            f"{what}, row {row}: expected finite gains, got {amplitudes[row, mode].item()} of mode {mode}",
+            row=row,
+            name=what,
+            value=amplitudes[row, mode].item(),
         )

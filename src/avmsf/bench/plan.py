@@ -1,4 +1,4 @@
-"""All that decides an evaluation's figures, in one value that travels to other processes."""
+"""The settings of an evaluation, in one value that can be sent to other processes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,16 +20,16 @@ from avmsf.scene.gaussians import GaussianCloud
 
 @runtime_checkable
 class FeatureMaker(Protocol):
-    """Makes what fields read of an object's points."""
+    """Computes an object's features."""
 
     def __call__(self, identifier: str, look: Look, views: int | None = None) -> FeatureField:
-        """Return an object's features, from at most `views` views. Raises SceneError where nothing shows its look."""
+        """Return an object's features, from at most `views` views. Raises SceneError without visual input."""
         ...
 
 
 @runtime_checkable
 class BodyMaker(Protocol):
-    """Makes what fields and simulations know of an object's shape."""
+    """Computes an object's FE models."""
 
     def __call__(self, identifier: str) -> CandidateBodies:
         """Return an object's bodies. Raises AvmsfError where its shape is unknown or unfit."""
@@ -45,28 +45,28 @@ class CloudMaker(Protocol):
     """Makes an object's Gaussians."""
 
     def __call__(self, identifier: str, views: int | None = None) -> GaussianCloud:
-        """Return an object's Gaussians, from at most `views` views. Raises SceneError where nothing shows its look."""
+        """Return an object's Gaussians, from at most `views` views. Raises SceneError without visual input."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What is evaluated, on what, and how."""
+    """Data set, protocol, methods and settings of an evaluation."""
 
     dataset: Dataset
     title: str
-    """What reports call the dataset; results of another are not mixed with its own."""
+    """Name of the dataset in reports; one folder of results has one."""
     protocol: EvaluationProtocol
     methods: tuple[Method, ...]
     features: FeatureMaker
     bodies: BodyMaker
     seed: int = 0
-    """Start of all chance in the methods."""
+    """Random seed of the methods."""
     judging: Judging = field(default_factory=Judging)
     finder: ModeFinder = field(default_factory=HighResolution)
-    """How modes are found, once a case."""
+    """Extraction of modes, once per case."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Plain values that decide the features."""
+    """Settings of the features, as plain values."""
     clouds: CloudMaker | None = None
     """None where no method reads Gaussians."""
 

@@ -1,4 +1,4 @@
-"""The experiments of the paper, as data: what is learnt from, what is judged by, and which methods take part."""
+"""The experiments of the paper, as data: training and test contacts, metrics, and methods."""
 
 import difflib
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ BASELINE = "knn3"
 PAPER_METRICS = ("l1", "l1_log", "envelope", "cdpam")
 """The columns of the paper's tables."""
 OWN_METRICS = ("relative_stft", "mac", "gain_error")
-"""What is shown besides: the last two where the truth is known."""
+"""Additional metrics: the last two where the ground truth is known."""
 _TABLE = (
     "white-noise",
     "random-impact",
@@ -36,8 +36,8 @@ _CURVES = (
     "field-elastic",
     "field-auto",
 )
-"""Methods that take part, where no others are asked for: those that need no pictures of the object. All but
-the network, `field-positions`, take seconds for each figure."""
+"""Default methods: those that need no photographs of the object. All but the network, `field-positions`, take seconds
+for each value."""
 _ABLATED = ("field-positions", "field-no-initialization", "field-unaligned", "field-no-residual")
 
 
@@ -50,67 +50,68 @@ class EvaluationProtocol:
     summary: str
     """What it does, in a sentence."""
     choosing: Choosing
-    """How each object's contacts are parted."""
+    """How each object's contacts are split."""
     methods: tuple[str, ...] = _TABLE
     """Names of the methods that take part unless others are asked for; the baseline is among them."""
     subset: str | None = None
     """Name of the objects that take part unless others are asked for; None for all."""
     required: bool = False
-    """Whether the subset is what the experiment is about: without it, datasets that have no such objects take part with
-    all of theirs."""
+    """Whether the subset is required; otherwise all objects of a dataset without such a subset take part."""
     metrics: tuple[str, ...] = (*PAPER_METRICS, *OWN_METRICS)
     """Columns of the tables, by the metrics' names."""
     locating: bool = False
-    """Whether methods are judged by where they locate the test recordings, not by their sounds."""
+    """Whether methods are evaluated by localizing the test recordings, not by their sounds."""
 
 
 PROTOCOLS = {
     each.name: each
     for each in (
         EvaluationProtocol(
-            "farthest", "Train on 20 % of the places, spread as far apart as they go; test on the others.", Farthest()
+            "farthest",
+            "Train on 20 % of the contacts, chosen by farthest-point sampling; test on the others.",
+            Farthest(),
         ),
-        EvaluationProtocol("leave-one-out", "Test on every place once, after training on all others.", LeaveOneOut()),
+        EvaluationProtocol("leave-one-out", "Test on every contact once, after training on all others.", LeaveOneOut()),
         EvaluationProtocol(
-            "closest", "Train on 20 % of the places, in one region, test on the others.", Closest(), subset="ablation"
+            "closest", "Train on 20 % of the contacts, in one region; test on the others.", Closest(), subset="ablation"
         ),
         EvaluationProtocol(
             "shots",
-            "Train on 16, 8, 4, 2 and 1 places, each choice within the one before; test on the same others.",
+            "Train on nested subsets of 16, 8, 4, 2 and 1 contacts; test on the same others.",
             Shots(),
             subset="ablation",
         ),
         EvaluationProtocol(
             LEARNING_CURVE,
-            "Train on more and more contacts, spread as far apart as possible; test on those that the most leave over.",
+            "Train on growing subsets of contacts, chosen by farthest-point sampling; test on those left by the last.",
             Growing(),
             _CURVES,
             metrics=("l1", "l1_log", "envelope", *OWN_METRICS),
         ),
         EvaluationProtocol(
             "views",
-            "Draw looks from all views and from 12; train and test as `farthest` does.",
+            "Visual features from all views and from 12; train and test as in `farthest`.",
             FewerViews(),
             (BASELINE, "field"),
             subset="ablation",
         ),
         EvaluationProtocol(
             "ablation",
-            "Leave out one part of the field at a time: looks, initialization, alignment, residual.",
+            "Ablations of one part each: visual features, initialization, symmetry pooling, residual noise.",
             Farthest(),
             (BASELINE, "field", *_ABLATED),
             subset="ablation",
         ),
         EvaluationProtocol(
             "non-symmetric",
-            "As `farthest`, on objects that no turn carries onto themselves, where near contacts tell least.",
+            "As `farthest`, on objects without rotational symmetry.",
             Farthest(),
             subset="non-symmetric",
             required=True,
         ),
         EvaluationProtocol(
             "localize",
-            "Train as `farthest` does; locate the test recordings, on objects that no turn carries onto themselves.",
+            "Train as in `farthest`; locate the test recordings, on objects without rotational symmetry.",
             Farthest(),
             ("white-noise", "nearest", "diffsound", "field", "field-no-residual", "field-auto"),
             subset="non-symmetric",
@@ -121,7 +122,7 @@ PROTOCOLS = {
         EvaluationProtocol(
             "grid",
             "Choose the field's settings from a small grid on validation contacts (the paper's: `paper-grid`); "
-            "test as `farthest` does.",
+            "test as in `farthest`.",
             Farthest(),
             (BASELINE, "field", "field-grid"),
             subset="ablation",
@@ -137,4 +138,6 @@ def protocol_named(name: str) -> EvaluationProtocol:
         return PROTOCOLS[name]
     near = difflib.get_close_matches(name, PROTOCOLS, n=1)
     guess = f"; did you mean {near[0]}?" if near else ""
-    raise EvaluationError(f"no protocol is called {name!r}: there are {', '.join(PROTOCOLS)}{guess}")
+    raise EvaluationError(
+        f"expected a protocol of {', '.join(PROTOCOLS)}, got {name!r}{guess}", name="protocol", value=name
+    )

@@ -1,4 +1,4 @@
-"""Sounds that someone else's system has made, judged like any other renderer's."""
+"""Sounds of another system, from files, evaluated like those of any renderer."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +17,8 @@ class Recorded:
     """Wav files, one a recording of the object, that are looked up by the contact of that recording.
 
     FOLDER/RECORDING.wav for the recording called RECORDING or RECORDING.wav, whose name may hold folders. Of several
-    recordings at one contact the first that has a file stands for all. Files are read when they are asked for, so
-    that only those of the contacts to be judged need be there.
+    recordings at one contact the first with a file is used for all. Files are read on demand, so that only those of the
+    evaluated contacts are needed.
     """
 
     folder: Path
@@ -35,13 +35,16 @@ class Recorded:
     def __post_init__(self) -> None:
         if len(self.contacts) != len(self.names):
             raise EvaluationError(
-                f"{len(self.names)} names of recordings were given for {len(self.contacts)} contacts; give one for each"
+                f"expected a name for each of {len(self.contacts)} contacts, got {len(self.names)}",
+                name="names",
+                value=len(self.names),
             )
         if not self.folder.is_dir():
             raise EvaluationError(
-                f"{self.folder}: expected a folder with this object's sounds, such as "
-                f"{self.path(self.names[0]) if self.names else 'RECORDING.wav'}, found none: render them there, or "
-                "leave the object out"
+                f"{self.folder}: expected a folder with the object's sounds, such as "
+                f"{self.path(self.names[0]).name if self.names else 'RECORDING.wav'}, found none; render them there, "
+                "or omit the object",
+                file=self.folder,
             )
 
     def path(self, name: str) -> Path:
@@ -53,8 +56,8 @@ class Recorded:
     ) -> Float[Tensor, "contacts samples"]:
         """Return the files' sounds, as they are.
 
-        Raises EvaluationError for a contact where nothing was recorded, for a file that is missing, and for one that is
-        no sound, has several different channels or another rate or length.
+        Raises EvaluationError for a contact without a recording, for a missing file, and for one that is no sound, has
+        several different channels or another rate or length.
         """
         sounds = [self._read(self._find(contact)) for contact in contacts]
         return torch.stack(sounds) if sounds else torch.zeros(0, self.samples)
@@ -65,15 +68,20 @@ class Recorded:
         if not rows:
             place = ", ".join(f"{value:g}" for value in contact.tolist())
             raise EvaluationError(
-                f"{self.folder}: there is no sound for a blow at ({place}) m, for nothing was recorded there: sounds "
-                "from files are known at the recordings' contacts alone"
+                f"{self.folder}: expected a contact of a recording, got ({place}) m; sounds from files are available "
+                "at recorded contacts only",
+                file=self.folder,
+                name="contacts",
+                value=contact.tolist(),
             )
         paths = [self.path(self.names[row]) for row in rows]
         present = [path for path in paths if path.is_file()]
         if not present:
             raise EvaluationError(
-                f"{paths[0]}: expected the sound that stands for the recording {self.names[rows[0]]}, found no such "
-                f"file: render it as a mono wav of {self.samples} samples at {self.sample_rate:g} Hz"
+                f"{paths[0]}: the file is missing; render it as a mono wav of {self.samples} samples at "
+                f"{self.sample_rate:g} Hz",
+                file=paths[0],
+                name=self.names[rows[0]],
             )
         return present[0]
 
@@ -81,15 +89,21 @@ class Recorded:
         try:
             recording = read_recording(path)
         except CaptureError as error:
-            raise EvaluationError(str(error)) from error
+            raise EvaluationError(str(error), **{**error.attributes, "file": path}) from error
         if recording.sample_rate != self.sample_rate or recording.frames != self.samples:
             raise EvaluationError(
-                f"{path}: expected {self.samples} samples at {self.sample_rate:g} Hz, as the recordings have, found "
-                f"{recording.frames} at {recording.sample_rate:g} Hz: render it anew, from the onset on"
+                f"{path}: expected {self.samples} samples at {self.sample_rate:g} Hz, as the recordings have, got "
+                f"{recording.frames} at {recording.sample_rate:g} Hz; render it again, from the onset on",
+                file=path,
+                name="samples",
+                value=(recording.frames, recording.sample_rate),
             )
         first = recording.channels[0]
         if any(not np.array_equal(channel, first) for channel in recording.channels[1:]):
             raise EvaluationError(
-                f"{path}: expected one channel, found {len(recording.channels)} different ones: save it as mono"
+                f"{path}: expected one channel, got {len(recording.channels)} different ones; save it as mono",
+                file=path,
+                name="channels",
+                value=len(recording.channels),
             )
         return torch.from_numpy(first.copy()).float()

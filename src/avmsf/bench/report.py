@@ -1,4 +1,4 @@
-"""Everything that is written of a results folder: the summary, the times, the tables, the page."""
+"""The files of a results folder: summary, times, tables, and page."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,7 +18,7 @@ from avmsf.files import write_whole
 from avmsf.plotting.spectrograms import draw_method_spectrograms
 
 SUMMARY, TIMES, TABLES, PAGE = "summary.json", "times.json", "report.md", "report.html"
-"""The files, beside `protocol.json` and the folder `objects`."""
+"""The files next to `protocol.json` and the folder `objects`."""
 FIGURES = "figures"
 """Folder of the spectrograms, one file for each object, or for each object and case."""
 _RECORDED = "recorded"
@@ -26,7 +26,7 @@ _RECORDED = "recorded"
 
 
 def write_summary(results: ResultsFolder, *, subsets: Mapping[str, frozenset[str]]) -> dict[str, Any]:
-    """Write `summary.json`, `times.json` and `report.md` of what the folder holds by now, and return the summary."""
+    """Write `summary.json`, `times.json` and `report.md` of the folder's results, and return the summary."""
     records, identity = results.records(), results.identity()
     summary = summarize(records, identity, subsets=subsets)
     write_json(results.path / SUMMARY, summary)
@@ -36,7 +36,7 @@ def write_summary(results: ResultsFolder, *, subsets: Mapping[str, frozenset[str
 
 
 def write_page(results: ResultsFolder, *, subsets: Mapping[str, frozenset[str]]) -> list[Section]:
-    """Write `report.html`, and return its parts. Raises EvaluationError where a kept sound is gone."""
+    """Write `report.html`, and return its parts. Raises EvaluationError where a stored sound is missing."""
     records = results.records()
     parts = sections(records, results.identity(), subsets=subsets)
     _write_text(results.path / PAGE, page(parts, records, results.path))
@@ -44,9 +44,9 @@ def write_page(results: ResultsFolder, *, subsets: Mapping[str, frozenset[str]])
 
 
 def write_figures(results: ResultsFolder) -> list[Path]:
-    """Draw the kept sounds as spectrograms, the recording and all methods side by side, and return the files.
+    """Draw the stored sounds as spectrograms, the recording next to all methods, and return the files.
 
-    One PNG for each object and each label of its cases. Raises EvaluationError where a kept sound is gone.
+    One PNG for each object and each label of its cases. Raises EvaluationError where a stored sound is missing.
     """
     return [path for record in results.records() for path in _write_spectrograms(record, results.path)]
 

@@ -1,4 +1,4 @@
-"""What a report says, as titles, words and tables that Markdown and HTML draw alike."""
+"""The content of a report, as titles, paragraphs and tables, for Markdown and HTML."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -32,23 +32,24 @@ HEADINGS = {
     "gain_error": "gain error",
     "rmed": "RMED",
     "rmed_posterior": "RMED, posterior",
+    "found": "energy of found modes",
 }
-"""Metrics as columns call them; others go by their own names."""
+"""Headings of metrics; others have their names."""
 WARNING = (
-    "The paper describes its metrics in words only. The convention that these figures are taken in is inferred from "
-    "its rows for white noise, so absolute figures must not be compared with the paper's: compare ratios to KNN."
+    "The paper describes its metrics in words only. The convention used here is inferred from its rows for white "
+    "noise. Compare ratios to KNN with the paper's, not absolute values."
 )
 _DASH = "–"
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A table of words; the first column names the rows."""
+    """A table of text; the first column names the rows."""
 
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     best: frozenset[tuple[int, int]] = frozenset()
-    """Rows and columns of the cells that are the best of their column."""
+    """Rows and columns of the best cells of each column."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def sections(
 
 
 def figure(value: float | None, digits: int = 3) -> str:
-    """Return a number with so many significant digits; a dash for what is not known."""
+    """Return a number with so many significant digits; a dash for None or NaN."""
     if value is None or not math.isfinite(value):
         return _DASH
     if value == 0 or not 1e-3 <= abs(value) < 1e6:
@@ -109,17 +110,17 @@ def _opening(records: Sequence[ObjectRecord], identity: Mapping[str, Any], label
         f"{identity['protocol']} on {identity['dataset']}",
         (
             f"{about}Objects: {len(records)}; training recordings of each: {_span(trained)}; "
-            f"test recordings in all: {tested}"
+            f"test recordings in total: {tested}"
             f"{f' ({labels[0]})' if len(labels) > 1 else ''}; avmsf {identity['version']}, seed {identity['seed']}.",
-            "Figures are means over an object's test recordings (CDPAM's over a few of them, `cdpam_contacts` below, 0 "
-            "for all), then over objects, ± the standard error over objects. RMED is the distance of the located "
-            "contact from the true one over the diagonal of the object, by cosine distance; methods that cannot locate "
-            "count as a random point. "
-            "Lower is better; of MAC, and of modes found, more is. L1, L1-log and ENV are in the convention `paper` of "
-            "docs/conventions.md; relative STFT is free of unit and level. With level='full-scale' an "
-            "object's sounds are multiplied by one factor that brings its loudest recording to a peak of one.",
+            "Values are means over an object's test recordings (CDPAM: over `cdpam_contacts` of them, 0 for all), then "
+            "over objects, ± the standard error over objects. RMED is the distance between the located and the true "
+            "contact relative to the diagonal of the object, by cosine distance; methods that cannot locate count as a "
+            "random point. "
+            "Lower is better, except for MAC and the energy of found modes. L1, L1-log and ENV follow the convention "
+            "`paper` of docs/conventions.md; relative STFT does not depend on unit and level. With level='full-scale' "
+            "an object's sounds are multiplied by one factor that brings its loudest recording to a peak of one.",
             WARNING,
-            f"What decides the figures: metrics {identity['metrics']}; modes {identity['modes']}.",
+            f"Settings: metrics {identity['metrics']}; modes {identity['modes']}.",
         ),
     )
 
@@ -145,9 +146,9 @@ def _main_table(main: Table, shown: Sequence[str], protocol: str, dataset: str, 
             if row.label in (None, labels[0])
         ]
     remark = (
-        f"Rows that begin with “paper:” are its own figures on {paper.dataset}. {WARNING}"
+        f"Rows that begin with “paper:” are the paper's values on {paper.dataset}. {WARNING}"
         if paper is not None
-        else f"The paper has no figures of this experiment on {dataset}."
+        else f"The paper has no values of this experiment on {dataset}."
     )
     grid = Grid(("method", *_headings(shown), "objects"), tuple(rows), best)
     titles = "; ".join(f"{method}: {TITLES[kind_of(method)]}" for method in found if kind_of(method) in TITLES)
@@ -170,9 +171,9 @@ def _ratio_table(main: Table, shown: Sequence[str], protocol: str, dataset: str)
     return Section(
         f"Ratio to {BASELINE}",
         (
-            "Below 1 is better than the mean of the three nearest recordings. Ours are geometric means over objects of "
-            "each object's ratio; the paper's are ratios of its means, which is all that its tables allow, from its "
-            "main tables where its table of this experiment has no KNN.",
+            "Below 1 is better than the mean of the three nearest recordings. Our values are geometric means of the "
+            "objects' ratios; the paper's are ratios of its means, since it gives no ratios, from its main tables "
+            "where its table of this experiment has no KNN.",
         ),
         Grid(("method", *_headings(falling)), tuple(rows)),
     )
@@ -188,7 +189,7 @@ def _difference_table(main: Table, shown: Sequence[str]) -> Section:
     )
     return Section(
         f"Paired difference to {BASELINE}",
-        ("Object by object, method less baseline; a difference of less than two standard errors may be chance.",),
+        ("Method minus baseline, paired by object; below two standard errors a difference is not significant.",),
         Grid(("method", *_headings(shown)), rows),
     )
 
@@ -209,7 +210,7 @@ def _case_table(metric: str, tables: Mapping[str, Table], protocol: str, dataset
         own = {row.label: row.figures.get(metric) for row in paper.rows if row.title == title} if paper else {}
         if any(own.get(label) is not None for label in tables):
             rows.append((f"paper: {title}", *(figure(own.get(label)) for label in tables)))
-    return Section(f"{HEADINGS.get(metric, metric)} case by case", (), Grid(("method", *tables), tuple(rows)))
+    return Section(f"{HEADINGS.get(metric, metric)} by case", (), Grid(("method", *tables), tuple(rows)))
 
 
 def _mode_table(main: Table, shown: Sequence[str]) -> list[Section]:
@@ -223,18 +224,17 @@ def _mode_table(main: Table, shown: Sequence[str]) -> list[Section]:
         if any(metric in figures for metric in others)
     )
     words = (
-        "Of methods that have modes: the part of the true energy whose modes were found, errors of frequency "
-        "(relative) and damping (natural logarithm) of those, modes that are not there, and their energy over the "
-        "true one's."
+        "Of methods that have modes: the fraction of the true energy whose modes were found, the errors of their "
+        "frequency (relative) and damping (natural logarithm), false modes, and their energy relative to the true one."
     )
-    return [Section("Modes beside the truth", (words,), Grid(("method", *_headings(others)), rows))]
+    return [Section("Modes compared with the ground truth", (words,), Grid(("method", *_headings(others)), rows))]
 
 
 def _object_tables(main: Table, shown: Sequence[str]) -> list[Section]:
     methods = list(dict.fromkeys(method for figures in main.values() for method in figures))
     return [
         Section(
-            f"{HEADINGS.get(metric, metric)} object by object",
+            f"{HEADINGS.get(metric, metric)} by object",
             (),
             Grid(
                 ("object", *methods),
@@ -267,9 +267,9 @@ def _times(records: Sequence[ObjectRecord], order: Sequence[str]) -> Section:
     if shared:
         rows.append(("shared: modes and features", figure(sum(shared) / len(shared)), _DASH))
     return Section(
-        "Time an object",
-        ("Seconds on one thread, mean over objects, all of a protocol's cases together; judging is not counted.",),
-        Grid(("method", "to fit", "to render the test contacts"), tuple(rows)),
+        "Time per object",
+        ("Seconds on one thread, mean over objects, sum over a protocol's cases, without the computation of metrics.",),
+        Grid(("method", "fit", "render the test contacts"), tuple(rows)),
     )
 
 
@@ -280,11 +280,11 @@ def _failures(records: Sequence[ObjectRecord]) -> Section:
     rows = tuple(
         (str(each["object"]), each["case"] or "all", each["method"] or "all", str(each["failure"])) for each in failures
     )
-    return Section("Failures", (), Grid(("object", "case", "method", "why"), rows))
+    return Section("Failures", (), Grid(("object", "case", "method", "reason"), rows))
 
 
 def _ordered(table: Table, order: Sequence[str]) -> Table:
-    """Return the table with its methods in the order in which they were asked for."""
+    """Return the table with its methods in the requested order."""
     return {
         identifier: {method: figures[method] for method in order if method in figures}
         for identifier, figures in table.items()
@@ -292,7 +292,7 @@ def _ordered(table: Table, order: Sequence[str]) -> Table:
 
 
 def _metrics(table: Table, protocol: str) -> tuple[str, ...]:
-    """Return the protocol's columns that have figures."""
+    """Return the protocol's columns that have values."""
     columns = PROTOCOLS[protocol].metrics if protocol in PROTOCOLS else tuple(HEADINGS)
     return tuple(metric for metric in columns if metric in _found(table))
 

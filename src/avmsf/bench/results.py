@@ -1,4 +1,4 @@
-"""A folder of results: a file an object, written whole after every method, so that a kill loses one method at most."""
+"""A folder of results: one file per object, written atomically after every method, so that a kill loses one method."""
 
 import json
 import math
@@ -13,61 +13,61 @@ from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
 
 IDENTITY, OBJECTS = "protocol.json", "objects"
-"""The file that says what the folder's figures are, and the folder of the objects' files."""
+"""The file that identifies the evaluation, and the folder of the objects' files."""
 _MAX_BYTES = 64 << 20
-"""Largest file of results that is read: three million figures, as of 100 strikes by 10 metrics in 3000 cases."""
+"""Largest file of results that is read: three million values, as of 100 contacts by 10 metrics in 3000 cases."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one method came to in one case of an object."""
+    """Result of one method in one case of an object."""
 
     case: str
     """The case's key."""
     method: str
     values: Mapping[str, tuple[float | None, ...]] = field(default_factory=dict)
-    """Each metric's figure for every test contact, in the case's order; None where it was not taken."""
+    """Each metric's value for every test contact, in the case's order; None where it was not computed."""
     figures: Mapping[str, float | None] = field(default_factory=dict)
-    """Figures that are of all test contacts at once."""
+    """Values over all test contacts."""
     fit_seconds: float = 0.0
-    """Without what methods share: modes and features."""
+    """Without the modes and features, which methods share."""
     render_seconds: float = 0.0
     """For all test contacts."""
     sounds: Mapping[str, str] = field(default_factory=dict)
-    """Files of sounds to listen to, relative to the folder, by the names of their recordings."""
+    """Files of sounds for the page, relative to the folder, by the names of their recordings."""
     report: Mapping[str, Any] = field(default_factory=dict)
-    """What the method chose on its way."""
+    """Choices that the method made."""
     failure: str | None = None
-    """Why there is no figure, in one line."""
+    """Reason for missing values, in one line."""
 
 
 @dataclass(frozen=True)
 class CaseRecord:
-    """One case of an object, with names in place of rows."""
+    """One case of an object, with names in place of indices."""
 
     key: str
     label: str
     train: tuple[str, ...]
     test: tuple[str, ...]
     sounds: Mapping[str, str] = field(default_factory=dict)
-    """Files of the recordings that methods can be listened to beside."""
+    """Files of the recordings for the page."""
     shared_seconds: float = 0.0
-    """What modes and features took, which all methods share."""
+    """Time of modes and features, which all methods share."""
 
 
 @dataclass(frozen=True)
 class ObjectRecord:
-    """All that is known of one object's evaluation."""
+    """Evaluation of one object."""
 
     identifier: str
     name: str = ""
     material: str | None = None
     inferred: bool = False
-    """Whether name and material are concluded rather than read."""
+    """Whether name and material are inferred rather than read."""
     digest: str = ""
-    """Of the recordings, and of the truth where it is known."""
+    """Of the recordings, and of the ground truth where it is known."""
     contacts: int = 0
-    """How many places were struck."""
+    """Number of distinct contacts."""
     sample_rate: float = 0.0
     duration: float = 0.0
     """Seconds of every sound."""
@@ -77,7 +77,7 @@ class ObjectRecord:
     """Why the object could not be evaluated at all."""
 
     def done(self, case: str, method: str) -> bool:
-        """Whether this method has figures in this case; failures are tried again."""
+        """Whether this method has values in this case; failures are retried."""
         return any(each.case == case and each.method == method and each.failure is None for each in self.outcomes)
 
     def adding(self, outcome: Outcome) -> "ObjectRecord":
@@ -88,39 +88,49 @@ class ObjectRecord:
 
 @dataclass(frozen=True)
 class ResultsFolder:
-    """Where an evaluation keeps what it has found."""
+    """Folder in which an evaluation stores its results."""
 
     path: Path
 
     def begin(self, identity: Mapping[str, Any], methods: Mapping[str, str]) -> None:
-        """Take the folder for figures of this identity, or go on with what is there of it.
+        """Use the folder for results of this identity, or continue with those that it holds.
 
-        `identity` holds plain values that decide the figures; `methods` says of each method what it is. Methods may be
-        added later. Raises EvaluationError where the folder's figures are of another identity, or a method has changed.
+        `identity` holds plain values that determine the results; `methods` describes each method. Methods may be added
+        later. Raises EvaluationError where the folder's results are of another identity, or a method has changed.
         """
         wanted = json.loads(json.dumps(dict(identity)))
         place = self.path / IDENTITY
         known = self.identity() if place.exists() else {**wanted, "methods": {}}
         # A kill may leave a hidden part of the file behind.
         if not place.exists() and self.path.is_dir() and any(self.path.glob("[!.]*")):
-            raise EvaluationError(f"{self.path}: is not empty and holds no {IDENTITY}; choose a new --output")
+            raise EvaluationError(
+                f"{self.path}: expected an empty folder or one with {IDENTITY}, found others; choose a new --output",
+                file=self.path,
+                name="output",
+            )
         kept = known.pop("methods")
         for key in dict.fromkeys((*wanted, *known)):
             if wanted.get(key) != known.get(key):
                 raise EvaluationError(
-                    f"{self.path}: holds results of another evaluation: {key} is {_brief(known.get(key))} there and "
-                    f"{_brief(wanted.get(key))} here; results are not mixed, choose another --output"
+                    f"{self.path}: expected results with {key} = {_brief(wanted.get(key))}, got "
+                    f"{_brief(known.get(key))}; choose another --output",
+                    file=self.path,
+                    name=key,
+                    value=known.get(key),
                 )
         for name in methods:
             if name in kept and kept[name] != methods[name]:
                 raise EvaluationError(
-                    f"{self.path}: holds results of another method {name}: {_brief(kept[name])} there and "
-                    f"{_brief(methods[name])} here; results are not mixed, choose another --output"
+                    f"{self.path}: expected results of the method {name} = {_brief(methods[name])}, got "
+                    f"{_brief(kept[name])}; choose another --output",
+                    file=self.path,
+                    name=name,
+                    value=kept[name],
                 )
         write_json(place, {**wanted, "methods": {**kept, **methods}})
 
     def identity(self) -> dict[str, Any]:
-        """Return what the folder's figures are, methods among it. Raises EvaluationError where there is none."""
+        """Return the evaluation that the folder holds, with its methods. Raises EvaluationError where there is none."""
         place = self.path / IDENTITY
         read = self._read(place)
         if not isinstance(read.get("methods"), dict):
@@ -170,8 +180,9 @@ class ResultsFolder:
 
     def _damaged(self, place: Path, error: object) -> EvaluationError:
         return EvaluationError(
-            f"{place}: cannot be read as results of this version ({error}); delete the file to compute them again, or "
-            "choose another --output"
+            f"{place}: expected results of this version, got {error}; delete the file to compute them again, or choose "
+            "another --output",
+            file=place,
         )
 
 

@@ -1,4 +1,4 @@
-"""Running an evaluation: object by object, case by case, method by method, keeping each figure as it comes."""
+"""Running an evaluation: all methods in all cases of an object, each result stored at once."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
@@ -25,10 +25,10 @@ from avmsf.simulate.truth import Truth
 def run_object(
     evaluation: Evaluation, identifier: str, results: ResultsFolder, tell: Callable[[str], None] | None = None
 ) -> None:
-    """Evaluate all methods on one object, but for those that have figures already; each is kept as it comes.
+    """Evaluate all methods on one object, except those with stored results; each result is stored at once.
 
-    One thread computes, whatever runs beside it. What keeps an object or a method from having figures is kept in their
-    place. `tell` hears what begins. Raises EvaluationError where kept figures are of other recordings.
+    On one thread. Failures of an object or a method are stored as their results. `tell` is called with a message for
+    each method that begins. Raises EvaluationError where stored results are of other recordings.
     """
     with one_thread():
         record = results.read(identifier) or ObjectRecord(identifier)
@@ -79,13 +79,16 @@ def run_object(
 def _of_same_recordings(
     record: ObjectRecord, digest: str, evaluation: Evaluation, results: ResultsFolder
 ) -> ObjectRecord:
-    """Return an object's record, an empty one where it has no figures; raise EvaluationError if they are of others."""
+    """Return an object's record, empty where it has no values; raise EvaluationError for other recordings' values."""
     if record.digest != digest and all(each.failure is not None for each in record.outcomes):
         record = ObjectRecord(record.identifier)
     if record.digest not in ("", digest):
         raise EvaluationError(
-            f"{results.path}: holds figures of other recordings of {record.identifier} than {evaluation.title} "
-            "holds now; results are not mixed, choose another --output"
+            f"{results.path}: expected results of the recordings of {record.identifier} in {evaluation.title}, got "
+            "those of others; choose another --output",
+            file=results.path,
+            name=record.identifier,
+            value=record.digest,
         )
     return replace(record, digest=digest)
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from avmsf.errors import EvaluationError
+from avmsf.plotting.style import FIRST
 
 Side: TypeAlias = tuple[float, float]
 """Azimuth about the direction to the sky, and elevation above the horizon, of an eye far away; degrees."""
@@ -26,15 +27,14 @@ ALL_SIDES: tuple[Side, ...] = (
     (-60.0, -75.0),
 )
 """Three sides, into what is open above, and two from below: nothing on a convex object is out of sight in all."""
-_INK = "#1f3b5c"
 _ARROW = 28.0
 """Length of the arrows along the axes, points."""
 
 
 def side_words(side: Side) -> str:
-    """Return where a side is seen from: how far round, and how far up or down."""
+    """Return a side's azimuth and elevation as text."""
     azimuth, elevation = side
-    return f"{azimuth:g}° round, {abs(elevation):g}° {'up' if elevation >= 0 else 'down'}"
+    return f"azimuth {azimuth:g}°, elevation {elevation:g}°"
 
 
 def view_from(side: Side, up: Sequence[float] = UP) -> Float[np.ndarray, "3 3"]:
@@ -45,7 +45,7 @@ def view_from(side: Side, up: Sequence[float] = UP) -> Float[np.ndarray, "3 3"]:
     azimuth, elevation = side
     sky = np.asarray(up, dtype=float)
     if sky.shape != (3,) or not np.isfinite(sky).all() or np.linalg.norm(sky) == 0.0:
-        raise EvaluationError(f"expected a direction of three numbers that points up, found {list(up)}")
+        raise EvaluationError(f"expected an up direction of three numbers, got {list(up)}", name="up", value=list(up))
     sky = sky / np.linalg.norm(sky)
     first = np.roll(np.eye(3)[np.argmax(np.abs(sky))], 1)
     first = first - (first @ sky) * sky
@@ -69,8 +69,8 @@ def name_axes(axes: Axes, view: Float[np.ndarray, "3 3"]) -> None:
                 (across, along),
                 xycoords="axes fraction",
                 textcoords="offset points",
-                arrowprops={"arrowstyle": "<-", "color": _INK},
-                color=_INK,
+                arrowprops={"arrowstyle": "<-", "color": FIRST},
+                color=FIRST,
                 ha="center",
                 va="center",
             )

@@ -16,8 +16,8 @@ from avmsf.scene.points import nearest_points
 class MeanSpectra:
     """The mean magnitudes of the nearest training sounds' short-time spectra, with the phases of the nearest one's.
 
-    The phases of one strike belong to one another, from frame to frame and from bin to bin, so that the sound has
-    nearly the mean magnitudes. Where a bin of the nearest is silent, its phase is zero.
+    The phases of one recording are consistent between frames and bins, so that the sound has nearly the mean
+    magnitudes. Where a bin of the nearest is silent, its phase is zero.
     """
 
     train: Impacts
@@ -29,11 +29,14 @@ class MeanSpectra:
     def __post_init__(self) -> None:
         if not 1 <= self.count <= len(self.train):
             raise EvaluationError(
-                f"the mean spectrum of {self.count} nearest impacts was asked of {len(self.train)} training impacts; "
-                f"ask for 1 to {len(self.train)}"
+                f"expected a count of 1 to {len(self.train)} nearest training impacts, got {self.count}",
+                name="count",
+                value=self.count,
             )
         if self.fft_size < 16:
-            raise EvaluationError(f"spectra of {self.fft_size} samples were asked for; ask for 16 or more")
+            raise EvaluationError(
+                f"expected an FFT size of 16 samples or more, got {self.fft_size}", name="fft_size", value=self.fft_size
+            )
 
     @property
     def sample_rate(self) -> float:

@@ -1,4 +1,4 @@
-"""Groups of objects within a dataset: those of the paper's smaller studies, and simulated ones known by their truth."""
+"""Groups of objects within a dataset: those of the paper's smaller studies, and simulated ones with ground truth."""
 
 from collections.abc import Mapping, Sequence
 
@@ -48,6 +48,8 @@ def choose_objects(dataset: Dataset, protocol: EvaluationProtocol, asked: Sequen
             return tuple(each for each in dataset.objects() if each in group)
         if protocol.required:
             raise EvaluationError(
-                f"no object of this dataset is known to be {protocol.subset}; name some of its objects with --objects"
+                f"expected objects of the group {protocol.subset}, found none; name objects with --objects",
+                name="subset",
+                value=protocol.subset,
             )
     return dataset.objects()

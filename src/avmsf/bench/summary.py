@@ -1,9 +1,9 @@
-"""From kept figures to what is concluded: means over contacts, then over objects, and how methods differ.
+"""Statistics of stored values: means over contacts, then over objects, and differences between methods.
 
-Every object counts once, however many contacts it has. A method's mean is over the objects that it has figures of;
-differences and ratios are over those that the baseline has figures of too, object by object. The ratio is the
-geometric mean of the objects' ratios, so that a loud object counts no more than a faint one and a ratio turned round
-is its inverse; the ratio of the means is the only one that the paper's tables allow, and stands beside it.
+Every object has the same weight. A method's mean is over the objects that it has values of; differences and ratios are
+over those that the baseline has values of too, paired by object. The ratio is the geometric mean of the objects'
+ratios, so that it does not depend on level and swapping the methods inverts it; the ratio of the means, the only one
+that the paper's tables allow, is given too.
 """
 
 import math
@@ -26,7 +26,7 @@ class Mean:
 
     mean: float
     standard_error: float | None
-    """As if the objects were drawn by chance; None for a single one."""
+    """As if the objects were a random sample; None for a single one."""
     objects: int
 
     @classmethod
@@ -149,7 +149,7 @@ def summarize(
 
 
 def failures_of(records: Iterable[ObjectRecord]) -> list[dict[str, str | None]]:
-    """Return what could not be computed, and why."""
+    """Return the failures with their reasons."""
     found: list[dict[str, str | None]] = []
     for record in records:
         if record.failure is not None:

@@ -1,4 +1,4 @@
-"""What a method is given to learn from: one object, some of its blows, and nothing of the others but their places."""
+"""The training data of a method: one object, its training recordings, and the contacts of all recordings."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,64 +17,61 @@ from avmsf.scene.features import FeatureField
 from avmsf.scene.gaussians import GaussianCloud
 
 Look = Literal["positions", "visual", "unaligned", "paper", "paper-positions", "paper-unaligned"]
-"""What a field reads of an object's points: positions alone; positions with what the places look like, made to obey the
-object's symmetries; the same without that; features of Gaussians as the paper has them, their positions alone, and the
-features without symmetry pooling."""
+"""Features of an object's points: only positions; positions with visual features, pooled over the object's symmetries;
+the same without pooling; the paper's features of Gaussians, only their positions, and the features without pooling."""
 
 
 def _no_family() -> BodyFamily:
-    raise EvaluationError("the object's shape is not known: expected a mesh, or views of it")
+    raise EvaluationError("expected a mesh or views of the object, found none", name="mesh")
 
 
 def _no_gaussians() -> GaussianCloud:
-    raise EvaluationError(
-        "the object has no Gaussians: expected views of it, its mesh, or a .ply of Gaussians in its folder"
-    )
+    raise EvaluationError("expected views, a mesh or a .ply of Gaussians of the object, found none", name="gaussians")
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
     """One object and one choice of training contacts.
 
-    What takes time is behind a function, which remembers what it made: methods that do not ask for it do not pay.
+    Slow inputs are cached functions, so that methods that do not use them take no time for them.
     """
 
     name: str
-    """What the object is called, in messages and as a folder of others' sounds."""
+    """Name of the object, in messages and as the folder of other systems' sounds."""
     train: Impacts
-    """The blows to learn from."""
+    """The training recordings."""
     contacts: Float[Tensor, "contacts 3"]
-    """Contacts of all the object's blows, training and test alike, meters."""
+    """Contacts of all recordings of the object, training and test, meters."""
     names: tuple[str, ...]
     """Names of their recordings, row for row."""
     seed: int
-    """Start of all chance in the method."""
+    """Random seed of the method."""
     modes: Callable[[], Extraction]
-    """Finds the modes of `train`, row for row."""
+    """Extracts the modes of `train`, row for row."""
     features: Callable[[Look], FeatureField]
-    """Makes what a field reads of the object's points. Raises SceneError where nothing shows the object's look."""
+    """Computes the features of the object's points. Raises SceneError without visual input."""
     bodies: Callable[[], CandidateBodies]
-    """Computes what may lie behind the object's surface. Raises AvmsfError where its shape is unknown or unfit."""
+    """Computes the candidate FE models of the object. Raises AvmsfError where its shape is unknown or unfit."""
     stranger: Callable[[], Float[Tensor, " samples"]]
     """Draws, by `seed`, the recording of another object, at the sample rate and of the length of `train`. Raises
     EvaluationError where there is no other object."""
     family: Callable[[], BodyFamily] = _no_family
-    """Computes the bodies that the object's surface may enclose, of any material. Raises AvmsfError likewise."""
+    """Computes the FE models of the object's surface, of any material. Raises AvmsfError likewise."""
     material: str | None = None
-    """What the dataset says that the object is made of, in lower case; None where it does not."""
+    """Material of the object in the dataset, in lower case; None where it is unknown."""
     gaussians: Callable[[], GaussianCloud] = _no_gaussians
-    """Fits Gaussians to the object's views. Raises AvmsfError where nothing shows its look."""
+    """Fits Gaussians to the object's views. Raises AvmsfError without views."""
 
 
 @runtime_checkable
 class Method(Protocol):
-    """A way to learn an object's sounds from some of them."""
+    """A method that predicts an object's sounds from its training recordings."""
 
     @property
     def name(self) -> str:
-        """What tables and the command line call it; words joined by hyphens."""
+        """Name in tables and on the command line; words joined by hyphens."""
         ...
 
     def fit(self, task: Task) -> Renderer:
-        """Learn from the task's training blows. Raises AvmsfError where it cannot."""
+        """Fit a renderer to the task's training recordings. Raises AvmsfError where it cannot."""
         ...

@@ -1,33 +1,33 @@
-"""What reports say of each method, so that no row is taken for what it is not."""
+"""Descriptions of the methods in reports."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
 
 TITLES: Mapping[str, str] = MappingProxyType(
     {
-        "white-noise": "Gaussian noise as loud as the training recordings",
+        "white-noise": "Gaussian noise at the level of the training recordings",
         "random-impact": "a recording of another object",
         "nearest": "the nearest training recording",
         "knn3": "mean waveform of the three nearest recordings (the paper's KNN)",
-        "knn3-directions": "the same, with the directions of impacts as part of the distance",
+        "knn3-directions": "mean waveform of the three nearest recordings, by position and impact direction",
         "knn-gains": "modal gains averaged over the three nearest recordings",
         "knn-spectra": "spectra averaged over the three nearest recordings",
         "spline-gains": "modal gains by thin-plate splines",
-        "diffsound": "DiffSound, rebuilt, as the paper compares with it",
+        "diffsound": "reimplementation of DiffSound, as in the paper",
         "diffsound-weighted": "DiffSound with a fitted weight for each mode",
-        "sonicgauss": "SonicGauss with its published weights, which have seen ObjectFolder Real, fine-tuned",
+        "sonicgauss": "SonicGauss with its published weights, trained on ObjectFolder Real, fine-tuned",
         "recorded": "sounds of another system, from files",
         "sonicgauss-small": "SonicGauss's objective at a small size, trained from scratch on simulated objects",
         "field": "attention network, quick settings, visual features",
         "field-auto": "Gaussian process over kernel families (the default of this package)",
-        "field-elastic": "Gaussian process on elastic mode shapes alone",
-        "field-smooth": "Gaussian process on distances alone",
-        "field-thin-plate": "Gaussian process of thin-plate splines alone",
+        "field-elastic": "Gaussian process on elastic mode shapes only",
+        "field-smooth": "Gaussian process on distances only",
+        "field-thin-plate": "Gaussian process of thin-plate splines only",
         "field-positions": "attention network, quick settings, positions only",
         "field-unaligned": "attention network, quick settings, without symmetry pooling",
         "field-no-initialization": "attention network, quick settings, without extracted modes",
         "field-no-residual": "attention network, quick settings, without residual noise",
-        "field-warmup": "attention network, quick settings, warm-up alone",
+        "field-warmup": "attention network, quick settings, warm-up only",
         "field-grid": "attention network, settings chosen from a small grid",
         "paper": "the paper's method with the preset `paper`, shared damping",
         "paper-per-contact": "the paper's method with damping per contact",

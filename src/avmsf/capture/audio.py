@@ -60,8 +60,11 @@ class Recording:
         """Return one channel, counted from 1 as sound editors count them; `CaptureError` where there is none."""
         if not 1 <= number <= len(self.channels):
             raise CaptureError(
-                f"{self.name}: there is no channel {number}, the file holds {len(self.channels)} (counted from 1): "
-                "mend response_channel or force_channel in capture.toml"
+                f"{self.name}: expected a channel from 1 to {len(self.channels)}, got {number}; correct "
+                "response_channel or force_channel in capture.toml",
+                file=self.name,
+                name="channel",
+                value=number,
             )
         return self.channels[number - 1]
 
@@ -76,14 +79,23 @@ class Recording:
             return number
         left = [index + 1 for index in range(len(self.channels)) if index + 1 != force_channel]
         if not left:
-            raise CaptureError(f"{self.name}: its one channel is the force channel, so there is no sound beside it")
+            raise CaptureError(
+                f"{self.name}: expected a channel with the sound, got only the force channel; record both, or remove "
+                "force_channel from capture.toml",
+                file=self.name,
+                name="response_channel",
+                value=0,
+            )
         if len(left) == 1:
             return left[0]
         loudest = max(left, key=lambda each: float(np.std(self.channels[each - 1])))
         if not all(self._agree(loudest, each) for each in left):
             raise CaptureError(
-                f"{self.name}: it holds {len(self.channels)} different channels and nothing says which one is the "
-                "sound: write response_channel = 1 (or another, counted from 1) in capture.toml, or save it as mono"
+                f"{self.name}: expected one channel with the sound, got {len(self.channels)} different ones; write "
+                "response_channel = 1 (or another, counted from 1) in capture.toml, or save it as mono",
+                file=self.name,
+                name="response_channel",
+                value=len(self.channels),
             )
         levels = {each: float(np.std(self.channels[each - 1])) for each in left}
         return next(each for each in left if levels[each] >= FAINT_CHANNEL * levels[loudest])
@@ -121,11 +133,14 @@ def read_recording(path: Path, name: str | None = None) -> Recording:
     try:
         missing = not path.is_file()
     except OSError as error:
-        raise CaptureError(f"{name[:80]}…: no file can be called that ({error.strerror})") from error
+        raise CaptureError(
+            f"{name[:80]}…: expected the name of a sound file ({error.strerror})", file=path, value=name
+        ) from error
     if path.is_dir():
-        raise CaptureError(f"{name} is a folder; expected one sound file in it")
+        raise CaptureError(f"{name}: expected a sound file, got a folder", file=path)
     if missing:
-        raise CaptureError(f"{name}: there is no such file{_nearest_name(path)}")
+        found, advice = _nearest_name(path)
+        raise CaptureError(f"{name}: expected a sound file, got none{advice}", file=path, value=found)
     return decode_recording(path, name)
 
 
@@ -133,7 +148,7 @@ class SoundBytes(io.BytesIO):
     """A sound file in memory, for soundfile to read."""
 
     def seek(self, offset: int, whence: int = 0, /) -> int:
-        """Move; stay where a damaged header asks for a place before the file, as a file on disk does."""
+        """Move; stay where a damaged header asks for a position before the file, as a file on disk does."""
         try:
             return super().seek(offset, whence)
         except ValueError:
@@ -151,16 +166,23 @@ def decode_recording(source: Path | SoundBytes, name: str) -> Recording:
         reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
         size = source.stat().st_size if isinstance(source, Path) else source.getbuffer().nbytes
         raise CaptureError(
-            f"{name}: not a sound file that can be read ({size} bytes: {reason}): export or copy it again as wav"
+            f"{name}: expected a sound file, got {size} bytes that cannot be read ({reason}); export it again as wav",
+            file=name,
+            name="bytes",
+            value=size,
         ) from error
     if not samples.size:
-        raise CaptureError(f"{name}: the file is empty, it holds no samples: record or export it again")
+        raise CaptureError(f"{name}: expected samples, got none; record or export it again", file=name, value=0)
     if not np.isfinite(samples).all():
         count = int((~np.isfinite(samples)).sum())
-        raise CaptureError(f"{name}: {count} samples are not finite numbers: export it again")
+        raise CaptureError(
+            f"{name}: expected finite samples, got {count} that are not; export it again", file=name, value=count
+        )
     peak = float(np.abs(samples).max())
     if peak > MAX_PEAK:
-        raise CaptureError(f"{name}: expected samples of at most {MAX_PEAK:g}, got {peak:.3g}: export it again")
+        raise CaptureError(
+            f"{name}: expected samples of at most {MAX_PEAK:g}, got {peak:.3g}; export it again", file=name, value=peak
+        )
     return Recording(name, np.ascontiguousarray(samples.T), rate, subtype)
 
 
@@ -168,7 +190,7 @@ def read_sound(path: str | Path, *, channel: int | None = None) -> tuple[Float[T
     """Read one clip for which no contact is known: the whole of it as float32, and its sample rate in Hz.
 
     `channel` counts from 1 and is needed only where a file holds several different ones. Raises `CaptureError` for
-    what `read_recording` refuses, for a rate outside 100 Hz to 192 kHz, and for silence.
+    what `read_recording` rejects, for a rate outside 100 Hz to 192 kHz, and for silence.
     """
     recording = read_recording(Path(path))
     sound = recording.response(channel)
@@ -181,8 +203,11 @@ def refuse_rate(rate: float, name: str) -> None:
     """Raise `CaptureError` unless the rate lies between 100 Hz and 192 kHz."""
     if not LOWEST_RATE <= rate <= HIGHEST_RATE:
         raise CaptureError(
-            f"{name}: a sample rate of {rate:g} Hz; expected {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz "
-            "(the file's rate times playback_speed)"
+            f"{name}: expected a sample rate of {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz (the file's rate times "
+            f"playback_speed), got {rate:g} Hz; export it at another rate",
+            file=name,
+            name="sample_rate",
+            value=rate,
         )
 
 
@@ -191,8 +216,11 @@ def refuse_peak(sound: Float64[np.ndarray, " frames"], name: str) -> None:
     peak = float(np.abs(sound).max())
     if not MIN_PEAK <= peak <= MAX_PEAK:
         raise CaptureError(
-            f"{name}: expected a peak of {MIN_PEAK:g} to {MAX_PEAK:g}, got {peak:.3g}: export it again, or check the "
-            "force that it is divided by"
+            f"{name}: expected a peak of {MIN_PEAK:g} to {MAX_PEAK:g}, got {peak:.3g}; export it again, or check the "
+            "force that it is divided by",
+            file=name,
+            name="peak",
+            value=peak,
         )
 
 
@@ -200,8 +228,10 @@ def refuse_silence(sound: Float64[np.ndarray, " frames"], name: str) -> None:
     """Raise `CaptureError` where every sample is the same."""
     if np.ptp(sound) == 0:
         raise CaptureError(
-            f"{name}: the sound is silent, all {len(sound)} samples are {sound[0]:g}: "
-            "record it again, or choose another response_channel"
+            f"{name}: expected a sound, got silence (all {len(sound)} samples are {sound[0]:g}); "
+            "record it again, or choose another response_channel",
+            file=name,
+            value=float(sound[0]),
         )
 
 
@@ -231,16 +261,21 @@ def _refuse_long(file: soundfile.SoundFile, name: str) -> None:
     if samples > MAX_SAMPLES:
         raise RecordingLengthError(
             f"{name}: expected at most {MAX_SAMPLES:,} samples in all channels, got {samples:,} "
-            f"({file.frames / file.samplerate / 60:.3g} minutes of {file.channels}): keep the seconds about the blow"
+            f"({file.frames / file.samplerate / 60:.3g} minutes of {file.channels}); cut it to the seconds around the "
+            "impact",
+            file=name,
+            value=samples,
         )
 
 
-def _nearest_name(path: Path) -> str:
-    """Return the end of an error about a path that does not exist: a file with a similar name, or what to do."""
+def _nearest_name(path: Path) -> tuple[str | None, str]:
+    """Return the file with the most similar name to a path that does not exist, if any, and the end of an error."""
     if not path.parent.is_dir():
-        return f", nor the folder {path.parent}"
+        return None, f", nor the folder {path.parent}"
     # The first by name: the order of a folder differs from disk to disk.
     listed = heapq.nsmallest(_MAX_NAMES_COMPARED, (other.name for other in path.parent.iterdir()))
     names = {name.lower(): name for name in listed}
     found = get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)
-    return f" (did you mean {names[found[0]]}?)" if found else ": copy it there, or remove its row from impacts.csv"
+    if not found:
+        return None, ": copy it there, or remove its row from impacts.csv"
+    return names[found[0]], f" (did you mean {names[found[0]]}?)"

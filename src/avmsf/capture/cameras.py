@@ -33,9 +33,11 @@ class Camera:
         numbers = [*self.focal, *self.principal, *self.world_to_camera.flatten().tolist()]
         if not all(map(math.isfinite, numbers)) or min(self.focal) <= 0 or min(self.width, self.height) < 1:
             raise CaptureError(
-                f"expected a camera with finite numbers, positive focal lengths and a size in pixels, found focal "
-                f"lengths {self.focal}, principal point {self.principal}, size {self.width} x {self.height}: check "
-                "the file that holds the cameras"
+                f"expected a camera with finite numbers, positive focal lengths and a size in pixels, got focal "
+                f"lengths {self.focal}, principal point {self.principal}, size {self.width} x {self.height}; check "
+                "the file that holds the cameras",
+                name="camera",
+                value=[*self.focal, *self.principal, self.width, self.height],
             )
 
     @classmethod
@@ -51,13 +53,18 @@ class Camera:
     ) -> "Camera":
         """Return a camera at `position` that sees `target` in the middle of its image, with `up` upwards in it.
 
-        Raises CaptureError where position and target are one place, or `up` is parallel to the line of sight.
+        Raises CaptureError where position and target are equal, or `up` is parallel to the line of sight.
         """
         position, target, up = position.double(), target.double(), up.double()
         forward = target - position
         right = torch.linalg.cross(forward, up)
         if float(right.norm()) < 1e-9 * max(float(forward.norm()) * float(up.norm()), 1e-300):
-            raise CaptureError(f"expected a camera that looks across its up direction {up.tolist()}; choose another up")
+            raise CaptureError(
+                f"expected an up direction across the line of sight {forward.tolist()}, got {up.tolist()}; choose "
+                "another up, or another target than the camera's position",
+                name="up",
+                value=up.tolist(),
+            )
         forward, right = forward / forward.norm(), right / right.norm()
         rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
         pose = torch.eye(4, dtype=torch.float64)
@@ -66,7 +73,7 @@ class Camera:
 
     @cached_property
     def position(self) -> Float[Tensor, " 3"]:
-        """The camera's place in the object frame, meters."""
+        """The camera's position in the object frame, meters."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
     @cached_property
@@ -78,9 +85,9 @@ class Camera:
         )
 
     def project(self, points: Float[Tensor, "points 3"]) -> tuple[Float[Tensor, "points 2"], Float[Tensor, " points"]]:
-        """Return the points' places in the image, pixels, and their depths along the optical axis, meters; float64.
+        """Return the points' positions in the image, pixels, and their depths along the optical axis, meters; float64.
 
-        A point at or behind the camera has no place: its pixels are NaN.
+        A point at or behind the camera has no position: its pixels are NaN.
         """
         inside = points.double() @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
         depth = inside[:, 2]
@@ -126,10 +133,12 @@ class View:
         expected = (self.camera.height, self.camera.width)
         if found != expected or (self.mask is not None and tuple(self.mask.shape) != expected):
             raise CaptureError(
-                f"{self.name}: the camera takes {expected[1]} x {expected[0]} pixels, the image has {found[1]} x "
-                f"{found[0]}"
-                + ("" if self.mask is None else f", its mask {self.mask.shape[1]} x {self.mask.shape[0]}")
-                + ": give the camera of this very image"
+                f"{self.name}: expected an image of the camera's {expected[1]} x {expected[0]} pixels, got {found[1]} "
+                f"x {found[0]}"
+                + ("" if self.mask is None else f" and a mask of {self.mask.shape[1]} x {self.mask.shape[0]}")
+                + ": give the camera of this image",
+                name=self.name,
+                value=list(found),
             )
 
     @property

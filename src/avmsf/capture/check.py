@@ -13,6 +13,7 @@ from avmsf.capture.starts import stay_uncut
 from avmsf.capture.surface import find_surface
 from avmsf.capture.table import TABLE, Row, Strike, read_rows, refuse_repeated_files, understand
 from avmsf.capture.together import common_length, common_rate, judge_contacts, judge_levels, judge_surface
+from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
 from avmsf.wording import counted
 
@@ -23,16 +24,16 @@ UNCUT = "all recordings start with the impact, as impulse responses do, and are 
 
 @dataclass(frozen=True)
 class CaptureReport:
-    """What `check` found: plain values throughout, so that `dataclasses.asdict` gives what JSON holds."""
+    """What `check` found, in plain values: `dataclasses.asdict` gives what JSON holds."""
 
     readable: bool
     """Whether `read_capture` would read this folder (perhaps with warnings)."""
     recordings: tuple[RecordingReport, ...]
-    """One a row of impacts.csv, in its order."""
+    """One for each row of impacts.csv, in its order."""
     problems: tuple[str, ...]
-    """What is wrong with the folder, its table, its surface, or with the recordings side by side."""
+    """What is wrong with the folder, its table, its surface, or the recordings together."""
     remarks: tuple[str, ...] = ()
-    """What was found out about the recordings together and is no problem."""
+    """Notes on the recordings together that are no problems."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +50,14 @@ class _Sound:
 
 
 def check(folder: str | Path, settings: CaptureSettings | None = None) -> CaptureReport:
-    """Look at a capture folder as `read_capture` would and report on every recording; raises nothing for bad input."""
+    """Check a capture folder as `read_capture` would and report on every recording; raises nothing for bad input."""
     folder = Path(folder)
     try:
         settings = settings or settings_of(folder)
-        rows, problems = read_rows(folder)
+        rows, warned = read_rows(folder)
     except CaptureError as error:
         return CaptureReport(False, (), (str(error),))
+    problems = [str(each) for each in warned]
     reports, strikes, sounds = list[RecordingReport](), list[Strike](), list[_Sound]()
     missing = list[str]()
     for row in rows:
@@ -69,7 +71,7 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
             sounds.append(_Sound(report.file, len(prepared.sound), rate, prepared.peak, start))
     refused = _check_contacts(folder, strikes, rows, settings=settings, problems=problems)
     if len(missing) > MAX_SUGGESTIONS:
-        refused.append(f"{TABLE}: there are no files for {len(missing)} of {len(rows)} rows")
+        refused.append(f"{TABLE}: expected a file for each row, {len(missing)} of {len(rows)} are missing")
     comparable = len(sounds) > 1 and len({each.rate for each in sounds}) == 1
     uncut = comparable and stay_uncut([each.start for each in sounds], rate=sounds[0].rate, settings=settings)
     if uncut:
@@ -94,14 +96,14 @@ def _wav_files(folder: Path) -> list[str]:
 def _check_row(
     folder: Path, row: Row, *, settings: CaptureSettings, missing: list[str]
 ) -> tuple[Strike | None, Prepared | None, RecordingReport]:
-    """Return what could be understood of one row, its sound, and its report; add its file to `missing` where it is."""
+    """Return one row parsed as far as possible, its sound, and its report; add its file to `missing` where it is."""
     strike = None
     try:
         strike = understand(row, settings)
         if not os.path.exists(folder / strike.file):
             missing.append(strike.file)
             if len(missing) > MAX_SUGGESTIONS:
-                raise CaptureError(f"{strike.file}: there is no such file")
+                raise CaptureError(f"{strike.file}: expected a sound file, got none", file=strike.file)
         prepared, report = read_strike(folder, strike, settings=settings)
     except CaptureError as error:
         file = strike.file if strike is not None else row.cells["file"]
@@ -117,13 +119,13 @@ def _check_sounds(sounds: list[_Sound], *, settings: CaptureSettings, problems: 
         *((each.file, each.samples, each.rate, each.peak) for each in sounds), strict=True
     )
     refused = []
-    judges: tuple[Callable[[], list[str]], ...] = (
+    judges: tuple[Callable[[], list[CaptureWarning]], ...] = (
         lambda: common_length(samples, names, rate=common_rate(rates, names), settings=settings)[1],
         lambda: judge_levels(peaks, names),
     )
     for judge in judges:
         try:
-            problems += judge()
+            problems += [str(each) for each in judge()]
         except CaptureError as error:
             refused.append(str(error))
     return refused
@@ -134,12 +136,12 @@ def _check_contacts(
 ) -> list[str]:
     """Add to `problems` what looks wrong about the contacts, and return what makes the folder unreadable."""
     if strikes:
-        problems += judge_contacts(strikes, settings)
+        problems += [str(each) for each in judge_contacts(strikes, settings)]
 
     def judge_shape() -> None:
         surface = find_surface(folder, settings)
         if surface is not None and strikes:
-            problems.extend(judge_surface(strikes, surface, settings=settings))
+            problems.extend(str(each) for each in judge_surface(strikes, surface, settings=settings))
 
     refused = []
     judges: tuple[Callable[[], None], ...] = (

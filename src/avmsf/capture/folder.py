@@ -15,6 +15,7 @@ import torch
 
 from avmsf.capture.audio import read_recording
 from avmsf.capture.impacts import Impacts
+from avmsf.capture.location import expect_free
 from avmsf.capture.measure import RecordingReport, measure, shared_problems
 from avmsf.capture.prepare import Prepared, prepare
 from avmsf.capture.settings import CaptureSettings
@@ -39,13 +40,13 @@ SETTINGS = "capture.toml"
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """One object, as it was struck and recorded."""
+    """The recorded impacts on one object, with its surface."""
 
     name: str
     impacts: Impacts
     surface: Surface | None = None
     settings: CaptureSettings = field(default_factory=CaptureSettings)
-    """By which its folder was read."""
+    """Settings with which its folder was read."""
 
     def __repr__(self) -> str:
         surface = "no surface" if self.surface is None else repr(self.surface)
@@ -81,11 +82,11 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
     """Read a capture folder; `settings`, where given, take the place of the folder's `capture.toml`.
 
     Every sound starts at its impact, is divided by its force where that is known, and has the length and the sample
-    rate of all others (see `CaptureSettings`); nothing is resampled. With `align`, what the files hold on either side
-    of the sounds is kept for their alignment with one another (`Impacts.before`, `after`), and recordings that all
-    start with the impact are not cut (`start_with_impact`). Rows keep the order of `impacts.csv`. Raises `CaptureError`
-    at the first thing that cannot be used, and warns with `CaptureWarning` of what can be used but looks wrong; `check`
-    lists everything.
+    rate of all others (see `CaptureSettings`); nothing is resampled. With `align`, the samples on either side of the
+    sounds are included for their alignment with one another (`Impacts.before`, `after`), and recordings that all start
+    with the impact are not cut (`start_with_impact`). The order is that of `impacts.csv`. Raises `CaptureError` at the
+    first input that cannot be used, and warns with `CaptureWarning` of what can be used but looks wrong; `check` lists
+    everything.
     """
     folder = Path(folder)
     settings = settings or settings_of(folder)
@@ -108,7 +109,7 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
     rate = common_rate([report.sample_rate or 0.0 for report in reports], names)
     cut = cut_together(recordings, names, rate=rate, settings=settings)
     for remark in remarks + cut.remarks + _summary(reports, folder):
-        warnings.warn(remark, CaptureWarning, stacklevel=2)
+        warnings.warn(remark, stacklevel=2)
     directions = [strike.direction for strike in strikes]
     forces = [each.newtons for each in recordings]
     impacts = Impacts(
@@ -148,8 +149,7 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
     is not empty, or cannot be written.
     """
     folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise CaptureError(f"{folder}: exists and is not an empty folder; choose another name or remove it")
+    expect_free(folder)
     begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
     try:
         begun.mkdir(parents=True)
@@ -158,7 +158,7 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
             folder.rmdir()
         os.rename(begun, folder)
     except (OSError, soundfile.LibsndfileError) as error:
-        raise CaptureError(f"{folder}: the capture cannot be written: {error}") from error
+        raise CaptureError(f"{folder}: the capture cannot be written ({error})", file=folder) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
 
@@ -201,13 +201,16 @@ def _write_files(capture: Capture, folder: Path, *, onsets_within: float | None)
 
 
 def _refuse_missing(folder: Path, strikes: list[Strike]) -> None:
-    """Raise one `CaptureError` where several recordings are missing; of a single one its reader says more."""
+    """Raise one `CaptureError` where several recordings are missing; for a single one its reader has more advice."""
     missing = [strike.file for strike in strikes if not os.path.exists(folder / strike.file)]
     if len(missing) > 1:
         shown = f"{', '.join(missing[:5])}{', …' * (len(missing) > 5)}"
         raise CaptureError(
-            f"{TABLE}: there are no files for {len(missing)} of {len(strikes)} rows: {shown}: copy them into {folder}, "
-            "or mend their names"
+            f"{TABLE}: expected a file for each row, {len(missing)} of {len(strikes)} are missing ({shown}); copy them "
+            f"into {folder}, or correct their names",
+            file=folder / TABLE,
+            name="file",
+            value=missing,
         )
 
 
@@ -234,7 +237,7 @@ def _whole_rate(sample_rate: float) -> tuple[int, float]:
     return rate, sample_rate / rate
 
 
-def _summary(reports: list[RecordingReport], folder: Path) -> list[str]:
+def _summary(reports: list[RecordingReport], folder: Path) -> list[CaptureWarning]:
     wrong = [report for report in reports if report.problems]
     if not wrong:
         return []
@@ -242,4 +245,5 @@ def _summary(reports: list[RecordingReport], folder: Path) -> list[str]:
     shown = "; ".join(sentences[:5])
     more = f"; and {len(sentences) - 5} more" if len(sentences) > 5 else ""
     look = "looks" if len(wrong) == 1 else "look"
-    return [f"{len(wrong)} of {len(reports)} recordings {look} wrong: {shown}{more}. `avmsf check {folder}` shows all"]
+    message = f"{len(wrong)} of {len(reports)} recordings {look} wrong: {shown}{more}. `avmsf check {folder}` shows all"
+    return [CaptureWarning(message, file=folder, value=[report.file for report in wrong])]

@@ -1,4 +1,4 @@
-"""The recordings of one object: where it was struck, and what was heard."""
+"""The recordings of one object, with their contact positions."""
 
 import hashlib
 import json
@@ -26,12 +26,12 @@ _BLOCK = 1024
 
 @dataclass(frozen=True, eq=False)
 class Impacts:
-    """Blows on one object, one row a blow, all at one sample rate and of one length."""
+    """Impacts on one object, one row each, all at one sample rate and of one length."""
 
     contacts: Float[Tensor, "contacts 3"]
     """Contact points in the object frame, meters; read in float64, so that equal distances stay equal."""
     sounds: Float[Tensor, "contacts samples"]
-    """Response to each blow, starting at its onset; per newton where the forces are known, else as recorded."""
+    """Response to each impact, starting at its onset; per newton where the forces are known, else as recorded."""
     sample_rate: float
     """Samples per second of `sounds`, Hz."""
     names: tuple[str, ...]
@@ -39,7 +39,7 @@ class Impacts:
     directions: Float[Tensor, "contacts 3"] | None = None
     """Unit vectors along which the hammer moved, where they are known."""
     forces: Float[Tensor, " contacts"] | None = None
-    """Peak force of each blow that `sounds` was divided by, newtons, where it is known."""
+    """Peak force of each impact that `sounds` was divided by, newtons, where it is known."""
     before: Float[Tensor, "contacts lead"] | None = None
     """What each file holds just before `sounds`, in the same unit; NaN where it holds nothing. None where the sounds
     are final: aligned already, or given without their files."""
@@ -48,7 +48,8 @@ class Impacts:
 
     def __post_init__(self) -> None:
         if (self.before is None) != (self.after is None):
-            raise ValueError("expected both before and after, or neither, got one of them")
+            name = "before" if self.before is None else "after"
+            raise ArrayError(f"{name}: expected both before and after, or neither, got only one", name=name)
 
     @classmethod
     def of(
@@ -70,7 +71,9 @@ class Impacts:
         count = len(places)
         named = tuple(f"{row:03d}" for row in range(1, count + 1)) if names is None else tuple(names)
         if len(named) != count:
-            raise ArrayError(f"names: expected {count}, one for each contact, got {len(named)}", name="names")
+            raise ArrayError(
+                f"names: expected {count}, one for each contact, got {len(named)}", name="names", value=len(named)
+            )
         return cls(
             places,
             as_rows(sounds, "sounds", count=count).float(),
@@ -119,10 +122,16 @@ class Impacts:
         """Return the recordings cut anew, each starting `delays` samples later in its file (earlier where negative).
 
         Between samples by a windowed sinc. What a file does not hold is zero. The result is final: its `before` and
-        `after` are None. Raises ValueError for delays that are not finite.
+        `after` are None. Raises ArrayError for delays that are not finite.
         """
         if not bool(torch.isfinite(delays).all()):
-            raise ValueError(f"expected finite delays, got {delays.tolist()}")
+            row = int((~torch.isfinite(delays)).nonzero()[0])
+            raise ArrayError(
+                f"delays: expected finite numbers of samples, got {float(delays[row])} (row {row})",
+                row=row,
+                name="delays",
+                value=float(delays[row]),
+            )
         margins = [self.sounds.new_zeros(len(self), 0) if each is None else each for each in (self.before, self.after)]
         whole = torch.cat([margins[0], self.sounds, margins[1]], dim=1).nan_to_num_(nan=0.0)
         sounds = _cut(whole, margins[0].shape[1] + delays, self.sounds.shape[1])

@@ -11,7 +11,7 @@ from avmsf.capture.surface import Surface
 from avmsf.errors import CaptureError
 
 _SPECK = 0.02
-"""Area of a part over the largest part's, below which it is no part of the body."""
+"""Area of a part over the largest part's, below which it does not belong to the object."""
 
 
 def enclose(
@@ -24,7 +24,7 @@ def enclose(
 ) -> Surface:
     """Return the closed surface around all that is above `level` on a grid, triangles counter-clockwise from outside.
 
-    `lowest` is the place of the first value and `spacing` the distance between two, meters; the values at the grid's
+    `lowest` is the position of the first value and `spacing` the distance between two, meters; the values at the grid's
     edge must be below the level. Parts much smaller than the largest are left out. With `faces` the surface is made
     coarser until it has at most so many triangles, twice or four times as many where fewer would pinch it open. Raises
     CaptureError where nothing or everything is above the level.
@@ -33,8 +33,10 @@ def enclose(
         float(values.take(end, axis=axis).max()) >= level for axis in range(3) for end in (0, -1)
     ):
         raise CaptureError(
-            f"values from {values.min():g} to {values.max():g} enclose nothing at the level {level:g}: expected some "
-            "above it, and none at the edge of the grid"
+            f"expected values above {level:g} inside the grid and none at its edge, got {values.min():g} to "
+            f"{values.max():g}",
+            name="values",
+            value=[float(values.min()), float(values.max())],
         )
     # Imported here, for it takes a third of a second that hardly any command needs.
     from skimage import measure

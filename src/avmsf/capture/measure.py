@@ -1,4 +1,4 @@
-"""What one recording is worth: its length, level, noise, clipping, onset and second blows."""
+"""Quality of one recording: its length, level, noise, clipping, onset and second impacts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,13 +39,13 @@ class RecordingReport:
     peak_db: float | None = None
     """Peak of the response against full scale (against 1.0 in float files), dB."""
     noise_db: float | None = None
-    """Noise (root mean square) against the peak, dB: before the blow, or else in the quietest tenth of the file."""
+    """Noise (root mean square) against the peak, dB: before the impact, or else in the quietest tenth of the file."""
     onset_seconds: float | None = None
-    """When the blow begins in the file, seconds as recorded."""
+    """When the impact begins in the file, seconds as recorded."""
     clipped: int | None = None
     """Samples on flat tops, in the response and the force."""
     double_hit_seconds: float | None = None
-    """When a second blow begins in the file, within what is kept; None where there is none."""
+    """When a second impact begins in the file, within the length that is used; None without one."""
 
 
 def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettings, line: int) -> RecordingReport:
@@ -70,16 +70,16 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         not np.array_equal(recording.channel(each), response) for each in others
     ):
         problems.append(
-            f"its channels hold one sound, up to a constant factor and rounding: channel {channel} is read; to choose "
+            f"its channels hold one sound, up to a constant factor and rounding: channel {channel} is used; to choose "
             "another, write response_channel in capture.toml"
         )
     if clipped:
         problems.append(f"{counted(clipped, 'clipped sample')}: turn the gain down and record it again")
     if second is not None:
-        problems.append(f"a second blow at {second / rate:.3f} s: record it again, or keep fewer seconds")
+        problems.append(f"a second impact at {second / rate:.3f} s: record it again, or reduce seconds")
     if noise > HIGHEST_NOISE_DB:
         problems.append(
-            f"never quieter than {-noise:.0f} dB below the peak: noise, no clear blow, or cut while it still rings"
+            f"its noise is only {-noise:.0f} dB below the peak: noisy, no clear impact, or cut before it has decayed"
         )
     if recording.subtype in EIGHT_BIT:
         problems.append(f"only 8 bits a sample ({recording.subtype}): its noise hides the decay; record 16 or more")
@@ -103,7 +103,7 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
 
 
 def shared_problems(reports: Sequence[RecordingReport]) -> list[str]:
-    """Return the recordings' problems, each with its file; what several have in common once, with the first names."""
+    """Return the recordings' problems, each with its file; common ones once, with the first names."""
     places: dict[str, list[str]] = {}
     for report in reports:
         for problem in report.problems:
@@ -114,7 +114,7 @@ def shared_problems(reports: Sequence[RecordingReport]) -> list[str]:
             shown = f"{', '.join(files[:3])}{', …' * (len(files) > 3)}"
             sentences.append(f"{len(files)} recordings ({shown}): {problem}")
         elif problem.startswith((files[0], "impacts.csv")):
-            # Errors of the capture's reader name the file or the line by themselves.
+            # Errors of the capture's reader begin with the file or the row.
             sentences.append(problem)
         else:
             sentences.append(f"{files[0]}: {problem}")
@@ -122,7 +122,7 @@ def shared_problems(reports: Sequence[RecordingReport]) -> list[str]:
 
 
 def noise_level(response: Float64[np.ndarray, " frames"], onset: int, rate: float) -> float:
-    """Return the noise's root mean square: of what lies before the blow, or of the quietest tenth of 10 ms blocks."""
+    """Return the noise's root mean square: before the impact, or of the quietest tenth of 10 ms blocks."""
     before = response[: max(0, onset - round(SECONDS_BEFORE * rate))]
     size = max(64, round(0.01 * rate))
     if len(before) >= size:

@@ -47,14 +47,17 @@ def load_mesh(path: Path, *, raising: type[AvmsfError] = CaptureError) -> trimes
     try:
         _expect_small(path)
         with warnings.catch_warnings():
-            # numpy's casts of damaged numbers; what comes of them is looked at below.
+            # numpy's casts of damaged numbers; the results are checked below.
             warnings.simplefilter("ignore", RuntimeWarning)
             scene = trimesh.load_scene(path, process=False)
             _expect_sound(scene)
     except AvmsfError as error:
-        raise raising(f"{path}: {error}") from error
+        raise raising(f"{path}: {error}", file=path, row=error.row, name=error.name, value=error.value) from error
     except Exception as error:  # trimesh's readers raise whatever their format's parsing raises
-        raise raising(f"{path}: not a mesh or point cloud that can be read: {error}: export it again") from error
+        raise raising(
+            f"{path}: expected a mesh or point cloud, got a file that cannot be read ({error}); export it again",
+            file=path,
+        ) from error
     return scene
 
 
@@ -74,13 +77,19 @@ def _expect_small(path: Path) -> None:
     """Raise CaptureError where the file's own counts are beyond the bounds, before anything is built."""
     suffix = path.suffix.lower()
     if not path.is_file():
-        raise CaptureError("there is no such mesh file")
+        raise CaptureError("expected a mesh file, got none")
     if suffix not in MESH_SUFFIXES:
-        raise CaptureError(f"expected a mesh ({', '.join(MESH_SUFFIXES)}), got {path.suffix or 'no suffix'}")
+        raise CaptureError(
+            f"expected a mesh ({', '.join(MESH_SUFFIXES)}), got {path.suffix or 'no suffix'}",
+            name="suffix",
+            value=path.suffix,
+        )
     size, most = path.stat().st_size, MAX_GLTF_BYTES if suffix == ".gltf" else MAX_BYTES
     if size > most:
         advice = ", or export it as .glb" if suffix == ".gltf" else ""
-        raise CaptureError(f"expected at most {most:,} bytes, got {size:,}: reduce the mesh{advice}")
+        raise CaptureError(
+            f"expected at most {most:,} bytes, got {size:,}; reduce the mesh{advice}", name="bytes", value=size
+        )
     if suffix == ".obj":
         _expect_small_obj(path)
     elif suffix in (".glb", ".gltf"):
@@ -112,7 +121,7 @@ def _glb_record(path: Path) -> Any:
     with open(path, "rb") as file:
         magic, _, _, length, kind = struct.unpack("<4sII I4s", file.read(20))
         if magic != b"glTF" or kind != b"JSON":
-            raise CaptureError(f"expected a binary glTF, got a file that begins with {magic!r}")
+            raise CaptureError(f"expected a binary glTF, got a file that begins with {magic!r}", value=magic)
         return parse_json(file.read(min(length, MAX_BYTES)).decode("utf-8"))
 
 
@@ -127,17 +136,22 @@ def _expect_small_gltf(record: Any) -> None:
     _expect_at_most(MAX_PARTS, sum(primitives), "primitives")
     _expect_at_most(MAX_PARTS, sum(primitives[row] for row in used if 0 <= row < len(primitives)), "parts")
     values = 0
-    for each in entries(record, "accessors"):
+    for row, each in enumerate(entries(record, "accessors")):
         count = each.get("count")
         if not isinstance(count, int) or count < 0:
-            raise CaptureError(f"expected a whole number as the count of an accessor, got {count!r}: export it again")
+            raise CaptureError(
+                f"expected a whole number as the count of accessor {row}, got {count!r}; export it again",
+                row=row,
+                name="count",
+                value=count,
+            )
         values += count
     _expect_at_most(_MAX_VALUES, values, "values")
 
 
 def _expect_at_most(most: int, found: int, what: str) -> None:
     if found > most:
-        raise CaptureError(f"expected at most {most:,} {what}, got {found:,}: reduce the mesh")
+        raise CaptureError(f"expected at most {most:,} {what}, got {found:,}; reduce the mesh", name=what, value=found)
 
 
 def _expect_sound(scene: trimesh.Scene) -> None:
@@ -149,22 +163,22 @@ def _expect_sound(scene: trimesh.Scene) -> None:
         vertices = np.asarray(getattr(geometry, "vertices", np.zeros((0, 3))), dtype=np.float64)
         _expect_at_most(3 * MAX_FACES, len(vertices), "vertices")
         if vertices.shape[1:] != (3,):
-            raise CaptureError(f"expected vertices of three coordinates, got {vertices.shape[1]}: export it again")
-        unfit = ~np.isfinite(vertices).all(axis=1)
-        if unfit.any():
-            row = int(unfit.argmax())
             raise CaptureError(
-                f"{int(unfit.sum())} of {len(vertices)} vertices are not finite numbers, the first vertex {row} "
-                f"(counted from 0): {vertices[row].tolist()}: export the mesh again"
+                f"expected vertices of three coordinates, got {vertices.shape[1]}; export it again",
+                name="vertices",
+                value=list(vertices.shape),
             )
-        _expect_indices(np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), dtype=np.int64), len(vertices))
+        expect_finite_vertices(vertices)
+        expect_corners(np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), dtype=np.int64), len(vertices))
     pixels = sum(image.width * image.height for geometry in scene.geometry.values() for image in _textures(geometry))
     _expect_at_most(MAX_TEXTURE_PIXELS, pixels, "pixels in its textures")
     farthest = 0.0 if scene.bounds is None else float(np.abs(scene.bounds).max())
     if not farthest <= MAX_COORDINATE:
         raise CaptureError(
-            f"expected coordinates up to {MAX_COORDINATE:g}, got {farthest:.3g}, with its parts in place: export the "
-            "mesh again"
+            f"expected coordinates up to {MAX_COORDINATE:g}, got {farthest:.3g} (with all parts positioned); export "
+            "the mesh again",
+            name="coordinates",
+            value=farthest,
         )
 
 
@@ -175,10 +189,27 @@ def _textures(geometry: Any) -> list[Image.Image]:
     return [each for each in named.values() if isinstance(each, Image.Image)]
 
 
-def _expect_indices(faces: np.ndarray, vertices: int) -> None:
-    for row in () if not faces.size else (int(faces.min()), int(faces.max())):
-        if not 0 <= row < vertices:
+def expect_finite_vertices(vertices: np.ndarray) -> None:
+    """Raise CaptureError for vertices [points, 3] that are not finite, with the first of them."""
+    unfit = ~np.isfinite(vertices).all(axis=1)
+    if unfit.any():
+        row = int(unfit.argmax())
+        raise CaptureError(
+            f"vertex {row}: expected finite coordinates, got {vertices[row].tolist()} ({int(unfit.sum())} of "
+            f"{len(vertices)} vertices are not finite); export the mesh again",
+            row=row,
+            name="vertices",
+            value=vertices[row].tolist(),
+        )
+
+
+def expect_corners(faces: np.ndarray, vertices: int) -> None:
+    """Raise CaptureError where corners of faces [faces, 3] are not indices of this number of vertices."""
+    for corner in () if not faces.size else (int(faces.min()), int(faces.max())):
+        if not 0 <= corner < vertices:
             raise CaptureError(
-                f"a face names vertex {row} (counted from 0) of {vertices}: the file is cut short or corrupt; export "
-                "the mesh again"
+                f"expected corners of faces from 0 to {vertices - 1}, got {corner}: the file is truncated or corrupt; "
+                "export the mesh again",
+                name="faces",
+                value=corner,
             )

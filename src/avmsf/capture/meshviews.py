@@ -227,11 +227,16 @@ def render_views(
     values out of range.
     """
     if not cameras:
-        raise CaptureError("expected cameras to render from, found none: `orbit_cameras` makes some")
-    if supersample < 1 or not all(0 <= value <= 1 for value in background):
         raise CaptureError(
-            f"expected a supersample of at least 1 and a background of numbers from 0 to 1, found {supersample} and "
-            f"{background}"
+            "expected cameras to render from, got none: `orbit_cameras` makes some", name="cameras", value=0
+        )
+    if supersample < 1:
+        raise CaptureError(
+            f"expected a supersample of at least 1, got {supersample}", name="supersample", value=supersample
+        )
+    if not all(0 <= value <= 1 for value in background):
+        raise CaptureError(
+            f"expected a background of numbers from 0 to 1, got {background}", name="background", value=background
         )
     tracer = MeshTracer(mesh)
     views = []
@@ -267,7 +272,11 @@ def orbit_cameras(
     low, high = vertices.amin(0), vertices.amax(0)
     radius = float((high - low).norm()) / 2
     if not (math.isfinite(radius) and radius > 0):
-        raise CaptureError(f"expected an object with an extent, found one of {radius:g} m: check the surface's points")
+        raise CaptureError(
+            f"expected a surface with a positive extent, got {radius:g} m; check its points",
+            name="surface",
+            value=radius,
+        )
     reach = distance * (radius / RADIUS if unit is None else unit)
     vertical = torch.tensor(up, dtype=torch.float64)
     vertical = vertical / vertical.norm()

@@ -68,14 +68,14 @@ class Mistake:
             steps.append(f"{'multiplied' if self.factor > 1 else 'divided'} by {ratio:.4g}")
             size, whose = (self.factor, "their unit") if self.factor < 1 else (1 / self.factor, "the surface's unit")
             named = [name for meters, name in UNITS.items() if abs(size / meters - 1) < 1e-6]
-            questions.append(f"is {whose} {named[0]}?" if named else "do they and the surface count one unit?")
+            questions.append(f"is {whose} {named[0]}?" if named else "are they and the surface in one unit?")
         if not torch.equal(self.axes, torch.eye(3, dtype=torch.float64)):
             steps.append(f"with (x, y, z) taken as {_written(self.axes)}")
             mirrored = float(torch.linalg.det(self.axes)) < 0
             questions.append("are the axes mirrored?" if mirrored else "does another axis point up?")
         if self.shift.any():
             steps.append(f"moved by ({', '.join(f'{value:.3g}' for value in self.shift.tolist())}) m")
-            questions.append("is the origin another?")
+            questions.append("do the origins differ?")
         undone = ", ".join(steps) + "," * (len(steps) > 1)
         return f"{undone} they lie within {_length(self.distance)} of it: {' '.join(questions)}"
 
@@ -128,7 +128,7 @@ class Placement:
         return tuple(row for row in rows.tolist() if float(self.distances[row]) > self.tolerance)
 
     def describe(self, names: Sequence[str] = ()) -> str:
-        """Return what to tell the contacts' owner, who knows them by these names or else by rows; "" if all is well."""
+        """Return a message on the contacts off the surface, by these names or else by indices; "" for none."""
         if self.on_surface:
             return ""
         if self.off:
@@ -139,38 +139,40 @@ class Placement:
             found = f"{which} up to {_length(farthest)} ({relative} object diagonals) off the surface"
             if few:
                 shown = ", ".join(names[row] if names else f"row {row}" for row in self.off[:8])
-                return f"{found}, the others on it: check {shown}{', …' * (len(self.off) > 8)}"
+                return f"{found}, the others on it; check {shown}{', …' * (len(self.off) > 8)}"
         else:
             found = f"the contacts lie within {_length(self.spread)} on an object {_length(self.diagonal)} across"
         if self.mistake is not None:
             return f"{found}; {self.mistake}"
         if not self.off:
-            return f"{found}: check that both are in one frame and unit"
+            return f"{found}; check that both are in one frame and unit"
         return (
-            f"{found}, and no change of unit, axes or origin that shows from so many contacts brings them onto it: "
-            "both must be of one object in one frame (that of structure from motion is arbitrary: `align_similarity` "
-            "brings it into the contacts')"
+            f"{found}, and no change of unit, axes or origin explains it; give both in one frame (structure from "
+            "motion chooses its own: see `align_similarity`)"
         )
 
 
 def judge_placement(contacts: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"]) -> Placement:
     """Measure how far contacts lie from a surface given by its points, and seek the mistake where most lie off it.
 
-    Tried are the ratios of usual units, all 48 ways to name and turn round the axes, a shift, and these together; a
-    mistake is told where undoing it brings nine of ten contacts within half the tolerance and all of them on average
-    `GAIN` times nearer in relation to their extent, the simplest of those that do about as well. Few contacts fit much
-    by chance: axes are judged from five on, shifts from eight. Raises CaptureError where there are no contacts, or
-    points without an extent.
+    Tried are the ratios of usual units, all 48 signed permutations of the axes, a shift, and these together. A mistake
+    is reported where undoing it brings nine of ten contacts within half the tolerance and all of them on average `GAIN`
+    times nearer in relation to their extent: the simplest of those that do about as well. Few contacts fit much by
+    chance: axes are tried from five on, shifts from eight. Raises CaptureError where there are no contacts, or points
+    without an extent.
     """
     places, cloud = contacts.double().numpy(), points.double().numpy()
     if not len(places) or not len(cloud) or not (np.isfinite(places).all() and np.isfinite(cloud).all()):
-        raise CaptureError(
-            f"expected contacts and points of a surface with finite coordinates, found {len(places)} contacts and "
-            f"{len(cloud)} points, or numbers that are not finite"
-        )
+        name = "contacts" if not len(places) or not np.isfinite(places).all() else "points"
+        count = len(places) if name == "contacts" else len(cloud)
+        raise CaptureError(f"expected {name} with finite coordinates, got {count}", name=name, value=count)
     diagonal = _diagonal(cloud)
     if not diagonal > 0:
-        raise CaptureError(f"expected points of an object with an extent, found {len(cloud)} in one place")
+        raise CaptureError(
+            f"expected points of an object with an extent, got {len(cloud)} at one position",
+            name="points",
+            value=diagonal,
+        )
     tree = cKDTree(cloud)
     some = _some(cloud, MOST_POINTS)
     # Between points that lie far apart, a contact on the surface is far from all of them.
@@ -201,12 +203,16 @@ def expect_placed(
     if placement.mistake is None and float(placement.distances.median()) <= placement.tolerance:
         return
     if placement.mistake is None:
-        advice = "; bring both into one frame, or take a gain model without elastic mode shapes"
+        advice = "; bring both into one frame, or use a gain model without elastic mode shapes"
     elif placement.mistake.unit_only:
-        advice = " State each one's unit, as unit and surface_unit in capture.toml do, or give both in meters"
+        advice = " State both units, as unit and surface_unit in capture.toml do, or give both in meters"
     else:
-        advice = " Undo this in one of the two, or take a gain model without elastic mode shapes"
-    raise FitError(f"elastic mode shapes need contacts on their surface, and {placement.describe(names)}{advice}")
+        advice = " Undo this in one of the two, or use a gain model without elastic mode shapes"
+    raise FitError(
+        f"expected contacts on the surface for elastic mode shapes, but {placement.describe(names)}{advice}",
+        name="contacts",
+        value=float(placement.distances.max()),
+    )
 
 
 def surface_points(surface: Surface, *, count: int = MOST_POINTS) -> Float[Tensor, "points 3"]:

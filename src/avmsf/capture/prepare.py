@@ -1,4 +1,4 @@
-"""From a recording to a sound that starts at its blow and no longer depends on how hard the blow was."""
+"""From a recording to a sound that starts at its impact and is normalized by the impact's force."""
 
 import math
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class Prepared:
     before: Float[np.ndarray, " lead"]
     """What the file holds just before `sound`, in the same unit: at most `margin_length` samples."""
     onset: int
-    """Sample of the file at which the blow begins, whether or not it was moved to zero."""
+    """Sample of the file at which the impact begins, whether or not it was moved to zero."""
     pulse: Pulse | None
     """The hammer's push, where there is a force channel."""
     newtons: float | None
@@ -66,7 +66,11 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
         manner = "none" if newtons is None else "peak"
     if manner == "peak" and newtons is None:
         raise CaptureError(
-            f'{recording.name}: normalize = "peak" needs a force: give force_newtons in impacts.csv, or a force_channel'
+            f'{recording.name}: expected a force for normalize = "peak", got none: give force_newtons in impacts.csv, '
+            "or a force_channel",
+            file=recording.name,
+            name="normalize",
+            value="peak",
         )
     if manner == "deconvolve" and pulse is not None:
         before, kept = deconvolve(sound, force, pulse=pulse, regularization=settings.regularization)
@@ -99,13 +103,19 @@ def remove_rumble(
     lowest = recording.sample_rate / len(sound)
     if highpass < lowest:
         raise CaptureError(
-            f"{recording.name}: expected a highpass of 0, or of {lowest:.3g} Hz or more, one period in the recording, "
-            f"got {highpass:g} Hz: change it in capture.toml"
+            f"{recording.name}: expected a highpass of 0, or of at least {lowest:.3g} Hz, one period in the recording, "
+            f"got {highpass:g} Hz; change it in capture.toml",
+            file=recording.name,
+            name="highpass",
+            value=highpass,
         )
     if highpass >= recording.sample_rate / 2:
         raise CaptureError(
-            f"{recording.name}: highpass is {highpass:g} Hz, and at {recording.sample_rate:g} Hz nothing lies above "
-            f"{recording.sample_rate / 2:g}: choose a lower one"
+            f"{recording.name}: expected a highpass below {recording.sample_rate / 2:g} Hz, half the sample rate, got "
+            f"{highpass:g} Hz; change it in capture.toml",
+            file=recording.name,
+            name="highpass",
+            value=highpass,
         )
     sections = scipy.signal.butter(4, highpass, "highpass", fs=recording.sample_rate, output="sos")
     filtered: Float64[np.ndarray, " frames"] = scipy.signal.sosfiltfilt(sections, sound)
@@ -130,16 +140,22 @@ def refuse_short(kept: Float64[np.ndarray, " samples"], recording: Recording) ->
     least = shortest_allowed(recording.sample_rate)
     if len(kept) < least:
         raise CaptureError(
-            f"{recording.name}: too short, {len(kept)} samples ({len(kept) / recording.sample_rate * 1e3:.3g} ms) "
-            f"after the onset; at least {least} are needed: record it again, or remove its row"
+            f"{recording.name}: expected at least {least} samples after the onset, got {len(kept)} "
+            f"({len(kept) / recording.sample_rate * 1e3:.3g} ms); record it again, or remove its row",
+            file=recording.name,
+            name="samples",
+            value=len(kept),
         )
 
 
 def _find_pulse(force: Float64[np.ndarray, " frames"], name: str, settings: CaptureSettings) -> Pulse:
     if np.ptp(force) == 0:
         raise CaptureError(
-            f"{name}: the force channel ({settings.force_channel}) is silent: "
-            "choose another force_channel or remove the recording"
+            f"{name}: expected a force in channel {settings.force_channel}, got silence; choose another force_channel "
+            "or remove the recording",
+            file=name,
+            name="force_channel",
+            value=settings.force_channel,
         )
     return find_pulse(force)
 

@@ -103,9 +103,11 @@ def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
         with open(path, "x", encoding="utf-8") as file:
             file.write(settings_text(proposals))
     except FileExistsError as error:
-        raise CaptureError(f"{path}: exists and is left as it is; add the proposed lines to it by hand") from error
+        raise CaptureError(
+            f"{path}: expected no such file, got an existing one; add the proposed lines to it by hand", file=path
+        ) from error
     except OSError as error:
-        raise CaptureError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise CaptureError(f"{path}: cannot be written ({error.strerror or error})", file=path) from error
     return path
 
 
@@ -137,7 +139,7 @@ def choose_channels(figures: Sequence[Float64[np.ndarray, "2 channels"]]) -> lis
             Proposal(
                 "force_channel",
                 hammer + 1,
-                f"Channel {hammer + 1} is a hammer's: in every recording one short push holds at least "
+                f"Channel {hammer + 1} is a hammer's: in every recording one short pulse holds at least "
                 f"{shares[:, hammer].min():.0%} of its energy, in the others at most {shares[:, sounds].max():.0%}. "
                 "Where it is not in newtons, write force_scale as well.",
             )
@@ -150,8 +152,8 @@ def choose_channels(figures: Sequence[Float64[np.ndarray, "2 channels"]]) -> lis
             Proposal(
                 "response_channel",
                 sounds[best] + 1,
-                f"Of the channels that can be the sound, {sounds[best] + 1} stands highest above its noise ({shown}). "
-                "Another one can be chosen.",
+                f"Of the channels that can be the sound, {sounds[best] + 1} has the highest level above its noise "
+                f"({shown}). Another one can be chosen.",
             )
         )
     return proposals
@@ -235,8 +237,8 @@ class Evidence:
         return Proposal(
             "normalize",
             "none",
-            f"The forces do not go with the loudness: 10 dB more force made the recordings {10 * slope:+.1f} dB louder "
-            f"(standard error {10 * error:.1f} dB), so that dividing by them would make levels differ more.",
+            f"The levels do not follow the forces: 10 dB more force changed the level by {10 * slope:+.1f} dB "
+            f"(standard error {10 * error:.1f} dB), so dividing by them would make levels differ more.",
         )
 
     def _highpass(self) -> Proposal | None:
@@ -259,7 +261,7 @@ class Evidence:
             "highpass",
             chosen,
             f"Before the impacts, an offset or rumble below {chosen:g} Hz is most of the noise: without it, noise is "
-            f"{10 * np.log10(before[0] / left):.0f} dB lower. The object does not ring there: the power below "
+            f"{10 * np.log10(before[0] / left):.0f} dB lower. The object does not vibrate there: the power below "
             f"{chosen:g} Hz does not rise at the impact.",
         )
 
@@ -277,8 +279,8 @@ class Evidence:
             "align",
             False,
             "All recordings are impulse responses with one time zero: they start with the impact, and their phases "
-            f"agree as they are (coherence {coherence:.2f} of 1). They are not cut in any case; this also leaves out "
-            "the estimation of their delays.",
+            f"agree (coherence {coherence:.2f} of 1). They are not cut in any case; this also skips the estimation of "
+            "their delays.",
         )
 
 

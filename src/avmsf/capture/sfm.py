@@ -21,17 +21,17 @@ import cv2
 import numpy as np
 
 from avmsf.capture.views.pictures import SUFFIXES, Picture, PictureSizeError, read_mask, read_picture
-from avmsf.capture.warning import CaptureWarning
+from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 WORKER = Path(__file__).with_name("sfm_worker.py")
 FEWEST = 3
-"""Images without which there is nothing to estimate."""
+"""Fewest images with which cameras can be estimated."""
 ALL_PAIRS = 150
 """Images up to which every pair is matched; of more, each with the next ones in the order of their names."""
 POLL = 0.2
-"""Seconds between two looks at the worker."""
+"""Seconds between two checks of the worker."""
 
 
 @dataclass(frozen=True)
@@ -41,16 +41,16 @@ class MotionProgress:
     stage: str
     """features, matches or cameras; starting before the first."""
     done: int
-    """Steps of the stage that are done, as far as COLMAP tells."""
+    """Steps of the stage that are done, as far as COLMAP reports them."""
     total: int
-    """Steps of the stage; 0 where nobody knows."""
+    """Steps of the stage; 0 where unknown."""
     seconds: float
     """Time since the start."""
 
 
 @dataclass(frozen=True)
 class EstimatedCameras:
-    """What structure from motion found, and where it lies."""
+    """What structure from motion found, and where it is saved."""
 
     model: Path
     """Folder of COLMAP's binary model, `sparse/0` in the output folder."""
@@ -120,31 +120,41 @@ def estimate_cameras(
         (output / "sparse").mkdir(exist_ok=True)
         os.rename(begun / "models" / str(models[0]["number"]), output / "sparse" / "0")
     except OSError as error:
-        raise CaptureError(f"{output}: the cameras cannot be written: {error}") from error
+        raise CaptureError(f"{output}: the cameras cannot be written ({error})", file=output) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
     registered = tuple(models[0]["names"])
     missing = tuple(name for name in everything if name not in set(registered))
     for remark in _remarks(models, lost, missing):
-        warnings.warn(f"{images}: {remark}", CaptureWarning, stacklevel=2)
+        warnings.warn(remark.about(images), stacklevel=2)
     return EstimatedCameras(output / "sparse" / "0", registered, missing, models[0]["points"], models[0]["error"])
 
 
 def _expect_job(images: Path, output: Path, *, camera_model: str, timeout: float) -> None:
     if importlib.util.find_spec("pycolmap") is None:
-        raise CaptureError("photographs without cameras need the package pycolmap: pip install 'avmsf[sfm]'")
+        raise CaptureError(
+            "expected the package pycolmap for photographs without cameras, got none: pip install 'avmsf[sfm]'",
+            name="pycolmap",
+        )
     if camera_model not in CAMERA_MODELS:
-        raise CaptureError(f"camera_model is {camera_model!r}; expected one of {', '.join(CAMERA_MODELS)}")
+        raise CaptureError(
+            f"camera_model: expected one of {', '.join(CAMERA_MODELS)}, got {camera_model!r}",
+            name="camera_model",
+            value=camera_model,
+        )
     if not timeout > 0:
-        raise CaptureError(f"timeout is {timeout:g} s; expected a time above 0")
+        raise CaptureError(f"timeout: expected a time above 0 s, got {timeout:g} s", name="timeout", value=timeout)
     if not images.is_dir():
-        raise CaptureError(f"{images}: there is no such folder of photographs")
+        raise CaptureError(f"{images}: expected a folder of photographs, got none", file=images)
     if (output / "sparse" / "0").exists():
-        raise CaptureError(f"{output / 'sparse' / '0'}: exists; cameras are there already: remove it to find them anew")
+        raise CaptureError(
+            f"{output / 'sparse' / '0'}: expected no cameras, got existing ones; remove it to estimate them again",
+            file=output / "sparse" / "0",
+        )
 
 
 def _stage_images(images: Path, begun: Path, *, shared_camera: bool) -> tuple[dict[str, str], list[str]]:
-    """Put links to the images and their masks where COLMAP wants them.
+    """Put links to the images and their masks where COLMAP expects them.
 
     Returns the images' names there with their true ones, and the names of those that cannot be read. Raises
     CaptureError for too few images, and for images of different sizes from one camera.
@@ -165,15 +175,21 @@ def _stage_images(images: Path, begun: Path, *, shared_camera: bool) -> tuple[di
         _stage_mask(images, picture, name, begun / "masks" / f"{staged}.png")
     if len(names) < FEWEST:
         raise CaptureError(
-            f"{images}: expected at least {FEWEST} photographs ({', '.join(SUFFIXES)}), found {len(names)}"
-            + (f" and {len(lost)} that cannot be read: {_some(lost)}" if lost else "")
+            f"{images}: expected at least {FEWEST} photographs ({', '.join(SUFFIXES)}), got {len(names)}"
+            + (f" and {len(lost)} that cannot be read: {_some(lost)}" if lost else ""),
+            file=images,
+            name="photographs",
+            value=len(names),
         )
     kinds = sorted(set(sizes.values()), key=list(sizes.values()).count)
     if shared_camera and len(kinds) > 1:
         odd = [name for name, size in sizes.items() if size != kinds[-1]]
         raise CaptureError(
-            f"{images}: the photographs differ in size: most have {kinds[-1][0]} x {kinds[-1][1]} pixels, but not "
-            f"{_some(odd)}: give photographs of one camera held one way, or say shared_camera=False"
+            f"{images}: expected photographs of one size, got most of {kinds[-1][0]} x {kinds[-1][1]} pixels, but not "
+            f"{_some(odd)}; give photographs of one camera in one orientation, or set shared_camera=False",
+            file=images,
+            name="shared_camera",
+            value=odd,
         )
     return names, lost
 
@@ -212,7 +228,7 @@ def _stage_mask(images: Path, picture: Picture, name: str, staged: Path) -> None
 
 
 def _run_worker(begun: Path, *, timeout: float, progress: Callable[[MotionProgress], None] | None) -> None:
-    """Run the worker to its end; raises CaptureError where that is not a good one or comes too late."""
+    """Run the worker to its end; raises CaptureError where it fails or takes too long."""
     log = begun / "worker.log"
     start = time.monotonic()
     # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
@@ -225,9 +241,12 @@ def _run_worker(begun: Path, *, timeout: float, progress: Callable[[MotionProgre
             while worker.poll() is None:
                 seconds = time.monotonic() - start
                 if seconds > timeout:
+                    stage = _progress(log, seconds).stage
                     raise CaptureError(
-                        f"structure from motion took more than {timeout:g} s, while it sought "
-                        f"{_progress(log, seconds).stage}: allow more time, or give fewer or smaller photographs"
+                        f"expected structure from motion within {timeout:g} s, got no result in the stage {stage}; "
+                        "increase timeout, or give fewer or smaller photographs",
+                        name=stage,
+                        value=timeout,
                     )
                 if progress is not None:
                     progress(_progress(log, seconds))
@@ -236,9 +255,11 @@ def _run_worker(begun: Path, *, timeout: float, progress: Callable[[MotionProgre
         finally:
             _end(worker)
     if worker.returncode != 0 or not (begun / "result.json").is_file():
+        stage, ending = _progress(log, 0.0).stage, _ending(worker.returncode)
         raise CaptureError(
-            f"structure from motion broke off while it sought {_progress(log, 0.0).stage} "
-            f"({_ending(worker.returncode)}); its last lines:\n{_last_lines(log)}"
+            f"structure from motion failed in the stage {stage} ({ending}); its last output:\n{_last_lines(log)}",
+            name=stage,
+            value=ending,
         )
 
 
@@ -278,32 +299,37 @@ def _refuse_few(models: Sequence[dict[str, Any]], everything: Sequence[str], *, 
     if len(registered) >= max(FEWEST, least * len(everything)):
         return
     lacking = [name for name in everything if name not in registered]
-    apart = f"; they fall into {len(models)} groups that could not be joined" if len(models) > 1 else ""
+    apart = f" in {len(models)} groups that could not be joined" if len(models) > 1 else ""
     raise CaptureError(
-        f"{images}: only {len(registered)} of {len(everything)} photographs got a camera{apart}; without one: "
-        f"{_some(lacking)}: photograph the object sharply from closer neighboring places (10 to 15 degrees apart), "
-        "with a patterned, unmoved ground in view"
+        f"{images}: expected cameras of most photographs, got {len(registered)} of {len(everything)}{apart}, none for "
+        f"{_some(lacking)}; take sharp photographs 10 to 15 degrees apart, with a patterned, fixed ground in view",
+        file=images,
+        name="cameras",
+        value=lacking,
     )
 
 
-def _remarks(models: Sequence[dict[str, Any]], lost: Sequence[str], missing: Sequence[str]) -> list[str]:
+def _remarks(models: Sequence[dict[str, Any]], lost: Sequence[str], missing: Sequence[str]) -> list[Remark]:
     remarks = []
     if lost:
-        remarks.append(f"{len(lost)} images cannot be read and are left out: {_some(lost)}")
-    # Groups overlap: an image may have a place in several that could not be joined.
+        message = f"{len(lost)} images cannot be read and are not used: {_some(lost)}"
+        remarks.append(Remark(message, name="unreadable images", value=lost))
+    # Groups overlap: an image may belong to several that could not be joined.
     kept = set(models[0]["names"])
     others = [[name for name in model["names"] if name not in kept] for model in models[1:]]
     others = [names for names in others if names]
     if others:
         groups = "; ".join(_some(names) for names in others)
-        remarks.append(
-            f"the photographs fall into {len(models)} groups that could not be joined, of which the largest is kept "
-            f"({len(kept)} images); the rest: {groups}"
+        message = (
+            f"the photographs form {len(models)} groups that could not be joined; only the largest, of {len(kept)} "
+            f"images, is used, without {groups}"
         )
+        remarks.append(Remark(message, name="groups", value=others))
     apart = {name for names in others for name in names}
     unseen = [name for name in missing if name not in apart and name not in lost]
     if unseen:
-        remarks.append(f"{len(unseen)} images got no camera: {_some(unseen)}")
+        message = f"{len(unseen)} images got no camera: {_some(unseen)}"
+        remarks.append(Remark(message, name="cameras", value=unseen))
     return remarks
 
 

@@ -31,20 +31,25 @@ def align_similarity(source: Float[Tensor, "points 3"], target: Float[Tensor, "p
     """Return the similarity that brings the source points nearest to the target points, row by row.
 
     Least squares in closed form (Umeyama 1991, "Least-squares estimation of transformation parameters between two
-    point patterns"). Raises CaptureError for fewer than three pairs, for points on one line, around which the rotation
-    would be anyone's guess, and for numbers that are not finite.
+    point patterns"). Raises CaptureError for fewer than three pairs, for points on one line, which do not determine the
+    rotation, and for numbers that are not finite.
     """
     if source.shape != target.shape or len(source) < 3:
-        raise CaptureError(f"expected the same 3 or more points in both frames, found {len(source)} and {len(target)}")
+        raise CaptureError(
+            f"expected the same 3 or more points in both frames, got {len(source)} and {len(target)}",
+            name="points",
+            value=[len(source), len(target)],
+        )
     source, target = source.double(), target.double()
-    if not bool(torch.isfinite(source).all() and torch.isfinite(target).all()):
-        raise CaptureError("expected points with finite coordinates in both frames")
     for name, points in (("source", source), ("target", target)):
+        if not bool(torch.isfinite(points).all()):
+            raise CaptureError(f"{name}: expected points with finite coordinates", name=name)
         spread = torch.linalg.svdvals(points - points.mean(0))
         if float(spread[1]) < 1e-6 * max(float(spread[0]), 1e-300):
             raise CaptureError(
-                f"the {len(points)} {name} points lie on one line or in one place, which leaves the rotation open: "
-                "choose points that span a triangle"
+                f"{name}: expected points that span a triangle, got {len(points)} on one line or at one position",
+                name=name,
+                value=len(points),
             )
     old, new = source - source.mean(0), target - target.mean(0)
     left, stretch, right = torch.linalg.svd(new.T @ old)

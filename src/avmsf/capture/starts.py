@@ -11,6 +11,7 @@ from torch import Tensor
 from avmsf.capture.prepare import MIN_MARGIN, Prepared, margin_length
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.together import common_length
+from avmsf.capture.warning import CaptureWarning
 
 START_LEVEL = 10**-2.0
 """Share of the largest mean square in the first 20 ms that a response must have at its start: -20 dB, the
@@ -28,8 +29,8 @@ class Sounds:
     sounds: Float[Tensor, "contacts samples"]
     before: Float[Tensor, "contacts lead"] | None
     after: Float[Tensor, "contacts tail"] | None
-    remarks: list[str]
-    """What their common length costs."""
+    remarks: list[CaptureWarning]
+    """Of a common length that one short recording causes."""
 
 
 def latest_start(rate: float) -> int:

@@ -42,9 +42,10 @@ class Surface:
         if len(wrong):
             row = int(wrong[0])
             raise ArrayError(
-                f"faces: expected rows of vertices, 0 to {len(places) - 1}, got {given[row].tolist()} (row {row})",
+                f"faces: expected indices of vertices, 0 to {len(places) - 1}, got {given[row].tolist()} (row {row})",
                 name="faces",
                 row=row,
+                value=given[row].tolist(),
             )
         return cls(places, corners)
 
@@ -76,7 +77,7 @@ def read_surface(path: str | Path, *, meters: float = 1.0) -> Surface:
         count += len(points)
     joined = np.concatenate(vertices)
     if not len(joined):
-        raise CaptureError(f"{path}: holds no points: export the surface again")
+        raise CaptureError(f"{path}: expected points, got none; export the surface again", file=path, value=0)
     return Surface(torch.from_numpy((joined * meters).astype(np.float32)), torch.from_numpy(np.concatenate(faces)))
 
 
@@ -85,7 +86,12 @@ def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
     if settings.surface is not None:
         named = Path(settings.surface)
         if named.is_absolute() or ".." in named.parts:
-            raise CaptureError(f"surface = {settings.surface!r} lies outside the capture folder: copy it there")
+            raise CaptureError(
+                f"surface: expected a file in the capture folder, got {settings.surface!r}; copy it there",
+                file=folder,
+                name="surface",
+                value=settings.surface,
+            )
         return folder / named
     return next((folder / name for name in SURFACE_FILES if (folder / name).is_file()), None)
 

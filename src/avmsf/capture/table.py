@@ -1,4 +1,4 @@
-"""`impacts.csv`: one row a recording, where it was struck and, where known, which way and how hard."""
+"""`impacts.csv`: one row for each recording, with the contact and, where known, the impact's direction and force."""
 
 import csv
 import io
@@ -9,7 +9,9 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 
 from avmsf._utils.text_files import read_text
+from avmsf.capture.location import Location
 from avmsf.capture.settings import METRES, CaptureSettings
+from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
 
 TABLE = "impacts.csv"
@@ -21,16 +23,16 @@ MAX_ROWS = 10_000
 MIN_FORCE_NEWTONS, MAX_FORCE_NEWTONS = 1e-6, 1e6
 """Peak forces that a row may give: from a grain of dust to the largest impact hammers (2e4 N) and beyond."""
 FARTHEST = 100.0
-"""Meters from the origin beyond which a contact cannot be meant."""
+"""Meters from the origin beyond which a contact must be in another unit."""
 HOW_TO_WRITE = (
-    f"{TABLE} has the header line file,x,y,z (and if known nx,ny,nz,force_newtons) and one row a recording, "
-    "for example: 001.wav,0.12,0.05,0.30. Without recordings, avmsf fit --material NAME guesses a field from the shape"
+    f"{TABLE} has the header file,x,y,z (and if known nx,ny,nz,force_newtons) and one row for each recording, "
+    "for example: 001.wav,0.12,0.05,0.30. Without recordings, avmsf fit --material NAME computes a field from the shape"
 )
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row as it is written, not yet understood."""
+    """One row as it is written, not yet parsed."""
 
     line: int
     """Line of the file, counted from 1 with the header, as spreadsheets and editors count."""
@@ -39,10 +41,15 @@ class Row:
     decimal_comma: bool
     """Whether numbers may be written 0,75: so in tables whose columns are not separated by commas."""
 
+    @property
+    def location(self) -> Location:
+        """Where it is, for errors."""
+        return Location(TABLE, self.line, f"row {self.line}")
+
 
 @dataclass(frozen=True)
 class Strike:
-    """One row understood."""
+    """One row parsed."""
 
     file: str
     """Path of the wav file inside the capture folder, with forward slashes."""
@@ -66,16 +73,20 @@ def read_cells(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
         reader = csv.reader(io.StringIO(text), delimiter=separator)
         lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in islice(reader, MAX_ROWS + 2)]
     except UnicodeDecodeError as error:
-        raise CaptureError(f"{path}: not UTF-8 text: save it from the spreadsheet as 'CSV UTF-8'") from error
+        raise CaptureError(
+            f"{path}: expected UTF-8 text; save it from the spreadsheet as 'CSV UTF-8'", file=path
+        ) from error
     except (OSError, ValueError, csv.Error) as error:
-        raise CaptureError(f"{path}: not a table that can be read: {error}") from error
+        raise CaptureError(f"{path}: expected a table, got a file that cannot be read: {error}", file=path) from error
     if len(lines) > MAX_ROWS + 1:
-        raise CaptureError(f"{path}: expected at most {MAX_ROWS:,} rows, got more: divide the table")
+        raise CaptureError(
+            f"{path}: expected at most {MAX_ROWS:,} rows, got more; divide the table", file=path, row=lines[-1][0]
+        )
     return [(line, cells) for line, cells in lines if any(cells)], separator
 
 
-def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
-    """Read the rows of the folder's `impacts.csv`, and remarks about columns that are not used.
+def read_rows(folder: Path) -> tuple[list[Row], list[CaptureWarning]]:
+    """Read the rows of the folder's `impacts.csv`, and warnings of columns that are not used.
 
     Commas, semicolons and tabs separate; a byte-order mark, Windows line ends, blank lines, upper case and spaces in
     the header do no harm. `CaptureError` where there is no table, no row, a column is missing or double, or a row is
@@ -83,36 +94,40 @@ def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
     """
     path = folder / TABLE
     if not folder.is_dir():
-        raise CaptureError(f"{folder}: there is no such folder")
+        raise CaptureError(f"{folder}: expected a folder, got none", file=folder)
     if not path.is_file():
-        raise CaptureError(f"{folder}: there is no {TABLE} in this folder; {HOW_TO_WRITE}")
+        raise CaptureError(f"{folder}: expected {TABLE} in this folder, got none; {HOW_TO_WRITE}", file=path)
     lines, separator = read_cells(path)
     if not lines:
-        raise CaptureError(f"{path}: the table is empty; {HOW_TO_WRITE}")
+        raise CaptureError(f"{path}: expected a table, got an empty file; {HOW_TO_WRITE}", file=path, value="")
     header = [name.lower() for name in lines[0][1]]
     remarks = _judge_header(header, path)
     rows = []
     for line, cells in lines[1:]:
         if len(cells) != len(header):
-            raise CaptureError(
-                f"{TABLE} line {line}: {len(cells)} cells where the header has {len(header)}: {separator.join(cells)}"
+            raise Location(path, line, f"row {line}").error(
+                f"expected {len(header)} cells as in the header, got {len(cells)}: {separator.join(cells)}",
+                value=len(cells),
             )
         rows.append(Row(line, dict(zip(header, cells, strict=True)), separator != ","))
     if not rows:
-        raise CaptureError(f"{path}: the table has a header and no row; {HOW_TO_WRITE}")
+        raise CaptureError(f"{path}: expected rows below the header, got none; {HOW_TO_WRITE}", file=path, value=0)
     return rows, remarks
 
 
 def understand(row: Row, settings: CaptureSettings) -> Strike:
-    """Turn one row into a contact in meters, a unit direction and a force; `CaptureError` names the line and value."""
-    where = f"{TABLE} line {row.line}"
+    """Turn one row into a contact in meters, a unit direction and a force; `CaptureError` names the row and value."""
+    where = row.location
     written = [_number(row, name) for name in ("x", "y", "z")]
     contact = [value * settings.meters for value in written]
     farthest = max(written, key=abs)
     if abs(farthest) * settings.meters > FARTHEST:
-        raise CaptureError(
-            f"{where}: the contact ({', '.join(row.cells[name] for name in ('x', 'y', 'z'))}) lies "
-            f"{math.hypot(*contact):.4g} m away (unit = {settings.unit!r}): {fitting_units(abs(farthest))}"
+        raise where.error(
+            f"expected a contact within {FARTHEST:g} m of the origin, got "
+            f"({', '.join(row.cells[name] for name in ('x', 'y', 'z'))}), {math.hypot(*contact):.4g} m away "
+            f"(unit = {settings.unit!r}): {fitting_units(abs(farthest))}",
+            name="unit",
+            value=written,
         )
     direction = None
     if DIRECTION[0] in row.cells:
@@ -121,9 +136,10 @@ def understand(row: Row, settings: CaptureSettings) -> Strike:
     if FORCE in row.cells:
         newtons = _number(row, FORCE)
         if not MIN_FORCE_NEWTONS <= newtons <= MAX_FORCE_NEWTONS:
-            raise CaptureError(
-                f"{where}: {FORCE} is {newtons:g}; expected a peak force of {MIN_FORCE_NEWTONS:g} to "
-                f"{MAX_FORCE_NEWTONS:g} N"
+            raise where.error(
+                f"expected {FORCE}, a peak force of {MIN_FORCE_NEWTONS:g} to {MAX_FORCE_NEWTONS:g} N, got {newtons:g}",
+                name=FORCE,
+                value=newtons,
             )
     return Strike(_inside(row.cells["file"], where), row.line, (contact[0], contact[1], contact[2]), direction, newtons)
 
@@ -133,38 +149,53 @@ def refuse_repeated_files(strikes: Sequence[Strike]) -> None:
     lines: dict[str, int] = {}
     for strike in strikes:
         if strike.file in lines:
-            raise CaptureError(
-                f"{TABLE} line {strike.line}: {strike.file} stands in line {lines[strike.file]} already; "
-                "each row needs its own recording"
+            raise Location(TABLE, strike.line, f"row {strike.line}").error(
+                f"expected a different recording for each row, got {strike.file} as in row {lines[strike.file]}",
+                name="file",
+                value=strike.file,
             )
         lines[strike.file] = strike.line
 
 
 def fitting_units(written: float) -> str:
-    """Say in which units a coordinate would belong to an object that one can strike by hand (1 cm to 5 m)."""
+    """Return advice with the units in which a coordinate would belong to an object of 1 cm to 5 m."""
     fitting = [(unit, written * size) for unit, size in METRES.items() if 0.01 <= written * size <= 5]
     if not fitting:
-        return "no unit would make that an object one can strike: mend the row"
+        return "no unit fits an object of 1 cm to 5 m, so correct the row"
     choices = " or ".join(f'unit = "{unit}" ({meters:.3g} m)' for unit, meters in fitting)
-    return f"write in capture.toml what the numbers count: {choices}"
+    return f"write the unit in capture.toml: {choices}"
 
 
-def _judge_header(header: Sequence[str], path: Path) -> list[str]:
+def _judge_header(header: Sequence[str], path: Path) -> list[CaptureWarning]:
     missing = [name for name in REQUIRED if name not in header]
     if missing:
         raise CaptureError(
-            f"{path}: the column{'s' * (len(missing) > 1)} {', '.join(missing)} "
-            f"{'are' if len(missing) > 1 else 'is'} missing, found {', '.join(header)}; {HOW_TO_WRITE}"
+            f"{path}: expected the columns {', '.join(missing)}, got only {', '.join(header)}; {HOW_TO_WRITE}",
+            file=path,
+            name=missing[0],
+            value=list(header),
         )
     directions = [name for name in DIRECTION if name in header]
     if 0 < len(directions) < 3:
-        raise CaptureError(f"{path}: a direction needs all of nx, ny, nz; found only {', '.join(directions)}")
+        raise CaptureError(
+            f"{path}: expected all of nx, ny, nz or none, got only {', '.join(directions)}",
+            file=path,
+            name=next(name for name in DIRECTION if name not in header),
+            value=directions,
+        )
     known = (*REQUIRED, *DIRECTION, FORCE)
     double = sorted({name for name in header if name in known and header.count(name) > 1})
     if double:
-        raise CaptureError(f"{path}: more than one column is called {', '.join(double)}")
+        raise CaptureError(
+            f"{path}: expected different names of columns, got more than one {', '.join(double)}",
+            file=path,
+            name=double[0],
+            value=list(header),
+        )
     extra = [name or "(no name)" for name in header if name not in known]
-    return [f"{path}: columns that are not used: {', '.join(extra)}"] if extra else []
+    if not extra:
+        return []
+    return [CaptureWarning(f"{path}: columns that are not used: {', '.join(extra)}", file=path, value=extra)]
 
 
 def _number(row: Row, name: str) -> float:
@@ -174,27 +205,33 @@ def _number(row: Row, name: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise CaptureError(f"{TABLE} line {row.line}: {name} is {text!r}; expected a number")
+        raise row.location.error(f"expected a number as {name}, got {text!r}", name=name, value=text)
     return value
 
 
-def _unit_vector(values: Sequence[float], where: str) -> tuple[float, float, float]:
+def _unit_vector(values: Sequence[float], where: Location) -> tuple[float, float, float]:
     length = math.hypot(*values)
     if length == 0:
-        raise CaptureError(f"{where}: nx,ny,nz is the zero vector, which points nowhere: give a direction or drop them")
+        raise where.error(
+            "expected a direction as nx,ny,nz, got the zero vector; give a direction or remove the columns",
+            name=DIRECTION[0],
+            value=list(values),
+        )
     # What has unit length already stays as it is, so that writing and reading again changes no digit.
     scale = 1.0 if abs(length - 1) < 1e-6 else 1 / length
     return (values[0] * scale, values[1] * scale, values[2] * scale)
 
 
-def _inside(text: str, where: str) -> str:
+def _inside(text: str, where: Location) -> str:
     """Return the path with forward slashes; `CaptureError` for one that leaves the folder.
 
     A capture is one folder that can be moved, sent and read by others, so nothing outside it belongs to it.
     """
     path = PurePosixPath(text.replace("\\", "/"))
     if not text:
-        raise CaptureError(f"{where}: file is empty; expected a wav file's path inside the folder")
+        raise where.error("expected a wav file's path as file, got nothing", name="file", value=text)
     if path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
-        raise CaptureError(f"{where}: {text} lies outside the capture folder: copy it there and give its path from it")
+        raise where.error(
+            f"expected a path inside the capture folder as file, got {text}; copy it there", name="file", value=text
+        )
     return str(path)

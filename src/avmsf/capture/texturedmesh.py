@@ -15,9 +15,9 @@ import trimesh
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from avmsf.capture.mesh_file import load_parts
+from avmsf.capture.mesh_file import expect_corners, expect_finite_vertices, load_parts
 from avmsf.capture.surface import Surface
-from avmsf.capture.warning import CaptureWarning
+from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
 
 GRAY = 0.7
@@ -107,12 +107,15 @@ def read_textured_mesh(path: str | Path, *, meters: float = 1.0) -> TexturedMesh
     parts = [part for part in load_parts(path) if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
         raise CaptureError(
-            f"{path}: holds no triangles: a picture can be taken of faces alone; export the mesh with them, or give "
-            "the points as the capture's surface"
+            f"{path}: expected a mesh with triangles to render, got none; export the mesh with its faces, or give the "
+            "points as the capture's surface",
+            file=path,
+            name="faces",
+            value=0,
         )
     lacking = _missing_images(path)
     painted = [_paint(part, lacking) for part in parts]
-    remarks = list(dict.fromkeys(paint.remark for paint in painted if paint.remark))
+    remarks = dict.fromkeys(paint.remark for paint in painted if paint.remark)
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts]) * meters
     faces = np.concatenate([np.asarray(part.faces, dtype=np.int64) + start for part, start in zip(parts, offsets)])  # noqa: B905
@@ -127,9 +130,9 @@ def read_textured_mesh(path: str | Path, *, meters: float = 1.0) -> TexturedMesh
             materials=torch.from_numpy(np.repeat(np.arange(len(parts)), counts)),
         )
     except CaptureError as error:
-        raise CaptureError(f"{path}: {error}") from error
+        raise CaptureError(f"{path}: {error}", file=path, row=error.row, name=error.name, value=error.value) from error
     for remark in remarks:
-        warnings.warn(f"{path}: {remark}", CaptureWarning, stacklevel=2)
+        warnings.warn(remark.about(path), stacklevel=2)
     return mesh
 
 
@@ -159,7 +162,10 @@ class _Paint:
     colors: np.ndarray
     coordinates: np.ndarray
     texture: np.ndarray
-    remark: str = ""
+    remark: Remark | None = None
+
+
+_COLORLESS = Remark("has neither texture nor colors; it is rendered gray", name="colors")
 
 
 def _paint(part: trimesh.Trimesh, lacking: dict[str, str]) -> _Paint:
@@ -174,7 +180,7 @@ def _paint(part: trimesh.Trimesh, lacking: dict[str, str]) -> _Paint:
         return _Paint(np.repeat(own, 3, axis=1), nowhere, white)
     gray = np.full((len(faces), 3, 3), GRAY)
     if visual.kind != "texture":
-        return _Paint(gray, nowhere, white, "has neither texture nor colors; it is taken as gray")
+        return _Paint(gray, nowhere, white, _COLORLESS)
     material = visual.material
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     factor = getattr(material, "baseColorFactor", None)
@@ -182,15 +188,17 @@ def _paint(part: trimesh.Trimesh, lacking: dict[str, str]) -> _Paint:
         try:
             texture = np.array(image.convert("RGB"))
         except (OSError, SyntaxError, ValueError) as error:  # what Pillow raises for images that are cut or corrupt
-            return _Paint(gray, nowhere, white, f"its texture cannot be read and is taken as gray: {error}")
+            remark = Remark(f"its texture cannot be read ({error}); it is rendered gray", name="texture")
+            return _Paint(gray, nowhere, white, remark)
         coordinates = np.nan_to_num(np.asarray(visual.uv, dtype=np.float64)[faces])
         tint = np.asarray([255.0] * 3 if factor is None else factor, dtype=np.float64)[:3] / 255.0
         return _Paint(np.broadcast_to(tint, gray.shape).copy(), coordinates, texture)
     name = str(getattr(material, "name", ""))
     if name in lacking:
-        return _Paint(gray, nowhere, white, f"its texture {lacking[name]} is missing; what it covers is taken as gray")
+        message = f"its texture {lacking[name]} is missing; the part is rendered gray"
+        return _Paint(gray, nowhere, white, Remark(message, name="texture", value=lacking[name]))
     if factor is None and "kd" not in getattr(material, "kwargs", {}):
-        return _Paint(gray, nowhere, white, "has neither texture nor colors; it is taken as gray")
+        return _Paint(gray, nowhere, white, _COLORLESS)
     tint = np.asarray(material.main_color, dtype=np.float64)[:3] / 255.0
     return _Paint(np.broadcast_to(tint, gray.shape).copy(), nowhere, white)
 
@@ -223,21 +231,15 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 def _expect_mesh(vertices: Tensor, faces: Tensor) -> None:
     if not len(faces):
         raise CaptureError(
-            f"expected a mesh, found {len(vertices)} points and no triangles: a picture can be taken of faces alone"
+            f"expected a mesh with triangles to render, got {len(vertices)} points without any", name="faces", value=0
         )
-    unfit = ~torch.isfinite(vertices).all(dim=1)
-    if bool(unfit.any()):
-        row = int(unfit.nonzero()[0])
-        raise CaptureError(
-            f"{int(unfit.sum())} of {len(vertices)} vertices are not finite numbers, the first vertex {row} (counted "
-            f"from 0): {vertices[row].tolist()}: export the mesh again"
-        )
-    if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
-        raise CaptureError(
-            f"a face names vertex {int(faces.max() if faces.min() >= 0 else faces.min())} (counted from 0) of "
-            f"{len(vertices)}: the file is cut short or corrupt; export the mesh again"
-        )
+    expect_finite_vertices(vertices.numpy())
+    expect_corners(faces.numpy(), len(vertices))
     corners = vertices.double()[faces]
     doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     if not bool((doubled != 0).any()):
-        raise CaptureError(f"none of the {len(faces)} triangles has an area: the mesh is a line or a point")
+        raise CaptureError(
+            f"expected triangles with an area, got {len(faces)} without; export the mesh again",
+            name="area",
+            value=0.0,
+        )

@@ -1,4 +1,4 @@
-"""What the recordings and contacts of one capture must have in common, and what looks wrong when seen side by side."""
+"""What the recordings and contacts of one capture must have in common, and what looks wrong when compared."""
 
 import math
 from collections import Counter, defaultdict
@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from avmsf.capture.location import Location
 from avmsf.capture.placement import Mistake, judge_placement, surface_points
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.capture.surface import Surface, find_surface
 from avmsf.capture.table import TABLE, Strike, fitting_units, read_rows, understand
+from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
 from avmsf.wording import counted
 
@@ -22,10 +24,10 @@ WIDEST = 10.0
 NARROWEST = 1e-3
 """Meters across below which they are."""
 USUAL_RANGE_DB = 80.0
-"""Level between a recording and the median beyond which its scale is in doubt: a contact near the nodes of most modes
-takes 40 dB, a soft blow 30."""
+"""Level between a recording and the median beyond which its scale is doubtful: a contact near the nodes of most modes
+takes 40 dB, a soft impact 30."""
 USUAL_GAP_DB = 12.0
-"""Level between the loudest recording and the next beyond which its scale is in doubt, of six recordings or more: 24
+"""Level between the loudest recording and the next beyond which its scale is doubtful, of six recordings or more: 24
 measured and simulated captures have at most 7. One recording at ten times its level outweighs all others in a fit."""
 MAX_RANGE_DB = 140.0
 """Level between the loudest and the faintest recording beyond which the faintest is less than the rounding of the
@@ -41,14 +43,16 @@ def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:
             for rate, count in counts.most_common()
         ]
         raise CaptureError(
-            f"the recordings have different sample rates: {', '.join(found)}; "
-            "a capture has one, and nothing is resampled on reading: convert them to one rate"
+            f"expected recordings of one sample rate, got {', '.join(found)}; nothing is resampled, so convert them to "
+            "one rate",
+            name="sample_rate",
+            value=[rate for rate, _ in counts.most_common()],
         )
     return rates[0]
 
 
-def judge_levels(peaks: Sequence[float], names: Sequence[str]) -> list[str]:
-    """Return a remark where a prepared sound is far louder or fainter than the others, which a single one never is.
+def judge_levels(peaks: Sequence[float], names: Sequence[str]) -> list[CaptureWarning]:
+    """Return a warning where a prepared sound is far louder or fainter than the others; of a single one, none.
 
     Raises `CaptureError` where the loudest is more than `MAX_RANGE_DB` above the faintest.
     """
@@ -62,48 +66,62 @@ def judge_levels(peaks: Sequence[float], names: Sequence[str]) -> list[str]:
     if np.ptp(levels) > MAX_RANGE_DB:
         raise CaptureError(
             f"{found}; expected at most {MAX_RANGE_DB:g} dB between the loudest and the faintest, got "
-            f"{np.ptp(levels):.0f}: export it at the scale of the others, or remove its row"
+            f"{np.ptp(levels):.0f}; export it at the scale of the others, or remove its row",
+            file=names[worst],
+            name="peak",
+            value=peaks[worst],
         )
     ascending = np.sort(levels)
     if len(levels) >= 6 and ascending[-1] - ascending[-2] > USUAL_GAP_DB:
         loudest = int(levels.argmax())
         above = ascending[-1] - ascending[-2]
-        return [
+        message = (
             f"{names[loudest]}: its peak, {peaks[loudest]:.3g}, is {above:.0f} dB above that of the next loudest "
-            f"recording; expected at most {USUAL_GAP_DB:g} dB: check its gain, its scale and its force"
-        ]
+            f"recording; expected at most {USUAL_GAP_DB:g} dB; check its gain, its scale and its force"
+        )
+        return [CaptureWarning(message, file=names[loudest], name="peak", value=peaks[loudest])]
     if abs(away[worst]) > USUAL_RANGE_DB:
-        return [f"{found}; expected at most {USUAL_RANGE_DB:g} dB: check its scale and its force"]
+        message = f"{found}; expected at most {USUAL_RANGE_DB:g} dB; check its scale and its force"
+        return [CaptureWarning(message, file=names[worst], name="peak", value=peaks[worst])]
     return []
 
 
 def common_length(
     lengths: Sequence[int], names: Sequence[str], *, rate: float, settings: CaptureSettings
-) -> tuple[int, list[str]]:
-    """Return how many samples from the onset every sound keeps, and a remark where one short recording costs the rest.
+) -> tuple[int, list[CaptureWarning]]:
+    """Return the common length of all sounds in samples from the onset, and a warning where one recording shortens all.
 
-    That is `settings.kept_seconds`, or all of the shortest recording. `CaptureError` where the settings ask for too
+    That is `settings.kept_seconds`, or all of the shortest recording. `CaptureError` where the settings give too
     little.
     """
     seconds = settings.kept_seconds(rate)
     asked = round(seconds * rate)
     least = shortest_allowed(rate)
     if asked < least:
-        raise CaptureError(f"seconds = {seconds:g} keeps {asked} samples at {rate:g} Hz; at least {least} are needed")
+        raise CaptureError(
+            f"seconds: expected at least {least} samples at {rate:g} Hz, got {asked} ({seconds:g} s); increase it in "
+            "capture.toml",
+            name="seconds",
+            value=seconds,
+        )
     shortest = min(lengths)
     usual = min(asked, int(np.median(lengths)))
     remarks = []
     if shortest < 0.9 * usual:
         name = names[list(lengths).index(shortest)]
         remarks.append(
-            f"all sounds are cut to {shortest / rate:.3g} s, the length of {name} after its onset, where most have "
-            f"{usual / rate:.3g} s: record it again or remove its row"
+            CaptureWarning(
+                f"{name}: {shortest / rate:.3g} s after its onset, most recordings have {usual / rate:.3g} s; all "
+                "sounds are cut to this length; record it again or remove its row",
+                file=name,
+                value=shortest / rate,
+            )
         )
     return min(asked, shortest), remarks
 
 
-def judge_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list[str]:
-    """Say which contacts are repeated, and whether all of them together look like another unit's."""
+def judge_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list[CaptureWarning]:
+    """Return warnings of repeated contacts, and of contacts that together look like another unit's."""
     remarks = []
     places = defaultdict(list)
     for strike in strikes:
@@ -113,51 +131,52 @@ def judge_contacts(strikes: Sequence[Strike], settings: CaptureSettings) -> list
     repeated = [lines for lines in places.values() if len(lines) > 1]
     if repeated:
         shown = "; ".join(", ".join(map(str, lines)) for lines in repeated[:5])
-        remarks.append(
-            f"{TABLE}: lines at one and the same contact: {shown}{' and more' * (len(repeated) > 5)}; "
-            "kept as repeated blows"
+        message = (
+            f"{TABLE}: rows at the same contact: {shown}{' and more' * (len(repeated) > 5)}; used as repeated impacts"
         )
+        remarks.append(CaptureWarning(message, file=TABLE, row=repeated[0][1], value=repeated))
     across = _diagonal([strike.contact for strike in strikes])
-    if across > WIDEST:
-        remarks.append(
-            f"{TABLE}: the contacts lie {across:.3g} m apart (unit = {settings.unit!r}); if that is not so, "
+    if across > WIDEST or 0 < across < NARROWEST:
+        size = f"{across:.3g} m apart" if across > WIDEST else f"within {across * 1e3:.2g} mm"
+        message = (
+            f"{TABLE}: the contacts lie {size} (unit = {settings.unit!r}); if that is wrong, "
             f"{fitting_units(across / settings.meters)}"
         )
-    elif 0 < across < NARROWEST:
-        remarks.append(
-            f"{TABLE}: all contacts lie within {across * 1e3:.2g} mm (unit = {settings.unit!r}); if that is not so, "
-            f"{fitting_units(across / settings.meters)}"
-        )
+        remarks.append(CaptureWarning(message, file=TABLE, name="unit", value=across))
     return remarks
 
 
-def judge_surface(strikes: Sequence[Strike], surface: Surface, *, settings: CaptureSettings) -> list[str]:
-    """Say whether contacts lie off the surface.
+def judge_surface(strikes: Sequence[Strike], surface: Surface, *, settings: CaptureSettings) -> list[CaptureWarning]:
+    """Return a warning of contacts off the surface.
 
-    `CaptureError` where surface and contacts count different units, and where a contact lies farther off than the
+    `CaptureError` where surface and contacts are in different units, and where a contact lies farther off than the
     surface is large.
     """
     contacts = torch.tensor([strike.contact for strike in strikes], dtype=torch.float64)
     placement = judge_placement(contacts, surface_points(surface))
     if placement.on_surface:
         return []
-    found = placement.describe([f"line {strike.line}" for strike in strikes]) + _mending(placement.mistake, settings)
+    found = placement.describe([f"row {strike.line}" for strike in strikes]) + _mending(placement.mistake, settings)
     farthest = float(placement.distances.max())
     if placement.other_unit:
-        raise CaptureError(f"{TABLE}: expected contacts and surface in one unit; {found}")
-    if farthest > placement.diagonal:
-        worst = strikes[int(placement.distances.argmax())]
         raise CaptureError(
-            f"{TABLE} line {worst.line}: the contact lies {farthest:.3g} m off the surface, which is only "
-            f"{placement.diagonal:.3g} m across: {found}"
+            f"{TABLE}: expected contacts and surface in one unit; {found}", file=TABLE, name="unit", value=farthest
         )
-    return [f"{TABLE}: {found}"]
+    worst = strikes[int(placement.distances.argmax())].line
+    if farthest > placement.diagonal:
+        raise Location(TABLE, worst, f"row {worst}").error(
+            f"expected a contact on the surface, got one {farthest:.3g} m off it, more than its extent of "
+            f"{placement.diagonal:.3g} m: {found}",
+            name="surface",
+            value=farthest,
+        )
+    return [CaptureWarning(f"{TABLE}: {found}", file=TABLE, row=worst, name="surface", value=farthest)]
 
 
 def expect_one_unit(folder: Path, settings: CaptureSettings) -> None:
-    """Raise `CaptureError` where a folder's surface and the contacts of its table count different units.
+    """Raise `CaptureError` where a folder's surface and the contacts of its table are in different units.
 
-    For those who read the surface alone. Rows that cannot be understood are passed over.
+    For callers that read only the surface. Rows that cannot be parsed are skipped.
     """
     if not (folder / TABLE).is_file():
         return

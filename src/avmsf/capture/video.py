@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from avmsf.capture.location import expect_free
 from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
 
@@ -47,11 +48,10 @@ def pick_frames(
     """
     path, folder = Path(path), Path(folder)
     if count < 1:
-        raise CaptureError(f"count is {count}; expected at least 1 frame to pick")
+        raise CaptureError(f"count: expected at least 1 frame, got {count}", name="count", value=count)
     if suffix not in (".png", ".jpg"):
-        raise CaptureError(f"suffix is {suffix!r}; expected .png or .jpg")
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise CaptureError(f"{folder}: exists and is not an empty folder; choose another name or remove it")
+        raise CaptureError(f"suffix: expected .png or .jpg, got {suffix!r}", name="suffix", value=suffix)
+    expect_free(folder)
     claimed = _claimed_frames(path)
     begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
     try:
@@ -72,16 +72,14 @@ def pick_frames(
             folder.rmdir()
         os.rename(begun, folder)
     except OSError as error:
-        raise CaptureError(f"{folder}: the frames cannot be written: {error}") from error
+        raise CaptureError(f"{folder}: the frames cannot be written ({error})", file=folder) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
     if total < 0.95 * claimed:
-        warnings.warn(
-            f"{path}: ends after {total} of the {claimed} frames that it claims to hold; the frames are picked from "
-            "what is there",
-            CaptureWarning,
-            stacklevel=2,
+        message = (
+            f"{path}: expected {claimed} frames as its header says, got {total}; the frames are selected from these"
         )
+        warnings.warn(CaptureWarning(message, file=path, name="frames", value=total), stacklevel=2)
     return tuple(PickedFrame(folder / frame.path.name, frame.number, frame.sharpness) for frame in picked)
 
 
@@ -163,17 +161,31 @@ def _claimed_frames(path: Path) -> int:
 
 def _open(path: Path) -> cv2.VideoCapture:
     if not path.is_file():
-        raise CaptureError(f"{path}: there is no such video file")
+        raise CaptureError(f"{path}: expected a video file, got none", file=path)
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
         video.release()
-        raise CaptureError(f"{path}: not a video that can be read: convert it to MP4 (H.264)")
+        raise CaptureError(
+            f"{path}: expected a video, got a file that cannot be read; convert it to MP4 (H.264)",
+            file=path,
+            name="format",
+        )
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
     return video
 
 
 def _expect_enough(path: Path, total: int, count: int) -> None:
     if total == 0:
-        raise CaptureError(f"{path}: not a single frame of the video can be read: convert it to MP4 (H.264)")
+        raise CaptureError(
+            f"{path}: expected a video with frames, got none that can be read; convert it to MP4 (H.264)",
+            file=path,
+            name="frames",
+            value=0,
+        )
     if total < count:
-        raise CaptureError(f"{path}: {count} frames were asked of a video of {total}: ask for {total} at most")
+        raise CaptureError(
+            f"{path}: expected a video of at least {count} frames, got {total}; choose at most {total}",
+            file=path,
+            name="count",
+            value=total,
+        )

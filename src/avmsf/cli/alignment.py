@@ -34,13 +34,13 @@ class AlignmentReport:
         return cls(found.coherence_before, found.coherence_after, delays, left, inverted)
 
     def sentences(self) -> list[str]:
-        """Say how coherent the modes' phases are, and name what is not aligned or has the opposite sign."""
+        """Return how coherent the modes' phases are, and which recordings are not aligned or have the opposite sign."""
         moved = [delay for name, delay in self.delays.items() if name not in self.not_aligned]
         if not moved:
             return [
                 f"the modes have no common phase (coherence {self.coherence_before:.2f}, 1 is one phase for each "
-                "mode): each recording keeps its own start. Was the sensor or the object moved, or the response "
-                "channel another?"
+                "mode): the recordings are not aligned. Check whether the sensor or the object was moved, and the "
+                "response channel"
             ]
         how = "no delays make the modes' phases agree better than they do as read"
         coherence = f"coherence {self.coherence_before:.2f} as read"
@@ -51,7 +51,7 @@ class AlignmentReport:
         if self.not_aligned:
             sentences.append(
                 f"not aligned: {_listed(self.not_aligned)}; the phases of their modes agree with those of no other "
-                "recording, and they keep their own start"
+                "recording"
             )
         if self.inverted:
             sentences.append(

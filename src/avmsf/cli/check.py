@@ -22,9 +22,9 @@ from avmsf.wording import counted
 
 UNREADABLE = 2
 _STRONGEST = 32
-"""Modes that recordings of inverted polarity are looked for by."""
+"""Modes by which recordings of inverted polarity are found."""
 MAX_PRINTED = 1000
-"""Rows, and sentences below them, of the printed report: what a terminal's scrollback holds."""
+"""Rows, and messages below them, of the printed report: as much as a terminal's scrollback holds."""
 
 
 def run(options: Options) -> int:
@@ -47,7 +47,7 @@ def run(options: Options) -> int:
     if len(problems) > MAX_PRINTED:
         screen.print(f"and {len(problems) - MAX_PRINTED} more; --json prints all", soft_wrap=True)
     if options.write_settings and not proposals:
-        screen.print("no setting other than the present ones would help: nothing was written", soft_wrap=True)
+        screen.print("no settings to propose: nothing was written", soft_wrap=True)
     if not options.write_settings:
         for each in proposals:
             screen.print(f"proposed: {each.line} (--write-settings writes it). {each.reason}", soft_wrap=True)
@@ -60,14 +60,14 @@ def run(options: Options) -> int:
             }
         )
     if not report.readable:
-        say(f"avmsf check: {options.capture} cannot be read as it is: mend what is listed and check again")
+        say(f"avmsf check: {options.capture} cannot be read; correct the errors above and check again")
         return UNREADABLE
     for remark in report.remarks if modes is not None else ():
         screen.print(remark, soft_wrap=True)
     for sentence in [] if aligned is None else aligned.sentences():
         screen.print(sentence, soft_wrap=True)
     if modes is None:
-        screen.print("no mode was found to align the recordings by: noise, or too short (avmsf modes says more)")
+        screen.print("no mode was found to align the recordings: noisy or too short (see avmsf modes)")
     wrong = len(problems) + (modes is None)
     if aligned is not None:
         wrong += bool(aligned.not_aligned) + bool(aligned.inverted)
@@ -77,9 +77,9 @@ def run(options: Options) -> int:
 
 
 def _modes(folder: Path, settings: CaptureSettings | None) -> tuple[Extraction, Impacts] | None:
-    """Return the strongest modes and the recordings they are of; None where there is none to align by."""
+    """Return the strongest modes and their recordings; None where there is no mode."""
     with warnings.catch_warnings():
-        # The report says the same.
+        # The report contains the same.
         warnings.simplefilter("ignore", CaptureWarning)
         impacts = read_capture(folder, settings).impacts
     try:
@@ -89,11 +89,13 @@ def _modes(folder: Path, settings: CaptureSettings | None) -> tuple[Extraction, 
 
 
 def _write(options: Options, proposals: Sequence[Proposal], screen: Console) -> None:
-    """Write the proposals and say so; print them where they cannot be written, and raise `CaptureError`."""
+    """Write the proposals and print them; raise `CaptureError` where they cannot be written."""
     if options.settings is not None:
         raise CaptureError(
-            f"expected --write-settings without --settings, got both: the new {SETTINGS} would lack what "
-            f"{options.settings} says"
+            f"expected --write-settings without --settings, got both; the new {SETTINGS} would not contain those of "
+            f"{options.settings}",
+            file=options.settings,
+            name="--write-settings",
         )
     try:
         path = write_settings(options.capture, proposals)
@@ -104,7 +106,7 @@ def _write(options: Options, proposals: Sequence[Proposal], screen: Console) -> 
 
 
 def problems_of(report: CaptureReport) -> list[str]:
-    """Return every problem as one sentence: the folder's first, then the recordings', what they share only once."""
+    """Return a message for every problem: the folder's first, then the recordings', common ones once."""
     return [*report.problems, *shared_problems(report.recordings)]
 
 
@@ -116,7 +118,7 @@ def _table(report: CaptureReport, title: str, aligned: AlignmentReport | None) -
     rows = [
         (
             row.file,
-            "unreadable" if not row.readable else "look" if row.problems or row.file in doubtful else "good",
+            "unreadable" if not row.readable else "warning" if row.problems or row.file in doubtful else "good",
             decimals(row.seconds, 2),
             decimals(row.sample_rate, 0),
             decimals(row.peak_db, 1),

@@ -1,4 +1,4 @@
-"""CLAP scores of an edit's previews, for `avmsf edit --clap`: kept next to the output, so that an edit can go on."""
+"""CLAP scores of an edit's previews, for `avmsf edit --clap`: stored next to the output for its continuation."""
 
 import json
 from pathlib import Path
@@ -19,10 +19,10 @@ CLAP = "clap"
 
 
 class ClapCurve:
-    """The CLAP score of a field's sound at one place over the steps of an edit; step 0 is the field as it was."""
+    """The CLAP score of a field's sound at one contact over the steps of an edit; step 0 is the unedited field."""
 
     def __init__(self, clap: Clap, prompt: str, field: SoundField, kept: Path, *, resumed: bool) -> None:
-        """Start a curve, or with `resumed` go on with that of the file `kept`.
+        """Start a curve, or with `resumed` continue that of the file `kept`.
 
         Raises EditError for a file that is damaged or has scores of another network.
         """
@@ -54,7 +54,12 @@ def _read(path: Path, clap: Clap) -> dict[int, float]:
         scores = {int(step): float(score) for step, score in read["scores"]}
         digest = read["digest"]
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise EditError(f"{path}: cannot be read as CLAP scores of an edit ({error}); delete it to go on") from error
+        raise EditError(f"{path}: expected CLAP scores, got {error}; delete the file to continue", file=path) from error
     if digest != clap.digest:
-        raise EditError(f"{path}: expected scores of {clap.name}, got those of another network; give that network")
+        raise EditError(
+            f"{path}: expected scores of {clap.name}, got those of another network; give that network",
+            file=path,
+            name="digest",
+            value=digest,
+        )
     return scores

@@ -21,7 +21,7 @@ _NORMALS = ("nx", "ny", "nz")
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Where to strike, and what to call each sound."""
+    """Contacts, and the name of each sound."""
 
     places: Float64[Tensor, "contacts 3"]
     """Object frame, meters."""
@@ -48,26 +48,37 @@ def contacts_at(
 def read_contacts(path: Path, *, meters: float) -> Contacts:
     """Read a table with the columns x, y, z and perhaps file, nx, ny and nz, such as a capture's impacts.csv.
 
-    Other columns are ignored. Sounds are called as the column `file` says, else by number. Raises `CaptureError` with
-    the line at fault.
+    Other columns are ignored. Sounds are named by the column `file`, else by number. Raises `CaptureError` with the
+    line at fault as `row`.
     """
     lines, separator = read_cells(path)
     header = [name.lower() for name in lines[0][1]] if lines else []
     missing = [name for name in _COLUMNS if name not in header]
     if missing or len(lines) < 2:
-        lacking = f"the column {missing[0]} is missing" if missing else "there is no row"
+        lacking = f"no column {missing[0]}" if missing else "no row"
         raise CaptureError(
-            f"{path}: {lacking}; expected a header line with x,y,z (and perhaps file) and one row for each impact"
+            f"{path}: expected a header with x,y,z (and optionally file) and one row for each impact, got {lacking}",
+            file=path,
+            row=lines[0][0] if lines else None,
+            name=missing[0] if missing else None,
+            value=header,
         )
     places, names, normals = [], [], []
     for line, cells in lines[1:]:
         row = dict(zip(header, cells, strict=False))
-        places.append([_number(row.get(name, ""), f"{path} line {line}: {name}", separator) for name in _COLUMNS])
-        normals.append([_number(row.get(name) or "0", f"{path} line {line}: {name}", separator) for name in _NORMALS])
-        names.append(_wav_name(row["file"], f"{path} line {line}") if "file" in row else f"{len(places):03d}.wav")
-    repeated = next((name for name in names if names.count(name) > 1), None)
+        places.append([_number(row.get(name, ""), path, line, name, separator) for name in _COLUMNS])
+        normals.append([_number(row.get(name) or "0", path, line, name, separator) for name in _NORMALS])
+        names.append(_wav_name(row["file"], path, line) if "file" in row else f"{len(places):03d}.wav")
+    repeated = next((place for place, name in enumerate(names) if name in names[:place]), None)
     if repeated is not None:
-        raise CaptureError(f"{path}: more than one row is to become {repeated}; each needs a name of its own")
+        line, name = lines[1 + repeated][0], names[repeated]
+        raise CaptureError(
+            f"{path}, row {line}: file: expected a name that no other row has, got {name}",
+            file=path,
+            row=line,
+            name="file",
+            value=name,
+        )
     directions = torch.tensor(normals, dtype=torch.float64)
     known = directions if bool(directions.any()) else None
     return Contacts(torch.tensor(places, dtype=torch.float64) * meters, tuple(names), known)
@@ -79,22 +90,34 @@ def refuse_far(contacts: Contacts, field: SoundField) -> None:
         expect_near(contacts.places, field.gain_field.points)
     except PositionError as error:
         name = contacts.names[error.row or 0]
-        raise OutputError(f"{name}: {error}; --unit says what the numbers count") from error
+        raise OutputError(f"{name}: {error}, see --unit", **{**error.attributes, "name": name}) from error
 
 
-def _number(text: str, where: str, separator: str) -> float:
+def _number(text: str, path: Path, line: int, column: str, separator: str) -> float:
     try:
         # Tables that are not separated by commas may write 0,75.
         value = float(text if separator == "," else text.replace(",", "."))
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise CaptureError(f"{where} is {text!r}; expected a number")
+        raise CaptureError(
+            f"{path}, row {line}: {column}: expected a number, got {text!r}",
+            file=path,
+            row=line,
+            name=column,
+            value=text,
+        )
     return value
 
 
-def _wav_name(text: str, where: str) -> str:
-    path = PurePosixPath(text.replace("\\", "/"))
-    if not path.name or path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
-        raise CaptureError(f"{where}: file is {text!r}; expected the name of a wav file inside the output folder")
-    return str(path if path.suffix.lower() == ".wav" else path.with_name(f"{path.name}.wav"))
+def _wav_name(text: str, path: Path, line: int) -> str:
+    sound = PurePosixPath(text.replace("\\", "/"))
+    if not sound.name or sound.is_absolute() or ".." in sound.parts or ":" in sound.parts[0]:
+        raise CaptureError(
+            f"{path}, row {line}: file: expected the name of a wav file inside the output folder, got {text!r}",
+            file=path,
+            row=line,
+            name="file",
+            value=text,
+        )
+    return str(sound if sound.suffix.lower() == ".wav" else sound.with_name(f"{sound.name}.wav"))

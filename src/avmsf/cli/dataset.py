@@ -1,4 +1,4 @@
-"""`avmsf dataset check`: what of a dataset is there, and what is missing."""
+"""`avmsf dataset check`: which parts of a dataset are present, and which are missing."""
 
 from dataclasses import asdict
 
@@ -20,7 +20,7 @@ def run(options: Options) -> int:
         print_json(asdict(report))
     readable = sum(_readable(each) for each in report.objects)
     if not readable:
-        say(f"avmsf dataset: no object of {options.dataset} can be read as it is: mend what is listed and check again")
+        say(f"avmsf dataset: {options.dataset}: expected a readable object, found none; fix the listed problems")
         return UNREADABLE
     recordings = sum(each.recordings for each in report.objects)
     screen.print(
@@ -34,7 +34,7 @@ def _readable(report: ObjectReport) -> bool:
 
 
 def _lines(report: DatasetReport) -> list[str]:
-    """Return everything that is not in the table, a line each: what is missing, then problems, then remarks."""
+    """Return what is not in the table, a line each: missing parts, then problems, then remarks."""
     problems = [f"{each.facts.identifier}: {problem}" for each in report.objects for problem in each.problems]
     return [*(f"missing: {part}" for part in report.missing), *problems, *(f"note: {each}" for each in report.remarks)]
 
@@ -47,7 +47,7 @@ def _table(report: DatasetReport, title: str) -> object:
         rows.append(
             (
                 facts.identifier,
-                "unreadable" if not _readable(each) else "look" if each.problems else "good",
+                "unreadable" if not _readable(each) else "incomplete" if each.problems else "good",
                 "–" if facts.name == facts.identifier else facts.name + inferred,
                 "–" if facts.material is None else facts.material + inferred,
                 str(each.recordings),

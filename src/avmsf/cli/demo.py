@@ -33,12 +33,12 @@ from avmsf.scene.splatconfig import SplatConfig
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
 
 TRAIN = 12
-"""Strikes that the field is fitted to; it is judged by the others."""
+"""Impacts that the field is fitted to; it is evaluated at the others."""
 CONFIG = PipelineConfig(
-    # With four times as many steps, the field's error is the same within the scatter of runs (.328; .321 to .340 with
+    # With four times as many steps, the field's error is the same within the variation of runs (.328; .321 to .340 with
     # these). The built-in descriptors need no download.
     scene=SceneConfig(splat=SplatConfig(steps=500), lift=LiftConfig(encoder=DESCRIPTORS)),
-    # A mug's dampings hardly change with place, so that the trials which would find this out can be left out.
+    # A mug's dampings hardly change with position, so the trials that would find this are left out.
     fit=FitConfig(damping="shared"),
 )
 STAGES = {
@@ -59,7 +59,7 @@ _HEARD = 2
 
 
 def run(options: Options) -> int:
-    """Fill the folder, then print what came of it."""
+    """Fill the folder, then print a summary."""
     with replaced_whole(options.folder) as begun, OverallBar(STAGES) as bar:
         scores, strikes, report = _go_all_the_way(begun, bar)
     console(errors=False).print(score_table(_title(*strikes), scores))
@@ -70,7 +70,7 @@ def run(options: Options) -> int:
 def _go_all_the_way(
     folder: Path, bar: OverallBar
 ) -> tuple[dict[str, Scores], tuple[Impacts, Impacts], Mapping[str, Any]]:
-    """Fill `folder`; return the scores, the strikes fitted to and scored on, and the field's report."""
+    """Fill `folder`; return the scores, the impacts fitted to and scored on, and the field's report."""
     shutil.copytree(EXAMPLE_FOLDER, folder / "capture")
     report = check(folder / "capture")
     wrong = sum(bool(each.problems) for each in report.recordings)
@@ -88,7 +88,7 @@ def _go_all_the_way(
         fitting=bar.fitting,
     )
     train, test = made.modes.aligned(train), made.modes.aligned(test)
-    bar.tell("page: a web page, sounds, pictures and scores")
+    bar.tell("page: a web page, sounds, figures and scores")
     shutil.move(made.field, folder / FIELD)
     shutil.move(folder / CACHE / CLOUD, folder / GAUSSIANS)
     field = load(folder / FIELD)
@@ -107,10 +107,10 @@ def _go_all_the_way(
             heard.sounds,
             field.render(heard.contacts, directions=heard.directions),
             sample_rate=field.sample_rate,
-            names=[f"strike {row + 1}" for row in range(len(heard))],
-            title="strikes that the model was not given",
+            names=[f"impact {row + 1}" for row in range(len(heard))],
+            title="held-out impacts",
         ),
-        "scores": draw_scores(scores, title="how far rendered sounds are from recorded ones"),
+        "scores": draw_scores(scores, title="errors of rendered sounds"),
     }
     for stem, picture in pictures.items():
         save_picture(picture, folder / "pictures" / f"{stem}.png")
@@ -128,7 +128,7 @@ def _go_all_the_way(
 
 
 def _title(train: Impacts, test: Impacts) -> str:
-    return f"{parts_words(train, test)}; lower is better; the floor has no noise, which L1-log counts"
+    return f"{parts_words(train, test)}; lower is better; the lower bound has no noise, which L1-log counts"
 
 
 def _write_sounds(folder: Path, field: SoundField, train: Impacts, heard: Impacts) -> None:
@@ -138,68 +138,66 @@ def _write_sounds(folder: Path, field: SoundField, train: Impacts, heard: Impact
     factor = Level("peak", -1.0).factor(torch.cat([heard.sounds, rendered, averaged]))
     for row in range(len(heard)):
         for kind, sounds in (("1-recorded", heard.sounds), ("2-model", rendered), ("3-mean-of-nearest", averaged)):
-            path = folder / f"strike-{row + 1}-{kind}.wav"
+            path = folder / f"impact-{row + 1}-{kind}.wav"
             write_sound(path, factor * sounds[row], sample_rate=field.sample_rate, coding="float32")
 
 
 def verdict(scores: Mapping[str, Scores], test: int) -> str:
-    """Return in words how far off the field and the recordings nearby are, and which is nearest to the truth."""
+    """Return the errors of the field and of the nearest recordings as text, and which is lowest."""
     mean = next(name for name in scores if name.startswith("mean waveform"))
     names = {
         "field": "the model",
-        "nearest strike": "the nearest recording",
+        "nearest recording": "the nearest recording",
         mean: "the mean of the three nearest recordings",
     }
     errors = {words: scores[name].mean()["relative_stft"] for name, words in names.items()}
     said = ", ".join(f"{words} has {figure(error, 2)}" for words, error in errors.items())
     best = min(errors, key=lambda words: errors[words])
     return (
-        f"The error at {test} places whose recordings the model was not given:\n{said}.\n"
-        "(Relative STFT error: 0 means the same sound, 1 means as far off as silence.)\n"
-        f"So here {best} comes closest to what was recorded."
+        f"The relative STFT error at {test} held-out positions:\n{said}.\n"
+        "(0: the same sound, 1: the error of silence.)\n"
+        f"The lowest error has {best}."
     )
 
 
 def wall_words(report: Mapping[str, Any]) -> str:
-    """Return what a field's report says of the wall's thickness, beside the true one; empty where it says nothing."""
+    """Return the wall thickness of a field's report, and the true one; empty where it has none."""
     found = report.get("thickness")
     if found is None or EXAMPLE.thickness is None:
         return ""
     median, low, high = (f"{1000 * found[name]:.2g}" for name in ("median", "low", "high"))
     return (
-        "\nPhotographs do not show how thick the mug's wall is. By the recordings it is "
-        f"{median} mm, between {low} and\n{high} mm with a probability of 90 %; in the simulation it is "
-        f"{1000 * EXAMPLE.thickness:.2g} mm."
+        f"\nThe photographs do not show the mug's wall thickness. By the recordings it is {median} mm (90 % interval: "
+        f"{low} to\n{high} mm); in the simulation it is {1000 * EXAMPLE.thickness:.2g} mm."
     )
 
 
 def closing_words(
     folder: Path, scores: Mapping[str, Scores], train: Impacts, test: Impacts, report: Mapping[str, Any]
 ) -> str:
-    """Return what a newcomer should know of a finished demo in `folder`; `report` is the field's."""
+    """Return the introduction to a finished demo in `folder`; `report` is the field's."""
     x, y, z = test.contacts[0].tolist()
     command, place, shape = _command(), shlex.quote(str(folder)), folder / SHAPE
-    surface = f"  {shape}: the mug's surface, as the photographs show it\n" if shape.is_file() else ""
+    surface = f"  {shape}: the mug's surface, reconstructed from the photographs\n" if shape.is_file() else ""
     return f"""
-What was done: from photographs of a mug and recordings of {len(train)} strikes, avmsf made a model of its sound.
-The model gives the sound of a strike anywhere on the mug, also where it was never struck.
-The mug is simulated: its photographs and its recordings, noise included, come from avmsf's simulator. The model was
-not given the mesh behind them; it made the mug's shape from the photographs.{wall_words(report)}
+From photographs of a mug and recordings of {len(train)} impacts, avmsf fitted a model of its sound. The model predicts
+the sound of an impact anywhere on the mug. The mug is simulated: its photographs and its recordings, with noise, come
+from avmsf's simulator. The model did not use the simulated mesh; the mug's shape is reconstructed from the
+photographs.{wall_words(report)}
 
-How good it is:
 {verdict(scores, len(test))}
 
 Open {folder / PAGE} in a browser and click the mug to strike it.
-  {folder / "sounds"}: strikes as recorded, by the model, and as the mean of the nearest recordings
-  {folder / "pictures" / "spectrograms.png"}: the same as pictures; {folder / SCORES}: all figures
-{surface}  {folder / "capture"}: what all was made of; record your own object in the same way
+  {folder / "sounds"}: impacts as recorded, by the model, and as the mean of the nearest recordings
+  {folder / "pictures" / "spectrograms.png"}: their spectrograms; {folder / SCORES}: all errors
+{surface}  {folder / "capture"}: the input; record your own object in the same way
 
 Next, try:
   {command} render {place}/{FIELD} --position {x:.3f} {y:.3f} {z:.3f} -o impact.wav   # an impact anywhere, in meters
-  {command} locate {place}/{FIELD} {place}/capture/{test.names[0]}   # where was the mug struck?
+  {command} locate {place}/{FIELD} {place}/capture/{test.names[0]}   # the contact of a recording
   {command} reconstruct YOUR_FOLDER --output yours.safetensors   # your own object"""
 
 
 def _command() -> str:
-    """Return how this program is called: by its path where the shell does not find it."""
+    """Return the command of this program: its path where the shell does not find it."""
     return "avmsf" if shutil.which("avmsf") or Path(sys.argv[0]).name != "avmsf" else shlex.quote(sys.argv[0])

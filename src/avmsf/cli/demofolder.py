@@ -1,4 +1,4 @@
-"""The folder that `avmsf demo` fills: what was there stays whole until all of the new demo is."""
+"""The folder that `avmsf demo` fills: an earlier demo stays complete until the new one is."""
 
 import shutil
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from avmsf.cli.writing import OutputError
 from avmsf.files import way_out
 
 FORMAT = "avmsf demo 1"
-"""What `demo.json` says its folder is."""
+"""Format of the folder in `demo.json`."""
 RECORD = "demo.json"
 """File that names all files of a finished demo."""
 UNFINISHED, REPLACED = ".avmsf-demo-unfinished", ".avmsf-demo-replaced"
@@ -51,8 +51,9 @@ def _replacing(folder: Path) -> Iterator[Path]:
         _expect_own(folder)
         _replace(folder, begun)
     except OSError as error:
+        path, reason = error.filename or folder, error.strerror or str(error)
         raise OutputError(
-            f"{error.filename or folder}: cannot be written ({error.strerror or error}): {way_out(error)}"
+            f"{path}: expected a writable path, got {reason!r}; {way_out(error)}", file=path, value=reason
         ) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
@@ -83,7 +84,7 @@ def _expect_own(folder: Path) -> None:
     if not folder.exists():
         return
     if not folder.is_dir():
-        raise OutputError(f"{folder}: expected a folder, got a file: choose another name")
+        raise OutputError(f"{folder}: expected a folder, got a file; choose another name", file=folder, value="file")
     own = _own_files(folder)
     found = {each.relative_to(folder) for each in folder.rglob("*") if not each.is_dir() or each.is_symlink()}
     # An old demo that was being deleted when its successor was already complete.
@@ -93,7 +94,9 @@ def _expect_own(folder: Path) -> None:
         shown = ", ".join(foreign[:_SHOWN]) + (", ..." if len(foreign) > _SHOWN else "")
         raise OutputError(
             f"{folder}: expected an empty folder or an earlier demo, got {len(foreign)} files that no demo wrote "
-            f"({shown}): choose another folder, or move them away"
+            f"({shown}); choose another folder, or move them away",
+            file=folder,
+            value=foreign,
         )
 
 

@@ -64,18 +64,20 @@ class Sliders(ModeOptions):
 
 
 def _called(frequency: float, named: Float[Tensor, " modes"], option: str) -> int:
-    """Return the row of the mode that is called by a frequency. Raises EditError where there is none."""
+    """Return the index of the mode at a frequency. Raises EditError where there is none."""
     row = int((named - frequency).abs().argmin())
     if not abs(float(named[row]) - frequency) <= _NEAR * float(named[row]):
         raise EditError(
-            f"{option} {frequency:g}: no mode is there, the nearest is at {float(named[row]):.5g} Hz; `avmsf info` "
-            "lists them"
+            f"{option}: expected the frequency of a mode, got {frequency:g} Hz; the nearest is at "
+            f"{float(named[row]):.5g} Hz (`avmsf info` lists them)",
+            name=option,
+            value=frequency,
         )
     return row
 
 
 def run(options: Options) -> int:
-    """Edit, write, and say what came of it; return 130 where Ctrl-C stopped it."""
+    """Edit, write, and print the result; return 130 where Ctrl-C stopped it."""
     asked = _Edit.of(options)
     _expect(options, asked)
     old = load(options.field)
@@ -85,7 +87,7 @@ def run(options: Options) -> int:
     except KeyboardInterrupt:
         kept = beside(options.output, "checkpoint")
         where = f"from {kept}, or delete it" if kept.exists() else "from the start"
-        say(f"avmsf edit: interrupted; give the same command again to go on {where}")
+        say(f"avmsf edit: interrupted; run the same command again to continue {where}")
         return INTERRUPTED
     save(new, options.output)
     if asked.steering.asked:
@@ -150,30 +152,37 @@ def _expect(options: Options, asked: _Edit) -> None:
     """Raise before any work for what cannot be done or written."""
     asked.steering.expect_usable()
     if asked.change.law != MaterialChange.law and not asked.change.asked:
-        raise EditError("--law goes with --material, --size or a constant of a material, and none of them is given")
+        raise EditError(
+            "--law: expected --material, --size or a constant of a material with it, got none", name="--law"
+        )
     if options.position is not None and options.plots is None:
-        raise EditError("--position goes with --plots, which is not given: it is where their sounds are struck")
+        raise EditError("--position: expected --plots with it, got none", name="--position")
     if asked.change.old is not None and not (asked.change.asked or asked.steering.like_material):
         raise EditError(
-            "--from is given without anything to lead to: add --material, --size, a constant or --like-material"
+            "--from: expected --material, --size, a constant or --like-material with it, got none", name="--from"
         )
     if not (asked.change.asked or asked.sliders.asked or asked.steering.asked):
         raise EditError(
-            "nothing is asked for: give --material, --size or a constant of a material, --pitch, --decay, "
-            "--brightness, --mode-db, --mode-pitch or --mode-decay, --prompt, --like or --like-material"
+            "expected an edit, got none: give --material, --size or a constant of a material, --pitch, --decay, "
+            "--brightness, --mode-db, --mode-pitch or --mode-decay, --prompt, --like or --like-material",
+            name="options",
         )
     expect_writable(options.output)
     if asked.steering.generated is not None:
         expect_writable(asked.steering.generated)
     if options.output.exists() and options.field.exists() and options.output.samefile(options.field):
-        raise OutputError(f"{options.output}: is the field itself, which would be lost: name another file")
+        raise OutputError(
+            f"{options.output}: expected another file than the field to edit; choose another --output",
+            file=options.output,
+            name="--output",
+        )
     if options.plots is not None:
         for name in (MODES, SPECTROGRAMS, BEFORE, AFTER, CURVE):
             expect_writable(options.plots / name)
 
 
 def _contact(field: SoundField, at: tuple[float, float, float] | None) -> Float[Tensor, " 3"]:
-    """Return the place that is listened to: the one that is asked for, or among some the loudest."""
+    """Return the contact of the sounds: the requested one, or the loudest of some."""
     if at is not None:
         chosen = contacts_at([at], meters=1.0)
         refuse_far(chosen, field)

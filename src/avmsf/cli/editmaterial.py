@@ -1,4 +1,4 @@
-"""Which material an edit starts from and which it leads to, as the command line has it."""
+"""The old and the new material of an edit on the command line."""
 
 from dataclasses import dataclass, replace
 
@@ -26,28 +26,28 @@ class MaterialChange(MaterialOptions):
         return self.material is not None or self.size != 1.0 or bool(self.constants)
 
     def made_of(self, field: SoundField) -> Material:
-        """Return what a field is of before the change, with words on how that is known where it is not given.
+        """Return a field's material before the change; prints its source where it is not given.
 
-        Raises `EditError` first of all where what it comes to be of is unknown.
+        Raises `SimulationError` first for an unknown new material.
         """
         if self.material is not None:
             material_named(self.material)
         return old_material(field) if self.old is None else material_named(self.old)
 
     def target(self, old: Material) -> Material:
-        """Return what an object of `old` comes to be of."""
+        """Return the new material of an object of `old`."""
         new = old if self.material is None else material_named(self.material)
         if self.constants:
             new = replace(new, name=f"{new.name} with {', '.join(self.constants)} changed", **self.constants)
         return new
 
     def apply(self, field: SoundField, *, old: Material) -> SoundField:
-        """Return the recast field of an object that is of `old`."""
+        """Return the field of an object of `old` in its new material."""
         return recast(field, old, self.target(old), size=self.size, law=LAWS[self.law])
 
 
 def old_material(field: SoundField) -> Material:
-    """Return what a field is made of, with words on how that is known. Raises `EditError` where no material fits."""
+    """Return a field's material, and print its source. Raises `EditError` where no material fits."""
     known = made_of(field, option="--from")
     say(known.words)
     return known.material

@@ -1,4 +1,4 @@
-"""`avmsf evaluate`: how good methods are on a dataset, as tables and as a page."""
+"""`avmsf evaluate`: the errors of methods on a dataset, as tables and as a page."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -40,7 +40,7 @@ _SHOWN = 5
 
 
 def run(options: Options) -> int:
-    """Evaluate, and say what came of it; return 130 where Ctrl-C stopped it."""
+    """Evaluate, and print the results; return 130 where Ctrl-C stopped it."""
     protocol = protocol_named(options.protocol)
     if protocol.name == LEARNING_CURVE:
         protocol = replace(protocol, choosing=Growing(options.counts, options.starts))
@@ -78,11 +78,16 @@ def run(options: Options) -> int:
         parts = write_page(results, subsets=groups)
         figures = write_figures(results) if options.figures else []
     except KeyboardInterrupt:
-        say(f"avmsf evaluate: interrupted; the same command goes on from what {folder} holds")
+        say(f"avmsf evaluate: interrupted; run the same command again to continue from {folder}")
         return INTERRUPTED
     if not summary["methods"]:
-        first = summary["failures"][0]["failure"] if summary["failures"] else "there is no object"
-        raise EvaluationError(f"no method has a figure: {first}")
+        first = summary["failures"][0]["failure"] if summary["failures"] else "no object"
+        raise EvaluationError(
+            f"expected a result of a method, got none: {first}",
+            file=folder,
+            name="failures",
+            value=len(summary["failures"]),
+        )
     screen = console(errors=options.json)
     for part in parts[1:3]:
         _print(part, screen)
@@ -91,7 +96,7 @@ def run(options: Options) -> int:
     if failures:
         for each in summary["failures"][:_SHOWN]:
             screen.print(f"failed: {each['object']}, {each['method'] or 'all'}: {each['failure']}", soft_wrap=True)
-        screen.print(f"failures: {failures}, listed in {TABLES}; asked for again, they are tried again", soft_wrap=True)
+        screen.print(f"{failures} failures, listed in {TABLES}; run the command again to retry them", soft_wrap=True)
     screen.print(f"wrote {SUMMARY}, {TABLES} and {PAGE} in {folder}", soft_wrap=True)
     for path in figures:
         screen.print(f"wrote {path}", soft_wrap=True)
@@ -142,7 +147,7 @@ def evaluation_of(
     body: BodyConfig,
     geometry: Geometry = "mesh",
 ) -> Evaluation:
-    """Return the plan of an evaluation that keeps features and surfaces in the folder `kept`."""
+    """Return the plan of an evaluation that stores features and surfaces in the folder `kept`."""
     lift, paper = settled_lifts(scene.lift, methods)
     scene = replace(scene, lift=lift)
     settings = {"scene": asdict(scene), "paper": asdict(paper), "geometry": geometry, "body": asdict(body)}
@@ -171,10 +176,10 @@ def run_shown(
 
 
 def settled_lifts(lift: LiftConfig, methods: Sequence[Method]) -> tuple[LiftConfig, LiftConfig]:
-    """Return how features are made, and how in the paper's form, with the encoders that will be taken.
+    """Return the settings of features, and those of the paper's form, with the encoders that will be used.
 
-    What replaces DINOv2 is said, and is part of what results are stored under. Raises SceneError where a method needs
-    the paper's encoder and it is not to be had.
+    The replacement of DINOv2 is printed, and is part of the results' identity. Raises SceneError where a method needs
+    the paper's encoder and it is not available.
     """
     paper = PRESETS["paper"].scene.lift
     if lift.encoder != AUTO:
@@ -185,7 +190,7 @@ def settled_lifts(lift: LiftConfig, methods: Sequence[Method]) -> tuple[LiftConf
 
 
 def title_of(dataset: Dataset, folder: Path) -> str:
-    """Return what reports call a dataset: captures by their folder, which tells them from other captures."""
+    """Return a dataset's name in reports: captures by their folder, which identifies them."""
     return folder.resolve().name if isinstance(dataset, CaptureCollection) else dataset.name
 
 

@@ -49,9 +49,9 @@ _ENDINGS = frozenset(
 
 
 def run(options: Options) -> int:
-    """Read, write, and say how large it is and what it lacks."""
+    """Read, write, and print the size and what is left out."""
     if options.points is not None and options.points < 1:
-        raise ExportError(f"--points is {options.points}; expected 1 or more")
+        raise ExportError(f"--points: expected 1 or more, got {options.points}", name="--points", value=options.points)
     expect_name(options)
     for sentence in unused_options(options):
         say(f"note: {sentence}")
@@ -85,8 +85,11 @@ def expect_name(options: Options) -> None:
         expect_ending(output, _FILES[options.to])
     elif suffix in _ENDINGS and not output.is_dir() and not (options.to == "web" and suffix in PAGE_SUFFIXES):
         raise ExportError(
-            f"{output}: expected a folder's name, since --to {options.to} writes {_FOLDERS[options.to]}, found one "
-            f"that ends in {output.suffix}: say --output {output.with_suffix('')}"
+            f"{output}: expected the name of a folder for --to {options.to} ({_FOLDERS[options.to]}), got one with "
+            f"{output.suffix}; use --output {output.with_suffix('')}",
+            file=output,
+            name="suffix",
+            value=output.suffix,
         )
 
 
@@ -94,8 +97,10 @@ def _read(options: Options) -> SoundField | SampledField:
     if options.field.is_dir():
         if not is_demo(options.field):
             raise ExportError(
-                f"{options.field}: expected a field file, or a folder in the layout of the paper's demo, found another "
-                "folder: name the .safetensors that avmsf fit wrote"
+                f"{options.field}: expected a field file, or a folder in the layout of the paper's demo, got another "
+                "folder; name the .safetensors that avmsf fit wrote",
+                file=options.field,
+                name="field",
             )
         variant = None if options.to == "avmsf-demo" else options.variant
         return read_demo(options.field, variant=variant, sample_rate=options.rate).field
@@ -109,7 +114,7 @@ def _sampled(field: SoundField | SampledField, options: Options) -> SampledField
     else:
         sampled, held = field if len(field) <= most else field.take(field.spread(most)), len(field)
     if len(sampled) < held and options.points is None:
-        say(f"note: {len(sampled)} of the field's {held} contacts are written; --points asks for others")
+        say(f"note: {len(sampled)} of the field's {held} contacts are written; --points sets the number")
     return sampled
 
 
@@ -163,7 +168,7 @@ def _faust(field: SoundField | SampledField, options: Options) -> Written:
         asked = len(sampled)
         sampled, noise = fitted(sampled, noise=noise)
         if len(sampled) < asked:
-            say(f"note: of these {len(sampled)}, as many as Faust compiles in reasonable time")
+            say(f"note: {len(sampled)} of these are written, as many as Faust compiles in reasonable time")
     return write_faust(sampled, options.output, noise=noise, force=options.overwrite)
 
 
@@ -175,8 +180,10 @@ def _demo(field: SoundField | SampledField, options: Options) -> Written:
     cloud = _gaussians(source, 1.0, sampled)
     if cloud is None and source is not None:
         raise ExportError(
-            f"{source}: expected a .ply of Gaussians, which the demo shows, found another object: name one, or leave "
-            "--object out, and each contact is shown as a disc"
+            f"{source}: expected a .ply of Gaussians for the demo, got another file; name one, or leave --object out "
+            "for a disc at each contact",
+            file=source,
+            name="--object",
         )
     if cloud is not None and isinstance(field, SoundField):
         if len(cloud) > most:
@@ -205,7 +212,9 @@ def _wavs(field: SoundField | SampledField, options: Options) -> Written:
         times = times * len(forces)
     if not forces or len(times) != len(forces):
         raise ExportError(
-            f"expected a contact time for each force, or one for all, found {len(forces)} forces and {len(times)} times"
+            f"--contact-times: expected one, or one for each of {len(forces)} --forces, got {len(times)}",
+            name="--contact-times",
+            value=len(times),
         )
     layers = tuple(Layer(force, each, options.pulse) for force, each in zip(forces, times, strict=True))
     sampled = _sampled(field, options)

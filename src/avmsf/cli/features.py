@@ -1,4 +1,4 @@
-"""`avmsf features`: features on an object's surface out of what a folder shows of it."""
+"""`avmsf features`: features on an object's surface from a folder's views of it."""
 
 import shlex
 
@@ -24,7 +24,7 @@ def run(options: Options) -> int:
             if options.output is not None:
                 copy_whole(features.path, options.output)
     except KeyboardInterrupt:
-        say("avmsf features: interrupted; the same command goes on from where it was")
+        say("avmsf features: interrupted; repeat the command to continue")
         return INTERRUPTED
     screen = console(errors=options.json)
     screen.print(features_words(report), soft_wrap=True)

@@ -34,7 +34,7 @@ _SHOWN = 8
 
 
 def run(options: Options) -> int:
-    """Fit, write, and say what came of it; return 130 where Ctrl-C stopped it."""
+    """Fit, write, and print a summary; return 130 where Ctrl-C stopped it."""
     expect_writable(options.output)
     usable_device(options.device, raising=FitError, kinds=TRAINABLE)
     known = settings_of(options.capture) if options.settings is None else CaptureSettings.read(options.settings)
@@ -64,7 +64,7 @@ def run(options: Options) -> int:
             raise
         checkpoint = unfinished(options.output, "checkpoint")
         where = f"from {checkpoint}, or delete it" if checkpoint.exists() else "from the start of training"
-        say(f"avmsf fit: interrupted; give the same command again to go on {where}")
+        say(f"avmsf fit: interrupted; repeat the command to continue {where}")
         return INTERRUPTED
     screen = console(errors=options.json)
     for sentence in describe_alignment(modes, train):
@@ -100,7 +100,7 @@ def run(options: Options) -> int:
 def print_fitted(
     screen: Console, fitted: SoundField, train: Impacts, test: Impacts | None, scores: Mapping[str, Scores], path: Path
 ) -> None:
-    """Print how a field in the file `path` does on the recordings left out, what is odd, and how good it is."""
+    """Print the errors of a field in the file `path` at held-out recordings, the outliers, and its quality."""
     if test is not None:
         screen.print(score_table(f"{parts_words(train, test)}; lower is better", scores))
     for words in (*describe_outliers(fitted), summary(fitted, len(train)), *quality_words(fitted, path)):
@@ -108,7 +108,7 @@ def print_fitted(
 
 
 def _run_guess(options: Options, material: str, settings: CaptureSettings) -> int:
-    """Guess, write, and say what it is."""
+    """Compute a field without recordings, write it and print a summary."""
     refuse_with_material(options)
     guessed = guess_field(
         known_surface(options.capture, settings),
@@ -138,14 +138,16 @@ def refuse_with_material(options: Any) -> None:
     if options.time_zero is not None:
         given.append("time_zero")
     if given:
+        option = f"--{given[0].replace('_', '-')}"
         raise FitError(
-            f"--material guesses a field without recordings, which --{given[0].replace('_', '-')} needs: leave one of "
-            "them out"
+            f"{option}: expected recordings, got --material, which computes a field without them; leave one out",
+            name=option,
+            value="--material",
         )
 
 
 def show_guess(guessed: SoundField, output: Path, *, json: bool) -> None:
-    """Say what a guessed field in the file `output` is."""
+    """Print a summary of a field without recordings in the file `output`."""
     screen = console(errors=json)
     for words in quality_words(guessed, output):
         screen.print(words, soft_wrap=True)
@@ -161,7 +163,7 @@ def part_contacts(
 ) -> tuple[Impacts, Impacts | None]:
     """Return the recordings to fit to and those to score on, None where all are fitted to."""
     if count is not None and fraction is not None:
-        raise FitError("expected --train-count or --train-fraction, found both: leave one of them out")
+        raise FitError("expected --train-count or --train-fraction, got both; leave one out", name="--train-count")
     if fraction is not None:
         return split(impacts, fraction=fraction, start=start)
     if count is not None:
@@ -170,17 +172,17 @@ def part_contacts(
 
 
 def describe_outliers(fitted: SoundField) -> list[str]:
-    """Return a line for each recording whose contact disagrees with all others."""
+    """Return a line for each recording whose contact is an outlier."""
     report = fitted.origin.report
     excluded = report.get("excluded", [])
     return [
-        f"check its row in impacts.csv: {found}; {'left out of the fit' if name in excluded else 'used all the same'}"
+        f"check its row in impacts.csv: {found}; {'left out of the fit' if name in excluded else 'used in the fit'}"
         for name, found in report.get("outliers", {}).items()
     ]
 
 
 def summary(fitted: SoundField, contacts: int) -> str:
-    """Say in a sentence what a fit came to."""
+    """Return the summary of a fit."""
     report = fitted.origin.report
     how = "chosen on validation contacts" if report.get("validated") else "as set"
     gains = report.get("gain_model", "attention")
@@ -191,9 +193,9 @@ def summary(fitted: SoundField, contacts: int) -> str:
         interval = between.format(**{key: 1000 * value for key, value in (thickness or {}).items()})
         gained = credibility["with_body"] - credibility["without_body"]
         gains += (
-            f" (most probable body: {best['body']}{interval and ', 90 % interval of the wall ' + interval}, its "
-            f"frequencies {best['frequency_factor']:.2f} times those of aluminum; adds {gained:.1f} nats per mode at "
-            "contacts left out)"
+            f" (most probable body: {best['body']}{interval and ', 90 % interval of the wall ' + interval}, "
+            f"frequencies {best['frequency_factor']:.2f} times those of aluminum; adds {gained:.1f} nats per mode by "
+            "leave-one-out)"
         )
     return (
         f"field of {fitted.origin.capture}: {len(fitted.bank)} modes from {counted(contacts, 'recording')}, gains by "

@@ -38,7 +38,7 @@ _BATCH = 1024
 
 
 def run(options: Options) -> int:
-    """Describe and draw a file; which kind it is, its content tells."""
+    """Describe and draw a file, whose kind its content shows."""
     suffix = options.file.suffix.lower()
     if suffix == ".ply" or (suffix == ".safetensors" and holds_features(options.file)):
         values = describe_cloud(options) if suffix == ".ply" else describe_features(options)
@@ -66,7 +66,7 @@ def run(options: Options) -> int:
         screen.print(score_table(f"{len(recorded)} contacts, {what}; lower is better", scores))
         values |= {"compared_with": {"recordings": list(recorded.names), "which": what, "scores": score_values(scores)}}
     if options.plots is not None:
-        doing("drawing the pictures")
+        doing("drawing the figures")
         draw_field(field, options.plots, points=points, gains=gains, level=level, recorded=recorded)
     next_command("avmsf render", options.file, "--position X Y Z -o impact.wav")
     if options.json:
@@ -127,7 +127,7 @@ def draw_field(
     level: Float[Tensor, " modes"],
     recorded: Impacts | None,
 ) -> None:
-    """Write the pictures of a field, with some of the recordings `recorded` beside its own sounds."""
+    """Write the figures of a field, with some of the recordings `recorded` next to its sounds."""
     name = field.origin.capture or "field"
     pictures = {
         "modes": draw_modes(field.bank, level, title=f"{len(field.bank)} modes of {name}"),
@@ -143,9 +143,8 @@ def draw_field(
             title=f"{name}: recorded and rendered",
         )
     if has_posterior(field):
-        doubt = relative_gain_std(field, points)
-        title = f"uncertainty of the gains of {name}"
-        pictures["doubt"] = draw_doubt(points, doubt, title=title, struck=training_contacts(field))
+        std, title = relative_gain_std(field, points), f"uncertainty of the gains of {name}"
+        pictures["uncertainty"] = draw_doubt(points, std, title=title, struck=training_contacts(field))
         pictures["spectrum"] = draw_band(
             spectrum_band(field, points[0]), title=f"{name}: one impact, with its uncertainty"
         )
@@ -169,17 +168,15 @@ def _held_out(impacts: Impacts, field: SoundField) -> tuple[Impacts, str]:
     known = set(field.origin.trained_on)
     rows = [row for row, name in enumerate(impacts.names) if name not in known]
     if not rows:
-        return impacts, "the field was fitted to all of them"
-    return impacts.take(rows), "the field was not fitted to these" if len(rows) < len(
-        impacts
-    ) else "the field was fitted to none of them"
+        return impacts, "all of them training recordings"
+    return impacts.take(rows), "not training recordings" if len(rows) < len(impacts) else "none a training recording"
 
 
 def _gains_words(gains: dict[str, Any]) -> str:
     if gains.get("inner", gains["kind"]) == AttentionGains.kind:
-        return f"the network's on features: {gains['encoder']}"
+        return f"attention network on features: {gains['encoder']}"
     if gains.get("inner", gains["kind"]) == BodyGains.kind:
-        return "guessed: mode shapes of a body, each times its level"
+        return "computed without recordings: mode shapes of a body, each times its level"
     return (
         f"Gaussian process over {', '.join(dict.fromkeys(gains['families']))} kernels, by {gains['contacts']} contacts"
     )
@@ -232,7 +229,7 @@ def _pipeline_lines(pipeline: dict[str, Any]) -> list[str]:
 
 
 def _edit_words(edit: dict[str, Any]) -> str:
-    """Return what an edit did, without what left all as it was."""
+    """Return the description of an edit, without settings that change nothing."""
     parts = [str(edit.get("edit"))]
     if "from" in edit:
         parts.append(f"from {edit['from']['name']} to {edit['to']['name']}")

@@ -27,7 +27,7 @@ _UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 def describe_cloud(options: Options) -> dict[str, Any]:
-    """Print what Gaussians are, draw them if asked, and return their values."""
+    """Print a description of Gaussians, draw them with --plots, and return their values."""
     cloud = read_splats(options.file)
     extent = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
     screen = console(errors=options.json)
@@ -39,7 +39,7 @@ def describe_cloud(options: Options) -> dict[str, Any]:
 
 
 def describe_features(options: Options) -> dict[str, Any]:
-    """Print what features are, draw them if asked, and return their values."""
+    """Print a description of features, draw them with --plots, and return their values."""
     features, report = load_features(options.file), read_report(options.file)
     screen = console(errors=options.json)
     count, dim = features.features.shape
@@ -80,8 +80,11 @@ def _colors_of(path: Path, features: FeatureField) -> Float[Tensor, "points 3"]:
     apart, rows = cKDTree(cloud.centers.numpy()).query(features.points.numpy())
     if apart.any():
         raise SceneError(
-            f"{path}: expected the Gaussians that the features lie on ({len(features.points)}), found {len(cloud)} "
-            "others: name the file that the features were lifted onto"
+            f"{path}: expected the {len(features.points)} Gaussians of the features, got {len(cloud)} others; name the "
+            "file that the features were computed on",
+            file=path,
+            name="--cloud",
+            value=len(cloud),
         )
     return plain_colors(cloud.take(torch.from_numpy(rows)))
 
@@ -105,7 +108,7 @@ def _write(picture: Figure, path: Path) -> None:
 
 
 def without_positions(features: FeatureField) -> FeatureField:
-    """Return the features alone, which positions next to them would outweigh."""
+    """Return the features without the positions, which would outweigh them."""
     if not features.encoder.startswith(f"{GEOMETRY} and "):
         return features
     return replace(features, features=features.features[:, 3:])

@@ -1,4 +1,4 @@
-"""`avmsf locate`: where recorded blows fell, in words, as heat maps and as point clouds."""
+"""`avmsf locate`: contacts of recorded impacts, as text, heat maps and point clouds."""
 
 import itertools
 from dataclasses import dataclass
@@ -38,10 +38,12 @@ UNLOCATED = 2
 def run(options: Options) -> int:
     """Locate, print and draw; return 2 where a recording could not be located."""
     if not options.recordings:
-        raise OutputError("expected one recording or more after the field, such as HIT.wav")
+        raise OutputError("expected one recording or more after the field, such as HIT.wav", name="recordings", value=0)
     if not 0.0 < options.probability < 1.0:
         raise OutputError(
-            f"--probability is {options.probability:g}; expected a probability between 0 and 1, such as 0.9"
+            f"--probability: expected a probability between 0 and 1, such as 0.9, got {options.probability:g}",
+            name="--probability",
+            value=options.probability,
         )
     if options.output is not None:
         expect_writable(options.output / "impact.png")
@@ -49,7 +51,7 @@ def run(options: Options) -> int:
     force = None if options.force is None else Force(options.force)
     known = _Known(load(options.field))
     truth = _true_contact(options, known.field)
-    say("preparing gains over the surface and their reliability, once a run (seconds to minutes)")
+    say("preparing the gains over the surface and their posterior, once a run (seconds to minutes)")
     screen = console(errors=options.json)
     quality = known.field.quality
     verdict = known.field.origin.report.get("guess") if quality is None else quality.verdict
@@ -81,7 +83,7 @@ def run(options: Options) -> int:
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """A field, and what is asked of it only where it is needed."""
+    """A field, and what is computed of it only where it is needed."""
 
     field: SoundField
 
@@ -103,7 +105,7 @@ def _answers(
     force: Force | None,
     options: Options,
 ) -> list[tuple[dict[str, Any], ContactMap | None]]:
-    """Return what is found out about each blow of a recording, and its map; None for one that has no place."""
+    """Return the values for each impact of a recording, and its map; None for one that could not be located."""
     try:
         blows = _blows(known, recording, settings, force, several=options.several)
     except LocationError as error:
@@ -117,7 +119,7 @@ def _answers(
 def _blows(
     known: _Known, recording: Recording, settings: CaptureSettings | None, force: Force | None, *, several: bool
 ) -> list[tuple[float | None, ContactMap]]:
-    """Return when the blows of a recording began, seconds, where that tells them apart, and where they fell."""
+    """Return the onsets of a recording's impacts, seconds, where there may be several, and their contacts."""
     if several:
         return [*locate_blows(known.field, recording, settings=settings, force=force, locator=known.locator)]
     return [(None, locate(known.field, recording, settings=settings, force=force, locator=known.locator))]
@@ -130,7 +132,11 @@ def _settings(options: Options) -> CaptureSettings | None:
     if options.capture is None:
         return None
     if not options.capture.is_dir():
-        raise OutputError(f"{options.capture}: expected a capture folder, found none: check the name, or leave it out")
+        raise OutputError(
+            f"{options.capture}: expected a capture folder, got none; check the name, or leave it out",
+            file=options.capture,
+            name="--capture",
+        )
     return settings_of(options.capture)
 
 
@@ -156,20 +162,20 @@ def _error(contact: ContactMap, truth: Float64[Tensor, " 3"]) -> dict[str, Any]:
 
 
 def _describe(name: str, seconds: float | None, contact: ContactMap, known: _Known, level: float) -> dict[str, Any]:
-    """Return all that is found out about a blow, as plain values."""
+    """Return the results for an impact, as plain values."""
     symmetries = known.symmetries if len(contact.peaks(level)) > 1 else None
     return {"recording": name, "seconds": seconds, **describe_blow(contact, symmetries, level)}
 
 
 def _words(values: dict[str, Any]) -> str:
-    """Return one line about a blow, and one more for each thing to know besides."""
+    """Return one line about an impact, and one for each further message."""
     when = "" if values["seconds"] is None else f" at {values['seconds']:.3f} s"
     if values["place"] is None:
         return f"{values['recording']}{when}: {values['status']}: {values['reason']}"
     region = values["region"]
     where = ", ".join(f"{value + 0.0:.4f}" for value in values["place"])
     lines = [
-        f"{values['recording']}{when}: struck at ({where}) m; {100 * region['level']:g} % within "
+        f"{values['recording']}{when}: impact at ({where}) m; {100 * region['level']:g} % within "
         f"{figure(1000 * region['radius_meters'], 2)} mm, {figure(100 * region['share'], 2)} % of the surface; the "
         f"field explains {100 * values['explained']:.0f} % of the sound"
     ]
@@ -177,13 +183,13 @@ def _words(values: dict[str, Any]) -> str:
         error, share = 1000 * values["error_meters"], 100 * values["rmed_posterior"]
         lines.append(f"  {error:.1f} mm from the true contact ({share:.1f} % of the diagonal)")
     if values["ambiguous"]:
-        lines.append("  ambiguous: several places sound about the same")
+        lines.append("  ambiguous: several positions have similar probabilities")
     lines += [f"  {other['words']}" for other in values["counterparts"]]
     return "\n".join([*lines, *(f"  note: {note}" for note in values["notes"])])
 
 
 def _name(path: Path, taken: set[str]) -> str:
-    """Return what a blow's files are called: the recording's name, numbered where that is taken."""
+    """Return the name of an impact's files: the recording's, numbered where that is taken."""
     numbered = (f"{path.stem}-{number}" for number in itertools.count(2))
     name = next(each for each in itertools.chain([path.stem], numbered) if each not in taken)
     taken.add(name)
@@ -196,7 +202,7 @@ def _draw(
     picture, cloud = folder / f"{name}.png", folder / f"{name}.ply"
     others = [other["place"] for other in values["counterparts"]]
     marks = torch.tensor(others) if others else None
-    title = f"{values['recording']}: where it was struck"
+    title = f"{values['recording']}: contact"
     save_picture(draw_contact(contact, title=title, others=marks, truth=truth), picture)
     write_contact_cloud(contact, cloud)
     for path in (picture, cloud):

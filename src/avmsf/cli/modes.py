@@ -16,8 +16,8 @@ from avmsf.wording import counted
 
 _EXPLANATION = """\
 ±: spread over recordings. energy: share of all. phase: coherence over recordings, 1 if the same in
-all. orders: part of the model orders that find the pole. left out: energy explained in a recording
-that is left out, 50 % by chance."""
+all. orders: part of the model orders that find the pole. left out: energy explained by
+leave-one-out, 50 % by chance."""
 
 
 def run(options: Options) -> int:
@@ -39,7 +39,7 @@ def run(options: Options) -> int:
     screen = console(errors=options.json)
     screen.print(quality_table(title, modes))
     if supporting:
-        screen.print(quality_table(f"{len(supporting)} supporting poles: kept in the model, not modes", supporting))
+        screen.print(quality_table(f"{len(supporting)} supporting poles: in the model, but not modes", supporting))
     screen.print(_EXPLANATION)
     aligned = AlignmentReport.of(extraction, impacts)
     for sentence in [] if aligned is None else aligned.sentences():

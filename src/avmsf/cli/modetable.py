@@ -1,4 +1,4 @@
-"""Modes as a table: what `avmsf modes` and `avmsf info` print."""
+"""Modes as a table, as `avmsf modes` and `avmsf info` print them."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What the verbs print: tables and words for people, JSON for programs, each on its own stream."""
+"""What the commands print: tables and text for people, JSON for programs, each on its own stream."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""`avmsf reconstruct`: a capture folder with all that it shows and sounds like in, a field out."""
+"""`avmsf reconstruct`: from a capture folder with views and recordings to a field."""
 
 from dataclasses import asdict
 
@@ -25,7 +25,7 @@ from avmsf.pipeline.stages import StageFolder
 
 
 def run(options: Options) -> int:
-    """Reconstruct, and say what came of it; return 130 where Ctrl-C stopped it."""
+    """Reconstruct, and print a summary; return 130 where Ctrl-C stopped it."""
     if options.output is not None:
         expect_writable(options.output)
     usable_device(options.device, raising=FitError, kinds=TRAINABLE)
@@ -52,7 +52,7 @@ def run(options: Options) -> int:
             if options.output is not None:
                 copy_whole(made.field, options.output)
     except KeyboardInterrupt:
-        say("avmsf reconstruct: interrupted; the same command goes on from where it was")
+        say("avmsf reconstruct: interrupted; repeat the command to continue")
         return INTERRUPTED
     doing("comparing the field with the recordings that it was not fitted to")
     scores = {} if test is None else compare(fitted, train, test, made.modes)
@@ -61,8 +61,8 @@ def run(options: Options) -> int:
         screen.print(sentence, soft_wrap=True)
     if made.report:
         screen.print(features_words(made.report), soft_wrap=True)
-    rows = [[each.stage, figure(each.seconds), "now" if each.fresh else "before"] for each in made.stages]
-    screen.print(table("stages", ["stage", "seconds", "made"], rows))
+    rows = [[each.stage, figure(each.seconds), "computed" if each.fresh else "cached"] for each in made.stages]
+    screen.print(table("stages", ["stage", "seconds", "source"], rows))
     print_fitted(screen, fitted, train, test, scores, options.output or made.field)
     if made.surface is not None:
         screen.print(f"the object's surface is {made.surface}", soft_wrap=True)
@@ -90,7 +90,7 @@ def run(options: Options) -> int:
 
 
 def _run_guess(options: Options, material: str, settings: CaptureSettings) -> int:
-    """Guess, write, and say what it is."""
+    """Compute a field without recordings, and print a summary."""
     refuse_with_material(options)
     try:
         with SceneBar() as bar, StageFolder(options.kept).lock("avmsf reconstruct"):
@@ -105,7 +105,7 @@ def _run_guess(options: Options, material: str, settings: CaptureSettings) -> in
             if options.output is not None:
                 copy_whole(made, options.output)
     except KeyboardInterrupt:
-        say("avmsf reconstruct: interrupted; the same command goes on from where it was")
+        say("avmsf reconstruct: interrupted; repeat the command to continue")
         return INTERRUPTED
     show_guess(load(made), options.output or made, json=options.json)
     return 0

@@ -1,4 +1,4 @@
-"""`avmsf render`: the sounds of blows anywhere on the object."""
+"""`avmsf render`: the sounds of impacts anywhere on the object."""
 
 import math
 from functools import partial
@@ -20,7 +20,7 @@ from avmsf.modal.pulse import ForcePulse
 from avmsf.simulate.recipe import LONGEST
 
 _MUCH_SOFTER = 20.0
-"""Decibels under the recorded blow from which a softer mallet's are told of."""
+"""Decibels below the recorded impact from which a softer hammer's sound is noted."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 
 
@@ -28,26 +28,37 @@ def run(options: Options) -> int:
     """Render and write."""
     meters = METRES[options.unit]
     if bool(options.position) == (options.contact_table is not None):
-        raise OutputError("expected contacts either by --position X Y Z, once or more, or by --contact-table TABLE.csv")
+        raise OutputError(
+            "expected contacts either by --position X Y Z, once or more, or by --contact-table TABLE.csv",
+            name="--position",
+            value=len(options.position),
+        )
     if options.direction and len(options.direction) != len(options.position):
         raise OutputError(
-            f"expected one --direction for each --position, got {len(options.direction)} for {len(options.position)}"
+            f"--direction: expected one for each --position, got {len(options.direction)} for {len(options.position)}",
+            name="--direction",
+            value=len(options.direction),
         )
     contacts = contacts_at(options.position, meters=meters, directions=options.direction)
     if options.contact_table is not None:
         contacts = read_contacts(options.contact_table, meters=meters)
     paths = _paths(options.output, contacts)
     for name in ("force", "level_db"):
-        if not math.isfinite(getattr(options, name)):
-            raise OutputError(f"--{name.replace('_', '-')} is {getattr(options, name)}; expected a finite number")
-    if not bool(torch.isfinite(contacts.places).all()):
-        raise OutputError("--position: expected finite numbers as coordinates")
+        value, option = getattr(options, name), f"--{name.replace('_', '-')}"
+        if not math.isfinite(value):
+            raise OutputError(f"{option}: expected a finite number, got {value}", name=option, value=value)
+    wrong = torch.nonzero(~torch.isfinite(contacts.places).all(1)).flatten().tolist()
+    if wrong:
+        found = contacts.places[wrong[0]].tolist()
+        raise OutputError(
+            f"--position: expected finite coordinates, got {found}", name="--position", row=wrong[0], value=found
+        )
     field = load(options.field)
     refuse_far(contacts, field)
     if options.force != 1 and not field.origin.per_newton:
-        say(f"note: the recordings' forces are not known, so {options.force:g} counts in average recorded blows")
+        say(f"note: the forces are not known: {options.force:g} is relative to an average recorded impact")
     if round(field.sample_rate) != field.sample_rate:
-        say(f"note: wav files hold whole sample rates: {round(field.sample_rate)} for {field.sample_rate:g} Hz")
+        say(f"note: the wav files have {round(field.sample_rate)} Hz for {field.sample_rate:g} Hz")
     doing("rendering")
     pulse = _pulse(options)
     rendered = partial(render_sounds, field, force=options.force, seconds=options.seconds)
@@ -62,8 +73,8 @@ def run(options: Options) -> int:
     peak = float(sounds.abs().max())
     if options.coding == "float32" and peak > 1:
         say(
-            f"note: the loudest sound peaks at {20 * math.log10(peak):+.1f} dB over full scale, where players clip; "
-            "add --normalize peak, or lower --level-db"
+            f"note: the loudest sound peaks at {20 * math.log10(peak):+.1f} dB over full scale and will clip; add "
+            "--normalize peak, or lower --level-db"
         )
     for path, sound in zip(paths, sounds, strict=True):
         write_sound(path, sound, sample_rate=field.sample_rate, coding=options.coding)
@@ -76,13 +87,12 @@ def run(options: Options) -> int:
 
 
 def _say_softer(hard: Float[Tensor, " samples"], soft: Float[Tensor, " samples"], contact_time: float) -> None:
-    """Say how many decibels of the recorded blow's peak a softer mallet takes, where these are many."""
+    """Print by how many decibels a softer hammer lowers the recorded impact's peak, where these are many."""
     loud, faint = (float(each.abs().max()) for each in (hard, soft))
     if faint > 0 and (softer := 20 * math.log10(loud / faint)) > _MUCH_SOFTER:
         say(
-            f"note: with a contact of {1e3 * contact_time:.3g} ms the sound peaks {softer:.0f} dB lower than that of "
-            "the recorded blow, and no level was changed: add --normalize peak or --level-db, or a shorter "
-            "--contact-time"
+            f"note: a contact time of {1e3 * contact_time:.3g} ms lowers the peak by {softer:.0f} dB; add --normalize "
+            "peak or --level-db, or a shorter --contact-time"
         )
 
 
@@ -95,13 +105,15 @@ def render_sounds(
     seconds: float | None,
     pulse: ForcePulse | None = None,
 ) -> Float[Tensor, "contacts samples"]:
-    """Render blows of `force` for `seconds`; raises `OutputError` for a time that holds no sample."""
+    """Render impacts of `force` for `seconds`; raises `OutputError` for a time of less than a sample."""
     if seconds is None:
         return field.render(places, directions=directions, forces=force, pulse=pulse)
     samples = round(seconds * field.sample_rate) if math.isfinite(seconds) else 0
     if not 1 <= samples <= MAX_SAMPLES:
         raise OutputError(
-            f"--seconds is {seconds:g}; expected a time above 0 and at most {MAX_SAMPLES / field.sample_rate:g} s"
+            f"--seconds: expected more than 0 and at most {MAX_SAMPLES / field.sample_rate:g} s, got {seconds:g}",
+            name="--seconds",
+            value=seconds,
         )
     return field.render(places, directions=directions, forces=force, samples=samples, pulse=pulse)
 
@@ -109,8 +121,9 @@ def render_sounds(
 def _pulse(options: Options) -> ForcePulse | None:
     if not 0 <= options.contact_time <= LONGEST:
         raise OutputError(
-            f"--contact-time is {options.contact_time:g}; expected seconds from 0 to {LONGEST:g}: beyond that a blow "
-            "is a push"
+            f"--contact-time: expected seconds from 0 to {LONGEST:g}, got {options.contact_time:g}",
+            name="--contact-time",
+            value=options.contact_time,
         )
     return ForcePulse(options.contact_time, options.pulse) if options.contact_time else None
 
@@ -118,7 +131,11 @@ def _pulse(options: Options) -> ForcePulse | None:
 def _paths(output: Path, contacts: Contacts) -> list[Path]:
     if output.suffix.lower() == ".wav" and not output.is_dir():
         if len(contacts.names) > 1:
-            raise OutputError(f"{output}: is one file and there are {len(contacts.names)} contacts; name a folder")
+            raise OutputError(
+                f"{output}: expected a folder for {len(contacts.names)} contacts, got the name of a file",
+                file=output,
+                value=len(contacts.names),
+            )
         expect_writable(output)
         return [output]
     paths = [output / name for name in contacts.names]

@@ -1,4 +1,4 @@
-"""What the verbs that turn a folder's look into features have in common."""
+"""Common parts of the commands that compute Gaussians, features and surfaces from a folder's views."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ from avmsf.scene.symmetry import Symmetries
 
 
 def settings_for(options: SceneOptions) -> CaptureSettings:
-    """Return the settings of the capture that the folder is, or the defaults."""
+    """Return the settings of the folder's capture, or the defaults."""
     return settings_of(options.folder) if options.settings is None else CaptureSettings.read(options.settings)
 
 
@@ -24,7 +24,7 @@ def settings_for(options: SceneOptions) -> CaptureSettings:
 def opened_scene(options: SceneOptions, config: SceneConfig, *, command: str) -> Iterator[SceneStages]:
     """Yield the stages of the options' folder, which show their progress and are locked for the command.
 
-    Raises SceneError for a folder that shows nothing of the object.
+    Raises SceneError for a folder without views of the object.
     """
     settings = settings_for(options)
     expect_one_unit(options.folder, settings)
@@ -39,21 +39,23 @@ def opened_scene(options: SceneOptions, config: SceneConfig, *, command: str) ->
 
 
 def stage_line(name: str, kept: Kept) -> str:
-    """Say what a stage cost."""
-    return f"{name:9} {kept.seconds:7.1f} s{'' if kept.fresh else ' (kept from before)'}  {kept.path}"
+    """Return a message on a stage's time and output."""
+    return f"{name:9} {kept.seconds:7.1f} s{'' if kept.fresh else ' (cached)'}  {kept.path}"
 
 
 def features_words(report: Mapping[str, Any]) -> str:
-    """Say what the features are, how sure of them the views are, and which symmetries they obey."""
+    """Return a message on the features, their consistency over the views, and their symmetries."""
     lines = [
-        f"features: {report['encoder']}, on {report['points']} points, {report['unseen']} of which no view sees; views "
-        f"agree on {100 * report['agreement']:.0f} % of the features' variance"
+        f"features: {report['encoder']}, on {report['points']} points, {report['unseen']} of them in no view; "
+        f"consistency of the views {100 * report['agreement']:.0f} % of the features' variance"
     ]
     if report.get("dropped"):
-        lines.append(f"left out: {report['dropped']} Gaussians inside the object or behind its surface in the views")
+        lines.append(f"removed: {report['dropped']} Gaussians inside the object or behind its surface in the views")
     if "symmetries" in report:
         lines.append(Symmetries.from_dict(report["symmetries"]).summary())
     if "orbit_spread" in report:
         before, after = report["orbit_spread"]
-        lines.append(f"spread over orbits, in the features' own spread: {before:.3f} before pooling, {after:.3f} after")
+        lines.append(
+            f"deviation over symmetric points, relative to all: {before:.3f} before pooling, {after:.3f} after"
+        )
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""A field beside what it has to beat, on contacts that none of them has heard."""
+"""A field and the baselines, at held-out contacts."""
 
 import shlex
 from collections.abc import Mapping
@@ -27,33 +27,33 @@ HEADINGS = {
 
 
 def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction) -> dict[str, Scores]:
-    """Score the field, the baselines made of the same training impacts, and the floor that the modes set.
+    """Score the field, the baselines of the same training impacts, and the lower bound that the modes allow.
 
-    All by recordings that start where those start that the modes were found in.
+    All by recordings aligned like those that the modes were found in.
     """
     train, test, count = modes.aligned(train), modes.aligned(test), min(3, len(train))
     renderers: dict[str, Renderer] = {
         "field": field,
-        "nearest strike": NearestStrike(train),
+        "nearest recording": NearestStrike(train),
         f"mean waveform of {count} nearest": MeanWaveform(train, count),
     }
     if train.directions is not None:
         renderers[f"mean waveform of {count} nearest, by direction"] = MeanWaveform(train, count, by_direction=True)
     renderers |= {f"mean gains of {count} nearest": MeanGains(train, modes, count), "white noise": WhiteNoise(train)}
     scores = {name: evaluate(renderer, test) for name, renderer in renderers.items()}
-    return scores | {"floor: the test strikes' own gains": score(floor(test, modes.bank), test)}
+    return scores | {"lower bound: the held-out recordings' own gains": score(floor(test, modes.bank), test)}
 
 
 def parts_words(train: Impacts, test: Impacts) -> str:
-    """Return how many places are not trained on and how many are, and their recordings where these are more."""
+    """Return how many positions are held out and how many are trained on, with the recordings where these are more."""
     owners = places_of(torch.cat([train.contacts, test.contacts]).double()).tolist()
     heard, left = len(set(owners[: len(train)])), len(set(owners[len(train) :]))
     repeats = "" if (heard, left) == (len(train), len(test)) else f" ({len(test)} and {len(train)} recordings)"
-    return f"{counted(left, 'place')} not trained on, {heard} trained on{repeats}"
+    return f"{counted(left, 'position')} not trained on, {heard} trained on{repeats}"
 
 
 def quality_words(field: SoundField, path: Path) -> list[str]:
-    """Return how good a field in the file `path` is, and which command says where to record more; empty if unknown."""
+    """Return the quality of a field in the file `path`, and the command for more contacts; empty if unknown."""
     if isinstance(guess := field.origin.report.get("guess"), str):
         return [f"{guess} Record a few impacts and fit again: avmsf fit"]
     if field.quality is None:

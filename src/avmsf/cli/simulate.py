@@ -23,7 +23,7 @@ def run(options: Options) -> int:
             print_json({"objects": list(SIM20), "shapes": list(KINDS), "materials": list(MATERIALS)})
         return 0
     if options.output is None:
-        raise SimulationError("expected --output FOLDER, where to put what is simulated; --list shows what there is")
+        raise SimulationError("--output: expected a folder, got none; --list names the objects", name="output")
     recipes, folder = _chosen(options, options.output)
     try:
         with ObjectBar() as bar:
@@ -33,7 +33,7 @@ def run(options: Options) -> int:
 
             simulate_set(recipes, folder, cache=options.cache, progress=show)
     except KeyboardInterrupt:
-        say("avmsf simulate: interrupted; the same command goes on from where it was")
+        say("avmsf simulate: interrupted; repeat the command to continue")
         return INTERRUPTED
     text = f"wrote {options.output}" if len(recipes) == 1 else f"wrote {len(recipes)} objects to {options.output}"
     values = {"output": str(options.output), "objects": [str(folder / name) for name in recipes]}
@@ -47,7 +47,12 @@ def _chosen(options: Options, output: Path) -> tuple[dict[str, ObjectRecipe], Pa
     if options.what == SET:
         for name in ("kind", "mesh", "material", "seed"):
             if getattr(options.recipe, name) != getattr(ObjectRecipe(), name):
-                raise SimulationError(f"--{name} was given with {SET}, whose objects have their own: leave it out")
+                value = getattr(options.recipe, name)
+                raise SimulationError(
+                    f"--{name}: expected none with {SET}, got {value}; leave it out",
+                    name=name,
+                    value=str(value),
+                )
         changes = {
             each.name: getattr(options.recipe, each.name)
             for each in fields(ObjectRecipe)
@@ -64,6 +69,6 @@ def _list(*, errors: bool) -> None:
         (name, recipe.kind, recipe.material, str(recipe.seed), "yes" if name not in NON_SYMMETRIC else "no")
         for name, recipe in SIM20.items()
     ]
-    screen.print(table(SET, ("object", "shape", "material", "seed", "symmetric by turns"), rows, words=3))
+    screen.print(table(SET, ("object", "shape", "material", "seed", "rotational symmetry"), rows, words=3))
     screen.print(f"shapes for --kind: {', '.join(KINDS)}")
     screen.print(f"materials: {', '.join(MATERIALS)}")

@@ -22,7 +22,7 @@ def run(options: Options) -> int:
             if options.output is not None:
                 copy_whole(cloud.path, options.output)
     except KeyboardInterrupt:
-        say("avmsf splat: interrupted; the same command goes on from where it was")
+        say("avmsf splat: interrupted; repeat the command to continue")
         return INTERRUPTED
     lines = [f"{gaussians} Gaussians", *(stage_line(name, kept) for name, kept in scene.made().items())]
     if options.output is not None:

@@ -1,4 +1,4 @@
-"""An edit towards words, recordings or a material's sound on the command line: its guide, progress and previews."""
+"""Guided edits on the command line, by a prompt, recordings or a material: guide, progress and previews."""
 
 import dataclasses
 import math
@@ -29,22 +29,22 @@ from avmsf.tasks.steer import Guide, SteerProgress, steer
 
 _PREVIEW = Level("peak", -1.0)
 _GENERATED_SECONDS = 3.0
-"""Length of a sound that is made of a prompt alone."""
+"""Duration of a sound that is generated from a prompt only."""
 _OF_THE_MODEL = ("--model", "--negative", "--model-seconds", "--device", "--generated", "--clap")
-"""Options that nothing but words needs."""
+"""Options that only a prompt needs."""
 
 
 @dataclass(frozen=True)
 class Steering(GuideOptions):
-    """A descent towards a prompt, recordings, or the sound of a material; only one of them.
+    """A guided edit towards a prompt, recordings, or the sound of a material; only one of them.
 
-    While it runs, the sound as it stands can be heard beside the output. An interrupted edit leaves its state there;
-    the same command goes on from it to the same result.
+    A preview is written next to the output while it runs. An interrupted edit leaves its state there; the same command
+    continues from it to the same result.
     """
 
     @property
     def asked(self) -> bool:
-        """Whether there is anything to lead to."""
+        """Whether there is a guide."""
         return bool(self._guides)
 
     def expect_usable(self) -> None:
@@ -54,28 +54,36 @@ class Steering(GuideOptions):
         """
         if len(self._guides) > 1:
             raise EditError(
-                f"expected one of --prompt, --like and --like-material, found {' and '.join(self._guides)}: edit by "
-                "one, then by the other"
+                f"expected one of --prompt, --like and --like-material, got {' and '.join(self._guides)}; use one "
+                "after the other",
+                name=self._guides[0],
+                value=tuple(self._guides),
             )
         if self.like_material is not None:
             material_named(self.like_material)
         if not self._guides:
             given = [*(name for name in _changed(self) if name == "--parameters"), *_changed(self.config)]
-            _expect_unchanged(given, "--prompt, --like or --like-material, and none of them is given")
+            _expect_unchanged(given, "--prompt, --like or --like-material")
         if self.prompt is None:
             own = [name for name in _changed(self) if name in _OF_THE_MODEL]
-            _expect_unchanged([*own, *_changed(self.distillation)], "--prompt, which is not given")
+            _expect_unchanged([*own, *_changed(self.distillation)], "--prompt")
             return
         expect_prompt(self.prompt)
         if self.clap is not None and self.config.preview_every == 0:
-            raise EditError("--clap takes scores of the previews, and --preview-every 0 makes none: give 50, say")
+            raise EditError(
+                "--clap: expected --preview-every 1 or more with it, such as 50, got 0", name="--clap", value=0
+            )
         if self.model_seconds is not None and not 0 < self.model_seconds < math.inf:
-            raise EditError(f"--model-seconds {self.model_seconds:g}: expected more than 0, such as 3")
+            raise EditError(
+                f"--model-seconds: expected more than 0, such as 3, got {self.model_seconds:g}",
+                name="--model-seconds",
+                value=self.model_seconds,
+            )
 
     def apply(self, field: SoundField, *, output: Path, old: Material | None) -> SoundField:
-        """Return the edited field; `output` is where it will be written, and its state and preview lie beside it.
+        """Return the edited field; its state and preview are written next to `output`, its later file.
 
-        `old` is what the field is of, needed for `like_material` alone.
+        `old` is the field's material, needed only for `like_material`.
         """
         guide = self._guide(field, old)
         preview, checkpoint = beside(output, "preview.wav"), beside(output, "checkpoint")
@@ -142,11 +150,13 @@ def _changed(options: Any) -> list[str]:
 
 def _expect_unchanged(given: list[str], wanted: str) -> None:
     if given:
-        raise EditError(f"{' and '.join(given)} {'goes' if len(given) == 1 else 'go'} with {wanted}")
+        raise EditError(
+            f"{' and '.join(given)}: expected {wanted} as well, got none", name=given[0], value=tuple(given)
+        )
 
 
 class SteerBar:
-    """A bar with the loss and the pitch so far, and a preview that is written over; in a file or a pipe, lines."""
+    """A bar with the present loss and pitch, and a preview that is overwritten; in a file or a pipe, lines."""
 
     def __init__(self, preview: Path, *, sample_rate: float) -> None:
         self.preview, self.sample_rate, self.live = preview, sample_rate, sys.stderr.isatty()
@@ -180,9 +190,9 @@ class SteerBar:
         factor = _PREVIEW.factor(progress.preview[None])
         write_sound(self.preview, factor * progress.preview, sample_rate=self.sample_rate, coding="float32")
         if not self.live:
-            say(f"step {progress.step} of {progress.steps}: loss {loss}, pitch x {pitch}; listen: {self.preview}")
+            say(f"step {progress.step} of {progress.steps}: loss {loss}, pitch x {pitch}; preview in {self.preview}")
 
 
 def beside(output: Path, ending: str) -> Path:
-    """Return where a part of an unfinished edit is kept: beside the field that it will become."""
+    """Return the path of a part of an unfinished edit: next to its later file."""
     return output.with_name(f"{output.name}.{ending}")

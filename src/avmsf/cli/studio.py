@@ -1,4 +1,4 @@
-"""`avmsf studio`: the page where an object is struck and heard, and captures are made."""
+"""`avmsf studio`: the web page that plays an object, locates impacts, edits fields and records captures."""
 
 import os
 
@@ -11,7 +11,7 @@ from avmsf.errors import StudioError
 def run(options: Options) -> int:
     """Serve the page until Ctrl-C."""
     if options.modes < 1:
-        raise OutputError(f"--modes is {options.modes}; expected 1 or more")
+        raise OutputError(f"--modes: expected 1 or more, got {options.modes}", name="modes", value=options.modes)
     try:
         from avmsf.studio.modules import fetch_modules, find_modules
         from avmsf.studio.opening import open_target
@@ -21,17 +21,18 @@ def run(options: Options) -> int:
         if error.name is None or error.name.partition(".")[0] not in ("anyio", "starlette", "uvicorn"):
             raise
         raise StudioError(
-            f"the page's server needs starlette and uvicorn, and {error.name} is missing: pip install 'avmsf[studio]'"
+            f"expected starlette and uvicorn for the page's server, got no {error.name}; pip install 'avmsf[studio]'",
+            name=error.name,
         ) from error
     if options.fetch_modules:
         say(f"the page's libraries are in {fetch_modules()}")
         if options.target is None:
             return 0
     if options.target is None:
-        raise StudioError("expected a field, a capture folder, a folder of images or a mesh to open, found none")
+        raise StudioError("expected a field, a capture folder, a folder of images or a mesh, got none", name="target")
     opened = open_target(options.target, object=options.object, capture=options.capture)
     if find_modules() is None:
-        say("the page takes three and spark from cdn.jsdelivr.net; --fetch-modules brings them here once and for all")
+        say("the page loads three and spark from cdn.jsdelivr.net; --fetch-modules downloads them once")
     computing = serve(
         opened,
         port=options.port,

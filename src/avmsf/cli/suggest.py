@@ -1,4 +1,4 @@
-"""`avmsf suggest`: where to strike next, as a table, a list to walk by and a picture."""
+"""`avmsf suggest`: where to record next, as a table, a list and a figure."""
 
 import csv
 import io
@@ -25,9 +25,9 @@ _DRAWN_POINTS = 4000
 def run(options: Options) -> int:
     """Suggest, print and draw."""
     if options.settings is not None and options.candidates is None:
-        raise FitError("--settings are those of a capture of candidates: give --candidates, or leave them out")
+        raise FitError("--settings: expected it with --candidates, got it without; leave it out", name="--settings")
     if options.unseen and options.candidates is not None:
-        raise FitError("expected --unseen or --candidates, got both: leave one out")
+        raise FitError("--unseen: expected it without --candidates, got both; leave one out", name="--unseen")
     paths = {} if options.output is None else {name: options.output / name for name in (TABLE, PICTURE)}
     for path in paths.values():
         expect_writable(path)
@@ -35,7 +35,7 @@ def run(options: Options) -> int:
     gains = unedited_mixture(field)
     names: tuple[str, ...] | None = None
     given = False
-    doing("weighing the contacts")
+    doing("choosing the contacts")
     if options.candidates is None:
         found = suggest(field, options.count, unseen=options.unseen)
     else:
@@ -46,22 +46,21 @@ def run(options: Options) -> int:
         names = tuple(impacts.names[row] for row in found.rows.tolist())
     rows = _rows(found, names)
     screen = console(errors=options.json)
-    title = f"where to strike next: expected error of the whole field now {figure(found.before)}"
+    title = f"where to record next: expected error of the field now {figure(found.before)}"
     columns = ["", *(("recording",) if names else ()), "x (m)", "y (m)", "z (m)"]
     columns += [*(("nx", "ny", "nz") if found.directions is not None else ()), "error after"]
     screen.print(
         table(title, columns, [[_cell(value) for value in row.values()] for row in rows], words=1 + bool(names))
     )
     screen.print(
-        "error: relative to the energy of the gains, as the field's posterior expects it; 0 = certain, 1 = as wrong "
-        "as silence",
+        "error: by the field's posterior, relative to the energy of the gains; 0 = certain, 1 = the error of silence",
         soft_wrap=True,
     )
     if found.unreachable:
-        screen.print(f"left out: {found.unreachable} places that no hammer reaches from outside", soft_wrap=True)
+        screen.print(f"left out: {found.unreachable} positions that no hammer reaches from outside", soft_wrap=True)
     if found.directions is not None:
-        straight = "" if given else ", as straight into the body as it can where the field has one"
-        screen.print(f"nx, ny, nz: the way the hammer moves{straight}")
+        straight = "" if given else ", as perpendicular to the surface as possible if the field has one"
+        screen.print(f"nx, ny, nz: direction of the impact{straight}")
     if paths:
         write_text(paths[TABLE], _list(rows))
         doing("drawing the uncertainty")
@@ -70,7 +69,7 @@ def run(options: Options) -> int:
         picture = draw_doubt(
             points,
             relative_gain_std(field, points),
-            title=f"{field.origin.capture or 'field'}: doubt, and where to strike next",
+            title=f"{field.origin.capture or 'field'}: uncertainty, and where to record next",
             struck=gains.contacts,
             suggested=found.contacts,
             directions=found.directions,

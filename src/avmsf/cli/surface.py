@@ -35,7 +35,7 @@ def run(options: Options) -> int:
             if options.output is not None:
                 write_whole(options.output, lambda place: write_surface(surface, place, kind=kind), raising=OutputError)
     except KeyboardInterrupt:
-        say("avmsf surface: interrupted; the same command goes on from where it was")
+        say("avmsf surface: interrupted; repeat the command to continue")
         return INTERRUPTED
     lines = [surface_words(surface)]
     lines += [stage_line(name, made) for name, made in {**scene.made(), "surface": kept}.items()]
@@ -49,19 +49,22 @@ def run(options: Options) -> int:
 
 
 def kind_of(path: Path) -> SurfaceKind:
-    """Return the format that a file's name ends in. Raises OutputError for another."""
+    """Return the format of a file by its suffix. Raises OutputError for another."""
     kinds: tuple[SurfaceKind, ...] = get_args(SurfaceKind)
     for kind in kinds:
         if path.suffix.lower() == f".{kind}":
             return kind
     raise OutputError(
         f"{path}: expected a name that ends in {', '.join(f'.{kind}' for kind in kinds)}, got "
-        f"{path.suffix or 'no ending'}: rename it"
+        f"{path.suffix or 'no suffix'}; rename it",
+        file=path,
+        name="suffix",
+        value=path.suffix,
     )
 
 
 def surface_words(surface: Surface) -> str:
-    """Say how large a surface is, and whether it is closed."""
+    """Return a message on a surface's size, and on whether it is closed."""
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=True)
     extent = " x ".join(f"{1000 * side:.3g}" for side in mesh.extents)
     words = f"{len(surface.faces)} triangles, {extent} mm, area {1e4 * mesh.area:.3g} cm2"

@@ -1,4 +1,4 @@
-"""What the verbs write: wav files, pictures and texts, each whole or not at all."""
+"""What the commands write: wav files, figures and texts, each complete or not at all."""
 
 import io
 import math
@@ -20,20 +20,20 @@ SUBTYPES = {"float32": "FLOAT", "int16": "PCM_16"}
 
 
 class OutputError(AvmsfError):
-    """What was asked for cannot be written as it was asked for."""
+    """An option or an output of a command cannot be used."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """How loud sounds are written."""
+    """The level at which sounds are written."""
 
     normalize: Literal["none", "peak"] = "none"
-    """none: as they are. peak: all sounds by one factor, so that the loudest reaches full scale."""
+    """none: unchanged. peak: all sounds times one factor, so that the loudest reaches full scale."""
     level_db: float = 0.0
-    """Gain on top of that, dB."""
+    """Additional gain, dB."""
 
     def factor(self, sounds: Float[Tensor, "contacts samples"]) -> float:
-        """Return what the sounds are multiplied by: one factor for all keeps loud contacts louder than faint ones."""
+        """Return the factor on all sounds: one for all preserves the differences in level between contacts."""
         peak = float(sounds.abs().max())
         gain = 10 ** (self.level_db / 20)
         return gain / peak if self.normalize == "peak" and peak > 0 else gain
@@ -44,19 +44,30 @@ def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: fl
     are not finite and for what would clip."""
     rate = round(sample_rate)
     if rate < 1:
-        raise OutputError(f"{path}: a wav file's sample rate is a whole number of Hz, at least 1, got {sample_rate:g}")
-    if not bool(torch.isfinite(sound).all()):
         raise OutputError(
-            f"{path}: expected finite samples, got {int((~torch.isfinite(sound)).sum())} of {len(sound)} that are not: "
-            "fit the field again, or choose a smaller force or level"
+            f"{path}: expected a sample rate of 1 Hz or more, got {sample_rate:g} Hz",
+            file=path,
+            name="sample_rate",
+            value=sample_rate,
+        )
+    wrong = int((~torch.isfinite(sound)).sum())
+    if wrong:
+        raise OutputError(
+            f"{path}: expected finite samples, got {wrong} of {len(sound)} that are not; fit the field again, or "
+            "choose a smaller force or level",
+            file=path,
+            name="finite",
+            value=wrong,
         )
     peak = float(sound.abs().max()) if len(sound) else 0.0
     # One step below full scale, which is as far as 16 bits reach upwards.
     if coding == "int16" and peak > 1 - 2**-15:
         raise OutputError(
-            f"{path}: 16 bits hold amplitudes up to 1 and this sound peaks at {peak:.3g} "
-            f"({20 * math.log10(peak):+.1f} dB), so it would clip: add --normalize peak --level-db -0.1, lower "
-            "--level-db, or write float32"
+            f"{path}: expected amplitudes up to 1 for 16 bits, got {peak:.3g} ({20 * math.log10(peak):+.1f} dB); add "
+            "--normalize peak --level-db -0.1, lower --level-db, or write float32",
+            file=path,
+            name="peak",
+            value=peak,
         )
     memory = io.BytesIO()
     soundfile.write(memory, sound.numpy().astype(np.float32), rate, subtype=SUBTYPES[coding], format="WAV")
@@ -69,10 +80,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def expect_writable(path: Path) -> None:
-    """Raise `OutputError` where no file can be put at `path`: before work of minutes, not after."""
+    """Raise `OutputError` where no file can be written at `path`: before work of minutes, not after."""
     if path.is_dir():
-        raise OutputError(f"{path}: is a folder; name the file to write")
+        raise OutputError(f"{path}: expected the name of a file, got a folder", file=path, value="folder")
     folder = path.parent
     existing = next(place for place in (folder, *folder.resolve().parents) if place.exists())
     if not existing.is_dir():
-        raise OutputError(f"{path}: {existing} is a file, so there can be no folder of this name; choose another place")
+        raise OutputError(
+            f"{path}: expected a folder at {existing}, got a file; choose another folder", file=existing, value="file"
+        )

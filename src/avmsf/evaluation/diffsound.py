@@ -127,7 +127,11 @@ def leveled(fit: MaterialFit, curve: DampingCurve, train: Impacts, residual: Res
     heard = damped_frequency(elastic.frequency, damping)
     inside = torch.nonzero((heard > 1.0) & (heard < 0.5 * train.sample_rate)).flatten()
     if not len(inside):
-        raise EvaluationError(f"expected modes below {0.5 * train.sample_rate:g} Hz, got none: state the mesh's unit")
+        raise EvaluationError(
+            f"expected modes below {0.5 * train.sample_rate:g} Hz, got none; give the mesh's unit",
+            name="frequency",
+            value=0,
+        )
     elastic = _some(elastic, inside)
     bank = ModalBank(heard[inside], damping[inside])
     weight = _weights(_displacements(elastic, bank, train.contacts, train.directions), bank, train, weighted=weighted)
@@ -183,8 +187,9 @@ def _weights(
     energy = float(gram.sum())
     if not energy > 0.0 or not float(products.sum()) > 0.0:
         raise EvaluationError(
-            f"expected recordings that sound and contacts where the body moves, got none among {len(train)}: record "
-            "the impacts again"
+            f"expected sounds and displacements above 0 at a contact, got none of {len(train)}; record them again",
+            name="train",
+            value=0.0,
         )
     if not weighted:
         return torch.full((len(bank),), float(products.sum()) / energy, dtype=torch.float64)

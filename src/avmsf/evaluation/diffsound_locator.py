@@ -45,7 +45,9 @@ class DiffSoundLocator:
         """
         heard = sound.detach().cpu()[: self.renderer.samples].double()
         if not bool(torch.isfinite(heard).all()) or not bool(heard.any()):
-            raise LocationError("expected a sound, got one that is silent or not finite: record the impact again")
+            raise LocationError(
+                "sound: expected finite samples that are not all 0, got others; record the impact again", name="sound"
+            )
         found = fit_sine_gains(heard[None], self.renderer.bank, sample_rate=self.renderer.sample_rate)[0]
         return 1.0 - (self.gains @ torch.nn.functional.normalize(found.double(), dim=0)).abs()
 

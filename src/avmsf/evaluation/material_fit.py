@@ -1,4 +1,4 @@
-"""DiffSound's inverse problem: the material, and the thickness of walls, whose modes sound like recorded clips.
+"""DiffSound's inverse problem: material and wall thickness from recorded clips.
 
 Jin et al. (DiffSound, SIGGRAPH 2024) predict one sound for all clips, the lowest 16 modes with the same amplitude, and
 move Young's modulus and Poisson's ratio by Adam until its spectra are those of the clips: first by optimal transport,
@@ -65,42 +65,44 @@ _ROUNDS = 2
 
 @dataclass(frozen=True)
 class DiffSoundConfig:
-    """How a material is fitted."""
+    """Settings of the fit of a material."""
 
     material: str | None = None
-    """Name in the table of materials of what the object is made of, at which the descent starts; None tries all."""
+    """Initial material, by its name in the table of materials; None tries all."""
     transport_steps: int = 12
     """Steps by optimal transport, each with one clip; 1000, with all clips, in the published program."""
     difference_steps: int = 100
     """Steps by differences of spectra; 2000 in the published program."""
     search: int = 60
-    """Generations in which the whole range is then searched for a smaller difference, half as many near a thickness
-    that was found; none in the published program."""
+    """Generations of the following global search for a smaller difference, and half as many near a thickness that was
+    found; none in the published program."""
 
     def __post_init__(self) -> None:
         if self.material is not None:
             material_named(self.material)
         for name in ("transport_steps", "difference_steps", "search"):
             if getattr(self, name) < 0:
-                raise EvaluationError(f"{name} = {getattr(self, name)}: expected 0 or more")
+                raise EvaluationError(
+                    f"{name}: expected 0 or more, got {getattr(self, name)}", name=name, value=getattr(self, name)
+                )
 
 
 @dataclass(frozen=True)
 class MaterialFit:
-    """What the clips say of a body."""
+    """Fitted material and wall thickness of a body."""
 
     stiffness: float
     """E / rho, m2/s2."""
     poisson: float
     thickness: float | None
-    """Of the walls on average, meters; None for a filled body."""
+    """Mean wall thickness, meters; None for a solid body."""
     difference: float
-    """The objective that was reached: the mean difference of spectra."""
+    """Value of the objective: the mean difference of spectra."""
     body: IsotropicModes
     """The body of that thickness."""
 
     def modes(self) -> ElasticModes:
-        """Return the body's modes, of the fitted material with a density of 1 kg/m3, which sounds do not tell."""
+        """Return the body's modes, of the fitted material with a density of 1 kg/m3, which sounds do not determine."""
         return self.body.modes(Material("fitted", 1.0, self.stiffness, self.poisson, 0.0, 0.0))
 
 
@@ -123,8 +125,9 @@ class DampingCurve:
         slow = (damping > 0.0) & (damping < _FASTEST_DECAY) & (frequency > BAND[0]) & (frequency < _CURVE_END)
         if not slow.any():
             raise EvaluationError(
-                f"expected modes that decay by less than {_FASTEST_DECAY:g} 1/s in the recordings, got none of "
-                f"{len(bank)}: the object is too dull for DiffSound"
+                f"expected a mode with a damping below {_FASTEST_DECAY:g} 1/s for DiffSound, got none of {len(bank)}",
+                name="damping",
+                value=len(bank),
             )
         bins = ((frequency[slow] - BAND[0]) // _CURVE_STEP).astype(int)
         kept = np.unique(bins)
@@ -151,8 +154,10 @@ def clip_spectra(impacts: Impacts) -> ClipSpectra:
     peaks = np.abs(kept).max(axis=1)
     if not (peaks > 0.0).any():
         raise EvaluationError(
-            f"expected a recording with a sound, got {len(impacts)} that are silent ({', '.join(impacts.names[:3])}): "
-            "record the impacts again"
+            f"expected a recording with a sound, got {len(impacts)} silent ones ({', '.join(impacts.names[:3])}); "
+            "record the impacts again",
+            name="sounds",
+            value=0.0,
         )
     loud = peaks > 0.0
     return ClipSpectra(torch.from_numpy((kept[loud] / peaks[loud, None])[:CLIPS]).float(), RATE)
@@ -168,7 +173,7 @@ def predicted_sound(
     heard = damped_frequency(frequency, damping)
     inside = (heard > BAND[0]) & (heard < BAND[1])
     if not bool(inside.any()):
-        raise EvaluationError(f"expected modes from {BAND[0]:g} to {BAND[1]:g} Hz, got none")
+        raise EvaluationError(f"expected modes from {BAND[0]:g} to {BAND[1]:g} Hz, got none", name="frequency", value=0)
     ones = torch.ones(1, int(inside.sum()))
     sound = synthesize(ones, heard[inside], damping[inside], samples=SAMPLES, sample_rate=RATE)[0]
     return sound / sound.detach().abs().max(), heard[inside]
@@ -315,6 +320,8 @@ def _expect_audible(family: BodyFamily, materials: Iterable[Material]) -> None:
                 return
     lowest = float(bodies[0].modes(next(iter(materials))).frequency[0])
     raise EvaluationError(
-        f"expected a body with modes from {BAND[0]:g} to {BAND[1]:g} Hz, got one whose lowest is at {lowest:.3g} Hz: "
-        "state the mesh's unit"
+        f"expected a body with modes from {BAND[0]:g} to {BAND[1]:g} Hz, got a lowest mode at {lowest:.3g} Hz; give "
+        "the mesh's unit",
+        name="frequency",
+        value=lowest,
     )

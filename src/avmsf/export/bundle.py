@@ -1,4 +1,4 @@
-"""A field as a page reads it: `manifest.json`, its tensors in `field.bin`, the object, its surface, measured strikes.
+"""A field as a page reads it: `manifest.json`, tensors in `field.bin`, the object, its surface, measured impacts.
 
 The manifest says where in `field.bin` each tensor lies, little endian and row by row: points, normals, frequency,
 damping, sine, noise, and cosine unless all of it is zero. Times and frequencies are float64, for a float32 frequency
@@ -22,7 +22,7 @@ from avmsf.errors import ExportError
 from avmsf.export.formats import MOST_POINTS
 from avmsf.export.objectfile import ObjectFile, read_object
 from avmsf.export.sampledfield import SampledField
-from avmsf.export.written import Written, write_folder
+from avmsf.export.written import Written, no_modes, write_folder
 from avmsf.field.soundfield import SoundField
 
 FORMAT = 1
@@ -39,7 +39,7 @@ class Bundle:
     files: Mapping[str, bytes]
     """Content by relative path, all but the manifest."""
     remarks: tuple[str, ...] = ()
-    """What the page shows less of than there is, a sentence each."""
+    """What the page leaves out, a sentence each."""
 
 
 def make_bundle(
@@ -66,9 +66,9 @@ def make_bundle(
     else:
         count, sampled = len(field), field if len(field) <= limit else field.take(field.spread(limit))
     if len(sampled) < count:
-        remarks = (f"{len(sampled):,} of the field's {count:,} contacts are kept, spread evenly",)
+        remarks = (f"{len(sampled):,} of the field's {count:,} contacts are exported, spread evenly",)
     if len(sampled.frequency) == 0 and not mute:
-        raise ExportError("expected a mode that can be heard, found none below half the sample rate: nothing to strike")
+        raise no_modes()
     shown = read_object(object, sampled.points, meters=meters)
     content, tensors = _packed(_tensors(sampled))
     files = {"field.bin": content}
@@ -147,8 +147,10 @@ def _strikes(strikes: Impacts | None, field: SampledField) -> tuple[list[dict[st
         return [], {}
     if strikes.sample_rate != field.sample_rate:
         raise ExportError(
-            f"expected strikes at the field's {field.sample_rate:g} Hz, found {strikes.sample_rate:g} Hz: name the "
-            "capture that the field was fitted to"
+            f"strikes: expected recordings at the field's {field.sample_rate:g} Hz, got {strikes.sample_rate:g} Hz; "
+            "name the capture that the field was fitted to",
+            name="strikes",
+            value=strikes.sample_rate,
         )
     records, files = [], {}
     for row, name in enumerate(strikes.names):

@@ -1,8 +1,8 @@
 """A field as a Faust program: a bank of resonators with the contact, the force and the hammer's softness as controls.
 
-The text needs no library of Faust's. A blow adds, over its contact time, its point's amplitudes to resonators that go
-on ringing, p[n] = z p[n-1] + (sine + i cosine) x[n] with z = exp((-d + 2 pi i f) / rate), of which the imaginary part
-is heard: at any sample rate, and in single precision without drift, which two-pole filters at low frequencies have.
+The text needs no library of Faust's. An impact adds, over its contact time, its point's amplitudes to the resonators,
+p[n] = z p[n-1] + (sine + i cosine) x[n] with z = exp((-d + 2 pi i f) / rate), of which the imaginary part is the sound:
+at any sample rate, and in single precision without drift, which two-pole filters at low frequencies have.
 """
 
 import re
@@ -17,7 +17,7 @@ from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import Written, expect_ending, generator, write_file
 
 _FEWEST = 16
-"""Points below which the noise is given up for more of them."""
+"""Points below which the noise is left out for more of them."""
 _ROW = 8
 """Numbers in a line of text."""
 MOST_NUMBERS = 150_000
@@ -36,22 +36,20 @@ def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, fo
     text = faust_library(field, noise=with_noise)
     if path.suffix == ".dsp":
         text += _CONTROLS
-    remarks = [
-        "blows ring into each other in one bank, without voices; their force is half a sine over the contact time"
-    ]
+    remarks = ["all impacts share one bank of resonators; the force of an impact is half a sine over the contact time"]
     if not field.shared_damping:
-        remarks.append("dampings belong to the point last struck, and what rings from before takes them on")
+        remarks.append("dampings are those of the last contact, for earlier impacts too")
     if noise and with_noise:
-        remarks.append("the noise starts anew with every blow")
+        remarks.append("the noise restarts with every impact")
     elif field.noise.any():
-        remarks.append("the noise beside the modes is left out")
+        remarks.append("the residual noise is left out")
     return Written(write_file(path, text.encode(), force=force), tuple(remarks))
 
 
 def fitted(field: SampledField, *, noise: bool = True) -> tuple[SampledField, bool]:
     """Return the field at as many of its points as Faust compiles in reasonable time, and whether with the noise.
 
-    Where hardly a point would be left beside a long noise, that is left out.
+    A noise so long that few points would fit is left out.
     """
     sounding = noise and bool(field.noise.any())
     if sounding and _fitting(field, noise=True) < min(_FEWEST, len(field)):
@@ -75,9 +73,11 @@ def faust_library(field: SampledField, *, noise: bool) -> str:
     numbers = points * _numbers_at_a_point(field) + noise * field.samples
     if numbers > MOST_NUMBERS:
         raise ExportError(
-            f"expected at most {MOST_NUMBERS} numbers, which Faust compiles in seconds, found {numbers}: {points} "
-            f"points with {modes} modes{f' and {field.samples} samples of noise' if noise else ''}; ask for fewer "
-            "points, or leave the noise out"
+            f"numbers: expected at most {MOST_NUMBERS}, which Faust compiles in seconds, got {numbers} ({points} points"
+            f", {modes} modes{f', {field.samples} samples of noise' if noise else ''}); ask for fewer points, or leave "
+            "the noise out",
+            name="numbers",
+            value=numbers,
         )
     name = re.sub(r'["\\\x00-\x1f]', "", field.name) or "object"
     parts = [

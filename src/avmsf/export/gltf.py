@@ -1,7 +1,7 @@
 """A field as a `.glb` that any viewer shows, with its modes in the draft extension `KHR_audio_rigid_bodies`.
 
 The draft (seen in 2026, not ratified) sounds an impulse j at a point as the sum over modes of 2 pi f (shape . j)
-exp(-d t) sin(2 pi f t). Here an impulse of 1 N s straight into the surface is a blow of force 1, so a shape is minus
+exp(-d t) sin(2 pi f t). Here an impulse of 1 N s straight into the surface is an impact of force 1, so a shape is minus
 the normal times the gain over 2 pi f. The draft leaves the absolute level to who plays it. It knows sines alone, one
 damping a mode, and no noise; what that leaves out lies in `extras`, where a reader that knows of it finds the rest.
 """
@@ -19,12 +19,11 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from avmsf.errors import ExportError
 from avmsf.export.formats import GLTF_SUFFIXES
 from avmsf.export.look import Look
 from avmsf.export.onephase import deviation, importance, shared_dampings, signed_amplitudes
 from avmsf.export.sampledfield import SampledField
-from avmsf.export.written import Written, expect_ending, generator, write_file
+from avmsf.export.written import Written, expect_ending, generator, no_modes, write_file
 
 EXTENSION = "KHR_audio_rigid_bodies"
 _FLOAT, _UNSIGNED = 5126, 5125
@@ -41,7 +40,7 @@ def write_gltf(sampled: SampledField, path: str | Path, *, look: Look | None = N
     path = Path(path)
     expect_ending(path, GLTF_SUFFIXES)
     if not len(sampled.frequency):
-        raise ExportError("expected a field with modes that sound below half the sample rate, found none to export")
+        raise no_modes(path)
     damping = shared_dampings(sampled)
     order = importance(sampled, damping)
     gains = signed_amplitudes(sampled)
@@ -133,7 +132,7 @@ def _extras(sampled: SampledField, order: Int[Tensor, " modes"], buffer: _Buffer
         "sampleRate": sampled.sample_rate,
         "samples": sampled.samples,
         "perNewton": sampled.per_newton,
-        "impulse": "1 N s against the normal is a blow of force 1",
+        "impulse": "1 N s against the normal is an impact of force 1",
     }
     if sampled.cosine.any():
         extras["sine"] = buffer.add(sampled.sine[:, order].T.reshape(-1).numpy())
@@ -155,13 +154,13 @@ def _glb(document: tuple[Mapping[str, Any], bytes]) -> bytes:
 
 
 def _remarks(sampled: SampledField) -> tuple[str, ...]:
-    remarks = ["the draft's absolute level is left to the player: an impulse of 1 N s is a blow of force 1 here"]
+    remarks = ["the draft leaves the absolute level to the player: an impulse of 1 N s is an impact of force 1 here"]
     if sampled.cosine.any():
-        remarks.append("every mode starts as a sine, of the loudness that it has in the field; phases are in extras")
+        remarks.append("every mode starts as a sine, with the field's level; phases are in extras")
     if not sampled.shared_damping:
         remarks.append("each mode has one damping, its mean by energy; those of each point are in extras")
     if sampled.noise.any():
-        remarks.append("the noise beside the modes is in extras alone")
+        remarks.append("the residual noise is in extras only")
     return tuple(remarks)
 
 

@@ -57,12 +57,12 @@ class Look:
 def read_look(path: Path, sampled: SampledField, *, meters: float = 1.0) -> tuple[Look, tuple[str, ...]]:
     """Read a mesh whose coordinates count `meters` each, and what differs from the file, a sentence each.
 
-    Meshes of more than `MOST_FACES` triangles are reduced. Raises `ExportError` for one that is huge, or plainly not in
-    the field's unit, and `CaptureError` for a file that is no mesh.
+    Meshes of more than `MOST_FACES` triangles are reduced. Raises `ExportError` for one that is huge, or not in the
+    field's unit, and `CaptureError` for a file that is not a mesh.
     """
     expect_readable(path)
     mesh = read_textured_mesh(path, meters=meters)
-    expect_alike(mesh.vertices.double().numpy(), sampled.points, str(path))
+    expect_alike(mesh.vertices.double().numpy(), sampled.points, path)
     faces = len(mesh.faces)
     if faces <= MOST_FACES:
         return Look.of_mesh(mesh), ()

@@ -23,7 +23,7 @@ from avmsf.export.discs import discs
 from avmsf.export.formats import Precision
 from avmsf.export.normals import outward_normals
 from avmsf.export.onephase import deviation, signed_amplitudes
-from avmsf.export.packedarrays import described, number_in, pack, read_array, read_manifest
+from avmsf.export.packedarrays import described, number_in, pack, read_array, read_manifest, unreadable
 from avmsf.export.sampledfield import SampledField
 from avmsf.export.written import MANIFEST, Written, generator, write_folder
 from avmsf.scene.gaussians import GaussianCloud
@@ -32,7 +32,7 @@ from avmsf.scene.ply import write_splats
 PICKING, SCENE, MODAL = "picking.bin", "scene.ply", "modal.bin"
 _PICKED = {"means": 3, "scales": 3, "quaternions": 4, "opacities": 1}
 _MOST_RATE, _MOST_SECONDS = 768_000, 600
-"""Hz and seconds that sounds have at most; what is beyond is taken for a slip."""
+"""Largest sample rate, Hz, and duration, seconds; larger values are taken for errors."""
 _COUNTS = ("count", "num_gaussians", "numGaussians", "N")
 _MODES = ("modes", "num_modes", "numModes", "M")
 
@@ -62,23 +62,32 @@ def write_demo(
 ) -> Written:
     """Write the demo's folder; where there is no `cloud` whose centers are the field's points, with a disc at each.
 
-    Modes keep their loudness and start as cosines, whatever their phase is in the field. Other variants that the folder
-    holds of the same Gaussians stay there. Raises `ExportError`, also where it holds variants of others.
+    Modes have the field's level and start as cosines, whatever their phase is in the field. Other variants of the same
+    Gaussians stay in the folder. Raises `ExportError`, also where it holds variants of others.
     """
     folder = Path(folder)
     shown = discs(field) if cloud is None else cloud
     if len(shown) != len(field):
         raise ExportError(
-            f"expected a Gaussian for each of the field's {len(field)} points, found {len(shown)}: sample the field at "
-            "the Gaussians' centers"
+            f"cloud: expected a Gaussian for each of the field's {len(field)} points, got {len(shown)}; sample the "
+            "field at the Gaussians' centers",
+            name="cloud",
+            value=len(shown),
         )
     if not variant or Path(variant).name != variant or variant.startswith("."):
-        raise ExportError(f"expected a variant's name that a folder can have, found {variant!r}: use letters alone")
-    gains = signed_amplitudes(field).numpy().astype(f"<{np.dtype(precision).str[1:]}")
-    if not np.isfinite(gains).all():
         raise ExportError(
-            f"expected gains that {precision} holds, up to 65504, found {float(field.sine.abs().max()):.3g}: write "
-            "float32"
+            f"variant: expected a name that a folder can have, got {variant!r}; use letters",
+            name="variant",
+            value=variant,
+        )
+    amplitudes = signed_amplitudes(field)
+    gains = amplitudes.numpy().astype(f"<{np.dtype(precision).str[1:]}")
+    if not np.isfinite(gains).all():
+        loudest = float(amplitudes.abs().max())
+        raise ExportError(
+            f"precision: expected gains up to 65504 for {precision}, got {loudest:.3g}; take float32",
+            name="precision",
+            value=loudest,
         )
     picking, places = pack(
         {
@@ -100,8 +109,10 @@ def write_demo(
     stay = bool(others) and _content(folder / PICKING) == picking
     if others and not stay and not force:
         raise ExportError(
-            f"{folder}: expected a free name, or variants of the same Gaussians, found {', '.join(others)} of others: "
-            "choose another folder, or add --overwrite to lose them"
+            f"{folder}: expected a free name, or variants of the same Gaussians, got {', '.join(others)} of others; "
+            "choose another folder, or add --overwrite to replace them",
+            file=folder,
+            value=sorted(others),
         )
     kept = others if stay else {}
 
@@ -118,13 +129,13 @@ def write_demo(
 
     manifest = {"name": field.name, "count": len(field), "file": PICKING, "arrays": places, "scene": SCENE}
     sizes = write_folder(folder, fill, {**manifest, "variants": sorted([variant, *kept])}, force=force)
-    remarks = ["every mode starts as a cosine in the demo, of the loudness that it has in the field"]
+    remarks = ["every mode starts as a cosine in the demo, with the field's level"]
     if field.noise.any():
-        remarks.append("the noise beside the modes is left out, of which the demo knows nothing")
+        remarks.append("the residual noise is left out, since the demo has none")
     if kept:
-        remarks.append(f"the folder's other variants stay as they were: {', '.join(kept)}")
+        remarks.append(f"the folder's other variants are unchanged: {', '.join(kept)}")
     elif others:
-        remarks.append(f"variants of other Gaussians are of no use any more: {', '.join(others)}")
+        remarks.append(f"variants of other Gaussians cannot be used any more: {', '.join(others)}")
     written = torch.from_numpy(gains.astype(np.float32))
     error = deviation(field, sine=None, cosine=written, damping=field.damping)
     return Written(sizes, tuple(remarks), error)
@@ -133,8 +144,8 @@ def write_demo(
 def read_demo(folder: str | Path, *, variant: str | None = None, sample_rate: float | None = None) -> Demo:
     """Read a folder of the demo: the named variant, or the only one, at `sample_rate` (Hz) if its manifest has none.
 
-    Modes at half the sample rate and above are left out. Raises `ExportError`, which names file and array, for a
-    folder of another kind, files cut short, and numbers that are none.
+    Modes at half the sample rate and above are left out. Raises `ExportError`, with file and array, for a folder of
+    another kind, truncated files, and numbers that are not finite.
     """
     folder = Path(folder)
     top = read_manifest(folder)
@@ -154,15 +165,29 @@ def read_demo(folder: str | Path, *, variant: str | None = None, sample_rate: fl
     rate = sound.get("sampleRate", sound.get("sample_rate", sample_rate)) if sample_rate is None else sample_rate
     if not isinstance(rate, int | float) or not 1 <= rate <= _MOST_RATE:
         raise ExportError(
-            f"{sound_folder / MANIFEST}: expected a sample rate from 1 to {_MOST_RATE} Hz, found {rate!r}: give it"
+            f"{sound_folder / MANIFEST}: expected a sample rate from 1 to {_MOST_RATE} Hz, got {rate!r}; give it",
+            file=sound_folder / MANIFEST,
+            name="sampleRate",
+            value=rate,
         )
-    if not (frequency > 0).all() or not (damping >= 0).all():
-        raise ExportError(f"{path}: expected frequencies above 0 and dampings from 0, found others: export it again")
+    for name, values, ok in (("frequencies", frequency, frequency > 0), ("dampings", damping, damping >= 0)):
+        if not ok.all():
+            least = float(values.min())
+            raise ExportError(
+                f"{path}: expected {name} {'above 0' if name == 'frequencies' else 'from 0'}, got {least:g}; export it "
+                "again",
+                file=path,
+                name=name,
+                value=least,
+            )
     seconds = sound.get("duration", 3.0)
     if not isinstance(seconds, int | float) or not 0 < seconds <= _MOST_SECONDS:
         raise ExportError(
-            f"{sound_folder / MANIFEST}: expected a duration above 0 and up to {_MOST_SECONDS} s, found {seconds!r}: "
-            "mend it"
+            f"{sound_folder / MANIFEST}: expected a duration above 0 and up to {_MOST_SECONDS} s, got {seconds!r}; "
+            "correct it",
+            file=sound_folder / MANIFEST,
+            name="duration",
+            value=seconds,
         )
     heard = frequency < 0.5 * rate
     points = torch.from_numpy(picked["means"].copy())
@@ -196,7 +221,13 @@ def _gain_kind(sound: Mapping[str, Any], path: Path) -> str:
     place = described(sound, "gains", path.with_name(MANIFEST))
     kind = place.get("dtype", sound.get("gains_dtype", sound.get("gainsDtype", "float32")))
     if kind not in ("float16", "float32"):
-        raise ExportError(f"{path.with_name(MANIFEST)}: expected gains in float16 or float32, found {kind!r}")
+        manifest = path.with_name(MANIFEST)
+        raise ExportError(
+            f"{manifest}: expected gains in float16 or float32, got {kind!r}; correct it",
+            file=manifest,
+            name="gains",
+            value=kind,
+        )
     return str(kind)
 
 
@@ -215,8 +246,12 @@ def _damping_shape(sound: Mapping[str, Any], path: Path, count: int, modes: int)
 def _only_variant(folder: Path) -> str:
     found = sorted(path.parent.name for path in folder.glob(f"*/{MODAL}"))
     if len(found) != 1:
-        names = ", ".join(found) or "none"
-        raise ExportError(f"{folder}: expected one variant, a folder with {MODAL}, found {names}: name one of them")
+        raise ExportError(
+            f"{folder}: expected one variant, a folder with {MODAL}, got {', '.join(found) or 'none'}; name one",
+            file=folder,
+            name="variant",
+            value=found,
+        )
     return found[0]
 
 
@@ -232,4 +267,4 @@ def _content(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise ExportError(f"{path}: cannot be read ({error.strerror or error}): choose another folder") from error
+        raise unreadable(path, error, "choose another folder") from error

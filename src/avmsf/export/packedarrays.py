@@ -1,4 +1,4 @@
-"""Arrays one after another in a binary file, and the JSON manifest that says where each begins: packed, and read."""
+"""Arrays one after another in a binary file, and the JSON manifest with the offset of each: packed, and read."""
 
 import math
 from collections.abc import Mapping
@@ -24,34 +24,38 @@ def pack(arrays: Mapping[str, Shaped[np.ndarray, "..."]]) -> tuple[bytes, dict[s
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Return the manifest of a folder; raises `ExportError` where it is missing or no JSON object."""
+    """Return the manifest of a folder; raises `ExportError` where it is missing or not a JSON object."""
     path = folder / MANIFEST
     try:
         found = read_json(path)
     except OSError as error:
-        raise ExportError(
-            f"{path}: expected the manifest of the paper's demo, found none ({error.strerror or error}): name a folder "
-            "that holds one"
-        ) from error
+        raise unreadable(path, error, "name a folder of the paper's demo") from error
     except ValueError as error:
-        raise ExportError(f"{path}: expected JSON, found something else ({error}): export it again") from error
+        raise ExportError(f"{path}: expected JSON ({error}); export it again", file=path) from error
     if not isinstance(found, dict):
-        raise ExportError(f"{path}: expected a JSON object, found {type(found).__name__}: export it again")
+        kind = type(found).__name__
+        raise ExportError(f"{path}: expected a JSON object, got {kind}; export it again", file=path, value=kind)
     return found
 
 
+def unreadable(path: Path, error: OSError, advice: str) -> ExportError:
+    """Return the error for a file that the system does not read."""
+    reason = error.strerror or str(error)
+    return ExportError(f"{path}: expected a readable file, got {reason!r}; {advice}", file=path, value=reason)
+
+
 def number_in(manifest: Mapping[str, Any], names: tuple[str, ...], path: Path) -> int:
-    """Return a whole number from 1 that goes by one of these names; raises `ExportError` for others, with the path."""
+    """Return a whole number from 1 under one of these names; raises `ExportError` for others, with the path."""
     value = next((manifest[name] for name in names if name in manifest), None)
     if type(value) is not int or value < 1:
-        raise ExportError(f"{path}: expected {names[0]!r} as a whole number from 1, found {value!r}: mend it")
+        raise _manifest_error(path, names[0], "a whole number from 1", value)
     return value
 
 
 def described(manifest: Mapping[str, Any], name: str, path: Path) -> dict[str, Any]:
     """Return where an array is: its offset in bytes alone, or a record of it, at the top or in a group.
 
-    Raises `ExportError`, which names the manifest at `path`, for no such array, no offset, and a shape that is none.
+    Raises `ExportError`, with the manifest at `path`, for no such array, no offset, and a shape that cannot be.
     """
     groups = [manifest, *(manifest[key] for key in ("arrays", "offsets", "buffers") if key in manifest)]
     for group in groups:
@@ -61,14 +65,18 @@ def described(manifest: Mapping[str, Any], name: str, path: Path) -> dict[str, A
             if isinstance(record, dict):
                 record = {**record, "offset": record.get("offset", record.get("byteOffset"))}
                 if not _is_shape(record.get("shape", [1])):
-                    raise ExportError(
-                        f"{path}: expected the shape of {name!r} as whole numbers from 1, found {record['shape']!r}: "
-                        "mend it"
-                    )
+                    raise _manifest_error(path, f"{name}.shape", "whole numbers from 1", record["shape"])
                 if type(record["offset"]) is int and record["offset"] >= 0:
                     return record
-            raise ExportError(f"{path}: expected the offset of {name!r} in bytes, found {found!r}: mend it")
-    raise ExportError(f"{path}: expected where {name!r} begins, found {', '.join(manifest) or 'nothing'}: mend it")
+            raise _manifest_error(path, f"{name}.offset", "an offset in bytes", found)
+    raise _manifest_error(path, name, "an offset in bytes", None)
+
+
+def _manifest_error(path: Path, name: str, expected: str, value: Any) -> ExportError:
+    found = "none" if value is None else repr(value)
+    return ExportError(
+        f"{path}: {name}: expected {expected}, got {found}; correct it", file=path, name=name, value=value
+    )
 
 
 def read_array(
@@ -77,24 +85,37 @@ def read_array(
     """Return an array of a file of such a shape and type; raises `ExportError` where it is not so, or not finite."""
     place = described(manifest, name, path.with_name(MANIFEST))
     if tuple(place.get("shape", shape)) not in (shape, (*shape, 1)):
+        manifest_path = path.with_name(MANIFEST)
         raise ExportError(
-            f"{path.with_name(MANIFEST)}: expected {name!r} of shape {list(shape)}, found {place['shape']}: "
-            "the two manifests belong to different objects"
+            f"{manifest_path}: {name}: expected the shape {list(shape)} of the other manifest, got {place['shape']}; "
+            "export both again",
+            file=manifest_path,
+            name=name,
+            value=place["shape"],
         )
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise ExportError(f"{path}: cannot be read ({error.strerror or error}): export it again") from error
+        raise unreadable(path, error, "export it again") from error
     layout = np.dtype(kind).newbyteorder("<")
     needed = place["offset"] + layout.itemsize * math.prod(shape)
     if needed > len(content):
-        raise ExportError(f"{path}: {name!r} ends at byte {needed} of {len(content)}: it was cut short, copy it again")
+        raise ExportError(
+            f"{path}: {name}: expected {needed} bytes or more, got {len(content)}; copy the file again",
+            file=path,
+            name=name,
+            value=len(content),
+        )
     values = np.frombuffer(content, layout, math.prod(shape), place["offset"]).reshape(shape)
     wrong = np.argwhere(~np.isfinite(values))
     if len(wrong):
+        row, value = int(wrong[0][0]), float(values[tuple(wrong[0])])
         raise ExportError(
-            f"{path}: expected finite numbers in {name!r}, found {values[tuple(wrong[0])]} in row {wrong[0][0]}: "
-            "export it again"
+            f"{path}: {name}, row {row}: expected finite numbers, got {value}; export it again",
+            file=path,
+            row=row,
+            name=name,
+            value=value,
         )
     return values
 

@@ -65,7 +65,7 @@ def with_policy(page: str, directives: Mapping[str, Sequence[str]]) -> str:
     meta = f'<meta http-equiv="Content-Security-Policy" content="{escape(policy_text(directives))}">'
     changed, count = _HEAD.subn(lambda found: f"{found[0]}\n{meta}", page, count=1)
     if not count:
-        raise ExportError("index.html: expected a head, found none: install avmsf again, its page is damaged")
+        raise ExportError("index.html: expected a head, got none; install avmsf again", file="index.html", name="head")
     return changed
 
 

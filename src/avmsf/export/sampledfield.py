@@ -188,17 +188,21 @@ def _expect_places(
 ) -> None:
     finite = bool(torch.isfinite(places).all()) and (normals is None or bool(torch.isfinite(normals).all()))
     if len(places) == 0 or not finite:
-        found = "none" if len(places) == 0 else "some that are NaN or infinite"
+        found = "none" if len(places) == 0 else "NaN or infinity"
         raise ExportError(
-            f"expected points of the object's surface as finite numbers, found {found}: name a mesh or a cloud of the "
-            "object, or fit the field to features that lie on its surface"
+            f"points: expected finite points of the object's surface, got {found}; name a mesh or Gaussians of the "
+            "object, or fit the field to features on its surface",
+            name="points",
+            value=len(places),
         )
     if normals is not None and normals.shape != places.shape:
         raise ExportError(
-            f"expected a normal for each of {len(places)} points, found {len(normals)}: give them in pairs"
+            f"normals: expected one for each of {len(places)} points, got {len(normals)}",
+            name="normals",
+            value=len(normals),
         )
     if limit is not None and limit < 1:
-        raise ExportError(f"expected to keep 1 point or more, found a limit of {limit}: ask for some")
+        raise ExportError(f"limit: expected 1 point or more, got {limit}", name="limit", value=limit)
 
 
 def _known_normals(gain_field: GainField, places: Float[Tensor, "points 3"]) -> Float64[Tensor, "points 3"] | None:

@@ -44,7 +44,7 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
     path = Path(path)
     expect_ending(path, UNIVERSAL_SUFFIXES)
     if functions < 0:
-        raise ExportError(f"expected 0 response functions or more, found {functions}: say how many are wanted")
+        raise ExportError(f"functions: expected 0 or more, got {functions}", name="functions", value=functions)
     pyuff = _pyuff()
     damping = shared_dampings(field)
     sets = [_header(field), _units(), _nodes(field)]
@@ -62,14 +62,14 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
         content = _TIME.sub(lambda found: b" " * len(found[0]), place.read_bytes(), count=1)
     remarks = ["frequencies, dampings and shapes have six digits in data set 55, as the format sets them"]
     if not field.shared_damping:
-        remarks.append("each mode has one damping, its mean by energy; the response functions have each point's own")
+        remarks.append("each mode has one damping, its mean by energy; response functions have each point's dampings")
     if field.noise.any():
-        remarks.append("the noise beside the modes is left out")
+        remarks.append("the residual noise is left out")
     leaning = math.degrees(math.acos(min(1.0, float(field.normals[rows].abs().amax(1).min())))) if len(rows) else 0.0
     if leaning > _STRAIGHT:
         remarks.append(
-            "response functions are of blows against the normal, of which their reference direction names the nearest "
-            f"axis, up to {leaning:.0f} degrees off"
+            "response functions are of impacts against the normal; their reference direction is the nearest axis, up "
+            f"to {leaning:.0f} degrees off"
         )
     return Written(write_file(path, content, force=force), tuple(remarks))
 
@@ -85,7 +85,7 @@ def response_frequencies(field: SampledField) -> Float64[np.ndarray, " lines"]:
 def response(
     field: SampledField, row: int, frequencies: Float64[np.ndarray, " lines"]
 ) -> Complex128[np.ndarray, " lines"]:
-    """Return the Laplace transform of a blow's modes at 2 pi i times the frequencies (Hz): sound over impulse.
+    """Return the Laplace transform of an impact's modes at 2 pi i times the frequencies (Hz): sound over impulse.
 
     Of sine exp(-d t) sin(w t) + cosine exp(-d t) cos(w t) it is (sine w + cosine (s + d)) / ((s + d)^2 + w^2).
     """
@@ -133,7 +133,7 @@ def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) ->
         "type": 55,
         "id1": field.name[:80] or "object",
         "id2": f"mode {mode + 1}: {frequency:.9g} Hz, exp(-{rate:.9g} t)",
-        "id4": "times the direction of a force: what it excites; blows go against normals",
+        "id4": "times the direction of a force: what it excites; impacts go against normals",
         "id5": "NONE",
         "model_type": 1,
         "data_ch": _TRANSLATION,
@@ -177,7 +177,7 @@ def _function(field: SampledField, row: int, frequencies: Float64[np.ndarray, " 
         "type": 58,
         "binary": 1,
         "func_type": _RESPONSE,
-        "id1": f"sound over impulse, point {row + 1} struck against its normal",
+        "id1": f"sound over impulse, impact at point {row + 1} against its normal",
         "rsp_ent_name": "MICROPHONE",
         "rsp_node": 0,
         "rsp_dir": 0,
@@ -202,5 +202,7 @@ def _pyuff() -> Any:
     try:
         import pyuff
     except ImportError as error:
-        raise ExportError("the universal file format needs pyuff: run pip install 'avmsf[uff]'") from error
+        raise ExportError(
+            "pyuff: expected it for the universal file format, got none; run pip install 'avmsf[uff]'", name="pyuff"
+        ) from error
     return pyuff

@@ -1,4 +1,4 @@
-"""A grid of blows as wav files, with a table of them and an SFZ instrument, for samplers."""
+"""A grid of impacts as wav files, with a table of them and an SFZ instrument, for samplers."""
 
 import csv
 import io
@@ -29,28 +29,28 @@ LOWEST_NOTE = 36
 
 @dataclass(frozen=True)
 class Layer:
-    """How hard the contacts are struck, for one range of a keyboard's velocities."""
+    """The force at all contacts for one range of a keyboard's velocities."""
 
     force: float = 1.0
-    """Newtons where the field knows forces, else relative to an average recorded blow."""
+    """Newtons where the field knows forces, else relative to an average recorded impact."""
     contact_time: float = 0.0
-    """How long hammer and object touch, seconds; 0 is the blow as it was recorded."""
+    """Seconds that hammer and object are in contact; 0 is the impact as recorded."""
     shape: PulseShape = "half-sine"
     """Course of the force over that time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Which blows are written."""
+    """Which impacts are written."""
 
     contacts: int = 16
-    """How many contacts, spread as far apart as they go, one MIDI note each."""
+    """How many contacts, as far apart as possible, one MIDI note each."""
     layers: tuple[Layer, ...] = (Layer(),)
-    """From soft to hard; each contact is struck once for each."""
+    """From soft to hard; each contact has one impact of each."""
     seconds: float | None = None
     """Length of the sounds; that of the training sounds where it is not given."""
     level_db: float = -1.0
-    """Peak of the loudest sound of all, dB below full scale; the others keep their ratio to it."""
+    """Peak of the loudest sound, dB relative to full scale; all sounds have one scale."""
 
 
 def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None, *, force: bool = False) -> Written:
@@ -63,7 +63,11 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
     _expect(grid)
     rate = round(field.sample_rate)
     if rate != field.sample_rate or rate < 1:
-        raise ExportError(f"expected a whole sample rate, as wav files hold, found {field.sample_rate:g} Hz")
+        raise ExportError(
+            f"sample_rate: expected whole hertz for wav files, got {field.sample_rate:g} Hz",
+            name="sample_rate",
+            value=field.sample_rate,
+        )
     rows = field.spread(grid.contacts)
     samples = field.samples if grid.seconds is None else max(1, round(grid.seconds * rate))
     sounds = [
@@ -103,25 +107,30 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
 def _expect(grid: Grid) -> None:
     most = HIGHEST_NOTE + 1 - LOWEST_NOTE
     if not 1 <= grid.contacts <= most:
-        raise ExportError(
-            f"expected 1 to {most} contacts, one MIDI note each from {LOWEST_NOTE}, found {grid.contacts}"
-        )
+        raise _setting("contacts", f"1 to {most}, one MIDI note each from {LOWEST_NOTE}", grid.contacts)
     if not 1 <= len(grid.layers) <= HIGHEST_NOTE:
-        raise ExportError(f"expected 1 to {HIGHEST_NOTE} layers of forces, found {len(grid.layers)}: name some")
+        raise _setting("layers", f"1 to {HIGHEST_NOTE} forces", len(grid.layers))
     for layer in grid.layers:
         if not (math.isfinite(layer.force) and layer.force > 0):
-            raise ExportError(f"expected forces above 0, found {layer.force:g}")
+            raise _setting("force", "a number above 0", layer.force)
         if not 0 <= layer.contact_time < 1:
-            raise ExportError(f"expected contact times from 0 to 1 s, found {layer.contact_time:g}")
+            raise _setting("contact_time", "0 to 1 s", layer.contact_time)
     if grid.seconds is not None and not (math.isfinite(grid.seconds) and grid.seconds > 0):
-        raise ExportError(f"expected sounds of more than 0 s, found {grid.seconds:g}")
+        raise _setting("seconds", "more than 0", grid.seconds)
     if not (math.isfinite(grid.level_db) and grid.level_db <= 0):
-        raise ExportError(f"expected a level of 0 dB or below, found {grid.level_db:g}")
+        raise _setting("level_db", "0 dB or below", grid.level_db)
+
+
+def _setting(name: str, expected: str, value: float | int) -> ExportError:
+    return ExportError(f"{name}: expected {expected}, got {value:g}", name=name, value=value)
 
 
 def _wav(sound: Float32[Tensor, " samples"], rate: int) -> bytes:
     if not bool(sound.isfinite().all()):
-        raise ExportError("expected finite samples, got others: fit the field again, or export smaller forces")
+        raise ExportError(
+            "expected finite samples, got NaN or infinity; fit the field again, or export smaller forces",
+            name="samples",
+        )
     memory = io.BytesIO()
     soundfile.write(memory, sound.numpy(), rate, subtype="FLOAT", format="WAV")
     return memory.getvalue()

@@ -123,5 +123,10 @@ def _carried(name: str, content: bytes) -> dict[str, str]:
 def _once(pattern: re.Pattern[str], text: str, change: Any, what: str) -> str:
     changed, count = pattern.subn(change, text)
     if count != 1:
-        raise ExportError(f"index.html: expected one {what}, found {count}: install avmsf again, its page is damaged")
+        raise ExportError(
+            f"index.html: expected one {what}, got {count}; install avmsf again",
+            file="index.html",
+            name=what,
+            value=count,
+        )
     return changed

@@ -1,4 +1,4 @@
-"""What an export leaves behind: whole files or folders, never over what is not its own, and a word on what is lost."""
+"""What an export writes: complete files or folders, never over files that no export wrote, and notes on losses."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from avmsf.files import temporary_path, way_out, write_whole
 
 MANIFEST = "manifest.json"
 _READ = 4096
-"""Bytes at a file's beginning in which its maker is looked for."""
+"""Bytes at a file's beginning in which its writer is searched for."""
 _MADE_HERE = re.compile(
     rb"""
       ^//\ .*\ as\ exported\ by\ avmsf\ \d    # Faust
@@ -37,7 +37,7 @@ class Written:
     remarks: tuple[str, ...] = ()
     """What the format cannot hold, a sentence each."""
     error: float = 0.0
-    """Largest difference between what the file sounds like and `SampledField.render`, over the loudest sample."""
+    """Largest difference between the file's sound and `SampledField.render`, over the loudest sample."""
 
     @property
     def size(self) -> int:
@@ -46,18 +46,30 @@ class Written:
 
 
 def generator() -> str:
-    """Return what files say of who made them."""
+    """Return the name and version that files hold."""
     return f"avmsf {version('avmsf')}"
 
 
 def expect_ending(path: Path, endings: Sequence[str]) -> None:
     """Raise `ExportError` for a file's name that has none of these endings, dots included."""
     if path.suffix.lower() not in endings:
-        found = repr(path.suffix) if path.suffix else "no ending"
         raise ExportError(
-            f"{path}: expected a name that ends in {' or '.join(endings)}, found {found}: name it "
-            f"{path.stem if path.suffix[1:].isalpha() else path.name}{endings[0]}"
+            f"{path}: expected a name that ends in {' or '.join(endings)}, got {path.suffix or 'no ending'}; name it "
+            f"{path.stem if path.suffix[1:].isalpha() else path.name}{endings[0]}",
+            file=path,
+            name="suffix",
+            value=path.suffix,
         )
+
+
+def no_modes(path: Path | None = None) -> ExportError:
+    """Return the error for a field without a mode below half the sample rate."""
+    return ExportError(
+        "modes: expected 1 or more below half the sample rate, got none; fit the field again",
+        file=path,
+        name="modes",
+        value=0,
+    )
 
 
 def write_file(path: Path, content: bytes, *, force: bool = False) -> dict[Path, int]:
@@ -73,9 +85,11 @@ def write_file(path: Path, content: bytes, *, force: bool = False) -> dict[Path,
 def expect_free(path: Path, content: bytes, *, force: bool = False) -> None:
     """Raise `ExportError` where `write_file` would."""
     if path.is_dir():
-        raise ExportError(f"{path}: expected the name of a file, found a folder: name a file in it")
+        raise ExportError(
+            f"{path}: expected the name of a file, got a folder; name a file in it", file=path, value="folder"
+        )
     if path.exists() and not force and not _made_here(path) and path.read_bytes() != content:
-        raise _foreign(path, "a file that no export wrote")
+        raise _foreign(path, "a file")
 
 
 def write_folder(
@@ -89,10 +103,12 @@ def write_folder(
     """
     place = folder.resolve()
     if folder.exists() and not folder.is_dir():
-        raise ExportError(f"{folder}: expected a folder, or a name that is free, found a file: choose another")
+        raise ExportError(
+            f"{folder}: expected a folder, or a free name, got a file; choose another", file=folder, value="file"
+        )
     ours = not folder.exists() or not any(folder.iterdir()) or _folder_made_here(folder)
     if not ours and not force:
-        raise _foreign(folder, "a folder with files that no export wrote")
+        raise _foreign(folder, "a folder with files")
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         temporary = temporary_path(place)
@@ -107,7 +123,10 @@ def write_folder(
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
     except OSError as error:
-        raise ExportError(f"{folder}: cannot be written ({error.strerror or error}): {way_out(error)}") from error
+        reason = error.strerror or str(error)
+        raise ExportError(
+            f"{folder}: expected a writable folder, got {reason!r}; {way_out(error)}", file=folder, value=reason
+        ) from error
     return sizes
 
 
@@ -150,6 +169,9 @@ def _folder_made_here(folder: Path) -> bool:
 
 def _foreign(path: Path, what: str) -> ExportError:
     return ExportError(
-        f"{path}: expected a free name or an earlier export, found {what}: choose another name, or add --overwrite to "
-        "write over files of the same names"
+        f"{path}: expected a free name or an earlier export, got {what} that no export wrote; choose another name, or "
+        "add --overwrite to replace files of the same names",
+        file=path,
+        name="--overwrite",
+        value=what,
     )

@@ -133,14 +133,16 @@ def _of_shape(shape: Shape, count: int, freedoms: int, filled: int, tell: Callab
         try:
             surface = shape.shell(thickness, faces=round(0.5 * TRIANGLES * freedoms))
         except SceneError as error:
-            raise SimulationError(str(error)) from error
+            raise SimulationError(
+                str(error), file=error.file, row=error.row, name=error.name, value=error.value
+            ) from error
         return filled_solid(checked(surface, tell=tell), freedoms, wall=thickness)
 
     return _of_walls(make, np.geomspace(*between, _THICKNESSES).tolist(), count, tell)
 
 
 def _filled(found: CheckedSurface, count: int, freedoms: int, tell: Callable[[str], None]) -> BodyFamily:
-    tell("tetrahedra of the body, filled")
+    tell("tetrahedra: solid body")
     return BodyFamily((isotropic_modes(filled_solid(found, freedoms), count=count),), ())
 
 
@@ -154,10 +156,12 @@ def _of_walls(
         try:
             made[thickness] = isotropic_modes(make(thickness), count=count)
         except SimulationError as error:
-            reasons.append(f"a wall of {1000 * thickness:.2g} mm: {error}")
+            reasons.append(f"wall of {1000 * thickness:.2g} mm: {error}")
     if not made:
         raise SimulationError(
-            f"no body can be made of this surface ({'; '.join(dict.fromkeys(reasons))}): mend the mesh"
+            f"expected a surface with a finite-element model, got none ({'; '.join(reasons)}); repair the mesh",
+            name="surface",
+            value=reasons,
         )
     return BodyFamily(tuple(made.values()), tuple(made), make)
 

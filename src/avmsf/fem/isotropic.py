@@ -86,7 +86,7 @@ def isotropic_modes(solid: Solid, *, count: int) -> IsotropicModes:
     Raises SimulationError for a body of several parts, and one whose modes cannot be computed.
     """
     if count < 1:
-        raise SimulationError(f"count = {count}: expected 1 mode or more")
+        raise SimulationError(f"count: expected 1 mode or more, got {count}", name="count", value=count)
     expect_whole(solid)
     mesh = SecondOrder.of(solid)
     weights = mass(mesh, torch.ones(len(solid.cells), dtype=torch.float64))

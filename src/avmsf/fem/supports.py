@@ -53,7 +53,9 @@ class Support:
         along = (end - start) / np.linalg.norm(end - start)
         near = (np.abs(_cross(along, places[:, :2] - start)) <= _NEAR * size) & (heights <= _LOW * size)
         if not near.any():
-            raise SimulationError(f"{self.name}: expected nodes within {1000 * _NEAR * size:.2g} mm of it, found none")
+            raise SimulationError(
+                f"support {self.name!r}: expected nodes within {1000 * _NEAR * size:.2g} mm, got none", name=self.name
+            )
         return outer[near]
 
 

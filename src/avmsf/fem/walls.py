@@ -105,12 +105,19 @@ class Wall:
             solid = prisms(coarse, factor * thickness, layers=self._layers(length))
             if solid is None:
                 raise SimulationError(
-                    f"a wall of {1000 * factor * self.thickness:.2g} mm folds where the mesh bends: take a thinner one"
+                    "expected a wall thinner than the mesh's radius of curvature, got "
+                    f"{1000 * factor * self.thickness:.2g} mm; use a thinner one",
+                    name="thickness",
+                    value=factor * self.thickness,
                 )
             return solid
 
         if thickness is None or not self._fills(scaled(1.0)):
-            raise SimulationError(f"prisms of {1000 * length:.2g} mm do not fill the mesh: make them finer")
+            raise SimulationError(
+                f"expected prisms that fill the mesh, got gaps with prisms of {1000 * length:.2g} mm; make them finer",
+                name="length",
+                value=length,
+            )
         return scaled
 
     def _thickness_at(self, sheet: Skin) -> Float64[np.ndarray, " points"] | None:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from avmsf._utils.records import count_of, like, record_of
+from avmsf._utils.records import RecordError, count_of, like, record_of
 from avmsf.field.config import AttentionShape
 from avmsf.field.gainfield import Gains, TrainableGains
 from avmsf.scene.features import FeatureField, Regions
@@ -159,7 +159,8 @@ class AttentionGains(TrainableGains):
         encoder = like(record["encoder"], "", "encoder")
         shape = record_of(_EXAMPLE, record["shape"], "shape")
         if shape.layers > _MAX_LAYERS or shape.bands > _MAX_LAYERS:
-            raise ValueError(f"layers and bands: expected at most {_MAX_LAYERS}, got {shape.layers} and {shape.bands}")
+            most = max(shape.layers, shape.bands)
+            raise RecordError(f"layers, bands: expected at most {_MAX_LAYERS}, got {most}", name="layers", value=most)
         with torch.device("meta"):
             return cls(
                 FeatureField(torch.empty(points, 3), torch.empty(points, dim), encoder),

@@ -44,7 +44,7 @@ class FitConfig:
     clusters: int = 16
     """Regions of the object that the network attends to (paper: 128, 256 or 512)."""
     bands: int = 0
-    """Octaves in the encoding of offsets; 0 leaves the plain offsets."""
+    """Octaves in the encoding of offsets; 0 uses the offsets only."""
     width: int = 64
     """Size of queries, keys and values."""
     hidden: int = 512
@@ -71,7 +71,7 @@ class FitConfig:
     warmup_gains: Literal["least-squares", "regression"] = "least-squares"
     """What these are: signed amplitudes by least squares, or each bin's own regression (paper, eq. 5)."""
     warmup_weights: Literal["energy", "equal"] = "energy"
-    """How the modes' squared errors weigh: by the energy that a gain makes over time, or alike (paper)."""
+    """Weights of the modes' squared errors: the energy of a unit gain over time, or all equal (paper)."""
     steps: int = 150
     """Steps end to end on spectra (paper, eq. 14)."""
     patience: int = 0
@@ -82,28 +82,28 @@ class FitConfig:
     hop: int = 0
     """Samples between frames at 44.1 and 48 kHz; 0 takes a quarter of each FFT size (paper: 64)."""
     interleave: int = 2
-    """Steps among which the frames are shared out in turn; 1 compares all of them at every step, as the paper does."""
+    """Each step compares every n-th frame, in turn; 1 compares all frames at every step, as the paper does."""
     spectral_norm: Literal["each", "common"] = "each"
     """Whether each resolution's distance is divided by its recordings' norm, or all by one number (paper)."""
     early: int = 8192
-    """Length of the beginning that is compared once more, samples at 44.1 and 48 kHz."""
+    """Length of the beginning that is compared again, samples at 44.1 and 48 kHz."""
     early_weight: float = 1.0
     """Weight of that beginning (paper: .5, 1 or 2)."""
     damping: Literal["shared", "per-contact", "validated"] = "validated"
-    """Whether dampings vary with the contact; `validated` tries both and keeps what validation contacts prefer."""
+    """Whether dampings vary with the contact; `validated` fits both and takes the better at validation contacts."""
     validation: float = 0.25
-    """Part of the training places that choices are validated on; with fewer than 6 places none are."""
+    """Part of the training positions that choices are validated on; with fewer than 6 positions none are."""
     phase: Literal["common", "sine"] = "common"
-    """How modes start: each with the phase that the training recordings agree on, or as sines (paper, eq. 3)."""
+    """Initial phases of the modes: each the common one of the training recordings, or sines (paper, eq. 3)."""
     residual: bool = True
     """Whether noise is modeled in addition to the modes."""
     residual_start: Literal["beneath-modes", "quietest"] = "beneath-modes"
-    """What its training starts from: what modes leave over, or the recordings' lowest-energy segments (paper)."""
+    """What its training starts from: the recordings without the modes, or their lowest-energy segments (paper)."""
     residual_noise: Literal["low-fluctuation", "gaussian"] = "low-fluctuation"
     """Noise that is filtered to the residual's spectrum when the field is rendered: a fixed sequence whose spectrogram
     hardly fluctuates, 2 dB below a recording's noise, or a random draw at its level (paper)."""
     seed: int = 0
-    """Start of all chance in the fit: initial weights, noise in training, and rendered Gaussian noise."""
+    """Seed of the random numbers: initial weights, noise in training, and rendered Gaussian noise."""
 
     def __post_init__(self) -> None:
         values = {name: value for name, value in asdict(self).items() if not isinstance(value, bool)}
@@ -111,19 +111,26 @@ class FitConfig:
         for name, value in numbers.items():
             least = 1 if name in _COUNTS else 0
             if not least <= value < math.inf or (name in _POSITIVE and value == 0):
-                raise FitError(
-                    f"{name} = {value}: expected {'more than 0' if name in _POSITIVE else f'{least} or more'}"
-                )
+                wanted = "more than 0" if name in _POSITIVE else f"{least} or more"
+                raise FitError(f"{name}: expected {wanted}, got {value}", name=name, value=value)
         if self.seed >= 2**63:
-            raise FitError(f"seed = {self.seed}: expected less than 2^63")
+            raise FitError(f"seed: expected less than 2^63, got {self.seed}", name="seed", value=self.seed)
         if not 0 <= self.validation <= 0.5:
-            raise FitError(f"validation = {self.validation}: expected 0 to 0.5, the part of the places held out")
+            raise FitError(
+                f"validation: expected 0 to 0.5 of the positions, got {self.validation}",
+                name="validation",
+                value=self.validation,
+            )
         if self.warmup_steps + self.steps == 0:
-            raise FitError("warmup_steps = 0 and steps = 0: expected at least one step of either, or nothing is learnt")
+            raise FitError("steps: expected warmup_steps or steps of 1 or more, got 0 for both", name="steps", value=0)
         # A rate as low as a structure's takes a quarter of each size, which has to be even.
         odd = [size for size in self.fft_sizes if size < 16 or size % 8]
         if odd or not self.fft_sizes:
-            raise FitError(f"fft_sizes = {self.fft_sizes}: expected one or more multiples of 8, none below 16")
+            raise FitError(
+                f"fft_sizes: expected one or more multiples of 8 from 16 on, got {self.fft_sizes}",
+                name="fft_sizes",
+                value=self.fft_sizes,
+            )
 
     @property
     def shape(self) -> AttentionShape:

@@ -46,7 +46,7 @@ class Progress:
     """Where a fit stands."""
 
     stage: str
-    """What is being done, in words."""
+    """Name of what is being done."""
     step: int
     """Steps done of this run."""
     steps: int
@@ -73,15 +73,14 @@ def fit(
     """Fit a sound field to recordings (paper, section 3.5).
 
     `modes` as extracted from `train`, or `random_modes` where there is no warm-up. `gains` makes the gain model; the
-    default is the Gaussian process without elastic mode shapes (`MixtureEstimator`), for of the object's shape
-    nothing is known here. `settings` are the capture's, which the field keeps: recordings that it is asked about later
-    are read by them. What the config leaves open is chosen on a part of the training contacts held out for the purpose,
-    then the field is fitted to all. With `checkpoint`, the state is kept there while the fit runs, on interruption and
-    at the end, and a fit of the same arguments goes on from it to the same result; delete the file once the field is
-    saved. The network and the spectral loss are trained on `device`, by default a CUDA GPU where there is one, with the
-    same result up to rounding; clusters, the Gaussian process and the field are on the CPU. Raises `FitError` for
-    arguments that do not fit together, a fit that diverges and a device that is not there, `FieldFileError` for a
-    checkpoint of another fit.
+    default is the Gaussian process without elastic mode shapes (`MixtureEstimator`), since the object's shape is not
+    known here. `settings` are the capture's; the field stores them, and recordings to be located are read by them. What
+    the config leaves open is chosen on held-out training contacts, then the field is fitted to all. With `checkpoint`,
+    the state is saved there during the fit, on interruption and at the end, and a fit of the same arguments continues
+    from it to the same result; delete the file once the field is saved. The network and the spectral loss are trained
+    on `device`, by default a CUDA GPU where there is one, with the same result up to rounding; clusters, the Gaussian
+    process and the field are on the CPU. Raises `FitError` for arguments that do not fit together, a fit that diverges
+    and a device that cannot be used, `FieldFileError` for a checkpoint of another fit.
     """
     config = FitConfig() if config is None else config
     settings = CaptureSettings() if settings is None else settings
@@ -195,7 +194,7 @@ class _Job:
     def run(self, name: str, learned: list[int], plan: _Plan, *, held: list[int] | None = None) -> TrainingRun:
         """Train on the rows `learned`; with `held`, note how well the best step does there."""
         run = self._start(learned, plan)
-        # What was struck elsewhere than its label says would pull the others' gains to its sound.
+        # A recording of another position than its label would pull the others' gains to its sound.
         targets = self._targets([learned[place] for place in run.network.used_rows(len(learned))])
         validation = None if held is None else _Validation(self._targets(held), self.train.sounds[held], self.config)
         if self.running is not None and self.running["name"] == name:
@@ -212,8 +211,10 @@ class _Job:
                 loss = run.advance(targets)
                 if not math.isfinite(loss):
                     raise FitError(
-                        f"the {name} diverged, its loss at step {run.step} is {loss}: lower learning_rate or "
-                        "warmup_rate, or the correction_rate"
+                        f"{name}: expected a finite loss, got {loss} at step {run.step}; lower learning_rate, "
+                        "warmup_rate or correction_rate",
+                        name=name,
+                        value=loss,
                     )
                 if self.progress is not None:
                     self.progress(Progress(name, run.step, end, loss, self.config.warmup_steps))
@@ -259,7 +260,8 @@ class _Job:
             write_checkpoint(self.checkpoint, state, self.identity, raising=FieldFileError)
         except FieldFileError as error:
             # A full disk costs the checkpoint, not the fit.
-            warnings.warn(f"the fit goes on without a new checkpoint: {error}", AvmsfWarning, stacklevel=2)
+            message = f"{error}; the fit continues without a new checkpoint"
+            warnings.warn(AvmsfWarning(message, file=error.file, value=error.value), stacklevel=2)
         self.saved_at = time.monotonic()
 
 

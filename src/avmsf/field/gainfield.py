@@ -73,7 +73,7 @@ class GainField(Protocol):
     def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return tensors on the device `meta`, of the names, shapes and dtypes that belong to a record.
 
-        Raises ValueError, TypeError or KeyError for a record that belongs to no such field.
+        Raises RecordError, ValueError, TypeError or KeyError for a record that belongs to no such field.
         """
         ...
 

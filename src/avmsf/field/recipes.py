@@ -199,29 +199,39 @@ def fingerprint(case: GainCase, recipe: GainRecipe) -> str:
 
 def _expect_fitting(train: Impacts, modes: Extraction) -> None:
     if len(train) == 0:
-        raise FitError("expected recordings to fit a field to, found none: strike the object in some places")
-    for name, sound, contact in zip(train.names, train.sounds, train.contacts, strict=True):
+        raise FitError("train: expected 1 recording or more, got none; record impacts", name="train", value=0)
+    for row, (name, sound, contact) in enumerate(zip(train.names, train.sounds, train.contacts, strict=True)):
         if not bool(torch.isfinite(sound).all() and torch.isfinite(contact).all()):
             raise FitError(
-                f"{name}: expected finite samples and coordinates, found NaN or infinity: leave the recording out or "
-                "read it again"
+                f"{name}: expected finite samples and coordinates, got NaN or infinity; remove the recording",
+                name=name,
+                row=row,
             )
     if train.directions is not None and not bool(torch.isfinite(train.directions).all()):
         row = int(torch.nonzero(~torch.isfinite(train.directions).all(1))[0])
+        direction = train.directions[row].tolist()
         raise FitError(
-            f"{train.names[row]}: expected a finite direction, got {train.directions[row].tolist()}: give the way the "
-            "hammer moves, or zeros where it is not known"
+            f"{train.names[row]}: expected a finite direction, got {direction}; give the direction in which the hammer "
+            "moves, or zeros if unknown",
+            name=train.names[row],
+            row=row,
+            value=direction,
         )
     if float(train.sounds.abs().max()) == 0.0:
-        raise FitError("all recordings are silent: there is nothing to fit; check the channel that was read")
+        raise FitError(
+            "train: expected sound, got silence in all recordings; check the channel", name="train", value="silence"
+        )
     advice = "extract the modes from the recordings that the field is fitted to"
     if len(modes.gains) != len(train):
         raise FitError(
-            f"the modes were extracted from {len(modes.gains)} recordings, the field is to be fitted to {len(train)}: "
-            f"{advice}"
+            f"modes: expected gains of {len(train)} recordings, got {len(modes.gains)}; {advice}",
+            name="modes",
+            value=len(modes.gains),
         )
     if len(modes.bank) == 0:
-        raise FitError("expected modes, found none: a field of noise alone is the same everywhere")
+        raise FitError("modes: expected 1 mode or more, got none; record longer or louder", name="modes", value=0)
     highest, limit = float(modes.bank.frequency.max()), train.sample_rate / 2
     if highest >= limit:
-        raise FitError(f"the highest mode is at {highest:g} Hz, the recordings reach {limit:g} Hz: {advice}")
+        raise FitError(
+            f"modes: expected frequencies below {limit:g} Hz, got {highest:g} Hz; {advice}", name="modes", value=highest
+        )

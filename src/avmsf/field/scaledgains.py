@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
-from avmsf._utils.records import count_of, like
+from avmsf._utils.records import RecordError, count_of, like
 from avmsf._utils.summary import short_repr
 from avmsf.field.attention import AttentionGains
 from avmsf.field.gainfield import GainField, Gains
@@ -84,7 +84,11 @@ class ScaledGains:
     def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return tensors like those of a field of these sizes."""
         if not 0.0 < like(record["size_factor"], 1.0, "size_factor") < math.inf:
-            raise ValueError(f"size_factor is {record['size_factor']}")
+            raise RecordError(
+                f"size_factor: expected a number above 0, got {record['size_factor']}",
+                name="size_factor",
+                value=record["size_factor"],
+            )
         inner = FITTED[_inner(record)].skeleton(record)
         scale = torch.empty(count_of(record["modes"], "modes"), dtype=torch.float64, device="meta")
         return {"mode_factors": scale, **{_INNER + name: tensor for name, tensor in inner.items()}}
@@ -107,5 +111,5 @@ def fitted_gains(gains: GainField) -> GainField:
 def _inner(record: Mapping[str, Any]) -> str:
     kind: str = like(record["fitted_kind"], "", "fitted_kind")
     if kind not in FITTED:
-        raise ValueError(f"fitted_kind is {kind!r}, not {', '.join(FITTED)}")
+        raise RecordError(f"fitted_kind: expected {', '.join(FITTED)}, got {kind!r}", name="fitted_kind", value=kind)
     return kind

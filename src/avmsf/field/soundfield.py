@@ -50,7 +50,7 @@ class Origin:
     config: FitConfig = field(default_factory=FitConfig)
     """Settings of the fit."""
     report: dict[str, Any] = field(default_factory=dict)
-    """What the fit chose and reached, as plain numbers and words."""
+    """What the fit chose and reached, as plain numbers and text."""
     settings: CaptureSettings = field(default_factory=CaptureSettings)
     """By which its recordings were read."""
 
@@ -376,10 +376,12 @@ def expect_near(positions: Float[Tensor, "contacts 3"], points: Float[Tensor, "p
     far = torch.nonzero(~(outside <= size)).flatten()
     if len(far):
         row = int(far[outside[far].argmax()])
-        where = ", ".join(f"{value:.4g}" for value in places[row].tolist())
+        found = places[row].tolist()
+        where = ", ".join(f"{value:.4g}" for value in found)
         raise PositionError(
-            f"expected positions on the object, in meters, got ({where}) m (row {row}), which is "
-            f"{float(outside[row]):.3g} m outside an object {size:.3g} m across: check the unit and the frame",
+            f"positions, row {row}: expected positions on the object, in meters, got ({where}), "
+            f"{float(outside[row]):.3g} m outside an object {size:.3g} m across; check the unit and the frame",
             name="positions",
             row=row,
+            value=found,
         )

@@ -1,11 +1,11 @@
-"""A sound field as one file: safetensors, and one JSON in its header for all that is no tensor.
+"""A sound field as one file: safetensors, with all that is not a tensor as JSON in its header.
 
 Tensors are named by the path of their field: `bank.frequency`, `phase`, `gains.points`. The header's metadata
 holds under the key `avmsf` a record:
 
 {"format": 8, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
  "sizes": {"modes": 43, "bins": 1025, "recordings": [8, 132300]},
- "gains": {"kind": "attention", what the gain model says of itself},
+ "gains": {"kind": "attention", the gain model's record},
  "alignment": null or {"modes": 32, "names": [...], "keys": [...]},
  "config": {FitConfig}, "origin": {"capture": "bowl", "trained_on": [...], "per_newton": true, "report": {...},
                                    "settings": {CaptureSettings}}}
@@ -23,12 +23,12 @@ import torch
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from avmsf._utils.records import count_of, like, record_of
+from avmsf._utils.records import RecordError, count_of, like, record_of
 from avmsf._utils.state import read_tensors
 from avmsf._utils.text_files import parse_json
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
-from avmsf.errors import CaptureError, FieldFileError, FitError
+from avmsf.errors import AvmsfError, FieldFileError
 from avmsf.field.config import FitConfig
 from avmsf.field.gainfield import GainField
 from avmsf.field.scaledgains import FITTED, ScaledGains
@@ -47,7 +47,7 @@ _MAX = {"bank.frequency": 1e9, "bank.damping": 1e9, "residual.magnitude": MAX_PE
 """Largest values: hertz and 1/s beyond any solid's modes, and noise as loud as the loudest recording."""
 _KINDS: dict[str, type[GainField]] = {**FITTED, ScaledGains.kind: ScaledGains}
 """The gain fields that a file may hold, by what it calls them."""
-_UNREADABLE = (ValueError, TypeError, KeyError, RuntimeError, FitError, CaptureError)
+_UNREADABLE = (ValueError, TypeError, KeyError, RuntimeError, AvmsfError)
 """What a record of another form raises; RuntimeError: torch, of sizes beyond 2^63 and of damaged values."""
 
 
@@ -63,13 +63,19 @@ def save(field: SoundField, path: str | Path) -> None:
         words = json.dumps(record, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise FieldFileError(
-            f"{path}: expected origin.report to hold finite numbers, words, lists and dicts ({error}): take the rest "
-            "out of it"
+            f"{path}: expected origin.report of finite numbers, text, lists and dicts ({error}); remove the rest",
+            file=path,
+            name="origin.report",
         ) from error
     try:
         header = _Header.of(json.loads(words))
     except _UNREADABLE as error:
-        raise FieldFileError(f"{path}: {error}: such a field cannot be kept") from error
+        raise FieldFileError(
+            f"{path}: expected a field that can be loaded: {error}",
+            file=path,
+            name=_key_of(error),
+            value=_value_of(error),
+        ) from error
     _expect_tensors(tensors, header.skeleton, path)
     content = to_bytes(tensors, {_KEY: words})
     write_whole(path, lambda place: place.write_bytes(content))
@@ -90,18 +96,26 @@ def load(path: str | Path) -> SoundField:
         found, writer = record["format"], record["version"]
         if found != FORMAT:
             raise FieldFileError(
-                f"{path}: expected a sound field of format {FORMAT}, found format {found}, written by avmsf {writer} "
-                f"(this is avmsf {version('avmsf')}): "
-                + (_remake(record, path) if isinstance(found, int) and found < FORMAT else "install a newer avmsf")
+                f"{path}: expected a sound field of format {FORMAT}, got format {found} of avmsf {writer} "
+                f"(this is avmsf {version('avmsf')}); "
+                + (_remake(record, path) if isinstance(found, int) and found < FORMAT else "install a newer avmsf"),
+                file=path,
+                name="format",
+                value=found,
             )
         header = _Header.of(record)
         _expect_tensors(tensors, header.skeleton, path)
         named = {name.removeprefix(_GAINS): each for name, each in tensors.items() if name.startswith(_GAINS)}
         gains = _KINDS[header.kind].restore(header.gain_field, named)
+    except FieldFileError:
+        raise
     except _UNREADABLE as error:
         raise FieldFileError(
-            f"{path}: expected the header of a sound field of format {FORMAT}, found another or a damaged one "
-            f"({type(error).__name__}: {error}): fit and save the field again"
+            f"{path}: expected the header of a sound field of format {FORMAT}, got another or a damaged one "
+            f"({type(error).__name__}: {error}); fit and save the field again",
+            file=path,
+            name=_key_of(error),
+            value=_value_of(error),
         ) from error
     return SoundField(
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
@@ -117,13 +131,13 @@ def load(path: str | Path) -> SoundField:
 
 @dataclass(frozen=True)
 class _Header:
-    """What a field's file says about its tensors."""
+    """What a field's file states about its tensors."""
 
     sample_rate: float
     samples: int
     kind: str
     gain_field: Mapping[str, Any]
-    """What the gain field says of itself."""
+    """The gain field's record."""
     origin: Origin
     skeleton: dict[str, Tensor]
     """Tensors of the names, shapes and dtypes of a field with these sizes, which take no memory."""
@@ -131,34 +145,52 @@ class _Header:
     @classmethod
     def of(cls, record: Mapping[str, Any]) -> "_Header":
         """Return the header of a file's record. Raises one of `_UNREADABLE`, also for sounds that no recording has."""
-        sizes, gains, origin = record["sizes"], dict(record["gains"]), record["origin"]
+        sizes, gains, origin = (dict(like(record[name], {}, name)) for name in ("sizes", "gains", "origin"))
         rate, samples = float(like(record["sample_rate"], 1.0, "sample_rate")), count_of(record["samples"], "samples")
         # Those of the recordings that a field is fitted to.
         if not LOWEST_RATE <= rate <= HIGHEST_RATE:
-            raise ValueError(f"sample_rate: expected {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz, got {rate:g}")
+            raise RecordError(
+                f"sample_rate: expected {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz, got {rate:g}",
+                name="sample_rate",
+                value=rate,
+            )
         if samples > MAX_SAMPLES:
-            raise ValueError(f"samples: expected at most {MAX_SAMPLES:,}, got {samples:,}")
+            raise RecordError(
+                f"samples: expected at most {MAX_SAMPLES:,}, got {samples:,}", name="samples", value=samples
+            )
         modes, bins = (count_of(sizes[name], f"sizes.{name}") for name in ("modes", "bins"))
         kind = like(gains.pop("kind"), "", "gains.kind")
         if kind not in _KINDS:
-            raise ValueError(f"gains.kind is {kind!r}, not {', '.join(_KINDS)}")
+            raise RecordError(f"gains.kind: expected {', '.join(_KINDS)}, got {kind!r}", name="gains.kind", value=kind)
         bank = torch.empty(modes, dtype=torch.float64, device="meta")
         skeleton = {"bank.frequency": bank, "bank.damping": bank, "phase": bank}
         skeleton["residual.magnitude"] = torch.empty(bins, device="meta")
         if sizes["recordings"] is not None:
             contacts, length = (count_of(each, "sizes.recordings") for each in sizes["recordings"])
             if gains.get("contacts") != contacts:
-                raise ValueError(f"sizes.recordings is {sizes['recordings']}, of other contacts than the gains")
+                raise RecordError(
+                    f"sizes.recordings: expected {gains.get('contacts')} contacts as in gains, got {contacts}",
+                    name="sizes.recordings",
+                    value=contacts,
+                )
             skeleton["residual.recordings"] = torch.empty(contacts, length, device="meta")
         skeleton |= {_GAINS + name: each for name, each in _KINDS[kind].skeleton(gains).items()}
         if (alignment := record["alignment"]) is not None:
             names, keys = (like(alignment[name], [], f"alignment.{name}") for name in ("names", "keys"))
             if len(names) != len(keys) or not all(isinstance(each, str) for each in (*names, *keys)):
-                raise ValueError(f"alignment has {len(names)} names and {len(keys)} keys")
+                raise RecordError(
+                    f"alignment.keys: expected {len(names)} as in alignment.names, got {len(keys)}",
+                    name="alignment.keys",
+                    value=len(keys),
+                )
             aligned = Alignment.skeleton(len(names), count_of(alignment["modes"], "alignment.modes", least=0))
             skeleton |= {_ALIGNMENT + name: each for name, each in aligned.items()}
         if gains["modes"] != modes:
-            raise ValueError(f"{gains['modes']} modes have gains, {modes} have frequencies")
+            raise RecordError(
+                f"gains.modes: expected {modes}, the number of frequencies, got {gains['modes']}",
+                name="gains.modes",
+                value=gains["modes"],
+            )
         read = Origin(
             capture=like(origin["capture"], "", "origin.capture"),
             trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
@@ -217,6 +249,17 @@ def _alignment(record: Mapping[str, Any] | None, tensors: Mapping[str, Tensor]) 
     return Alignment.restore(named, record["names"], record["keys"])
 
 
+def _key_of(error: Exception) -> str | None:
+    """Return the key of a record that an error is about, where it is known."""
+    if isinstance(error, AvmsfError):
+        return error.name
+    return str(error.args[0]) if isinstance(error, KeyError) else None
+
+
+def _value_of(error: Exception) -> Any:
+    return error.value if isinstance(error, AvmsfError) else None
+
+
 def _remake(record: Mapping[str, Any], path: Path) -> str:
     """Return the command that makes the field of an older file again."""
     report = record["origin"]["report"]
@@ -231,22 +274,38 @@ def _expect_tensors(tensors: dict[str, Tensor], skeleton: dict[str, Tensor], pat
     missing, unexpected = sorted(skeleton.keys() - tensors.keys()), sorted(tensors.keys() - skeleton.keys())
     if missing or unexpected:
         raise FieldFileError(
-            f"{path}: the tensors are not those of format {FORMAT}: missing {', '.join(missing) or 'none'}; unexpected "
-            f"{', '.join(unexpected) or 'none'}: the file was changed after it was saved, fit and save it again"
+            f"{path}: expected the tensors of format {FORMAT}; missing {', '.join(missing) or 'none'}; unexpected "
+            f"{', '.join(unexpected) or 'none'}; fit and save the field again",
+            file=path,
+            name=(missing or unexpected)[0],
+            value=[missing, unexpected],
         )
     for name, tensor in tensors.items():
         if tensor.shape != skeleton[name].shape or tensor.dtype != skeleton[name].dtype:
             raise FieldFileError(
-                f"{path}: expected {name} as {_named(skeleton[name])}, found {_named(tensor)}: the header and the "
-                "tensors do not belong together, fit and save the field again"
+                f"{path}: expected {name} as {_named(skeleton[name])}, got {_named(tensor)}; fit and save the field "
+                "again",
+                file=path,
+                name=name,
+                value=_named(tensor),
             )
         low, high = (float(each) for each in tensor.aminmax()) if tensor.numel() else (0.0, 0.0)
         negative = low < 0 and name == "residual.magnitude"
         if not bool(torch.isfinite(tensor).all()) or (name in _POSITIVE and low <= 0) or negative:
             wanted = "positive" if name in _POSITIVE else "not negative" if negative else "finite"
-            raise FieldFileError(f"{path}: expected {name} to be {wanted} throughout, found otherwise: fit it again")
+            raise FieldFileError(
+                f"{path}: expected {name} to be {wanted}, got {low:.3g} to {high:.3g}; fit the field again",
+                file=path,
+                name=name,
+                value=(low, high),
+            )
         if high > _MAX.get(name, math.inf):
-            raise FieldFileError(f"{path}: expected {name} up to {_MAX[name]:g}, got {high:.3g}: fit the field again")
+            raise FieldFileError(
+                f"{path}: expected {name} up to {_MAX[name]:g}, got {high:.3g}; fit the field again",
+                file=path,
+                name=name,
+                value=high,
+            )
 
 
 def _named(tensor: Tensor) -> str:

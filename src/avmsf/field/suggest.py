@@ -79,7 +79,7 @@ def suggest(
     """
     gains = unedited_mixture(field)
     if count < 1:
-        raise FitError(f"count = {count}: expected 1 contact or more")
+        raise FitError(f"count: expected 1 contact or more, got {count}", name="count", value=count)
     surface = _body_nodes(gains) if unseen else gains.points
     points = surface[farthest_points(surface, min(PLACES, len(surface)))].double()
     _expect_directions(directions, candidates)
@@ -93,8 +93,10 @@ def suggest(
     allowed = (pool[:, None] - gains.contacts).norm(dim=2).amin(1) > same
     if int(allowed.sum()) < count:
         raise FitError(
-            f"{count} contacts are asked for and {int(allowed.sum())} of the {len(pool)} candidates have not been "
-            "struck yet: ask for fewer, or give more candidates"
+            f"candidates: expected {count} or more without a recording, got {int(allowed.sum())} of {len(pool)}; ask "
+            "for fewer, or give more candidates",
+            name="candidates",
+            value=int(allowed.sum()),
         )
     kept = _weighed(pool, allowed, max(MAX_CANDIDATES, count))
     sites = gains.sites(pool[kept], None if directions is None else directions[kept])
@@ -107,7 +109,11 @@ def suggest(
         allowed &= (sites.points - sites.points[rows[-1]]).norm(dim=1) > same
         after.append(float(error.map().square().mean().sqrt()))
     if len(rows) < count:
-        raise FitError(f"{count} contacts are asked for and the candidates are only {len(rows)} different places")
+        raise FitError(
+            f"candidates: expected {count} different positions or more, got {len(rows)}; ask for fewer",
+            name="candidates",
+            value=len(rows),
+        )
     return Suggestions(
         sites.points[rows],
         sites.directions[rows] if gains.directional else None,
@@ -184,8 +190,10 @@ def _reachable(
     reached, places, axes = judge(points.numpy())
     if not reached.any():
         raise FitError(
-            f"expected places that a hammer of {1000 * HAMMER_DIAMETER:g} mm can strike from outside, got none of "
-            f"{len(points)}: the object's shape is wrong or closed; give candidates"
+            f"candidates: expected positions that a hammer of {1000 * HAMMER_DIAMETER:g} mm reaches from outside, got "
+            f"none of {len(points)}; check the object's shape, or give candidates",
+            name="candidates",
+            value=0,
         )
     return torch.from_numpy(places[reached]), None if axes is None else -torch.from_numpy(axes[reached])
 
@@ -194,8 +202,10 @@ def _body_nodes(gains: MixtureGains) -> Float64[Tensor, "nodes 3"]:
     """Return places all over the body's surface. Raises FitError without a body."""
     if gains.body is None:
         raise FitError(
-            "expected a field that knows the object's surface, of which no view saw a part, got one without a body: "
-            "ask without unseen places, or give candidates"
+            "unseen: expected a field with the object's surface, got one without a body; leave unseen out, or give "
+            "candidates",
+            name="unseen",
+            value=True,
         )
     return gains.body.nodes
 
@@ -214,27 +224,45 @@ def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates:
     if directions is None:
         return
     if candidates is None:
-        raise FitError("directions are given and no candidates: give the places that can be struck along them")
+        raise FitError("directions: expected candidates with them, got none; give candidates", name="directions")
     if len(directions) != len(candidates):
         raise FitError(
-            f"expected a direction for each of the {len(candidates)} candidates, found {len(directions)} directions"
+            f"directions: expected one for each of the {len(candidates)} candidates, got {len(directions)}",
+            name="directions",
+            value=len(directions),
         )
     zero = torch.nonzero(~(directions.norm(dim=1) > 0)).flatten().tolist()
     if zero:
-        raise FitError(f"candidate {zero[0]}: its direction is a vector of length zero: give the way the hammer moves")
+        row, direction = zero[0], directions[zero[0]].tolist()
+        raise FitError(
+            f"directions, row {row}: expected a length above 0, got {direction}; give the direction in which the "
+            "hammer moves",
+            name="directions",
+            row=row,
+            value=direction,
+        )
 
 
 def _expect_on_surface(candidates: Float64[Tensor, "candidates 3"], surface: Float64[Tensor, "points 3"]) -> None:
     if not len(candidates):
-        raise FitError("candidates is empty: give places on the surface, in meters, or none at all")
+        raise FitError("candidates: expected 1 position or more, got none; leave it out", name="candidates", value=0)
     if not bool(torch.isfinite(candidates).all()):
         row = int(torch.nonzero(~torch.isfinite(candidates).all(1))[0])
-        raise FitError(f"candidate {row} is {candidates[row].tolist()}: expected finite coordinates in meters")
+        found = candidates[row].tolist()
+        raise FitError(
+            f"candidates, row {row}: expected finite coordinates in meters, got {found}",
+            name="candidates",
+            row=row,
+            value=found,
+        )
     distance = torch.from_numpy(cKDTree(surface.numpy()).query(candidates.numpy())[0])
     worst = int(distance.argmax())
     if float(distance[worst]) > _OFF * float((surface.amax(0) - surface.amin(0)).norm()):
+        found = [round(each, 4) for each in candidates[worst].tolist()]
         raise FitError(
-            f"candidate {worst} at {[round(each, 4) for each in candidates[worst].tolist()]} m is "
-            f"{float(distance[worst]):.2g} m from the object's surface: candidates lie on it, in meters, in the "
-            "object's frame"
+            f"candidates, row {worst}: expected a position on the object's surface, got {found} m, "
+            f"{float(distance[worst]):.2g} m from it; check the unit and the frame",
+            name="candidates",
+            row=worst,
+            value=found,
         )

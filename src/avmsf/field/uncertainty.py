@@ -69,7 +69,11 @@ def has_posterior(field: SoundField) -> bool:
 def unedited_mixture(field: SoundField) -> MixtureGains:
     """Return the field's gain model, to plan measurements for. Raises as `fitted_mixture`, and for an edited field."""
     if isinstance(field.gain_field, ScaledGains):
-        raise FitError("expected a fitted field, got an edited one, which nobody can record: ask the unedited field")
+        raise FitError(
+            "field: expected a field as fitted, got an edited one; give the unedited field",
+            name="field",
+            value="edited",
+        )
     return fitted_mixture(field)
 
 
@@ -81,14 +85,22 @@ def fitted_mixture(field: SoundField) -> MixtureGains:
     gains = fitted_gains(field.gain_field)
     if isinstance(gains, BodyGains):
         raise FitError(
-            "expected a field that was fitted to recordings, got a guess without any: record impacts and fit"
+            "field: expected one fitted to recordings, got one computed without; record impacts and fit",
+            name="field",
+            value=gains.kind,
         )
     if not isinstance(gains, MixtureGains):
         raise FitError(
-            f"expected gains of the kind {MixtureGains.kind!r}, got {gains.kind!r}: fit with --gain-model auto"
+            f"field: expected gains of the kind {MixtureGains.kind!r}, got {gains.kind!r}; fit with --gain-model auto",
+            name="field",
+            value=gains.kind,
         )
     if gains.place_count < 2:
-        raise FitError("expected gains from 2 places or more, got 1: record impacts in a second place")
+        raise FitError(
+            "field: expected recordings at 2 positions or more, got 1; record impacts at another position",
+            name="field",
+            value=gains.place_count,
+        )
     return gains
 
 
@@ -194,8 +206,10 @@ def coverage(
     gains, scale = fitted_mixture(field), scale_of(field).square()[:, None]
     if parts.shape != (len(contacts), len(field.bank), 2):
         raise FitError(
-            f"gains are of shape {tuple(parts.shape)}: expected {len(contacts)} contacts, the field's "
-            f"{len(field.bank)} modes and 2 parts"
+            f"parts: expected the shape [{len(contacts)}, {len(field.bank)}, 2], got {list(parts.shape)}; give gains "
+            "of the contacts and of the field's modes",
+            name="parts",
+            value=list(parts.shape),
         )
     deviation = std_of(field, contacts, directions)
     spread = (deviation.square() + scale * gains.noise().square()).sqrt()
@@ -223,4 +237,6 @@ def _spectra(field: SoundField, modes: Tensor) -> Tensor:
 
 def _expect_level(level: float) -> None:
     if not 0.0 < level < 1.0:
-        raise FitError(f"level = {level:g}: expected a probability between 0 and 1, as .9")
+        raise FitError(
+            f"level: expected a probability between 0 and 1, such as 0.9, got {level:g}", name="level", value=level
+        )

@@ -15,7 +15,11 @@ def difference(surface: Surface, cut: Surface) -> Surface:
     """
     left = _manifold(surface) - _manifold(cut)
     if left.status() != manifold3d.Error.NoError:
-        raise SceneError(f"expected two closed surfaces, got {left.status().name}: make the shape on finer cells")
+        raise SceneError(
+            f"expected two closed surfaces, got {left.status().name}; make the shape on finer cells",
+            name="surface",
+            value=left.status().name,
+        )
     mesh = max(left.decompose(), key=lambda part: float(part.volume()), default=left).to_mesh()
     vertices, faces = np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts)
     return Surface(torch.from_numpy(vertices).float(), torch.from_numpy(faces).long())

@@ -21,7 +21,9 @@ def depth_in_convex_hull(
     try:
         planes = ConvexHull(points).equations
     except QhullError as error:
-        raise SceneError(f"expected points that span a volume, got {len(points)} in one plane") from error
+        raise SceneError(
+            f"expected points that span a volume, got {len(points)} in one plane", name="points", value=len(points)
+        ) from error
     # Triangles of one flat face share their plane.
     planes = np.unique(np.round(planes, 6), axis=0)
     result = np.full(len(rows), np.inf, dtype=np.float32)

@@ -19,22 +19,33 @@ def masked_views(views: Sequence[View]) -> list[View]:
     empty = [view.name for view in known if view.mask is not None and not bool((view.mask > 127).any())]
     if known and len(empty) == len(known):
         raise SceneError(
-            f"expected the object in the masks, got background alone in all {len(known)} of them: check that white "
-            "stands for the object, or leave the masks out and let the foreground be found"
+            f"expected the object in the masks, got only background in all {len(known)}; check that white is the "
+            "object, or remove the masks so that the foreground is found",
+            name="masks",
+            value=empty,
         )
     if empty:
-        warnings.warn(
-            f"the object is in no pixel of the masks of {', '.join(empty)}; these views are not used",
-            CaptureWarning,
-            stacklevel=3,
-        )
+        message = f"views whose masks are empty are not used: {', '.join(empty)}"
+        warnings.warn(CaptureWarning(message, name="masks", value=empty), stacklevel=3)
     kept = [view for view in known if view.name not in empty]
     if len(kept) < 3:
         raise SceneError(
-            f"expected 3 or more views with a mask, got {len(kept)} of {len(views)}: give masks, images with "
-            "alpha or a plain background whose foreground can be found, or points to start from"
+            f"expected 3 or more views with a mask, got {len(kept)} of {len(views)}; give masks, images with alpha or "
+            "a plain background, or initial points",
+            name="views",
+            value=len(kept),
         )
     return kept
+
+
+def no_common_point(views: int) -> SceneError:
+    """Return the error of masks of this many views that no point of the object frame lies in."""
+    return SceneError(
+        f"expected masks with a common volume, got none from {views} views; check that cameras and masks belong "
+        "together and that the poses have the convention of their file (shifted or small masks miss thin objects)",
+        name="masks",
+        value=views,
+    )
 
 
 def object_extent(views: Sequence[View]) -> tuple[np.ndarray, float]:

@@ -13,7 +13,7 @@ from avmsf.capture.meshviews import MeshTracer
 from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.errors import SceneError
 from avmsf.geometry.convex import depth_in_convex_hull
-from avmsf.geometry.extent import masked_views, object_extent
+from avmsf.geometry.extent import masked_views, no_common_point, object_extent
 from avmsf.geometry.fusion import SeenDepth, fused_depth
 from avmsf.geometry.grid import Grid
 from avmsf.geometry.masks import DISSENT, agreeing, edge_offset
@@ -65,7 +65,7 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     common, and where views do not bound the object: an image cuts it, or all are from one side.
     """
     if cells < 16:
-        raise SceneError(f"cells = {cells}: expected 16 or more")
+        raise SceneError(f"cells: expected 16 or more, got {cells}", name="cells", value=cells)
     masked = masked_views(views)
     outlines = [Outline.of(view) for view in masked]
     offset = edge_offset(masked, outlines)
@@ -121,7 +121,9 @@ def _rough(
         reach *= 1.5
     raise SceneError(
         f"expected views from several sides, whose masks bound the object, got {len(views)} whose masks leave it open "
-        f"{reach / 1.5:.3g} m from its middle: add views from other sides, with the whole object in them"
+        f"{reach / 1.5:.3g} m from its middle; add views of the complete object from other sides",
+        name="views",
+        value=len(views),
     )
 
 
@@ -142,11 +144,7 @@ def _box(
     """Return the lowest and highest corner of the box around what is inside, meters."""
     rows = np.argwhere(inside)
     if not len(rows):
-        raise SceneError(
-            f"the masks of {views} views have no place in common: check that cameras and masks belong together, and "
-            "that the poses are camera-to-world in the convention that their file promises; masks that are shifted or "
-            "too small leave thin objects out"
-        )
+        raise no_common_point(views)
     return grid.places(rows.min(axis=0)), grid.places(rows.max(axis=0))
 
 
@@ -220,7 +218,11 @@ def _closed(
     rows = np.rint((places - grid.lowest) / grid.spacing).astype(int)
     known = ndimage.maximum_filter(sights, 3)[tuple(rows.T)] >= 1
     if int(known.sum()) < 4:
-        raise SceneError("no view sees a surface in its mask: check that depth and views are of one object")
+        raise SceneError(
+            "expected views with a surface in their masks, got none; check that depth and views are of one object",
+            name="views",
+            value=0,
+        )
     near = hull > -2 * grid.spacing
     bound = hull.copy()
     inside = depth_in_convex_hull(places[known], grid, np.argwhere(near))

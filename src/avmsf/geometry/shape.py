@@ -134,14 +134,19 @@ class ObjectShape:
         a thickness that is not positive or leaves nothing of the cavity.
         """
         if not 0 < thickness < np.inf:
-            raise SceneError(f"expected a thickness above 0 m, got {thickness:g} m")
+            raise SceneError(f"expected a thickness above 0 m, got {thickness:g} m", name="thickness", value=thickness)
         if not self.hollow.any():
-            raise SceneError("expected an object with a cavity, got one without: take solid() or as_seen()")
+            raise SceneError(
+                "expected an object with a cavity, got one without; use solid() or as_seen()", name="cavity"
+            )
         empty = self._emptied(thickness)
         if empty is None:
+            deepest = float(self._depth[self.hollow > 0].max())
             raise SceneError(
-                f"a wall of {1000 * thickness:.3g} mm leaves nothing of the cavity: try less than "
-                f"{1000 * float(self._depth[self.hollow > 0].max()):.3g} mm"
+                f"expected a wall thickness below {1000 * deepest:.3g} mm, the depth of the cavity, got "
+                f"{1000 * thickness:.3g} mm",
+                name="thickness",
+                value=thickness,
             )
         # Both sides are drawn by themselves, so a wall may be thinner than a cell.
         values = np.minimum(self._signed_depth - np.float32(thickness), -empty)
@@ -149,7 +154,11 @@ class ObjectShape:
         cavity = self._enclose(np.pad(values, 1, constant_values=-self.grid.spacing), grid, faces)
         left = difference(self.solid(faces=faces), cavity)
         if not len(left.faces):
-            raise SceneError(f"a wall of {1000 * thickness:.3g} mm leaves nothing: try a thicker one")
+            raise SceneError(
+                f"expected a wall that can be represented, got {1000 * thickness:.3g} mm; choose a thicker one",
+                name="thickness",
+                value=thickness,
+            )
         return left
 
     @cached_property
@@ -240,4 +249,8 @@ def closed_surface(values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int 
     try:
         return enclose(values, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
     except CaptureError as error:
-        raise SceneError(f"expected a shape with an inside, got none on a grid of {grid.shape}: {error}") from error
+        raise SceneError(
+            f"expected a shape with an inside, got none on a grid of {grid.shape}: {error}",
+            name=error.name,
+            value=error.value,
+        ) from error

@@ -1,4 +1,4 @@
-"""The force of a blow over its contact time: a soft hammer stays long and leaves the high modes alone."""
+"""The force of an impact over its contact time: with a soft hammer it is long and excites high modes less."""
 
 import math
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ from jaxtyping import Float, Float64
 from scipy.special import betainc
 from torch import Tensor
 
+from avmsf.errors import SimulationError
 from avmsf.modal.config import PulseShape
 
 _EXPONENTS: dict[str, float] = {"half-sine": 1.0, "hertz": 1.5}
@@ -16,18 +17,27 @@ _EXPONENTS: dict[str, float] = {"half-sine": 1.0, "hertz": 1.5}
 
 @dataclass(frozen=True)
 class ForcePulse:
-    """A blow's force over time, of unit impulse: zero before the contact, a power of a half sine, zero after."""
+    """An impact's force over time, of unit impulse: zero before the contact, a power of a half sine, zero after.
+
+    Raises SimulationError for a contact time below 0 or not finite, and for an unknown shape.
+    """
 
     contact_time: float
-    """How long hammer and object touch, seconds; 0 is the blow as it was recorded."""
+    """Seconds that hammer and object are in contact; 0 is the impact as recorded."""
     shape: PulseShape = "half-sine"
     """half-sine: a linear contact. hertz: sin^1.5, two curved bodies that flatten each other (Hertz 1881)."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.contact_time < math.inf:
-            raise ValueError(f"contact_time is {self.contact_time}; expected seconds, 0 or more")
+            raise SimulationError(
+                f"contact_time: expected seconds, 0 or more, got {self.contact_time}",
+                name="contact_time",
+                value=self.contact_time,
+            )
         if self.shape not in _EXPONENTS:
-            raise ValueError(f"shape is {self.shape!r}; expected one of {', '.join(_EXPONENTS)}")
+            raise SimulationError(
+                f"shape: expected {' or '.join(_EXPONENTS)}, got {self.shape!r}", name="shape", value=self.shape
+            )
 
     def samples(self, sample_rate: float) -> Float64[Tensor, " samples"]:
         """Return the part of the impulse that falls into each sample's time; their sum is 1.

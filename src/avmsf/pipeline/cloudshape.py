@@ -61,20 +61,30 @@ def _visible(cloud: GaussianCloud) -> GaussianCloud:
         values = getattr(cloud, each.name).detach()
         wrong = torch.nonzero(~torch.isfinite(values.reshape(len(values), -1)).all(1)).flatten()
         if len(wrong):
+            row = int(wrong[0])
+            found = values[row].tolist()
             raise SceneError(
-                f"expected finite numbers, found {each.name} {values[wrong[0]].tolist()} of Gaussian {int(wrong[0])}, "
-                f"and of {len(wrong) - 1} others: drop them with `GaussianCloud.take`"
+                f"{each.name}, row {row}: expected finite numbers, got {found} ({len(wrong)} Gaussians); remove them "
+                "with GaussianCloud.take",
+                row=row,
+                name=each.name,
+                value=found,
             )
     visible = cloud.detach().take(cloud.opacities.detach() >= _FAINT)
     if len(visible) < _FEWEST:
         raise SceneError(
-            f"{len(visible)} of {len(cloud)} Gaussians have an opacity of {_FAINT} or more; expected {_FEWEST} and "
-            "more to show a surface: splat the object again, with more steps or better masks"
+            f"opacities: expected {_FEWEST} Gaussians or more of at least {_FAINT}, got {len(visible)} of "
+            f"{len(cloud)}; fit the Gaussians again, with more steps or better masks",
+            name="opacities",
+            value=len(visible),
         )
     extent = (visible.centers.amax(0) - visible.centers.amin(0)).tolist()
     if not max(extent) > 0:
+        center = visible.centers[0].tolist()
         raise SceneError(
-            f"all {len(visible)} Gaussians are in one place, {visible.centers[0].tolist()}: expected them all over an "
-            "object; splat it again"
+            f"centers: expected Gaussians all over an object, got {len(visible)} at one position, {center}; fit the "
+            "Gaussians again",
+            name="centers",
+            value=center,
         )
     return visible

@@ -1,4 +1,4 @@
-"""One configuration for the whole way from views and recordings to a field, and the presets.
+"""One configuration for all stages from views and recordings to a field, and the presets.
 
 Importing this imports nothing that computes.
 """
@@ -28,9 +28,9 @@ class ViewsConfig:
     """How views are made of what a folder holds."""
 
     source: Literal["best", "mesh"] = "best"
-    """What shows the object: the best of what the folder holds, photographs with cameras before a mesh, or its mesh."""
+    """Source of the views: the best in the folder, photographs with cameras before a mesh, or the mesh."""
     count: int = 0
-    """Views to use at most, of cameras as far apart as they stand; 0 uses all."""
+    """Views to use at most, of cameras far apart; 0 uses all."""
     longest: int = 640
     """Pixels of a photograph's longer side; larger ones are scaled down."""
     masks: bool = True
@@ -38,15 +38,15 @@ class ViewsConfig:
     frames: int = 72
     """Frames to pick from a video."""
     rendered: int = 256
-    """Pixels along each side of the 72 pictures that are rendered of a mesh."""
+    """Pixels along each side of the 72 images that are rendered of a mesh."""
     minutes: float = 30.0
     """Time that structure from motion may take."""
     seed: int = 0
-    """Start of the chance in structure from motion."""
+    """Seed of structure from motion."""
 
     def __post_init__(self) -> None:
         if self.count < 0:
-            raise SceneError(f"count = {self.count}: expected 0 for all views, or how many to use")
+            raise _scene_error("count", self.count, "0 for all views, or how many to use")
 
 
 @dataclass(frozen=True)
@@ -55,70 +55,72 @@ class LiftConfig:
 
     encoder: str = AUTO
     """What describes the images: the name of a DINOv2 model (such as facebook/dinov2-base), a folder that holds one,
-    `descriptors` (built in, no download), or `auto`: DINOv2 base where it is to be had, else the built-in ones."""
+    `descriptors` (built in, no download), or `auto`: DINOv2 base if it is available, else the built-in ones."""
     longest: int = 518
-    """Pixels of an image's longer side as DINOv2 sees it."""
+    """Pixels of the longer side of DINOv2's input images."""
     background: Literal["inpainted", "kept"] = "inpainted"
-    """What the encoder sees outside an object's mask: the object's colors carried on, or the image as it is (paper)."""
+    """Encoder input outside an object's mask: colors of the object continued, or the image unchanged (paper)."""
     weighting: Literal["plain", "visibility"] = "visibility"
-    """How the views that see a point are averaged: by how well they see it, or plainly (paper)."""
+    """Average over the views that see a point: weighted by visibility, or plain (paper)."""
     components: int = 32
-    """Principal components of the features to keep; 0 keeps the features as they are."""
+    """Principal components of the features to use; 0 uses the features unchanged."""
     symmetry: bool = True
-    """Whether features are made alike where the object's symmetries make its shape alike."""
+    """Whether features are averaged over the symmetries of the object's shape."""
     missing: float = 0.1
     """Part of the object's surface that may have its counterpart in a hole of the points, for a symmetry to count: more
-    where large parts of the object were not seen, up to .45."""
+    where large parts of the object are in no view, up to .45."""
     iterations: int = 3
     """How often features are pooled over the symmetries (paper: T)."""
     angles: int = 36
-    """Angles that stand for all of a continuous rotation (paper: the size of Theta)."""
+    """Angles by which a continuous rotation is sampled (paper: the size of Theta)."""
     reach: float = 3.0
     """Point spacings within which the nearest point is a symmetric counterpart; 0 takes it at any distance (paper)."""
     positions: bool = True
-    """Whether the points' positions, relative to the object's size, stand before the features."""
+    """Whether the features begin with the points' positions relative to the object's size."""
     size: float = 0.3
-    """Root mean square length of the features beside positions, which are about .5 long; alone they have length 1."""
+    """Root mean square length of the features after positions, which are about .5 long; without them it is 1."""
     onto: Literal["mesh", "gaussians"] = "mesh"
-    """What is the object where a folder shows a mesh alone: its own surface, or Gaussians fitted to pictures of it."""
+    """Points of the features for a folder with a mesh only: on its surface, or Gaussians fitted to images of it."""
     points: int = 8192
-    """Points of a mesh whose own surface is the object."""
+    """Points on the surface of a mesh."""
     seed: int = 0
-    """Start of all chance: which points of a mesh, which of them the search for symmetries looks at."""
+    """Seed of the random choices: points of a mesh, and those of them that the search for symmetries uses."""
 
     def __post_init__(self) -> None:
         for name, least in {"longest": 1, "components": 0, "iterations": 1, "angles": 2, "points": 100}.items():
             if getattr(self, name) < least:
-                raise SceneError(f"{name} = {getattr(self, name)}: expected {least} or more")
+                raise _scene_error(name, getattr(self, name), f"{least} or more")
         if not 0 <= self.missing <= 0.45:
-            raise SceneError(f"missing = {self.missing}: expected 0 to 0.45")
+            raise _scene_error("missing", self.missing, "0 to 0.45")
         if not 0 <= self.reach < math.inf:
-            raise SceneError(f"reach = {self.reach}: expected a number of point spacings, or 0 for any distance")
+            raise _scene_error("reach", self.reach, "a number of point spacings, or 0 for any distance")
         if not 0 < self.size < math.inf:
-            raise SceneError(f"size = {self.size}: expected more than 0")
+            raise _scene_error("size", self.size, "more than 0")
 
 
 @dataclass(frozen=True)
 class BodyConfig:
-    """How an object's shape becomes bodies that vibrate."""
+    """How finite-element models are made of an object's shape."""
 
     wall: float | None = None
-    """Thickness of the object's wall, meters, where it is known; 0 for a body that its surface encloses whole. By
-    itself it tries several, and the recordings choose."""
+    """Wall thickness of the object, meters; 0 for a solid object. By default several are tried, and the recordings
+    decide."""
     shapes: int = 80
-    """Lowest elastic mode shapes that gains are made of, and on which stiffness and density are updated."""
+    """Number of the lowest elastic mode shapes for the gains and for updating stiffness and density."""
     freedoms: int = 40_000
-    """Degrees of freedom of the finite elements, about."""
+    """Approximate degrees of freedom of the finite elements."""
     supports: Literal["auto", "free", "try"] = "auto"
     """Whether the object may have been held at its lowest face or point, or along a lower edge (z is upwards). auto:
-    tried if the free body predicts recordings left out little better than no body. free: it lay on foam or hung. try:
-    always tried, which takes 10 to 30 s more."""
+    tried if by leave-one-out the free body predicts little better than none. free: it lay on foam or hung. try: always
+    tried, which takes 10 to 30 s more."""
 
     def __post_init__(self) -> None:
         if self.wall is not None and not 0 <= self.wall < float("inf"):
-            raise SimulationError(f"wall = {self.wall}: expected meters, or 0 for a body without a cavity")
+            raise SimulationError(
+                f"wall: expected meters, or 0 for a solid object, got {self.wall}", name="wall", value=self.wall
+            )
         if self.shapes < 1:
-            raise SimulationError(f"shapes = {self.shapes}: expected 1 or more")
+            raise SimulationError(f"shapes: expected 1 or more, got {self.shapes}", name="shapes", value=self.shapes)
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ class PipelineConfig:
     gain_model: GainModel = "auto"
     """How gains vary over the object."""
     body: BodyConfig = field(default_factory=BodyConfig)
-    """How the object's shape becomes bodies that vibrate."""
+    """How finite-element models are made of the object's shape."""
     scene: SceneConfig = field(default_factory=SceneConfig)
     """How views, Gaussians and features are made."""
     fit: FitConfig = field(default_factory=FitConfig)
@@ -148,12 +150,16 @@ class PipelineConfig:
     method: ExtractionMethod = "high-resolution"
     """How modes are found."""
     modes: int = 128
-    """Most modes to keep."""
+    """Modes to use at most."""
     time_zero: TimeZero | None = None
-    """Where sounds start; None leaves that to the capture's settings."""
+    """Where sounds start; None takes the capture's settings."""
     device: str | None = None
-    """What computes: cpu or cuda; None takes the GPU where there is one. Training gives the same up to rounding,
-    Gaussians do not; stages that are kept are used whichever device made them."""
+    """cpu or cuda; None takes the GPU where there is one. Training gives the same result up to rounding, Gaussians
+    differ; cached stages are used for either device."""
+
+
+def _scene_error(name: str, value: float | int, expected: str) -> SceneError:
+    return SceneError(f"{name}: expected {expected}, got {value}", name=name, value=value)
 
 
 PRESETS: Mapping[Preset, PipelineConfig] = {

@@ -43,7 +43,7 @@ class MadeFeatures:
 def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None], device: str | None = None) -> Encoder:
     """Return the encoder that the settings name, on a device as for `usable_device`.
 
-    Raises SceneError where either is not to be had.
+    Raises SceneError where either is not available.
     """
     if config.encoder == DESCRIPTORS:
         return ImageDescriptors()
@@ -53,13 +53,13 @@ def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None], device: s
     try:
         return DinoEncoder.load(DINO, longest=config.longest, device=place)
     except SceneError as error:
-        reason = str(error).split(":")[0]
-        tell(f"encoder: the built-in descriptors, for {DINO} is not to be had: {reason}")
+        reason = str(error).partition(";")[0]
+        tell(f"encoder: the built-in descriptors, since {DINO} is not available ({reason})")
         return ImageDescriptors()
 
 
 def settled(config: LiftConfig, *, tell: Callable[[str], None]) -> LiftConfig:
-    """Return the settings with the encoder that `auto` means here, which `tell` hears of if it is not DINOv2."""
+    """Return the settings with the encoder that `auto` means here; `tell` reports any other than DINOv2."""
     if config.encoder != AUTO:
         return config
     found = choose_encoder(config, tell=tell)

@@ -60,7 +60,7 @@ def fit_capture(
         points = features
         expect_on_object(capture.impacts, points.points)
     if len(train) < _FEW:
-        log(f"{len(train)} recordings tell little of how loud modes are between contacts; {_FEW} or more tell much")
+        log(f"expected {_FEW} recordings or more to predict gains between contacts well, got {len(train)}")
     # Before the modes: what is wrong with the object's shape shows in less time than they take.
     gains = estimator_for(
         config.gain_model,
@@ -141,8 +141,8 @@ def _points_of(capture: Capture, config: PipelineConfig, log: Callable[[str], No
     """Return the object's points: of its surface where there is one, else those that fill the contacts' box."""
     if capture.surface is None:
         log(
-            "the capture has no surface: points that fill the box of its contacts stand for the object. Photographs, a "
-            "video or Gaussians are used by avmsf reconstruct"
+            "expected a surface in the capture, got none: points that fill the bounding box of its contacts are used. "
+            "avmsf reconstruct uses photographs, a video or Gaussians"
         )
         return FeatureField.from_contacts(capture.impacts.contacts)
     return FeatureField.from_mesh(capture.surface, seed=config.fit.seed)
@@ -152,7 +152,7 @@ def _bodies(
     capture: Capture, config: PipelineConfig, cache: Path | None, log: Callable[[str], None]
 ) -> CandidateBodies:
     if capture.surface is None:
-        raise FitError("the capture has no mesh: add it to the folder as surface.obj")
+        raise FitError("surface: expected a mesh in the capture, got none; add surface.obj to it", name="surface")
     return candidate_bodies(capture.surface, config.body, impacts=capture.impacts, cache=cache, tell=log)
 
 

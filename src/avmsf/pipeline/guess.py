@@ -103,8 +103,9 @@ def expect_no_recordings(folder: Path) -> None:
     table = folder / TABLE
     if table.is_file() and len(read_cells(table)[0]) > 1:
         raise FitError(
-            f"--material guesses a field without recordings, but {table} lists some: leave --material out, or name the "
-            "mesh alone"
+            f"{table}: expected no recordings with --material, got some; leave --material out, or name the mesh",
+            file=table,
+            name="--material",
         )
 
 
@@ -116,8 +117,10 @@ def known_surface(place: Path, settings: CaptureSettings) -> Surface:
     surface = find_surface(place, settings)
     if surface is None:
         raise FitError(
-            f"{place}: expected a mesh ({', '.join(SURFACE_FILES)}), got none: name the mesh's file, or use avmsf "
-            "reconstruct for photographs"
+            f"{place}: expected a mesh ({', '.join(SURFACE_FILES)}), got none; name the mesh's file, or use avmsf "
+            "reconstruct for photographs",
+            file=place,
+            name="surface",
         )
     return surface
 
@@ -126,8 +129,10 @@ def _expect_meters(surface: Surface) -> None:
     extent = float((surface.vertices.amax(0) - surface.vertices.amin(0)).max())
     if not NARROWEST <= extent <= WIDEST:
         raise FitError(
-            f"expected a surface of {NARROWEST:g} to {WIDEST:g} m, got one of {extent:.3g} m: state its unit as "
-            "surface_unit in capture.toml"
+            f"surface: expected a size of {NARROWEST:g} to {WIDEST:g} m, got {extent:.3g} m; state its unit as "
+            "surface_unit in capture.toml",
+            name="surface_unit",
+            value=extent,
         )
 
 
@@ -144,8 +149,10 @@ def _body(
     if between is not None and config.wall is None:
         low, high = (1000 * each for each in between)
         raise FitError(
-            f"expected the thickness of the object's wall, which is {low:.2g} to {high:.2g} mm by its views and sets "
-            "its frequencies: state it in meters by --body.wall (0: it is solid)"
+            f"wall: expected the wall thickness, which sets the frequencies; give it in meters by --body.wall (0: "
+            f"solid; by the views {low:.2g} to {high:.2g} mm)",
+            name="wall",
+            value=between,
         )
     try:
         found = nominal_bodies(
@@ -155,7 +162,12 @@ def _body(
     except SimulationError as error:
         if config.wall:
             raise
-        raise SimulationError(f"{error}; a wall's thickness in meters is stated by --body.wall") from error
+        raise SimulationError(
+            f"{error}; give the wall thickness in meters by --body.wall",
+            file=error.file,
+            name="wall",
+            value=error.value,
+        ) from error
     return found.bodies[0]
 
 

@@ -47,13 +47,15 @@ class ObjectBodies:
             return self._shape(identifier)
         surface = self.dataset.capture(identifier).surface
         if surface is None or not len(surface.faces):
-            raise SceneError(f"{identifier}: the dataset holds no mesh of it; geometry from Gaussians needs none")
+            raise SceneError(
+                f"{identifier}: expected a mesh in the dataset, got none; take geometry from Gaussians", name=identifier
+            )
         return surface if self.geometry == "mesh" else roughened(surface, NOISE, seed=self.seed)
 
     def _shape(self, identifier: str) -> ObjectShape:
         seen = self.dataset.look(identifier)
         if seen is None:
-            raise SceneError(f"{identifier}: the dataset holds neither a mesh nor pictures of it, so it has no shape")
+            raise SceneError(f"{identifier}: expected a mesh or photographs in the dataset, got none", name=identifier)
         scene = replace(self.scene, views=replace(self.scene.views, source=ViewsConfig().source))
         stages = SceneStages(
             seen.folder, StageFolder(self.cache / identifier / "all views"), scene, settings=seen.settings

@@ -67,7 +67,7 @@ class ObjectLooks:
         """Return the stages from what shows an object. Raises SceneError where nothing does."""
         seen = self.dataset.look(identifier)
         if seen is None:
-            raise SceneError(f"{identifier}: the dataset holds neither a mesh nor pictures of it, so it has no looks")
+            raise SceneError(f"{identifier}: expected a mesh or photographs in the dataset, got none", name=identifier)
         config = replace(config, views=replace(config.views, count=views or 0))
         place = self.cache / identifier / ("all views" if views is None else f"{views} views")
         return SceneStages(seen.folder, StageFolder(place), config, settings=seen.settings, name=name)

@@ -124,14 +124,14 @@ def _reconstruct(
     shape = _shape(folder, capture, config, stages, settings=settings, listener=listener)
     method = finder_of(config)
     heard = {"impacts": train.digest(), "method": repr(method)}
-    listener.tell(f"modes: of {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
+    listener.tell(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
     found = stages.keep(MODES, heard, lambda path: extract_once(train, method, path, needed=True))
     modes = extract_once(train, method, found.path)
     basis = {**heard, "features": shape.digest, "fit": asdict(config.fit)}
 
     @once
     def bodies() -> CandidateBodies:
-        listener.tell("bodies: what the object may be behind its surface")
+        listener.tell("bodies: finite-element models of the object")
         cache = stages.folder / BODIES
         return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, tell=listener.tell)
 
@@ -200,7 +200,9 @@ def reconstruct_guess(
             if scene.source is not None and scene.source.kind in ("photographs", "video"):
                 raise SceneError(
                     f"{folder}: expected a mesh, or photographs with cameras in meters (transforms.json, COLMAP), got "
-                    f"{scene.source.kind} alone, from which the object's size and so its pitch are not known"
+                    f"{scene.source.kind} without the object's size",
+                    file=folder,
+                    value=scene.source.kind,
                 )
         shape, digest = object_shape(mesh, scene)
 
@@ -276,7 +278,8 @@ def _shape(
     if not scene or (bare and scene.source is not None and scene.source.kind == "mesh"):
         if capture.surface is None:
             listener.tell(
-                f"{folder} shows nothing of the object: points that fill the box of its contacts stand for it"
+                f"{folder}: expected views or a mesh, got none: points that fill the bounding box of the contacts are "
+                "used"
             )
             features = FeatureField.from_contacts(capture.impacts.contacts)
         else:
@@ -287,9 +290,9 @@ def _shape(
     if scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
         views = read_views(scene.views.path)
-        words = None if capture.surface is None else judge_outlines(capture.surface, views, settings)
-        if words is not None:
-            warnings.warn(words, CaptureWarning, stacklevel=2)
+        warning = None if capture.surface is None else judge_outlines(capture.surface, views, settings)
+        if warning is not None:
+            warnings.warn(warning, stacklevel=2)
         expect_contacts_in_outlines(capture.impacts.contacts, views, settings)
     features = load_features(scene.features.path)
     surface, digest = object_shape(capture.surface, scene)
@@ -361,7 +364,7 @@ def object_shape(found: Surface | None, scene: SceneStages | None) -> tuple[Call
     if scene is None:
 
         def unknown() -> ObjectShape:
-            raise SceneError("the folder holds neither a mesh nor pictures of the object, so its shape is unknown")
+            raise SceneError("surface: expected a mesh or views of the object in the folder, got none", name="surface")
 
         return unknown, ""
     return once(scene.shape), f"{scene.cloud.digest} {scene.views.digest}"
@@ -379,14 +382,14 @@ def keep_surface(stages: StageFolder, make: Callable[[], Surface | ObjectShape],
 
 
 def expect_on_object(impacts: Impacts, points: Float[Tensor, "points 3"], *, strict: bool = False) -> None:
-    """Say with `CaptureWarning` how far contacts lie off the object's points, and what mistake may explain it.
+    """Warn with `CaptureWarning` of contacts off the object's points, with the mistake that may explain it.
 
-    Raises `CaptureError` where they count another unit, where one lies farther off than the object is large, and, if
-    `strict`, where any lies off.
+    Raises `CaptureError` for contacts in another unit, for one farther off than the object is large, and, if `strict`,
+    for any off it. The `value` of both is the largest distance, meters.
     """
     placement = judge_placement(impacts.contacts, points)
-    words = placement.describe(impacts.names)
-    if words and (strict or placement.other_unit or float(placement.distances.max()) > placement.diagonal):
-        raise CaptureError(words)
+    words, distance = placement.describe(impacts.names), float(placement.distances.max())
+    if words and (strict or placement.other_unit or distance > placement.diagonal):
+        raise CaptureError(words, name="contacts", value=distance)
     if words:
-        warnings.warn(words, CaptureWarning, stacklevel=2)
+        warnings.warn(CaptureWarning(words, name="contacts", value=distance), stacklevel=2)

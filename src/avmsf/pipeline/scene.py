@@ -149,7 +149,7 @@ class SceneStages:
         source = (
             f"{len(views)} views"
             if masks_suffice(views)
-            else "pictures of the Gaussians, as fewer than 3 views have masks,"
+            else "images of the Gaussians, as fewer than 3 views have masks,"
         )
         self.listener.tell(f"shape: of {source} and {len(cloud)} Gaussians")
         shape = shape_of_cloud(cloud, views)
@@ -164,7 +164,8 @@ class SceneStages:
         if self.source is None:
             raise SceneError(
                 f"{self.folder}: expected photographs (transforms.json, a COLMAP model or a folder images/), a video, "
-                "a mesh (surface.obj, .ply, .glb, .stl) or Gaussians (splats.ply), found none of these"
+                "a mesh (surface.obj, .ply, .glb, .stl) or Gaussians (splats.ply), got none",
+                file=self.folder,
             )
         return self.source
 
@@ -177,8 +178,11 @@ class SceneStages:
         found = read_sparse_points(where, meters=self.settings.views_meters)
         if found is None:
             raise SceneError(
-                f"expected masks, or points of structure from motion, to start Gaussians from; {len(bare)} views "
-                f"({bare[0]}, ...) have no mask and there are no points: give masks, or leave their search on"
+                f"{where}: expected masks, or points of structure from motion, to initialize Gaussians, got "
+                f"{len(bare)} views without a mask ({bare[0]}, ...); give masks, or let them be computed",
+                file=where,
+                name="masks",
+                value=bare,
             )
         return StartPoints(found[0].float(), found[1].float() / 255)
 
@@ -201,7 +205,7 @@ class SceneStages:
         views = None if self.source is None else self.views
 
         def make(path: Path) -> None:
-            self.listener.tell(f"splat: the Gaussians of {splats.name}, as they are")
+            self.listener.tell(f"splat: the Gaussians of {splats.name}, unchanged")
             cloud = scaled(read_splats(splats), self.settings.views_meters)
             if views is not None:
                 cloud = keep_object(cloud, read_views(views.path), rasterizer=choose_rasterizer(cloud.centers.device))

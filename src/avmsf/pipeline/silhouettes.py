@@ -1,4 +1,4 @@
-"""Whether a mesh and photographs show one object in one frame: the mesh's outlines beside the photographs' masks."""
+"""Whether a mesh and photographs show one object in one frame: the mesh's outlines and the photographs' masks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +15,7 @@ from avmsf.capture.placement import FACTORS, WRONG_ROWS
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.capture.surface import Surface
 from avmsf.capture.texturedmesh import TexturedMesh
+from avmsf.capture.warning import CaptureWarning
 from avmsf.errors import CaptureError
 from avmsf.scene.points import farthest_points
 
@@ -62,12 +63,12 @@ def compare_outlines(
     return OutlineDifference(*np.median(np.array(found), axis=0).tolist())
 
 
-def judge_outlines(surface: Surface, views: Sequence[View], settings: CaptureSettings) -> str | None:
-    """Return what to tell of a mesh that differs from the masks of photographs by more than these are exact.
+def judge_outlines(surface: Surface, views: Sequence[View], settings: CaptureSettings) -> CaptureWarning | None:
+    """Return a warning for a mesh that differs from the masks of photographs by more than their accuracy.
 
-    None where they agree, and where no view has a mask; `settings` are those that both were read by. Raises
-    CaptureError where cameras and mesh count different units, with the one that fits: nothing that is made of the
-    photographs would lie on the mesh.
+    Its `value` is the difference as a part of the area. None where they agree, and where no view has a mask; `settings`
+    are those that both were read by. Raises CaptureError where cameras and mesh are in different units, with the factor
+    on the mesh that fits as `value`: nothing made of the photographs would lie on the mesh.
     """
     chosen = _masked(views)
     if not chosen or not len(surface.faces):
@@ -85,12 +86,16 @@ def judge_outlines(surface: Surface, views: Sequence[View], settings: CaptureSet
         if best.difference < min(SAME_SHAPE, 0.5 * found.difference):
             raise CaptureError(
                 f"expected the mesh and the cameras in one unit; {words}, and by {_percent(best.difference)} with the "
-                f"mesh times {factor:.4g}: {_mending(factor, settings)}"
+                f"mesh times {factor:.4g}; {_mending(factor, settings)}",
+                name="surface_unit",
+                value=factor,
             )
     size = f"{_percent(abs(found.size - 1))} {'larger' if found.size > 1 else 'smaller'}"
-    return (
-        f"{words}, {_percent(found.beyond)} beyond {MASK_PIXELS:g} pixels of the masks' edges, and the mesh is {size}: "
-        "are both of one object, in one unit and frame? The mesh is taken for the object's shape"
+    return CaptureWarning(
+        f"{words}, {_percent(found.beyond)} beyond {MASK_PIXELS:g} pixels of the masks' edges, and the mesh is {size}; "
+        "check that both are of one object, in one unit and frame (the mesh is used as the object's shape)",
+        name="surface",
+        value=found.difference,
     )
 
 
@@ -113,8 +118,10 @@ def expect_contacts_in_outlines(
     name = next((unit for unit, size in METRES.items() if abs(size / (factor * settings.meters) - 1) < 1e-6), None)
     mended = f'write unit = "{name}" in capture.toml' if name else "scale the contacts or the cameras"
     raise CaptureError(
-        f"expected contacts on the object that the photographs show; most lie outside of its outlines, and inside when "
-        f"multiplied by {factor:.4g}: {mended}"
+        f"unit: expected contacts on the object in the photographs, got most outside of its outlines, and inside when "
+        f"multiplied by {factor:.4g}; {mended}",
+        name="unit",
+        value=factor,
     )
 
 

@@ -58,7 +58,9 @@ def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["bes
     a frame of their own. Raises SceneError for more than one video, and for one or two photographs alone.
     """
     if not folder.is_dir():
-        raise SceneError(f"{folder}: there is no such folder; name the one with the photographs, the video or the mesh")
+        raise SceneError(
+            f"{folder}: expected a folder with photographs, a video or a mesh, got none; check the name", file=folder
+        )
     transforms = folder / "transforms.json"
     model = None if transforms.is_file() else find_model(folder)
     photographs = folder / "images" if (folder / "images").is_dir() else folder
@@ -73,12 +75,20 @@ def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["bes
         return Source("mesh", (surface, *beside), surface, folder)
     if len(images) >= FEWEST or (images and photographs != folder):
         if len(images) < FEWEST:
-            raise SceneError(f"{photographs}: expected {FEWEST} photographs or more, found {len(images)}: take more")
+            raise SceneError(
+                f"{photographs}: expected {FEWEST} photographs or more, got {len(images)}; take more",
+                file=photographs,
+                value=len(images),
+            )
         return Source("photographs", (*images, *masks), photographs, folder)
     videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
     if len(videos) > 1:
-        named_videos = ", ".join(path.name for path in videos)
-        raise SceneError(f"{folder}: expected one video of the object, found {named_videos}: leave one there")
+        names = [path.name for path in videos]
+        raise SceneError(
+            f"{folder}: expected one video of the object, got {', '.join(names)}; remove the others",
+            file=folder,
+            value=names,
+        )
     return Source("video", tuple(videos), videos[0], folder) if videos else None
 
 
@@ -137,7 +147,7 @@ def _photographed(folder: Path, config: ViewsConfig, *, meters: float, tell: Tel
     views = read_views(folder, longest=config.longest, meters=meters)
     bare = sum(view.mask is None for view in views)
     if config.masks and bare:
-        tell(f"views: {len(views)}, looking for the object in {bare} without a mask")
+        tell(f"views: {len(views)}, finding the object in {bare} without a mask")
         views = find_foreground(views)
     return views
 

@@ -50,7 +50,7 @@ class StageFolder:
         Hold it from the first stage until the last output is read: stages read each other's files. Raises
         FolderInUseError where another process, which is told `command`, holds it for longer than `wait` seconds.
         """
-        advice = ", or keep this one's stages in another folder (--cache)"
+        advice = ", or choose another folder by --cache"
         return write_lock(self.folder, "stages", command=command, wait=wait, advice=advice, parents=True)
 
     def path(self, name: str) -> Path:
@@ -97,13 +97,16 @@ class StageFolder:
 
     @contextmanager
     def _explaining(self, name: str) -> Iterator[None]:
-        """Let an OSError become a CaptureError that says what to do."""
+        """Turn an OSError into a CaptureError with advice."""
         try:
             yield
         except OSError as error:
+            reason = error.strerror or str(error)
+            path = self.path(name)
             raise CaptureError(
-                f"{self.path(name)}: cannot be read or replaced ({error.strerror or error}): {way_out(error)}, as by "
-                "--cache"
+                f"{path}: expected a readable and writable path, got {reason!r}; {way_out(error)} by --cache",
+                file=path,
+                value=reason,
             ) from error
 
 

@@ -38,24 +38,32 @@ class NumbaRasterizer:
 
 
 def _expect_plain(cloud: GaussianCloud, background: Float[Tensor, " 3"]) -> None:
-    named = [(f"the cloud's {each.name}", getattr(cloud, each.name)) for each in fields(cloud)]
-    for name, tensor in [*named, ("the background", background)]:
+    tensors = {each.name: getattr(cloud, each.name) for each in fields(cloud)}
+    for name, tensor in {**tensors, "background": background}.items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise SceneError(
-                f"expected float32 numbers on the CPU, found {name} in {str(tensor.dtype).removeprefix('torch.')} on "
-                f"{tensor.device}: convert it, or take the rasterizer that `choose_rasterizer` gives for that device"
+                f"{name}: expected float32 numbers on the CPU, got {str(tensor.dtype).removeprefix('torch.')} on "
+                f"{tensor.device}; convert it, or use the rasterizer of `choose_rasterizer` for that device",
+                name=name,
+                value=[str(tensor.dtype).removeprefix("torch."), str(tensor.device)],
             )
 
 
 def _fault(cloud: GaussianCloud, row: int) -> SceneError:
-    """Return the error that tells what is wrong with one Gaussian."""
+    """Return the error of one Gaussian."""
     for each in fields(cloud):
         values = getattr(cloud, each.name)[row].detach()
         if not bool(torch.isfinite(values).all()):
             return SceneError(
-                f"expected finite numbers, found {each.name} {values.tolist()} of Gaussian {row}: drop it with "
-                "`GaussianCloud.take`, and if training made it, lower the learning rate"
+                f"{each.name}, row {row}: expected finite numbers, got {values.tolist()}; remove the Gaussian with "
+                "`GaussianCloud.take`, or lower the learning rate if training made it",
+                row=row,
+                name=each.name,
+                value=values.tolist(),
             )
     return SceneError(
-        f"expected a rotation, found a quaternion of length 0 for Gaussian {row}: write 1, 0, 0, 0 for no rotation"
+        f"rotations, row {row}: expected a quaternion, got one of length 0; write 1, 0, 0, 0 for no rotation",
+        row=row,
+        name="rotations",
+        value=cloud.rotations[row].tolist(),
     )

@@ -23,8 +23,9 @@ class GsplatRasterizer:
             self._gsplat: Any = importlib.import_module("gsplat")
         except ImportError as error:
             raise SceneError(
-                f"expected gsplat, which renders on graphics cards, found that it cannot be imported ({error}): "
-                "pip install 'avmsf[gpu]', or render on the CPU"
+                f"expected the package gsplat to render on the GPU, got an import error ({error}); pip install "
+                "'avmsf[gpu]', or render on the CPU",
+                name="gsplat",
             ) from error
 
     def __call__(self, cloud: GaussianCloud, camera: Camera, *, background: Float[Tensor, " 3"]) -> Rendering:
@@ -36,8 +37,10 @@ class GsplatRasterizer:
         for name, tensor in (("cloud", centers), ("background", background)):
             if not _lies_on_card(tensor):
                 raise SceneError(
-                    f"expected a {name} on a CUDA device, found it on {tensor.device}: move it there, or take the "
-                    "rasterizer that `choose_rasterizer` gives for that device"
+                    f"{name}: expected a CUDA device, got {tensor.device}; move it, or use the rasterizer of "
+                    "`choose_rasterizer` for that device",
+                    name=name,
+                    value=str(tensor.device),
                 )
         painted, covered, found = self._gsplat.rasterization(
             means=centers,

@@ -45,7 +45,11 @@ class DinoEncoder:
         model was trained to have colors normalized with.
         """
         if longest is not None and longest < 1:
-            raise SceneError(f"longest = {longest}: expected the pixels of the longer side, such as 518")
+            raise SceneError(
+                f"longest: expected the pixels of the longer side, such as 518, got {longest}",
+                name="longest",
+                value=longest,
+            )
         self.model, self.name, self.longest = model.eval().requires_grad_(False), name, longest
         self._mean, self._deviation = torch.tensor(mean), torch.tensor(deviation)
 
@@ -119,15 +123,18 @@ def _fast_dtype(device: torch.device) -> torch.dtype:
 
 
 def _find(source: str | Path) -> tuple[Path, str]:
-    """Return the folder that holds a model, and what its features are to be called."""
+    """Return the folder that holds a model, and the name of its features."""
     folder = Path(source).expanduser()
     if folder.is_dir():
         return folder, f"DINOv2 from the folder {folder.resolve().name}"
     name = str(source)
     if name not in MODELS:
         raise SceneError(
-            f"{name}: expected a folder with {_CONFIG} and {_WEIGHTS}, or one of {', '.join(MODELS)}; found no such "
-            "folder: check the path"
+            f"{name}: expected a folder with {_CONFIG} and {_WEIGHTS}, or one of {', '.join(MODELS)}, got no such "
+            "folder; check the path",
+            file=folder,
+            name="encoder",
+            value=name,
         )
     return _from_hub(name), name
 
@@ -146,10 +153,11 @@ def _from_hub(name: str) -> Path:
         paths = [hf_hub_download(name, file, etag_timeout=HUB_SECONDS) for file in wanted]
     except Exception as error:  # the hub's client raises whatever the network beneath it does
         raise SceneError(
-            f"{name}: not in the cache of downloaded models, and it cannot be downloaded ({type(error).__name__}: "
-            f"{error}). Where there is a network, save {_CONFIG}, {_WEIGHTS} and {_PREPROCESSOR} from "
-            f"https://huggingface.co/{name}/tree/main into one FOLDER, copy it here, and say --encoder FOLDER; or use "
-            "the embedded encoder, --encoder descriptors, which needs no download"
+            f"{name}: expected a cached or downloadable model, got {type(error).__name__}: {error}; save {_CONFIG}, "
+            f"{_WEIGHTS} and {_PREPROCESSOR} from https://huggingface.co/{name}/tree/main in one FOLDER and use "
+            "--encoder FOLDER, or use --encoder descriptors, which needs no download",
+            name="encoder",
+            value=name,
         ) from error
     return Path(paths[0]).parent
 
@@ -159,37 +167,56 @@ def _load_model(folder: Path, device: torch.device, dtype: torch.dtype) -> nn.Mo
     lacking = [name for name in (_CONFIG, _WEIGHTS) if not (folder / name).is_file()]
     if lacking:
         raise SceneError(
-            f"{folder}: expected a DINOv2 model, found no {' and no '.join(lacking)}: copy {_CONFIG}, {_WEIGHTS} and "
-            f"{_PREPROCESSOR} of a model such as {MODELS[0]} there"
+            f"{folder}: expected a DINOv2 model, got no {' and no '.join(lacking)}; copy {_CONFIG}, {_WEIGHTS} and "
+            f"{_PREPROCESSOR} of a model such as {MODELS[0]} there",
+            file=folder,
+            name=lacking[0],
         )
     kind = read_settings(folder / _CONFIG, raising=SceneError).get("model_type")
     classes = {"dinov2": "Dinov2Model", "dinov2_with_registers": "Dinov2WithRegistersModel"}
     if kind not in classes:
-        raise SceneError(f"{folder / _CONFIG}: expected a model of type {' or '.join(classes)}, found {kind!r}")
+        raise SceneError(
+            f"{folder / _CONFIG}: expected a model of type {' or '.join(classes)}, got {kind!r}",
+            file=folder / _CONFIG,
+            name="model_type",
+            value=kind,
+        )
     try:
         model, report = getattr(transformers, classes[kind]).from_pretrained(
             folder, local_files_only=True, use_safetensors=True, dtype=dtype, output_loading_info=True
         )
     except Exception as error:  # whatever is wrong with the file, transformers and safetensors have their own errors
-        raise SceneError(f"{folder / _WEIGHTS}: cannot be loaded ({error}): copy the model's files again") from error
+        raise SceneError(
+            f"{folder / _WEIGHTS}: expected the model's weights, got a file that cannot be loaded ({error}); copy the "
+            "model's files again",
+            file=folder / _WEIGHTS,
+        ) from error
     # The mask token is for training alone. Any other weight would be left random.
     missing = sorted(name for name in report["missing_keys"] if not name.endswith("mask_token"))
     if missing:
         raise SceneError(
-            f"{folder / _WEIGHTS}: lacks {len(missing)} of the model's weights, {missing[0]} among them: it belongs to "
-            f"another {_CONFIG}; copy both from one model"
+            f"{folder / _WEIGHTS}: expected all of the model's weights, {len(missing)} are missing, such as "
+            f"{missing[0]}; copy it and {_CONFIG} from the same model",
+            file=folder / _WEIGHTS,
+            name=missing[0],
+            value=len(missing),
         )
     return model.to(device)
 
 
 def _constants(path: Path) -> tuple[Sequence[float], Sequence[float]]:
-    """Return the mean and deviation of colors that a preprocessor's file asks for, ImageNet's without one."""
+    """Return the mean and standard deviation of colors in a preprocessor's file, ImageNet's without one."""
     if not path.is_file():
         return IMAGENET_MEAN, IMAGENET_DEVIATION
     record = read_settings(path, raising=SceneError)
     found = record.get("image_mean", list(IMAGENET_MEAN)), record.get("image_std", list(IMAGENET_DEVIATION))
     if not all(isinstance(each, list) and len(each) == 3 and all(map(_is_number, each)) for each in found):
-        raise SceneError(f"{path}: expected image_mean and image_std of three numbers, found {found}: copy it again")
+        raise SceneError(
+            f"{path}: expected image_mean and image_std of three numbers, got {found}; copy it again",
+            file=path,
+            name="image_mean",
+            value=found,
+        )
     return found
 
 
@@ -203,7 +230,8 @@ def _transformers() -> Any:
         from transformers import Dinov2Model, Dinov2WithRegistersModel  # noqa: F401
     except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
         raise SceneError(
-            f"DINOv2 needs the package transformers, which cannot be imported ({error}): "
-            "pip install 'avmsf[vision]', or use the embedded encoder, --encoder descriptors"
+            f"expected the package transformers for DINOv2, got an import error ({error}); pip install "
+            "'avmsf[vision]', or use --encoder descriptors",
+            name="transformers",
         ) from error
     return transformers

@@ -40,14 +40,16 @@ class Encoder(Protocol):
 def unit_image(
     image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"],
 ) -> Float[Tensor, "height width 3"]:
-    """Return an image as float32 numbers from 0 to 1. Raises SceneError for numbers that no image holds."""
+    """Return an image as float32 numbers from 0 to 1. Raises SceneError for numbers outside of an image's range."""
     color = image.float() / 255 if image.dtype == torch.uint8 else image.float()
     lowest, highest = (float(color.min()), float(color.max())) if color.numel() else (float("nan"),) * 2
     # Renderings overshoot a little; a factor of 255 is a mistake.
     if not -1.0 <= lowest <= highest <= 2.0:
         raise SceneError(
-            f"expected an image of bytes or of numbers from 0 to 1, found {tuple(image.shape)} numbers from {lowest:g} "
-            f"to {highest:g}: divide by the largest value that a pixel can have"
+            f"expected an image of bytes or of numbers from 0 to 1, got {tuple(image.shape)} numbers from {lowest:g} "
+            f"to {highest:g}; divide by the largest value of a pixel",
+            name="image",
+            value=[lowest, highest],
         )
     return color.clamp(0.0, 1.0)
 

@@ -117,6 +117,7 @@ def _half_diagonal(points: Float[Tensor, "points 3"]) -> float:
 def _expect_extent(points: Float[Tensor, "points 3"]) -> None:
     if len(points) == 0 or not bool(torch.isfinite(points).all()) or _half_diagonal(points) == 0.0:
         raise FitError(
-            f"expected points that span an object, found {len(points)} points in one place or not finite: "
-            "a field needs to know where on the object a contact lies"
+            f"expected points that span an object, got {len(points)} at one position or not finite",
+            name="points",
+            value=len(points),
         )

@@ -48,7 +48,9 @@ def save_features(features: FeatureField, path: str | Path, *, report: dict[str,
         words = json.dumps(record, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise SceneError(
-            f"{path}: expected a report of finite numbers, words, lists and dicts ({error}): take the rest out of it"
+            f"{path}: expected a report of finite numbers, text, lists and dicts ({error}); remove other values",
+            file=path,
+            name="report",
         ) from error
     content = to_bytes(tensors, {_KEY: words})
     write_whole(path, lambda place: place.write_bytes(content), raising=SceneError)
@@ -57,8 +59,8 @@ def save_features(features: FeatureField, path: str | Path, *, report: dict[str,
 def load_features(path: str | Path) -> FeatureField:
     """Read features that `save_features` wrote.
 
-    Raises SceneError for a file that is missing, cut short, of another kind or of another format, and where its
-    tensors are not those that its header speaks of.
+    Raises SceneError for a file that is missing, truncated, of another kind or of another format, and where its tensors
+    are not those of its header.
     """
     path = Path(path)
     words, tensors = _read(path)
@@ -67,9 +69,12 @@ def load_features(path: str | Path) -> FeatureField:
     expected = {"points": (sizes["points"], 3), "features": (sizes["points"], sizes["dim"])}
     found = {name: tuple(tensor.shape) for name, tensor in tensors.items() if tensor.dtype == torch.float32}
     if found != expected or tensors.keys() != expected.keys():
+        shapes = {name: list(tensor.shape) for name, tensor in tensors.items()}
         raise SceneError(
-            f"{path}: expected the float32 tensors {expected}, found "
-            f"{ {name: tuple(tensor.shape) for name, tensor in tensors.items()} }: lift the features again"
+            f"{path}: expected the float32 tensors {expected}, got {shapes}; compute the features again",
+            file=path,
+            name="tensors",
+            value=shapes,
         )
     _expect_values(tensors, path)
     return FeatureField(tensors["points"], tensors["features"], record["encoder"])
@@ -86,7 +91,7 @@ def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
 
 
 def _understand(words: str, path: Path) -> dict[str, Any]:
-    """Return the header's record after looking at every entry of it."""
+    """Return the header's record after checking every entry of it."""
     try:
         record = parse_json(words)
         found, writer = record["format"], record["version"]
@@ -97,13 +102,18 @@ def _understand(words: str, path: Path) -> dict[str, Any]:
                 raise ValueError(f"sizes {record['sizes']}, encoder {record['encoder']!r}")
     except (ValueError, TypeError, KeyError) as error:
         raise SceneError(
-            f"{path}: expected the header of a file of features, found a damaged one ({type(error).__name__}: {error}):"
-            " lift them again"
+            f"{path}: expected the header of a file of features, got a damaged one ({type(error).__name__}: {error}); "
+            "compute the features again",
+            file=path,
+            name="header",
         ) from error
     if found != FORMAT:
         raise SceneError(
-            f"{path}: expected features of format {FORMAT}, found format {found}, written by avmsf {writer} (this is "
-            f"avmsf {version('avmsf')}): install avmsf {writer} or newer, or lift them again"
+            f"{path}: expected features of format {FORMAT}, got format {found}, written by avmsf {writer} (this is "
+            f"avmsf {version('avmsf')}); install avmsf {writer} or newer, or compute the features again",
+            file=path,
+            name="format",
+            value=found,
         )
     return record
 
@@ -111,7 +121,11 @@ def _understand(words: str, path: Path) -> dict[str, Any]:
 def _expect_values(tensors: dict[str, Tensor], path: Path) -> None:
     for name, tensor in tensors.items():
         if not tensor.numel() or not bool(torch.isfinite(tensor).all()):
-            raise SceneError(f"{path}: expected {name} to be finite numbers, found otherwise: lift the features again")
+            raise SceneError(
+                f"{path}: expected finite numbers as {name}, got others or none; compute the features again",
+                file=path,
+                name=name,
+            )
 
 
 def holds_features(path: Path) -> bool:

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from avmsf.capture.cameras import View
 from avmsf.compiled import compiled, lane_count, run_lanes
-from avmsf.errors import SceneError
-from avmsf.geometry.extent import masked_views, object_extent
+from avmsf.geometry.extent import masked_views, no_common_point, object_extent
 
 _ROUGH = 48
 """Voxels along the longest side of the first carving, which finds where the object is."""
@@ -141,7 +140,4 @@ def _normals(solid: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 def _expect_something(solid: np.ndarray, views: Sequence[View]) -> None:
     if not solid.any():
-        raise SceneError(
-            f"the masks of {len(views)} views have no place in common: check that cameras and masks belong together, "
-            "and that the poses are camera-to-world in the convention that their file promises"
-        )
+        raise no_common_point(len(views))

@@ -115,6 +115,8 @@ def _close(points: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
 def _expect_some(rows: Tensor, cloud: GaussianCloud) -> None:
     if not len(rows):
         raise SceneError(
-            f"none of {len(cloud)} Gaussians lies on the object: masks, cameras and Gaussians do not belong together, "
-            "or all are almost transparent"
+            f"expected Gaussians on the object, got none of {len(cloud)}; check that masks, cameras and Gaussians "
+            "belong together and that not all are almost transparent",
+            name="gaussians",
+            value=0,
         )

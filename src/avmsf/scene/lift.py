@@ -81,10 +81,11 @@ def supported(lifted: Lifted, views: Sequence[View]) -> Lifted:
     kept = (lifted.seen >= (LEAST_SEEN * held).clamp_min(1.0)) & (2 * lifted.past <= lifted.seen)
     if not bool(kept.any()):
         raise SceneError(
-            f"expected points on the surface that the views see, got {len(points)} of which "
-            f"{int((lifted.seen > 0).sum())} are seen, none by {100 * LEAST_SEEN:g} % of the views that have it in "
-            "their image and at its depth: check that cameras and points are in one frame and unit, and that the "
-            "Gaussians were fitted to these views"
+            f"expected points visible in {100 * LEAST_SEEN:g} % of the views that show their position, got none of "
+            f"{len(points)} ({int((lifted.seen > 0).sum())} are visible in any); check that cameras and points are in "
+            "one frame and unit, and that the Gaussians were fitted to these views",
+            name="points",
+            value=0,
         )
     features = replace(lifted.features, points=points[kept], features=lifted.features.features[kept])
     return replace(
@@ -150,7 +151,11 @@ def lift_points(
     described at a time. Raises SceneError where there is nothing to lift or where no view sees any point.
     """
     if not len(points) or not len(views):
-        raise SceneError(f"expected points and views to lift features from, found {len(points)} and {len(views)}")
+        raise SceneError(
+            f"expected points and views to lift features from, got {len(points)} and {len(views)}",
+            name="views" if len(points) else "points",
+            value=0,
+        )
     tally = _Tally(len(points))
     for done, view in enumerate(views, start=1):
         behind = points.new_zeros(len(points)) if reach is None else reach(view.camera)
@@ -172,13 +177,15 @@ class _Tally:
         self.sums, self.squares = torch.zeros(count, 0), torch.zeros(count, dtype=torch.float64)
 
     def add(self, found: Float[Tensor, "points dim"], weights: Float[Tensor, " points"], view: str) -> None:
-        """Add what one view says."""
+        """Add the features of one view."""
         if not self.sums.shape[1]:
             self.sums = torch.zeros(found.shape)
         if found.shape != self.sums.shape:
             raise SceneError(
-                f"{view}: expected {self.sums.shape[1]} features as in the views before, found {found.shape[1]}: an "
-                "encoder gives every image the same number"
+                f"{view}: expected {self.sums.shape[1]} features as in the other views, got {found.shape[1]}; use an "
+                "encoder of one dimension",
+                name=view,
+                value=found.shape[1],
             )
         self.seen += weights > 0
         self.weights += weights
@@ -190,9 +197,10 @@ class _Tally:
         known = self.seen > 0
         if not bool(known.any()):
             raise SceneError(
-                f"no view sees any of the {len(points)} points: the cameras look elsewhere, or the points and the "
-                "cameras are in different frames or units (meters?), or the masks are empty: look at one view's points "
-                "in its image"
+                f"expected points visible in the views, got none of {len(points)}; check that points and cameras are "
+                "in one frame and in meters, and that the masks are not empty",
+                name="points",
+                value=0,
             )
         means = self.sums[known] / self.weights[known][:, None]
         features = torch.zeros_like(self.sums)
@@ -219,8 +227,10 @@ def _describe(view: View, encoder: Encoder, *, inpainted: bool) -> Float[Tensor,
     found = encoder.describe(color)
     if found.ndim != 3 or not found.numel() or not bool(torch.isfinite(found).all()):
         raise SceneError(
-            f"{view.name}: expected finite features [dim, rows, columns] from the encoder {encoder.name!r}, found "
-            f"{list(found.shape)}" + (" with numbers that are not finite" if found.numel() else "")
+            f"{view.name}: expected finite features [dim, rows, columns] from the encoder {encoder.name!r}, got "
+            f"{list(found.shape)}" + (" with numbers that are not finite" if found.numel() else ""),
+            name=encoder.name,
+            value=list(found.shape),
         )
     return found.float()
 

@@ -61,8 +61,9 @@ def choose_backdrop(views: Sequence[View], config: SplatConfig) -> Backdrop:
     if config.background == "random":
         if not masked:
             raise SceneError(
-                "background = random takes masks, to know where the background is; no view has one: give masks or the "
-                "background's color"
+                "expected views with masks for a random background, got none; give masks or the background's color",
+                name="background",
+                value="random",
             )
         return Backdrop(None)
     pixels = np.concatenate([_outside(view) for view in views])
@@ -83,14 +84,15 @@ def prepare_photographs(views: Sequence[View], backdrop: Backdrop, *, halvings: 
     if backdrop.color is None:
         unknown = [view.name for view in kept if view.mask is None]
         if unknown:
-            warnings.warn(
-                f"{', '.join(unknown)}: without a mask, and the background is not plain: passed over",
-                CaptureWarning,
-                stacklevel=3,
-            )
+            message = f"views without a mask are not used, since the background is not plain: {', '.join(unknown)}"
+            warnings.warn(CaptureWarning(message, name="masks", value=unknown), stacklevel=3)
         kept = [view for view in kept if view.mask is not None]
     if len(kept) < 3:
-        raise SceneError(f"{len(kept)} of {len(views)} views can be fitted; expected 3 or more: give more views")
+        raise SceneError(
+            f"expected 3 or more views, got {len(kept)} of {len(views)} that can be used; give more",
+            name="views",
+            value=len(kept),
+        )
     return [Photograph.of(view, halvings=halvings) for view in kept]
 
 

@@ -65,14 +65,17 @@ def write_splats(cloud: GaussianCloud, path: str | Path) -> None:
 def read_splats(path: str | Path) -> GaussianCloud:
     """Read Gaussians from a 3DGS `.ply`, text or binary of either byte order, whatever else its vertices hold.
 
-    Raises `SceneError`, which says what the file is, for one that is missing, no .ply, a mesh, a point cloud, a
-    compressed form, cut short, or holds numbers that no Gaussian has.
+    Raises `SceneError`, which describes the file, for one that is missing, no .ply, a mesh, a point cloud, compressed
+    or truncated, or holds numbers that are not finite.
     """
     path = Path(path)
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise SceneError(f"{path}: cannot be read ({error.strerror or error}): name a .ply of Gaussians") from error
+        raise SceneError(
+            f"{path}: expected a .ply of Gaussians, got a file that cannot be read ({error.strerror or error})",
+            file=path,
+        ) from error
     header = _header(path, content)
     vertices = _expect_gaussians(path, header)
     table = _table(path, content, header, vertices)
@@ -82,28 +85,44 @@ def read_splats(path: str | Path) -> GaussianCloud:
         # Text and float64 hold numbers that are infinite as float32, in which Gaussians are computed.
         wrong = np.flatnonzero(~(np.abs(table[name]) <= np.finfo(np.float32).max))
         if len(wrong):
+            row, value = int(wrong[0]), float(table[name][wrong[0]])
             raise SceneError(
-                f"{path}: {name} of vertex {wrong[0]} is {table[name][wrong[0]]}, as are {len(wrong) - 1} others; "
-                "expected finite float32 numbers: export the Gaussians again, without the broken ones"
+                f"{path}, vertex {row}: expected a finite float32 number as {name}, got {value} ({len(wrong)} vertices "
+                "of this kind); export the Gaussians again without these",
+                file=path,
+                row=row,
+                name=name,
+                value=value,
             )
     columns = [_columns(table, names) for names in (_MIDDLE, _ROTATION, _SCALES, _OPACITY, _ZEROTH)]
     if not bool((columns[1] != 0).any(1).all()):
         row = int((columns[1] == 0).all(1).nonzero()[0])
-        raise SceneError(f"{path}: the rotation of vertex {row} is 0, 0, 0, 0; expected a quaternion: export it again")
+        raise SceneError(
+            f"{path}, vertex {row}: expected a quaternion as rotation, got 0, 0, 0, 0; export it again",
+            file=path,
+            row=row,
+            name=_ROTATION[0],
+            value=[0.0] * 4,
+        )
     rest = _columns(table, others)
     harmonics = torch.cat([columns[4][:, None], rest.reshape(len(rest), 3, count // 3).mT], dim=1).contiguous()
     return GaussianCloud(columns[0], columns[1], columns[2], columns[3][:, 0], harmonics)
 
 
 def _header(path: Path, content: bytes) -> _Header:
-    """Return what the header says. Raises SceneError for what is no .ply."""
+    """Return the parsed header. Raises SceneError for other files than .ply."""
     end = content.find(b"end_header", 0, _LONGEST_HEADER)
     line_end = content.find(b"\n", end, end + len(b"end_header") + 3)
     if not content.startswith(b"ply") or end < 0 or line_end < 0:
-        found = "its header does not end" if content.startswith(b"ply") else f"it begins with {content[:12]!r}"
-        raise SceneError(f"{path}: this is no .ply file, {found}: name a .ply of Gaussians as 3DGS writes it")
+        found = "a header without an end" if content.startswith(b"ply") else f"a file that begins with {content[:12]!r}"
+        raise SceneError(
+            f"{path}: expected a .ply of Gaussians as 3DGS writes it, got {found}",
+            file=path,
+            name="header",
+            value=content[:12],
+        )
     order, elements = None, list[_Element]()
-    for line in content[:end].decode("latin-1").splitlines()[1:]:
+    for row, line in enumerate(content[:end].decode("latin-1").splitlines()[1:], start=2):
         match line.split():
             case ["format", word, *_] if word in _ORDERS:
                 order = word
@@ -116,9 +135,19 @@ def _header(path: Path, content: bytes) -> _Header:
             case ["comment", *_] | ["obj_info", *_] | []:
                 pass
             case _:
-                raise SceneError(f"{path}: the line {line!r} of its header is not .ply 1.0: export the file again")
+                raise SceneError(
+                    f"{path}, row {row}: expected a header line of .ply 1.0, got {line!r}; export the file again",
+                    file=path,
+                    row=row,
+                    name="header",
+                    value=line,
+                )
     if order is None:
-        raise SceneError(f"{path}: its header names no format, ascii or binary: export the file again")
+        raise SceneError(
+            f"{path}: expected a format in the header, ascii or binary, got none; export the file again",
+            file=path,
+            name="format",
+        )
     return _Header(order, tuple(elements), line_end + 1)
 
 
@@ -127,13 +156,16 @@ def _with(element: _Element, name: str, kind: str) -> _Element:
 
 
 def _expect_gaussians(path: Path, header: _Header) -> _Element:
-    """Return the element that holds the Gaussians. Raises SceneError, which says what the file is instead."""
+    """Return the element that holds the Gaussians. Raises SceneError, which describes the file, for other files."""
     named = {element.name: element for element in header.elements}
     names = [name for element in header.elements for name, _ in element.properties]
     if any(name.startswith("packed_") for name in names):
         raise SceneError(
-            f"{path}: these are Gaussians in a compressed form ({', '.join(named)}); expected the plain 3DGS .ply: "
-            "export it uncompressed"
+            f"{path}: expected uncompressed Gaussians as 3DGS writes them, got compressed ones ({', '.join(named)}); "
+            "export them uncompressed",
+            file=path,
+            name="compression",
+            value=list(named),
         )
     vertices = named.get("vertex")
     found = [] if vertices is None else [name for name, _ in vertices.properties]
@@ -143,30 +175,55 @@ def _expect_gaussians(path: Path, header: _Header) -> _Element:
         rest = sorted(name for name in found if name.startswith("f_rest_"))
         if len(rest) not in degrees or rest != sorted(f"f_rest_{place}" for place in range(len(rest))):
             raise SceneError(
-                f"{path}: {len(rest)} coefficients f_rest_*; expected 0, 9, 24 or 45, for harmonics of degree 0 to 3"
+                f"{path}: expected 0, 9, 24 or 45 coefficients f_rest_* (degrees 0 to 3), got {len(rest)}",
+                file=path,
+                name="f_rest",
+                value=len(rest),
             )
         if not vertices.count:
-            raise SceneError(f"{path}: it holds no Gaussians, 0 vertices: splat the object again")
+            raise SceneError(
+                f"{path}: expected Gaussians, got none; fit them to the views again", file=path, name="vertex", value=0
+            )
         return vertices
     if "opacity" in found or "f_dc_0" in found:
-        raise SceneError(f"{path}: its Gaussians lack {', '.join(missing)}; expected the properties that 3DGS writes")
+        raise SceneError(
+            f"{path}: expected the properties that 3DGS writes, got Gaussians without {', '.join(missing)}",
+            file=path,
+            name=missing[0],
+            value=missing,
+        )
     if "face" in named and named["face"].count:
         raise SceneError(
-            f"{path}: this is a mesh of {named['face'].count} faces and not Gaussians: use it as the capture's surface"
+            f"{path}: expected Gaussians, got a mesh of {named['face'].count} faces; use it as the capture's surface",
+            file=path,
+            name="face",
+            value=named["face"].count,
         )
     if vertices is not None and {"x", "y", "z"} <= set(found):
         raise SceneError(
-            f"{path}: this is a point cloud of {vertices.count} points and not Gaussians: use it as the capture's "
-            "surface, or start splatting from its points"
+            f"{path}: expected Gaussians, got a point cloud of {vertices.count} points; use it as the capture's "
+            "surface, or as initial points",
+            file=path,
+            name="vertex",
+            value=vertices.count,
         )
-    raise SceneError(f"{path}: a .ply of {', '.join(named) or 'nothing'}; expected the Gaussians that 3DGS writes")
+    raise SceneError(
+        f"{path}: expected the Gaussians that 3DGS writes, got a .ply of {', '.join(named) or 'nothing'}",
+        file=path,
+        name="elements",
+        value=list(named),
+    )
 
 
 def _table(path: Path, content: bytes, header: _Header, vertices: _Element) -> np.ndarray:
-    """Return the vertices, one field a property. Raises SceneError where some are missing."""
+    """Return the vertices, one field for each property. Raises SceneError where some are missing."""
     before = header.elements[: header.elements.index(vertices)]
     if any(kind == "list" for element in (*before, vertices) for _, kind in element.properties):
-        raise SceneError(f"{path}: lists come before or in its vertices; expected plain numbers: export it with 3DGS")
+        raise SceneError(
+            f"{path}: expected single numbers before and in the vertices, got lists; export it with 3DGS",
+            file=path,
+            name="list",
+        )
     if header.order == "ascii":
         return _text_table(path, content[header.length :], before, vertices)
     mark = _ORDERS[header.order]
@@ -187,7 +244,7 @@ def _text_table(path: Path, content: bytes, before: tuple[_Element, ...], vertic
     try:
         values = np.array(words, dtype="S").astype(np.float64).reshape(vertices.count, width)
     except ValueError as error:
-        raise SceneError(f"{path}: expected numbers in its vertices, found something else: {error}") from error
+        raise SceneError(f"{path}: expected numbers in the vertices ({error})", file=path, name="vertex") from error
     table = np.empty(vertices.count, [(name, "f8") for name, _ in vertices.properties])
     for place, (name, _) in enumerate(vertices.properties):
         table[name] = values[:, place]
@@ -196,7 +253,10 @@ def _text_table(path: Path, content: bytes, before: tuple[_Element, ...], vertic
 
 def _short(path: Path, found: int, expected: int) -> SceneError:
     return SceneError(
-        f"{path}: the file ends after {found} of its {expected} vertices, it was cut short: copy or export it again"
+        f"{path}: expected {expected} vertices, got {found}; the file is truncated; copy or export it again",
+        file=path,
+        row=found,
+        value=found,
     )
 
 

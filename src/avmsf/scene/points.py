@@ -110,15 +110,17 @@ def nearest_points(
 def cluster(points: Float[Tensor, "points 3"], count: int, *, iterations: int = 100) -> Clusters:
     """Return `count` groups of the points by k-means: Lloyd's iteration from farthest points, until no label changes.
 
-    The seeds leave nothing to chance. A group that loses its last point starts anew from the point that is farthest
-    from its center. Raises FitError where the points have fewer than `count` different places.
+    The result is deterministic. A group that loses its last point restarts at the point that is farthest from its
+    center. Raises FitError where the points have fewer than `count` different positions.
     """
     places = points.detach().double().cpu()
     distinct = len(torch.unique(places, dim=0)) if len(places) else 0
     if not 1 <= count <= distinct:
         raise FitError(
-            f"{count} clusters were asked of points at {distinct} different places; ask for 1 to {distinct} clusters, "
-            "or give more points"
+            f"expected 1 to {distinct} clusters, the number of different positions, got {count}; reduce it or give "
+            "more points",
+            name="count",
+            value=count,
         )
     centers = places[farthest_points(places, count)]
     labels = nearest_points(centers, places)[:, 0]
@@ -141,8 +143,9 @@ def sample_surface(
     mesh = trimesh.Trimesh(vertices.double().cpu().numpy(), faces.cpu().numpy(), process=False)
     if not (math.isfinite(mesh.area) and mesh.area > 0.0):
         raise CaptureError(
-            f"a surface of {len(vertices)} vertices and {len(faces)} faces has an area of {mesh.area:g} m^2; "
-            "points can only be drawn from triangles that have one"
+            f"expected a surface with an area, got {mesh.area:g} m² of {len(vertices)} vertices, {len(faces)} faces",
+            name="surface",
+            value=float(mesh.area),
         )
     seed = int(torch.randint(2**31 - 1, (1,), generator=generator))
     places, rows = trimesh.sample.sample_surface(mesh, count, seed=seed)
@@ -165,7 +168,9 @@ def lattice(contacts: Float[Tensor, "contacts 3"], count: int) -> Float[Tensor, 
     wide = [side > 1e-3 * longest for side in extent]
     corners = 2 ** sum(wide)
     if count < corners:
-        raise EvaluationError(f"{count} points cannot fill a box of {corners} corners; ask for at least {corners}")
+        raise EvaluationError(
+            f"expected at least {corners} points, the corners of the box, got {count}", name="count", value=count
+        )
     numbers = [1, 1, 1]
     for spacing in (longest / steps for steps in range(1, count + 1)):
         finer = [1 + max(1, round(side / spacing)) if on else 1 for side, on in zip(extent, wide, strict=True)]
@@ -203,6 +208,8 @@ def _distances(places: Float[Tensor, "points 3"], row: int) -> Float[Tensor, " p
 
 def _expect_rows(points: Float[Tensor, "points 3"], count: int, start: int) -> None:
     if not 1 <= count <= len(points):
-        raise EvaluationError(f"{count} points were asked of {len(points)}; ask for 1 to {len(points)}")
+        raise EvaluationError(f"expected 1 to {len(points)} points, got {count}", name="count", value=count)
     if not 0 <= start < len(points):
-        raise EvaluationError(f"there is no point {start} among {len(points)}; they are numbered from 0")
+        raise EvaluationError(
+            f"start: expected a point from 0 to {len(points) - 1}, got {start}", name="start", value=start
+        )

@@ -54,11 +54,17 @@ def choose_rasterizer(device: torch.device | str) -> Rasterizer:
 
         return NumbaRasterizer()
     if kind != "cuda":
-        raise SceneError(f"expected a device of kind 'cpu' or 'cuda', found {str(device)!r}: move the cloud to one")
+        raise SceneError(
+            f"device: expected cpu or cuda, got {str(device)!r}; move the Gaussians to one",
+            name="device",
+            value=str(device),
+        )
     if not torch.cuda.is_available():
         raise SceneError(
-            "expected a CUDA device, found none that this torch can use: choose the device 'cpu', or install the torch "
-            "that fits your graphics card"
+            "device: expected a CUDA device that PyTorch can use, got none; choose cpu, or install the PyTorch build "
+            "for your GPU",
+            name="device",
+            value=str(device),
         )
     from avmsf.scene.cuda import GsplatRasterizer
 

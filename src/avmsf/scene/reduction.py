@@ -12,10 +12,12 @@ def reduce(features: FeatureField, dim: int, *, whitening: float = 1.0) -> Featu
     `whitening` says how even they become: at 1 each has variance 1 over the points; at 0 they keep the proportions
     that they have, the first having variance 1. A component's sign is that of its largest loading, so that the same
     features give the same components anywhere. Fewer come out where the features vary in fewer directions. Raises
-    SceneError for features that are all alike.
+    SceneError for features that are all equal.
     """
-    if dim < 1 or not 0.0 <= whitening <= 1.0:
-        raise SceneError(f"expected dim of at least 1 and whitening from 0 to 1, found {dim} and {whitening:g}")
+    if dim < 1:
+        raise SceneError(f"dim: expected at least 1, got {dim}", name="dim", value=dim)
+    if not 0.0 <= whitening <= 1.0:
+        raise SceneError(f"whitening: expected 0 to 1, got {whitening:g}", name="whitening", value=whitening)
     values = features.features.double()
     values = values - values.mean(0)
     variances, directions = torch.linalg.eigh(values.T @ values / len(values))
@@ -24,8 +26,10 @@ def reduce(features: FeatureField, dim: int, *, whitening: float = 1.0) -> Featu
     kept = min(dim, int((variances > 1e-10 * variances[0]).sum()))
     if not float(variances[0]) > 0:
         raise SceneError(
-            f"all {len(values)} features of the encoder {features.encoder!r} are alike: they tell no place of the "
-            "object from another; use another encoder, or geometry alone"
+            f"expected features that differ over the object, got {len(values)} equal ones from the encoder "
+            f"{features.encoder!r}; use another encoder, or only positions",
+            name=features.encoder,
+            value=len(values),
         )
     variances, directions = variances[:kept], directions[:, :kept]
     largest = directions.gather(0, directions.abs().argmax(0, keepdim=True))
@@ -41,7 +45,11 @@ def resize(features: FeatureField, size: float) -> FeatureField:
     """
     length = float(features.features.double().square().sum(1).mean().sqrt())
     if not length > 0:
-        raise SceneError(f"all features of the encoder {features.encoder!r} are zero: they tell nothing; use another")
+        raise SceneError(
+            f"expected features other than zero, got zeros from the encoder {features.encoder!r}; use another",
+            name=features.encoder,
+            value=0.0,
+        )
     return FeatureField(features.points, features.features * (size / length), features.encoder)
 
 

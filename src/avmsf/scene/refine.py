@@ -47,9 +47,8 @@ def refine(
     SceneError for fewer than one iteration or angle.
     """
     if iterations < 1 or angles < 1:
-        raise SceneError(
-            f"expected at least one iteration and one angle to refine with, found {iterations} and {angles}"
-        )
+        name, value = ("iterations", iterations) if iterations < 1 else ("angles", angles)
+        raise SceneError(f"{name}: expected at least 1, got {value}", name=name, value=value)
     orbits = _orbits(features.points, symmetries, angles=angles, reach=reach, tell=tell or _silent)
     pools = [_pool(rows, found) for rows, found in orbits]
     values = features.features.detach().cpu().numpy()
@@ -67,9 +66,7 @@ def orbit_spread(features: FeatureField, symmetries: Symmetries, *, angles: int 
     Points in whose orbit nothing else was seen do not count. Raises SceneError without symmetries.
     """
     if not symmetries:
-        raise SceneError(
-            "expected symmetries to measure the spread over their orbits, found none: nothing is symmetric"
-        )
+        raise SceneError("expected symmetries, got none", name="symmetries", value=0)
     values = features.features.detach().cpu().double()
     total = float(values.var(dim=0, correction=0).sum())
     within, counted = 0.0, 0

@@ -96,7 +96,7 @@ def splat(
                 progress(SplatProgress(run.step, config.steps, loss, likeness, elapsed, run.cloud))
             keeper.look(run)
     except KeyboardInterrupt:
-        # Amid a step's changes there is nothing to keep but what was saved before.
+        # During a step's changes, only the state saved before it is consistent.
         if run.whole:
             keeper.save(run)
         raise
@@ -105,17 +105,17 @@ def splat(
 
 
 class _Keeper:
-    """Saves a run's state now and then."""
+    """Saves a run's state at intervals."""
 
     def __init__(self, path: Path | None, fingerprint: str) -> None:
         self.path, self.saved_at = path, time.monotonic()
-        self.identity = {"view, start or setting": fingerprint}
+        self.identity = {"view, initial point or setting": fingerprint}
 
     def resume(self, run: SplatRun) -> None:
         state = (
             None
             if self.path is None
-            else read_checkpoint(self.path, self.identity, what="a splatting", raising=SceneError)
+            else read_checkpoint(self.path, self.identity, what="fit of Gaussians", raising=SceneError)
         )
         if state is not None:
             run.resume(state["run"])
@@ -131,7 +131,8 @@ class _Keeper:
             write_checkpoint(self.path, {"run": run.state()}, self.identity, raising=SceneError)
         except SceneError as error:
             # A full disk costs the checkpoint, not the run.
-            warnings.warn(f"splatting goes on without a new checkpoint: {error}", AvmsfWarning, stacklevel=3)
+            message = f"the fit of the Gaussians continues without a new checkpoint: {error}"
+            warnings.warn(AvmsfWarning(message, file=error.file, value=error.value), stacklevel=3)
         self.saved_at = time.monotonic()
 
 

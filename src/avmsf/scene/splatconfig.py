@@ -1,4 +1,4 @@
-"""How Gaussians are fitted to views: one flat record, which is the command line's options too."""
+"""Settings of the fit of Gaussians to views: one flat record, which is also the command line's options."""
 
 import math
 from dataclasses import dataclass
@@ -37,94 +37,98 @@ _PARTS = ("coarse_until", "degree_every", "densify_from", "densify_until", "leas
 
 @dataclass(frozen=True)
 class SplatConfig:
-    """Settings of a splatting. The defaults are what a short run on a processor does best with."""
+    """Settings of the fit of Gaussians to views. The defaults suit a short run on a CPU."""
 
     steps: int = 2000
-    """Steps of the optimizer, one view each; all schedules stretch with them."""
+    """Optimizer steps, one view each; all schedules scale with them."""
     degree: Literal[0, 1, 2, 3] = 2
-    """Degree of the spherical harmonics: how a color depends on the direction of view."""
+    """Degree of the spherical harmonics, by which a color depends on the viewing direction."""
     start_points: int = 15_000
-    """Points on the visual hull that the Gaussians start at."""
+    """Points on the visual hull at which Gaussians are initialized."""
     start_scale: float = 1.0
-    """First standard deviation of a Gaussian, in mean distances to its three nearest neighbors."""
+    """Initial standard deviation of a Gaussian, in mean distances to its three nearest neighbors."""
     start_opacity: float = 0.5
-    """First opacity."""
+    """Initial opacity."""
     gaussians: int = 30_000
-    """Gaussians at most."""
+    """Maximum number of Gaussians."""
     dissimilarity_weight: float = 0.2
-    """Part of the loss on the image that is 1 - SSIM; the rest is the absolute difference (3DGS: .2)."""
+    """Weight of 1 - SSIM in the loss on the image; the rest is the absolute difference (3DGS: .2)."""
     mask_weight: float = 0.1
     """Weight of the absolute difference between coverage and mask, where masks are known."""
     flat_weight: float = 0.1
-    """Weight of the Gaussians' mean thickness, their smallest scale, in half diagonals: thick ones sink below the
-    surface, for none may stand out from the object's outline."""
+    """Weight of the Gaussians' mean thickness, their smallest scale, in half diagonals of the object. Without it, thick
+    Gaussians lie below the surface, since none may extend beyond the object's outline."""
     start_flatness: float = 0.3
-    """First thickness of a Gaussian whose normal is known, in parts of its width."""
+    """Initial thickness of a Gaussian whose normal is known, relative to its width."""
     background: tuple[float, float, float] | Literal["found", "random"] = "found"
-    """Red, green, blue behind the object, 0 to 1. `random` puts the masked object before another color every step;
-    `found` takes the color around the masks where it is plain, and `random` where it is not."""
+    """Red, green, blue behind the object, 0 to 1. `random` uses another color behind the masked object every step;
+    `found` uses the color around the masks if it is plain, else `random`."""
     halvings: int = 2
-    """How often the first images are halved."""
+    """How often the images are halved in size at the start."""
     coarse_until: float = 0.5
-    """Part of the steps by which the images have come to full size, in equal spans."""
+    """Fraction of the steps after which the images have full size."""
     degree_every: float = 0.1
-    """Part of the steps after which the harmonics gain a degree."""
+    """Fraction of the steps after which the degree of the harmonics increases by one."""
     center_rate: float = 6e-3
-    """Adam's step of the centers at the start, in half diagonals of the object's bounding box."""
+    """Initial learning rate of the centers, in half diagonals of the object's bounding box."""
     final_center_rate: float = 0.02
-    """Part of it that is left at the end; it falls exponentially."""
+    """Final learning rate of the centers relative to the initial one; it decays exponentially."""
     rotation_rate: float = 5e-3
-    """Adam's step of the quaternions."""
+    """Learning rate of the quaternions."""
     scale_rate: float = 2e-2
-    """Adam's step of the logarithms of the scales."""
+    """Learning rate of the logarithms of the scales."""
     opacity_rate: float = 0.1
-    """Adam's step of the opacities' logits."""
+    """Learning rate of the opacities' logits."""
     color_rate: float = 1e-2
-    """Adam's step of the harmonics of degree 0."""
+    """Learning rate of the harmonics of degree 0."""
     shade_rate: float = 1e-3
-    """Adam's step of the harmonics above."""
+    """Learning rate of the harmonics of higher degrees."""
     final_rate: float = 0.5
-    """Part of these steps that is left at the end; they fall exponentially."""
+    """Final value of these learning rates relative to the initial one; they decay exponentially."""
     densify_from: float = 0.05
-    """Part of the steps after which Gaussians are first added and removed."""
+    """Fraction of the steps after which Gaussians are first added and removed."""
     densify_until: float = 0.7
-    """Part of the steps after which no more are added."""
+    """Fraction of the steps after which no more are added."""
     densify_every: int = 100
     """Steps between additions."""
     growth: float = 2e-4
-    """Mean slope of the loss by a Gaussian's place in the image, in half images, above which it is doubled."""
+    """Mean gradient of the loss by a Gaussian's position in the image, in half images, above which it is doubled."""
     large: float = 0.01
     """Largest scale, in half diagonals, up to which a doubled Gaussian is copied; above, it is split."""
     least_opacity: float = 0.1
     """Opacity below which a Gaussian is removed."""
     reset_every: int = 0
-    """Steps between resets of all opacities to twice the least; 0 never resets them."""
+    """Steps between resets of all opacities to twice `least_opacity`; 0 never resets them."""
     dissent: float = 0.05
-    """Part of the views that may say otherwise about what belongs to the object: wrong masks."""
+    """Fraction of the views whose masks may be wrong."""
     seed: int = 0
-    """Start of all chance: the order of the views, backgrounds and splits."""
+    """Seed of the order of the views, backgrounds and splits."""
 
     def __post_init__(self) -> None:
         for name, least in _LEAST.items():
             value = getattr(self, name)
             if not least <= value < math.inf:
-                raise SceneError(f"{name} = {value}: expected {least} or more")
+                raise _unexpected(name, value, f"{least} or more")
         for name in _RATES:
             value = getattr(self, name)
             if not 0 < value < math.inf:
-                raise SceneError(f"{name} = {value}: expected more than 0")
+                raise _unexpected(name, value, "more than 0")
         for name in _PARTS:
             value = getattr(self, name)
             if not 0 <= value <= 1:
-                raise SceneError(f"{name} = {value}: expected 0 to 1")
+                raise _unexpected(name, value, "0 to 1")
         if self.degree not in (0, 1, 2, 3):
-            raise SceneError(f"degree = {self.degree}: expected 0, 1, 2 or 3")
+            raise _unexpected("degree", self.degree, "0, 1, 2 or 3")
         if self.seed >= 2**63:
-            raise SceneError(f"seed = {self.seed}: expected less than 2^63")
+            raise _unexpected("seed", self.seed, "less than 2^63")
         if not 0 < self.start_opacity < 1:
-            raise SceneError(f"start_opacity = {self.start_opacity}: expected more than 0 and less than 1")
+            raise _unexpected("start_opacity", self.start_opacity, "more than 0 and less than 1")
         if isinstance(self.background, str):
             if self.background not in ("found", "random"):
-                raise SceneError(f"background = {self.background!r}: expected found, random or three numbers")
+                raise _unexpected("background", self.background, "found, random or three numbers")
         elif not all(0 <= value <= 1 for value in self.background):
-            raise SceneError(f"background = {self.background}: expected red, green and blue from 0 to 1")
+            raise _unexpected("background", self.background, "red, green and blue from 0 to 1")
+
+
+def _unexpected(name: str, value: object, expected: str) -> SceneError:
+    return SceneError(f"{name}: expected {expected}, got {value!r}", name=name, value=value)

@@ -84,8 +84,11 @@ class SplatRun:
         value = float(loss.detach())
         if not math.isfinite(value):
             raise SceneError(
-                f"splatting diverged, its loss at step {self.step} is {value}: lower center_rate, scale_rate and "
-                "opacity_rate"
+                f"expected a finite loss, got {value} at step {self.step}; lower center_rate, scale_rate and "
+                "opacity_rate",
+                row=self.step,
+                name="loss",
+                value=value,
             )
         self.whole = False
         if growing:
@@ -215,8 +218,11 @@ class SplatRun:
         count = len(self.parameters["centers"])
         if count < 4:
             raise SceneError(
-                f"{count} Gaussians are left at step {self.step}: the views and cameras contradict one another, or the "
-                "start lies off the object; check the cameras, or lower least_opacity"
+                f"expected at least 4 Gaussians, got {count} at step {self.step}; check the cameras and that the "
+                "initial points are on the object, or lower least_opacity",
+                row=self.step,
+                name="gaussians",
+                value=count,
             )
         self.density = Density.none(self.cloud)
 

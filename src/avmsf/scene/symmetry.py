@@ -175,14 +175,14 @@ def _numbers(values: Float[Tensor, " 3"]) -> str:
 def _entries(stored: Mapping[str, Any], name: str) -> list[tuple[Mapping[str, Any], str]]:
     entries = stored.get(name) if isinstance(stored, Mapping) else None
     if not isinstance(entries, Sequence) or not all(isinstance(each, Mapping) for each in entries):
-        raise SceneError(f"symmetries: expected a list {name!r} of entries, found {entries!r}: find them again")
-    return [(each, f"{name}[{number}]") for number, each in enumerate(entries)]
+        raise _damaged("symmetries", name, "a list of entries", entries)
+    return [(each, f"symmetries.{name}[{number}]") for number, each in enumerate(entries)]
 
 
 def _number(entry: Mapping[str, Any], name: str, place: str) -> float:
     value = entry.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise SceneError(f"symmetries: {place}: expected a number {name!r}, found {value!r}: find them again")
+        raise _damaged(place, name, "a number", value)
     return float(value)
 
 
@@ -190,24 +190,24 @@ def _vector(entry: Mapping[str, Any], name: str, place: str) -> Float[Tensor, " 
     value = entry.get(name)
     numbers = value if isinstance(value, Sequence) and not isinstance(value, str) else []
     if len(numbers) != 3 or not all(isinstance(each, int | float) and math.isfinite(each) for each in numbers):
-        raise SceneError(f"symmetries: {place}: expected three numbers {name!r}, found {value!r}: find them again")
+        raise _damaged(place, name, "three numbers", value)
     return torch.tensor(numbers, dtype=torch.float64)
 
 
 def _unit(entry: Mapping[str, Any], name: str, place: str) -> Float[Tensor, " 3"]:
     vector = _vector(entry, name, place)
     if abs(float(vector.norm()) - 1.0) > 1e-6:
-        raise SceneError(
-            f"symmetries: {place}: expected a unit vector {name!r}, found {vector.tolist()}: find them again"
-        )
+        raise _damaged(place, name, "a unit vector", vector.tolist())
     return vector
 
 
 def _order(entry: Mapping[str, Any], place: str) -> int | None:
     value = entry.get("order")
     if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 2):
-        raise SceneError(
-            f"symmetries: {place}: expected an order of 2 or more, or none for any angle, found {value!r}: find them "
-            "again"
-        )
+        raise _damaged(place, "order", "2 or more, or null for any angle", value)
     return value
+
+
+def _damaged(place: str, name: str, expected: str, value: Any) -> SceneError:
+    name = f"{place}.{name}"
+    return SceneError(f"{name}: expected {expected}, got {value!r}; find the symmetries again", name=name, value=value)

@@ -74,10 +74,10 @@ def find_symmetries(
     of a ball, two of its axes are. Raises SceneError for points that are too few (240), not finite, or on one line, and
     for a tolerance that is not positive.
     """
-    if not tolerance > 0.0 or limit < _FEWEST:
-        raise SceneError(
-            f"expected a tolerance above 0 and a limit of at least {_FEWEST} points, found {tolerance:g} and {limit}"
-        )
+    if not tolerance > 0.0:
+        raise SceneError(f"tolerance: expected a number above 0, got {tolerance:g}", name="tolerance", value=tolerance)
+    if limit < _FEWEST:
+        raise SceneError(f"limit: expected at least {_FEWEST} points, got {limit}", name="limit", value=limit)
     random = np.random.default_rng(int(torch.randint(2**31 - 1, (1,), generator=generator_of(seed))))
     places, middle, diagonal = _normalized(points)
     places = _evened(places, limit, random)
@@ -130,23 +130,30 @@ def _normalized(
     """Return the points about their middle in units of their diagonal, and both."""
     if len(points) < _FEWEST:
         raise SceneError(
-            f"expected at least {_FEWEST} points of a surface to look for symmetries, found {len(points)}: draw more "
-            "points from it, or reconstruct with more Gaussians"
+            f"expected at least {_FEWEST} points of a surface to find symmetries, got {len(points)}; draw more points "
+            "from it, or reconstruct with more Gaussians",
+            name="points",
+            value=len(points),
         )
     wrong = torch.nonzero(~torch.isfinite(points).all(dim=1)).flatten()
     if len(wrong):
         row = int(wrong[0])
         raise SceneError(
-            f"{len(wrong)} of {len(points)} points are not finite, the first is point {row} at "
-            f"{points[row].tolist()}: leave them out before looking for symmetries"
+            f"points, row {row}: expected finite coordinates, got {points[row].tolist()} ({len(wrong)} of "
+            f"{len(points)} are not finite); remove these",
+            row=row,
+            name="points",
+            value=points[row].tolist(),
         )
     places = points.detach().double().cpu().numpy()
     middle = places.mean(axis=0)
     _, extent, axes = np.linalg.svd(places - middle, full_matrices=False)
     if extent[1] < 1e-3 * extent[0] or extent[0] == 0.0:
         raise SceneError(
-            f"the {len(points)} points lie on one line or in one place (they spread by {extent[0]:.3g}, "
-            f"{extent[1]:.3g} and {extent[2]:.3g} m): expected points all over an object's surface"
+            f"expected points all over an object's surface, got {len(points)} on one line or at one position (extent "
+            f"{extent[0]:.3g}, {extent[1]:.3g} and {extent[2]:.3g} m)",
+            name="points",
+            value=extent.tolist(),
         )
     # A box along the principal axes: the diagonal must not depend on how the object lies.
     diagonal = float(np.linalg.norm(np.ptp((places - middle) @ axes.T, axis=0)))

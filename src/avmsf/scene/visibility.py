@@ -89,11 +89,13 @@ def depth_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer) -> DepthMap:
 
 
 def depth_of_surface(surface: Surface) -> DepthMap:
-    """Return what casts a ray through each pixel's center at a surface. Raises SceneError for one without triangles."""
+    """Return a depth map by rays through each pixel's center to a surface. Raises SceneError without triangles."""
     if len(surface.faces) == 0:
         raise SceneError(
-            f"expected a surface of triangles, which can hide points from a camera, found {len(surface.vertices)} "
-            "points: lift onto Gaussians instead, or give a mesh"
+            f"expected a surface of triangles, which can hide points from a camera, got {len(surface.vertices)} "
+            "points; lift onto Gaussians instead, or give a mesh",
+            name="surface",
+            value=0,
         )
     tracer = MeshTracer(TexturedMesh.plain(surface))
 

@@ -15,7 +15,11 @@ def block(size: tuple[float, float, float], cells: tuple[int, int, int]) -> Soli
     neighboring boxes meet in whole sides. Raises SimulationError for sizes and numbers that are not positive.
     """
     if not all(0 < side < float("inf") for side in size) or min(cells) < 1:
-        raise SimulationError(f"a block of {size} m in {cells} boxes: expected sizes above 0 and 1 box or more an axis")
+        raise SimulationError(
+            f"block: expected sizes above 0 and 1 box or more per axis, got {size} m in {cells} boxes",
+            name="block",
+            value=(size, cells),
+        )
     places = [
         torch.linspace(0.0, side, number + 1, dtype=torch.float64) for side, number in zip(size, cells, strict=True)
     ]

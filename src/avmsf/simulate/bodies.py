@@ -55,7 +55,7 @@ def make_body(recipe: ObjectRecipe, *, cache: Path | None, tell: Tell) -> Body:
     kept = None if cache is None else cache / f"modes-{key_of(recipe.elastic_values())}.safetensors"
 
     def compute() -> ElasticModes:
-        tell("solid")
+        tell("tetrahedra")
         solid = _uneven(recipe, make_solid())
         tell(f"elastic modes of {len(solid.cells)} tetrahedra")
         return _elastic(recipe, solid, legs)
@@ -85,8 +85,10 @@ def _made_solid(recipe: ObjectRecipe, surface: Surface) -> Solid:
             return fill(surface, detail=recipe.detail)
         return shell(surface, thickness=recipe.thickness, detail=recipe.detail)
     except SimulationError as error:
-        advice = " (--thickness gives it walls)" if recipe.thickness is None else ""
-        raise SimulationError(f"{recipe.mesh} cannot be made solid: {error}{advice}") from error
+        advice = " (--thickness)" if recipe.thickness is None else ""
+        raise SimulationError(
+            f"{recipe.mesh}: {error}{advice}", file=recipe.mesh, row=error.row, name=error.name, value=error.value
+        ) from error
 
 
 def _uneven(recipe: ObjectRecipe, solid: Solid) -> Solid:
@@ -118,10 +120,18 @@ def _scale(recipe: ObjectRecipe, vertices: Tensor) -> float:
     """Return what makes the longest side of the bounding box as long as the recipe has it."""
     longest = float((vertices.amax(0) - vertices.amin(0)).max())
     if not longest > 0.0:
-        raise SimulationError("the mesh has no extent: all of its vertices lie in one place; export it again")
+        raise SimulationError(
+            f"{recipe.mesh}: expected a mesh with an extent, got one point; export it again",
+            file=recipe.mesh,
+            name="size",
+            value=longest,
+        )
     if recipe.size is None and longest > _LARGEST:
         raise SimulationError(
-            f"the mesh is {longest:g} m long, and expected are meters, at most {_LARGEST:g} of them: if it counts "
-            f"millimeters, give --size {longest / 1000:g}; else say how long it is by --size"
+            f"{recipe.mesh}: expected a mesh of at most {_LARGEST:g} m, got {longest:g} m; if it is in millimeters, "
+            f"give --size {longest / 1000:g}, else its length by --size",
+            file=recipe.mesh,
+            name="size",
+            value=longest,
         )
     return 1.0 if recipe.size is None else recipe.size / longest

@@ -76,8 +76,10 @@ def lowest_vibrations(
     wanted = count + (_RIGID if supported else 0)
     if wanted + 2 * _RIGID > freedoms:
         raise SimulationError(
-            f"{count} modes of a body with {freedoms // 3} nodes: too coarse, expected {wanted // 3 + 5} nodes or "
-            "more; ask for fewer modes or a finer detail"
+            f"expected {wanted // 3 + 5} nodes or more for {count} modes, got {freedoms // 3}; ask for fewer modes or "
+            "a finer detail",
+            name="nodes",
+            value=freedoms // 3,
         )
     heavy = scipy.sparse.kron(mass, scipy.sparse.eye_array(3), format="csc")
     try:
@@ -87,8 +89,8 @@ def lowest_vibrations(
         )  # fmt: skip
     except RuntimeError as error:
         raise SimulationError(
-            f"the stiffness cannot be inverted ({error}): the tetrahedra are badly shaped; make them again with "
-            "another detail"
+            f"expected an invertible stiffness matrix, got {error}; make the tetrahedra with another detail",
+            name="stiffness",
         ) from error
     weighted = _times(mass, rigid)
 
@@ -133,8 +135,10 @@ def _largest_responses(
                 return values[chosen], basis[:, :end] @ vectors[:, chosen]
         if end + size > longest + _BLOCK:
             raise SimulationError(
-                f"the {wanted} lowest modes were not found in {end} steps: the tetrahedra are badly shaped; make them "
-                "again with another detail"
+                f"expected the {wanted} lowest modes within {end} steps, got fewer; make the tetrahedra with another "
+                "detail",
+                name="modes",
+                value=end,
             )
         basis[:, end : end + size] = block
         begin, end = end, end + size

@@ -19,7 +19,7 @@ from avmsf.geometry.closest import Closest, ClosestPoints
 from avmsf.simulate.eigen import Vibrations, lowest_vibrations, rigid_motions
 from avmsf.simulate.elements import SecondOrder, elements_of, mass, stiffness
 from avmsf.simulate.material import Material
-from avmsf.simulate.solid import Solid
+from avmsf.simulate.solid import Solid, no_tetrahedra
 
 _PENDULUM = 1e-9
 """Squared frequency over the largest, below which a body turns about the nodes that it is held at: rounding alone."""
@@ -92,7 +92,13 @@ class ElasticModes:
         unfit = torch.nonzero(~torch.isfinite(places).all(dim=1)).flatten()
         if len(unfit):
             row = int(unfit[0])
-            raise SimulationError(f"place {row} is {places[row].tolist()}: expected finite coordinates, in meters")
+            value = places[row].tolist()
+            raise SimulationError(
+                f"position {row}: expected finite coordinates in meters, got {value}",
+                row=row,
+                name="places",
+                value=value,
+            )
         return self._closest(places.double().numpy())
 
     def _shapes_in(self, found: Closest) -> Float64[Tensor, "contacts modes 3"]:
@@ -149,9 +155,13 @@ def elastic_modes(
     and where no mode lies below `highest`.
     """
     if count < 1:
-        raise SimulationError(f"count = {count}: expected 1 mode or more")
+        raise SimulationError(f"count: expected 1 mode or more, got {count}", name="count", value=count)
     if perturbed and (stiffness_factor is not None or density_factor is not None):
-        raise SimulationError("perturbed: expected a body without factors, got factors: ask for the modes alone")
+        raise SimulationError(
+            "perturbed: expected no stiffness or density factors, got some; leave them out",
+            name="perturbed",
+            value=True,
+        )
     expect_whole(solid)
     light = _factor(solid, density_factor, "density_factor")
     mesh = SecondOrder.of(solid)
@@ -165,8 +175,10 @@ def elastic_modes(
     kept = len(frequency) if highest is None else int((frequency <= highest).sum())
     if not kept:
         raise SimulationError(
-            f"no mode up to {highest:g} Hz, the lowest is at {float(frequency[0]):g} Hz: raise `highest`, or make the "
-            "body larger or thinner"
+            f"highest: expected a limit above the lowest mode at {float(frequency[0]):g} Hz, got {highest:g} Hz; raise "
+            "it, or make the body larger or thinner",
+            name="highest",
+            value=highest,
         )
     whole = found.shapes[:, :kept].reshape(len(mesh.nodes), 3, -1)
     changes = None if not perturbed else perturbations(
@@ -220,7 +232,12 @@ def _support(mesh: SecondOrder, springs: Sequence[tuple[Tensor, float]]) -> scip
     total = scipy.sparse.csr_array((3 * len(mesh.nodes),) * 2)
     for spring, (_, strength) in enumerate(springs):
         if not 0 < strength < math.inf:
-            raise SimulationError(f"spring {spring} has {strength:g} N/m: expected more than 0")
+            raise SimulationError(
+                f"spring {spring}: expected a stiffness above 0 N/m, got {strength:g}",
+                row=spring,
+                name="springs",
+                value=strength,
+            )
         corner = found.weights[spring]
         weights = np.concatenate([corner * (2.0 * corner - 1.0), 4.0 * corner * np.roll(corner, -1)])
         nodes = triangles[found.rows[spring]]
@@ -233,24 +250,33 @@ def _factor(solid: Solid, factor: Float[Tensor, " cells"] | None, name: str) -> 
     if factor is None:
         return torch.ones(len(solid.cells), dtype=torch.float64)
     if len(factor) != len(solid.cells):
-        raise SimulationError(f"{name} has {len(factor)} numbers for {len(solid.cells)} cells: expected one a cell")
+        raise SimulationError(
+            f"{name}: expected {len(solid.cells)} numbers, one per cell, got {len(factor)}",
+            name=name,
+            value=len(factor),
+        )
     unfit = torch.nonzero(~((factor > 0) & torch.isfinite(factor))).flatten()
     if len(unfit):
         row = int(unfit[0])
-        raise SimulationError(f"{name}[{row}] = {float(factor[row]):g}: expected more than 0")
+        value = float(factor[row])
+        raise SimulationError(
+            f"{name}, row {row}: expected more than 0, got {value:g}", row=row, name=name, value=value
+        )
     return factor.double()
 
 
 def expect_whole(solid: Solid) -> None:
     """Raise SimulationError for a body without volume, with flat tetrahedra, or of several parts."""
     if not len(solid.cells):
-        raise SimulationError("expected tetrahedra, found none: the body has no volume; give a sheet a thickness")
+        raise no_tetrahedra()
     solid.expect_volume()
     number = int(solid.parts.max()) + 1
     if number > 1:
         volumes = torch.bincount(solid.parts, weights=solid.volumes)
-        told = ", ".join(f"{volume:.3g}" for volume in volumes[:4].tolist())
+        sizes = ", ".join(f"{volume:.3g}" for volume in volumes[:4].tolist())
         raise SimulationError(
-            f"the body has {number} parts that share no side ({told}{', ...' if number > 4 else ''} m3): one body "
-            "sounds as one; join them, or keep the largest"
+            f"expected a connected body, got {number} parts of {sizes}{', ...' if number > 4 else ''} m3; join them, "
+            "or use the largest",
+            name="parts",
+            value=number,
         )

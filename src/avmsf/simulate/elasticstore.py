@@ -77,8 +77,11 @@ def load_modes(path: str | Path) -> ElasticModes:
         found, writer = record["format"], record["version"]
         if found != FORMAT:
             raise SimulationError(
-                f"{path}: expected elastic modes of format {FORMAT}, found format {found}, written by avmsf {writer} "
-                f"(this is avmsf {version('avmsf')}): compute them again"
+                f"{path}: expected elastic modes of format {FORMAT}, got format {found}, written by avmsf {writer} "
+                f"(this is avmsf {version('avmsf')}); compute them again",
+                file=path,
+                name="format",
+                value=found,
             )
         sizes, material, weight = record["sizes"], Material(**record["material"]), float(record["mass"])
         expected = {
@@ -92,15 +95,29 @@ def load_modes(path: str | Path) -> ElasticModes:
             each = ((fields, *square), (fields, *square), square)
             expected |= {name: (shape, torch.float64) for name, shape in zip(_PERTURBATIONS, each, strict=True)}
     except (ValueError, TypeError, KeyError) as error:
-        raise SimulationError(f"{path}: its header is damaged ({error!r}): compute the modes again") from error
+        raise SimulationError(
+            f"{path}: expected the header of elastic modes, got {error!r}; compute the modes again",
+            file=path,
+            name="header",
+            value=repr(error),
+        ) from error
     present = {name: (tuple(tensor.shape), tensor.dtype) for name, tensor in tensors.items()}
     if present != expected:
         raise SimulationError(
-            f"{path}: expected the tensors {_told(expected)}, found {_told(present)}: compute the modes again"
+            f"{path}: expected the tensors {_told(expected)}, got {_told(present)}; compute the modes again",
+            file=path,
+            name="tensors",
+            value=sorted(present),
         )
     rows = tensors["triangles"]
     if len(rows) and (int(rows.min()) < 0 or int(rows.max()) >= sizes["nodes"]):
-        raise SimulationError(f"{path}: a triangle names a node that is not there: compute the modes again")
+        raise SimulationError(
+            f"{path}: expected triangles of nodes 0 to {sizes['nodes'] - 1}, got {int(rows.min())} to "
+            f"{int(rows.max())}; compute the modes again",
+            file=path,
+            name="triangles",
+            value=[int(rows.min()), int(rows.max())],
+        )
     changes = None if fields is None else Perturbations(*(tensors[name].numpy() for name in _PERTURBATIONS))
     return ElasticModes(tensors["frequency"], tensors["nodes"], rows, tensors["shapes"], material, weight, changes)
 
@@ -115,7 +132,7 @@ def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, tell: 
         try:
             return load_modes(path)
         except SimulationError as error:
-            tell(f"computing again what cannot be read ({error})")
+            tell(f"computing the modes again ({error})")
     modes = compute()
     if path is not None:
         keep_if_possible(lambda: save_modes(modes, path), path)

@@ -49,9 +49,12 @@ def contact_times(
     else:
         times = _computed_times(hammer, material, mass=mass, speeds=speeds)
     if float(times.max()) > LONGEST:
+        longest = float(times.max())
         raise SimulationError(
-            f"the hammer stays on the body for {float(times.max()):.2g} s; a blow takes less than {LONGEST:g}: take a "
-            "lighter hammer, a stiffer tip, or a faster blow"
+            f"hammer: expected a contact time up to {LONGEST:g} s, got {longest:.2g} s; use a lighter hammer, a "
+            "stiffer tip, or a higher speed",
+            name="hammer",
+            value=longest,
         )
     return times
 

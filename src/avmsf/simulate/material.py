@@ -26,16 +26,19 @@ class Material:
         for constant, unit in (("density", "kg/m3"), ("young", "Pa")):
             value = getattr(self, constant)
             if not 0 < value < math.inf:
-                raise SimulationError(f"{self.name}: {constant} = {value:g} {unit}: expected more than 0")
+                raise self._unfit(constant, f"more than 0 {unit}")
         if not -1 < self.poisson < 0.5:
-            raise SimulationError(
-                f"{self.name}: poisson = {self.poisson:g}: expected more than -1 and less than .5, outside of which a "
-                "body would gain energy by being squeezed; solids have .1 to .45"
-            )
+            raise self._unfit("poisson", "more than -1 and less than .5; solids have .1 to .45")
         for constant, unit in (("alpha", "1/s"), ("beta", "s")):
             value = getattr(self, constant)
             if not 0 <= value < math.inf:
-                raise SimulationError(f"{self.name}: {constant} = {value:g} {unit}: expected 0 or more")
+                raise self._unfit(constant, f"0 {unit} or more")
+
+    def _unfit(self, constant: str, expected: str) -> SimulationError:
+        value = getattr(self, constant)
+        return SimulationError(
+            f"material {self.name}, {constant}: expected {expected}, got {value:g}", name=constant, value=value
+        )
 
 
 CERAMIC = Material("ceramic", 2700.0, 7.2e10, 0.19, 6.0, 1e-7)
@@ -52,5 +55,7 @@ MATERIALS = {material.name: material for material in (CERAMIC, GLASS, WOOD, PLAS
 def material_named(name: str) -> Material:
     """Return the material of this name, whatever its case. Raises SimulationError with the names there are."""
     if name.lower() not in MATERIALS:
-        raise SimulationError(f"no material is called {name!r}; there are {', '.join(MATERIALS)}")
+        raise SimulationError(
+            f"material: expected one of {', '.join(MATERIALS)}, got {name!r}", name="material", value=name
+        )
     return MATERIALS[name.lower()]

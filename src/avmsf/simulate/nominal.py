@@ -160,10 +160,15 @@ def nominal_bodies(
             pool.shutdown(cancel_futures=True)
     reasons = _grouped(refused)
     for reason in reasons:
-        told(f"not tried: {reason}")
+        told(f"skipped: {reason}")
     if not bodies:
-        other = "state its wall in meters if it has one" if guessed else "state another wall, or none"
-        raise SimulationError(f"no body can be made of this surface ({'; '.join(reasons)}): mend the mesh, or {other}")
+        other = "give the wall thickness in meters" if guessed else "give another wall thickness, or none"
+        raise SimulationError(
+            f"expected a surface with a finite-element model, got none ({'; '.join(reasons)}); repair the mesh, or "
+            f"{other}",
+            name="surface",
+            value=reasons,
+        )
     if len(bodies) == 1 and not bodies[0].fine:
         bodies = [refined(surface, bodies[0], freedoms=freedoms, cache=cache, tell=tell)]
     return NominalBodies(tuple(bodies), MappingProxyType(refused))
@@ -186,7 +191,7 @@ def with_wall(
     try:
         return _Maker(surface, count, cache, told).body(wall, freedoms, fine=False)
     except SimulationError as error:
-        told(f"not tried: {body_name(wall)}: {error}")
+        told(f"skipped: {body_name(wall)}: {error}")
         return None
 
 
@@ -214,7 +219,7 @@ def refined(
         modes = maker.held(body.wall, freedoms, maker.solid(body.wall, freedoms), body.support, perturbed=True)
         return replace(body, elastic=modes, fine=True)
     except SimulationError as error:
-        told(f"{body.name} stays coarse: {error}")
+        told(f"{body.name}: using the coarse mesh: {error}")
         return body
 
 
@@ -245,9 +250,9 @@ def supported(
             except SimulationError as error:
                 if support is None:
                     raise
-                told(f"{body.name}, {support.name}: not tried ({error})")
+                told(f"skipped: {body.name}, {support.name}: {error}")
     except SimulationError as error:
-        told(f"{body.name}: no supports are tried ({error})")
+        told(f"{body.name}: no supports tested: {error}")
     return tuple(bodies)
 
 
@@ -290,8 +295,10 @@ class _Maker:
             self.checked.expect_filling()
         elif wall >= self.checked.width:
             raise SimulationError(
-                f"a wall of {1000 * wall:.3g} mm is thicker than the object, which is "
-                f"{1000 * self.checked.width:.3g} mm wide: state the wall's thickness in meters"
+                f"expected a wall thinner than the object's width of {1000 * self.checked.width:.3g} mm, got "
+                f"{1000 * wall:.3g} mm; give the wall thickness in meters",
+                name="wall",
+                value=wall,
             )
         elif guessed and self._shape is None:
             self.checked.expect_hollow(wall)
@@ -306,7 +313,7 @@ class _Maker:
                 # Thin walls are lost in few tetrahedra. A shape has other thicknesses, and the thinnest is a bound.
                 if self._shape is not None:
                     raise
-                self._tell(f"again with more tetrahedra ({error})")
+                self._tell(f"retrying with more tetrahedra ({error})")
         return NominalBody(wall, self._converged(wall, freedoms))
 
     def _converged(self, wall: float | None, freedoms: int) -> ElasticModes:
@@ -318,18 +325,18 @@ class _Maker:
         try:
             error = _frequency_error(self._modes(wall, TRIAL, perturbed=False), modes)
         except SimulationError as failure:
-            self._tell(f"{body_name(wall)}: whether its elements are fine enough is not known ({failure})")
+            self._tell(f"{body_name(wall)}: mesh convergence not checked ({failure})")
             return modes
         if error > LARGEST_ERROR:
             try:
                 finer = self._modes(wall, 2 * freedoms, perturbed=True)
                 modes, error = finer, _frequency_error(modes, finer)
             except SimulationError as failure:
-                self._tell(f"{body_name(wall)}: no finer elements ({failure})")
+                self._tell(f"{body_name(wall)}: no finer mesh ({failure})")
         if error > LARGEST_ERROR:
             self._tell(
-                f"{body_name(wall)}: elements too coarse, the lowest frequencies are wrong by about {error:.0%}: allow "
-                f"freedoms={4 * freedoms}"
+                f"{body_name(wall)}: mesh too coarse, relative error of the lowest frequencies about {error:.0%}; "
+                f"allow freedoms={4 * freedoms}"
             )
         return modes
 
@@ -358,21 +365,25 @@ class _Maker:
             return elastic_modes(solid, self._material, count=self._count, fixed=fixed, perturbed=perturbed)
         except MemoryError as error:
             raise SimulationError(
-                f"the modes of {size} degrees of freedom do not fit into the memory: ask for fewer, as "
-                f"freedoms={max(freedoms // 2, FEWEST)}, or end other programs"
+                f"expected enough memory for {size} degrees of freedom, got too little; use "
+                f"freedoms={max(freedoms // 2, FEWEST)}, or close other programs",
+                name="freedoms",
+                value=size,
             ) from error
 
     def solid(self, wall: float | None, freedoms: int) -> Solid:
         """Return tetrahedra with about so many degrees of freedom."""
         expect_memory(freedoms)
-        self._tell(f"tetrahedra of the body, {body_name(wall)}")
+        self._tell(f"tetrahedra: {body_name(wall)}")
         if wall is None:
             return filled_solid(self.checked, freedoms)
         if self._shape is not None:
             try:
                 surface = self._shape.shell(wall, faces=round(0.5 * TRIANGLES * freedoms))
             except SceneError as error:
-                raise SimulationError(str(error)) from error
+                raise SimulationError(
+                    str(error), file=error.file, row=error.row, name=error.name, value=error.value
+                ) from error
             return filled_solid(checked(surface, tell=self._tell), freedoms, wall=wall)
         with self._lock:
             if freedoms not in self._walls:
@@ -424,14 +435,21 @@ def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:
 
 def _expect_settings(count: int, freedoms: int, walls: Sequence[float | None] | None) -> None:
     if count < 1:
-        raise SimulationError(f"count = {count}: expected 1 mode or more")
+        raise SimulationError(f"count: expected 1 mode or more, got {count}", name="count", value=count)
     if freedoms < FEWEST:
-        raise SimulationError(f"freedoms = {freedoms}: expected {FEWEST} degrees of freedom or more")
+        raise SimulationError(f"freedoms: expected {FEWEST} or more, got {freedoms}", name="freedoms", value=freedoms)
     if walls is not None and not len(walls):
-        raise SimulationError("walls is empty: expected thicknesses in meters, None among them for a filled body")
-    for wall in walls or ():
+        raise SimulationError(
+            "walls: expected thicknesses in meters, or None for a solid body, got an empty list", name="walls", value=[]
+        )
+    for row, wall in enumerate(walls or ()):
         if wall is not None and not 0 < wall < float("inf"):
-            raise SimulationError(f"wall = {wall:g} m: expected more than 0, or None for a filled body")
+            raise SimulationError(
+                f"walls, row {row}: expected more than 0 m, or None for a solid body, got {wall:g}",
+                row=row,
+                name="walls",
+                value=wall,
+            )
 
 
 def _grouped(refused: Mapping[float | None, str]) -> list[str]:

@@ -61,8 +61,10 @@ class CheckedSurface:
         """Raise SimulationError where the surface is too open to be filled."""
         if self.lids > _LIDS:
             raise SimulationError(
-                f"{self.skin.open_edges} of the mesh's edges are open, and lids over its holes would be "
-                f"{self.lids:.0%} of the surface: it is a sheet; give it a wall, or close the mesh"
+                f"expected a closed mesh, got {self.skin.open_edges} open edges whose holes are {self.lids:.0%} of the "
+                "surface; give a wall thickness, or close the mesh",
+                name="mesh",
+                value=self.lids,
             )
 
     def expect_hollow(self, wall: float) -> None:
@@ -70,8 +72,10 @@ class CheckedSurface:
         held = self.mean_thickness
         if held is not None and wall > _HOLLOW * held:
             raise SimulationError(
-                f"the mesh shows both sides of what is {1000 * held:.2g} mm thick on average: it is filled, "
-                f"and no wall above {1000 * _HOLLOW * held:.2g} mm is tried"
+                f"expected a wall of at most {1000 * _HOLLOW * held:.2g} mm in a mesh that is {1000 * held:.2g} mm "
+                f"thick on average, got {1000 * wall:.2g} mm; use a solid body",
+                name="wall",
+                value=wall,
             )
 
     def sheet(self) -> Skin:
@@ -81,10 +85,12 @@ class CheckedSurface:
         """
         areas = np.bincount(self.parts, weights=self.skin.areas)
         if areas[0] < (1.0 - _LOOSE) * areas.sum():
-            told = ", ".join(f"{10000 * area:.3g}" for area in areas[:4])
+            sizes = ", ".join(f"{10000 * area:.3g}" for area in areas[:4])
             raise SimulationError(
-                f"the mesh has {len(areas)} parts that share no vertex ({told}{', ...' if len(areas) > 4 else ''} "
-                "cm2), and a wall follows one: join them, or give one of them"
+                f"expected a connected mesh, got {len(areas)} parts of {sizes}{', ...' if len(areas) > 4 else ''} cm2; "
+                "join them, or give one of them",
+                name="parts",
+                value=len(areas),
             )
         return Skin.compact(self.skin.points, self.skin.faces[self.parts == 0]).oriented()
 
@@ -97,24 +103,24 @@ def checked(surface: Surface, *, tell: Callable[[str], None]) -> CheckedSurface:
     """
     skin, turned = _turned(thinned(Skin.of(surface), tell=tell))
     if turned:
-        tell(f"the mesh faced inwards: {turned} of its {len(skin.faces)} triangles were turned")
+        tell(f"{turned} of {len(skin.faces)} triangles of the mesh faced inwards: reversed")
     before = roughness(skin)
     skin, moved = denoised(skin)
     if moved:
         tell(
-            f"the mesh is noisy, its triangles differ by {before:.0f} degrees from one to the next: smoothed, its "
-            f"vertices {1000 * moved:.2g} mm away from where they were"
+            f"noisy mesh, adjacent triangles differ by {before:.0f} degrees on average: smoothed, vertices moved by "
+            f"{1000 * moved:.2g} mm (RMS)"
         )
     result = CheckedSurface(skin)
     if skin.open_edges:
         # No mistake that could be undone: what was seen from inside alone faces inwards, and its wall lies outside.
         if _held(skin) < -_VESSEL * float(skin.areas.sum()) ** 1.5:
             tell(
-                "the mesh is open and faces the inside of what it encloses: a wall lies outside of it; turn its "
-                "triangles if the wall lies inside"
+                "open mesh whose triangles face inwards: its wall is taken to be outside; reverse the triangles if the "
+                "wall is inside"
             )
-        helps = "closing them by lids is tried" if result.lids <= _LIDS else "a wall turns it into a body"
-        tell(f"{skin.open_edges} of the mesh's edges are open: {helps}")
+        helps = "trying to close the holes" if result.lids <= _LIDS else "give a wall thickness"
+        tell(f"the mesh has {skin.open_edges} open edges: {helps}")
     return result
 
 

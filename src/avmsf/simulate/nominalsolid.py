@@ -50,8 +50,10 @@ def expect_memory(freedoms: int) -> None:
     if free is not None and needed > free:
         fitting = int(measured * (free / (_CAUTION * peak)) ** (1.0 / power)) // 1000 * 1000
         raise SimulationError(
-            f"{freedoms} degrees of freedom take about {needed / 1e9:.2g} GB, and {free / 1e9:.2g} GB of memory are "
-            f"free: a coarser mesh of freedoms={max(fitting, FEWEST)} fits; or end other programs"
+            f"expected about {needed / 1e9:.2g} GB of free memory for {freedoms} degrees of freedom, got "
+            f"{free / 1e9:.2g} GB; use freedoms={max(fitting, FEWEST)}, or close other programs",
+            name="memory",
+            value=free,
         )
 
 
@@ -134,8 +136,10 @@ def _near(make: Callable[[float], Solid], freedoms: int, *, first: float) -> Sol
     if best is None:
         least = min(tried.values())
         raise SimulationError(
-            f"expected {freedoms} degrees of freedom, and the coarsest mesh that was made has {least}: allow "
-            f"freedoms={least}, or simplify the mesh"
+            f"expected a mesh of {freedoms} degrees of freedom, got {least} at least; allow freedoms={least}, or "
+            "simplify the mesh",
+            name="freedoms",
+            value=least,
         )
     return best[1]
 

@@ -33,8 +33,8 @@ def thinned(skin: Skin, *, tell: Callable[[str], None]) -> Skin:
     found = simplified(even, MOST, like=skin)
     if found is even:
         return skin
-    noise = "" if even is skin else f", its noise of {rough:.0f} degrees from one to the next averaged out"
-    tell(f"the mesh was thinned to {len(found.faces)} triangles{noise}")
+    noise = "" if even is skin else f", after smoothing its noise of {rough:.0f} degrees"
+    tell(f"mesh simplified to {len(found.faces)} triangles{noise}")
     return found
 
 

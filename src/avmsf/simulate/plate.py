@@ -21,6 +21,7 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
+from avmsf.errors import PositionError, SimulationError
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ def plate_modes(
 
     A hammer's tip stays on the plate for `contact_time` seconds and pushes with half a sine, which excites a mode of
     frequency f by cos(pi f tau) / (1 - (2 f tau)^2) of what an impulse in its middle does; zero is an impulse.
-    Raises ValueError for contacts off the plate and for a band that holds no mode.
+    Raises PositionError for contacts off the plate and SimulationError for a band that holds no mode.
     """
     places = contacts.double()
     _expect_on_plate(plate, places)
@@ -90,9 +91,11 @@ def plate_modes(
     heard = torch.nonzero((omega <= 2.0 * math.pi * highest) & (frequency > 0.0)).flatten()
     if len(heard) == 0:
         lowest = scale * (1.0 / plate.length**2 + 1.0 / plate.width**2) / (2.0 * math.pi)
-        raise ValueError(
-            f"no mode of the plate sounds up to {highest:g} Hz, its lowest is at {lowest:g} Hz undamped; ask for a "
-            "wider band, or make the plate larger, thinner or less damped"
+        raise SimulationError(
+            f"highest: expected a limit above the plate's lowest mode at {lowest:g} Hz (undamped), got {highest:g} Hz; "
+            "raise it, or make the plate larger, thinner or less damped",
+            name="highest",
+            value=highest,
         )
     heard = heard[torch.argsort(frequency[heard])]
     pickup = torch.tensor([[plate.pickup[0] * plate.length, plate.pickup[1] * plate.width]], dtype=torch.float64)
@@ -128,11 +131,13 @@ def strike(
     `noise_db` is the level of the white Gaussian noise that is added to all sounds: its root mean square over that of
     the noiseless sounds, both taken over all sounds and their whole length, so that -40.0 is noise 40 dB down and one
     recorder's floor for loud and faint blows alike. None adds none. Frequencies in Hz. Raises as `plate_modes`, and
-    ValueError where a mode would alias.
+    SimulationError where a mode would alias.
     """
     if highest >= 0.5 * sample_rate:
-        raise ValueError(
-            f"modes up to {highest:g} Hz alias at {sample_rate:g} Hz; ask for less than half the sample rate"
+        raise SimulationError(
+            f"highest: expected less than half the sample rate of {sample_rate:g} Hz, got {highest:g} Hz",
+            name="highest",
+            value=highest,
         )
     modes = plate_modes(plate, contacts, highest=highest, contact_time=contact_time)
     sounds = ring(modes, sample_rate=sample_rate, samples=round(seconds * sample_rate))
@@ -189,8 +194,11 @@ def _expect_on_plate(plate: Plate, places: Float64[Tensor, "contacts 3"]) -> Non
     off = torch.nonzero(~((places >= -slack) & (places <= ends + slack)).all(dim=1)).flatten()
     if len(off):
         row = int(off[0])
-        found = ", ".join(f"{value:g}" for value in places[row].tolist())
-        raise ValueError(
-            f"contact {row} at ({found}) m is not on the plate, 0 to {plate.length:g} m by 0 to {plate.width:g} m at "
-            "z = 0"
+        value = places[row].tolist()
+        raise PositionError(
+            f"contacts, row {row}: expected x from 0 to {plate.length:g} m, y from 0 to {plate.width:g} m and z = 0, "
+            f"got {value}",
+            row=row,
+            name="contacts",
+            value=value,
         )

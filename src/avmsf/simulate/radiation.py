@@ -50,8 +50,9 @@ def radiated(
     nearest = float(distance.min())
     if nearest < CLOSEST:
         raise SimulationError(
-            f"the microphone at ({', '.join(f'{value:.3g}' for value in microphone.tolist())}) m is {nearest:.2g} m "
-            f"from the object's surface: put it {CLOSEST:g} m or more away from it"
+            f"microphone: expected a distance of {CLOSEST:g} m or more from the object's surface, got {nearest:.2g} m",
+            name="microphone",
+            value=nearest,
         )
     area = outward.norm(dim=1)
     facing = (outward * towards).sum(dim=1) / (area * distance).clamp(min=1e-300)

@@ -13,13 +13,13 @@ from avmsf.errors import SimulationError
 from avmsf.simulate.material import material_named
 
 LONGEST = 0.02
-"""Seconds of contact beyond which a blow is a push."""
+"""Longest contact of an impact, seconds."""
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 @dataclass(frozen=True)
 class Hammer:
-    """A small steel hammer with a round tip, unless told otherwise."""
+    """The hammer; by default a small steel one with a round tip."""
 
     mass: float = 0.02
     """Of its head, kilograms."""
@@ -30,49 +30,47 @@ class Hammer:
     poisson: float = 0.29
     """Poisson's ratio of its tip."""
     speed: float = 0.5
-    """With which it meets the body, meters per second."""
+    """Speed at impact, meters per second."""
     pulse: Literal["hertz", "half-sine"] = "hertz"
     """hertz: a round tip; half-sine: a flat one."""
     contact_time: float = 0.0
-    """Seconds that the tip stays on the body at `speed`; 0 computes it from the above."""
+    """Duration of the contact at `speed`, seconds; 0 computes it from the above."""
 
     def __post_init__(self) -> None:
         for name, unit in (("mass", "kg"), ("radius", "m"), ("young", "Pa"), ("speed", "m/s")):
             value = getattr(self, name)
             if not 0 < value < math.inf:
-                raise SimulationError(f"hammer: {name} = {value:g} {unit}: expected more than 0")
+                raise _unfit(f"hammer.{name}", f"more than 0 {unit}", value)
         if not -1 < self.poisson < 0.5:
-            raise SimulationError(f"hammer: poisson = {self.poisson:g}: expected more than -1 and less than .5")
+            raise _unfit("hammer.poisson", "more than -1 and less than .5", self.poisson)
         if not 0 <= self.contact_time <= LONGEST:
-            raise SimulationError(
-                f"hammer: contact_time = {self.contact_time:g} s: expected 0 to compute it, or up to {LONGEST:g}"
-            )
+            raise _unfit("hammer.contact_time", f"0 to compute it, or up to {LONGEST:g} s", self.contact_time)
 
 
 @dataclass(frozen=True)
 class Imperfections:
-    """How far an object and its recordings stray from a textbook; 0 switches each off."""
+    """Deviations of the object and its recordings from the ideal; 0 switches each off."""
 
     thickness: float = 0.03
-    """Variation of the walls' thickness, root mean square over its mean."""
+    """Variation of the wall thickness, root mean square over its mean."""
     stiffness: float = 0.05
     """Variation of Young's modulus over the body, root mean square of its logarithm."""
     density: float = 0.02
     """Variation of the density, likewise."""
     support: float = 15.0
-    """Frequency at which the object would bounce on three soft springs under it, Hz."""
+    """Resonance frequency of the object on three soft springs under it, Hz."""
     support_damping: float = 0.015
-    """Damping of that bouncing, over the critical one."""
+    """Damping ratio of that resonance."""
     coupling: float = 0.2
-    """Part of all damping that sits at places of its own and so couples modes, 0 to 1."""
+    """Part of the damping that is localized and so couples modes, 0 to 1."""
     retardation: float = 1.0
-    """Part of the differences of delay between the body and the microphone that is heard, 0 to 1."""
+    """Factor on the differences of delay from the body's parts to the microphone, 0 to 1."""
     contact: float = 0.0015
-    """Distance between where a blow was written down and where it fell, along the surface, meters, root mean square."""
+    """Distance along the surface from the recorded contact to the true one, meters, root mean square."""
     direction: float = 5.0
-    """Angle between the blow's direction as written and as it was, degrees, root mean square."""
+    """Angle between the recorded direction of the impact and the true one, degrees, root mean square."""
     force: float = 0.02
-    """Error of the written peak force, relative, root mean square."""
+    """Relative error of the recorded peak force, root mean square."""
     speed: float = 0.3
     """Variation of the impacts' speeds, root mean square of their logarithm.
 
@@ -82,12 +80,12 @@ class Imperfections:
     contact_time: float = 0.1
     """Variation of the contact times that does not follow from the speeds, root mean square of their logarithm.
 
-    The hand adds mass to the hammer, and the tip does not meet the surface square. In 31 impacts by hand on ceramic,
+    The hand adds mass to the hammer, and the tip is inclined to the surface. In 31 impacts by hand on ceramic,
     wood, polycarbonate and steel (the recordings published with DiffImpact, Clarke et al. 2021) the pulses' widths
     depart from Hertz's law by .11.
     """
     pretrigger: float = 0.05
-    """Time that a recording runs before the impact's sound arrives, seconds; the next two add to it."""
+    """Time from the start of a recording to the arrival of the impact's sound, seconds; the next two add to it."""
     jitter: float = 0.001
     """Variation of that time from recording to recording, seconds, root mean square.
 
@@ -95,7 +93,7 @@ class Imperfections:
     which a sound starts is uniformly random.
     """
     propagation: float = 1.0
-    """Part of the time that sound takes from the object's nearest point to the microphone that delays the recordings,
+    """Factor on the delay of the recordings by the travel of sound from the object's nearest point to the microphone,
     0 to 1."""
 
     def __post_init__(self) -> None:
@@ -107,14 +105,12 @@ class Imperfections:
             }  # fmt: skip
             most = highest.get(each.name, 0.5)
             if not (0 <= value <= most and math.isfinite(value)):
-                raise SimulationError(
-                    f"imperfections: {each.name} = {value:g}: expected 0 to switch it off"
-                    f"{f', or up to {most:g}' if math.isfinite(most) else ' or a finite number above it'}"
-                )
+                limit = f"up to {most:g}" if math.isfinite(most) else "a finite number above 0"
+                raise _unfit(f"imperfections.{each.name}", f"0 to switch it off, or {limit}", value)
 
     @classmethod
     def none(cls) -> "Imperfections":
-        """Return the record with everything switched off, sounds heard from all parts of the body at their times.
+        """Return the record with everything switched off; sound travels from all parts of the body with its delay.
 
         Every recording then starts with the sound of its impact.
         """
@@ -123,43 +119,43 @@ class Imperfections:
 
 @dataclass(frozen=True)
 class ObjectRecipe:
-    """What an object is, how it is struck and how it is heard and seen."""
+    """An object, its impacts, recordings and images."""
 
     kind: str = "bowl"
-    """Shape to make: `avmsf simulate --list` names them."""
+    """Shape: `avmsf simulate --list` names them."""
     mesh: Path | None = None
-    """A mesh or scan to take in place of a shape: obj, ply, glb or stl, in meters."""
+    """A mesh or scan instead of a shape: obj, ply, glb or stl, in meters."""
     thickness: float | None = None
-    """Of the walls, meters. None draws a shape's, and fills a mesh, which is a solid body then; with a thickness its
-    surface is the outside of a wall."""
+    """Wall thickness, meters. None draws that of a shape at random, and makes a mesh a solid body; with a thickness the
+    mesh is the outside of a wall."""
     material: str = "ceramic"
     """Name in the table of materials."""
     seed: int = 0
-    """Start of all chance: the shape's proportions, the contacts, the noise, the imperfections."""
+    """Random seed of the shape's proportions, the contacts, the noise and the imperfections."""
     size: float | None = None
-    """Longest side of the bounding box, meters; as drawn or as scanned where it is not given."""
+    """Longest side of the bounding box, meters; None for that of the random shape or of the mesh."""
     up: Literal["x", "y", "z"] = "z"
-    """Axis that points to the sky: a hammer comes from above or from the side."""
+    """Upward axis: the hammer comes from above or from the side."""
     modes: int = 64
-    """Lowest elastic modes to compute; those that do not sound below 45 % of the sample rate are left out."""
+    """Number of elastic modes to compute, the lowest; those above 45 % of the sample rate are left out."""
     detail: float = 0.04
-    """Edge of the tetrahedra that fill a mesh, over its diagonal. Shapes bring tetrahedra of their own."""
+    """Edge length of the tetrahedra in a mesh, over its diagonal. Shapes have tetrahedra of their own."""
     contacts: int = 40
-    """Blows."""
+    """Number of impacts."""
     sample_rate: int = 48000
-    """Hz."""
+    """Sample rate, Hz."""
     seconds: float = 2.0
-    """Length of what is kept of each recording, from its onset on. The files also hold what is before and after it."""
+    """Length of each recording that is used, from its onset. The files are longer."""
     noise_db: float | None = -30.0
-    """Room noise: its root mean square over that of the noiseless sounds from their impacts on, dB; None for none."""
+    """Room noise: its root mean square over that of the noiseless sounds after the impacts, dB; None for none."""
     microphone: tuple[float, float, float] = (0.45, -0.35, 0.4)
-    """Where it stands, from the middle of the object's bounding box, meters."""
+    """Position of the microphone from the center of the object's bounding box, meters."""
     views: int = 72
-    """Pictures to render, on three circles around the object; 0 for none."""
+    """Images to render, on three circles around the object; 0 for none."""
     view_size: int = 256
-    """Pixels along each side of a picture."""
+    """Pixels along each side of an image."""
     surface: bool = True
-    """Whether the folder holds the object's mesh; without it, the shape has to be found in the pictures."""
+    """Write the object's mesh; without it, the shape has to be reconstructed from the images."""
     hammer: Hammer = field(default_factory=Hammer)
     imperfections: Imperfections = field(default_factory=Imperfections)
 
@@ -175,19 +171,17 @@ class ObjectRecipe:
         ):
             value = getattr(self, name)
             if not least <= value <= most:
-                raise SimulationError(f"{name} = {value:g}: expected {least:g} to {most:g}")
+                raise _unfit(name, f"{least:g} to {most:g}", value)
         for name in ("thickness", "size"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
-                raise SimulationError(f"{name} = {value:g} m: expected more than 0")
+                raise _unfit(name, "more than 0 m", value)
         if self.noise_db is not None and not -math.inf < self.noise_db < 100.0:
-            raise SimulationError(
-                f"noise_db = {self.noise_db:g}: expected a level in dB, such as -30, or None for none"
-            )
+            raise _unfit("noise_db", "a level in dB, such as -30, or None for none", self.noise_db)
         if self.views < 0 or self.views % 3:
-            raise SimulationError(f"views = {self.views}: expected a multiple of 3, for three circles of them, or 0")
+            raise _unfit("views", "a multiple of 3, for three circles, or 0", self.views)
         if self.seed < 0:
-            raise SimulationError(f"seed = {self.seed}: expected 0 or more")
+            raise _unfit("seed", "0 or more", self.seed)
 
     def values(self) -> dict[str, Any]:
         """Return all settings as JSON holds them, with the package's version and the digest of the mesh's file."""
@@ -209,8 +203,14 @@ def key_of(values: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:24]
 
 
+def _unfit(name: str, expected: str, value: float | int) -> SimulationError:
+    return SimulationError(f"{name}: expected {expected}, got {value:g}", name=name, value=value)
+
+
 def _digest(path: Path) -> str:
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
-        raise SimulationError(f"{path}: the mesh cannot be read ({error.strerror}): check the name") from error
+        raise SimulationError(
+            f"{path}: expected a mesh, got {error.strerror!r}; check the name", file=path, value=error.strerror
+        ) from error

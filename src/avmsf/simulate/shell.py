@@ -12,7 +12,7 @@ from avmsf.capture.surface import Surface
 from avmsf.errors import SimulationError
 from avmsf.simulate.skin import Skin, unit
 from avmsf.simulate.solid import Solid
-from avmsf.simulate.tetrahedra import fill
+from avmsf.simulate.tetrahedra import expect_detail, fill
 
 _STEPS = 30
 """Most times that the wall is turned and thinned where prisms are folded."""
@@ -41,15 +41,18 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
     than the wall would.
     """
     if not 0 < thickness < np.inf:
-        raise SimulationError(f"thickness = {thickness:g} m: expected more than 0")
-    if not 0 < detail < 1:
-        raise SimulationError(f"detail = {detail:g}: expected more than 0 and less than 1 of the body's size")
+        raise SimulationError(
+            f"thickness: expected more than 0 m, got {thickness:g}", name="thickness", value=thickness
+        )
+    expect_detail(detail)
     skin = Skin.of(surface).oriented()
     if skin.open_edges == 0 and skin.areas.sum() * thickness > abs(skin.volume):
         middle = 0.5 * abs(skin.volume) / skin.areas.sum()
         raise SimulationError(
-            f"a wall of {1000 * thickness:.3g} mm is more than the closed surface holds, {4000 * middle:.2g} mm on "
-            f"the mean: take it as filled (a wall of 0 m), or its wall as {middle:.1g} m"
+            f"thickness: expected less than the {4 * middle:.2g} m of the closed surface on average, got "
+            f"{thickness:.3g} m; use a solid body (0 m), or a wall of {middle:.1g} m",
+            name="thickness",
+            value=thickness,
         )
     coarse = skin.remeshed(detail * skin.size)
     if _folded_part(coarse, thickness) > _SPARED:
@@ -57,7 +60,9 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
         suggested = next((each for each in fitting if _folded_part(coarse, each) <= _SPARED), None)
         hint = "smooth the mesh" if suggested is None else f"try thickness={suggested:.2g}, or smooth the mesh"
         raise SimulationError(
-            f"a wall of {thickness:g} m folds over itself where the surface bends more tightly than that: {hint}"
+            f"thickness: expected less than the surface's radius of curvature, got {thickness:g} m; {hint}",
+            name="thickness",
+            value=thickness,
         )
     solid = prisms(coarse, np.full(len(coarse.points), thickness))
     return solid if solid is not None else fill(_both_sides(coarse, thickness), detail=detail)

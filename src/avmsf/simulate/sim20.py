@@ -57,5 +57,7 @@ ABLATED = ("mug-ceramic", "bowl-glass", "bracket-steel", "pot-steel", "dish-cera
 def sim20_recipe(name: str) -> ObjectRecipe:
     """Return the recipe of one of the set's objects. Raises SimulationError with the names there are."""
     if name not in SIM20:
-        raise SimulationError(f"{SET} has no object called {name!r}; it has {', '.join(SIM20)}")
+        raise SimulationError(
+            f"expected an object of {SET} ({', '.join(SIM20)}), got {name!r}; check the name", name=SET, value=name
+        )
     return SIM20[name]

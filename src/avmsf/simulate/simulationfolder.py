@@ -36,7 +36,9 @@ def write_simulation(
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise SimulationError(f"{folder}: exists and is not an empty folder; choose another name or remove it")
+        raise SimulationError(
+            f"{folder}: expected a new or empty folder, got other files; choose another name or remove it", file=folder
+        )
     begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
     try:
         _write_recordings(simulation, begun)
@@ -50,7 +52,9 @@ def write_simulation(
             folder.rmdir()
         os.rename(begun, folder)
     except (OSError, CaptureError) as error:
-        raise SimulationError(f"{folder}: the simulated object cannot be written: {error}") from error
+        raise SimulationError(
+            f"{folder}: expected a writable folder, got {error}; choose another folder", file=folder, value=str(error)
+        ) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
 
@@ -72,13 +76,19 @@ def is_written(recipe: ObjectRecipe, folder: str | Path) -> bool:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return False
     if not (folder / TRUTH).is_file():
-        raise SimulationError(f"{folder}: exists and holds no simulated object; choose another name or remove it")
+        raise SimulationError(
+            f"{folder}: expected a simulated object or no files, got no {TRUTH}; choose another name or remove it",
+            file=folder,
+            name=TRUTH,
+        )
     found, wanted = read_truth(folder).recipe, recipe.values()
     if found != wanted:
         differing = sorted(key for key in found.keys() | wanted.keys() if found.get(key) != wanted.get(key))
         raise SimulationError(
-            f"{folder}: holds an object simulated with other settings ({', '.join(differing)}): remove it, or choose "
-            "another folder"
+            f"{folder}: expected an object of these settings, got another {', '.join(differing)}; remove it, or choose "
+            "another folder",
+            file=folder,
+            value=differing,
         )
     return True
 

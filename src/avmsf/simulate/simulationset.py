@@ -20,7 +20,7 @@ class SetProgress:
     """Objects that are whole."""
     total: int
     stage: str
-    """What is being done to it; `kept` where it was there already, `done` once it is whole."""
+    """What is being computed; `exists` for an object that was complete before, `done` for one that is complete now."""
 
 
 def simulate_set(
@@ -37,7 +37,7 @@ def simulate_set(
     """
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
-        raise SimulationError(f"{folder}: is a file; name a folder for the objects")
+        raise SimulationError(f"{folder}: expected a folder, got a file; choose another name", file=folder)
     tell = progress or (lambda _: None)
     whole = {name: is_written(recipe, folder / name) for name, recipe in recipes.items()}
     for done, (name, recipe) in enumerate(recipes.items()):
@@ -49,4 +49,4 @@ def simulate_set(
             simulation = simulate_object(recipe, name=name, cache=cache, progress=stage)
             stage(f"{recipe.views} views" if recipe.views else "files")
             write_simulation(simulation, folder / name)
-        tell(SetProgress(name, done + 1, len(recipes), "kept" if whole[name] else "done"))
+        tell(SetProgress(name, done + 1, len(recipes), "exists" if whole[name] else "done"))

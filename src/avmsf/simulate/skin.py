@@ -93,23 +93,34 @@ class Skin:
         points, faces = surface.vertices.double().numpy(), surface.faces.numpy()
         if not len(faces):
             raise SimulationError(
-                f"expected a mesh, found {len(points)} points and no triangles: mesh the points, for a body has a skin"
+                f"expected a mesh, got {len(points)} points without triangles; make a mesh of the points",
+                name="faces",
+                value=0,
             )
         if int(faces.min()) < 0 or int(faces.max()) >= len(points):
             found = int(faces.max()) if int(faces.min()) >= 0 else int(faces.min())
             raise SimulationError(
-                f"a triangle names vertex {found} (counted from 0) of {len(points)}: the file is cut short or corrupt; "
-                "export the mesh again"
+                f"expected corners of triangles from 0 to {len(points) - 1}, got {found}; export the mesh again",
+                name="faces",
+                value=found,
             )
         if not np.isfinite(points).all():
             row = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-            raise SimulationError(f"vertex {row} is {points[row].tolist()}: expected finite coordinates, in meters")
+            value = points[row].tolist()
+            raise SimulationError(
+                f"vertex {row}: expected finite coordinates in meters, got {value}",
+                row=row,
+                name="vertices",
+                value=value,
+            )
         places, rows = np.unique(points[faces.ravel()], axis=0, return_inverse=True)
         welded = rows.reshape(-1, 3)
         wide = np.linalg.norm(_doubled(places[welded]), axis=1) > 1e-12 * np.linalg.norm(np.ptp(places, axis=0)) ** 2
         if not wide.any():
             raise SimulationError(
-                f"none of the {len(faces)} triangles has an area: the mesh is a line or a point; scan the object again"
+                f"expected triangles with an area, got {len(faces)} without; scan the object again",
+                name="areas",
+                value=0.0,
             )
         return cls.compact(places, welded[wide])
 
@@ -130,8 +141,10 @@ class Skin:
         lost = float(areas[~kept].sum() / areas.sum())
         if lost > 0.05:
             raise SimulationError(
-                f"{lost:.0%} of the surface faces against its neighbors or meets more than one of them at an edge: "
-                "expected triangles counter-clockwise from outside; make the normals of the mesh consistent"
+                f"expected triangles counter-clockwise from outside and at most two per edge, got others on {lost:.0%} "
+                "of the surface; make the normals of the mesh consistent",
+                name="normals",
+                value=lost,
             )
         return self.compact(self.points, self.faces[kept])
 

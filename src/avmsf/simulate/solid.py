@@ -35,17 +35,22 @@ class Solid:
         for coordinates that are not finite.
         """
         if not len(cells):
-            raise SimulationError("expected tetrahedra, found none: the body has no volume; give a sheet a thickness")
+            raise no_tetrahedra()
         if int(cells.min()) < 0 or int(cells.max()) >= len(points):
             found = int(cells.max()) if int(cells.min()) >= 0 else int(cells.min())
             raise SimulationError(
-                f"a tetrahedron names point {found} (counted from 0) of {len(points)}: make the tetrahedra again"
+                f"expected corners of tetrahedra from 0 to {len(points) - 1}, got {found}; make the tetrahedra again",
+                name="cells",
+                value=found,
             )
         used, rows = torch.unique(cells, return_inverse=True)
         corners = points[used]
         if not bool(torch.isfinite(corners).all()):
             row = int(used[(~torch.isfinite(corners)).any(dim=1).nonzero()[0]])
-            raise SimulationError(f"point {row} is {points[row].tolist()}: expected finite coordinates, in meters")
+            value = points[row].tolist()
+            raise SimulationError(
+                f"point {row}: expected finite coordinates in meters, got {value}", row=row, name="points", value=value
+            )
         volumes = _volumes(corners, rows)
         turned = torch.where((volumes < 0)[:, None], rows[:, [0, 2, 1, 3]], rows)
         solid = cls(corners, turned)
@@ -99,11 +104,22 @@ class Solid:
         unfit = torch.nonzero(~(self.volumes > FLATTEST * longest**3)).flatten()
         if len(unfit):
             row = int(unfit[0])
+            volume = float(self.volumes[row])
             raise SimulationError(
-                f"{len(unfit)} of {len(self.cells)} tetrahedra are flat or inside out, the first number {row} (counted "
-                f"from 0) of {float(self.volumes[row]):.3g} m3 and edges up to {float(longest[row]):.3g} m: make the "
-                "tetrahedra again with another detail"
+                f"tetrahedron {row}: expected a positive volume, got {volume:.3g} m3 with edges up to "
+                f"{float(longest[row]):.3g} m ({len(unfit)} of {len(self.cells)} are flat or inverted); make the "
+                "tetrahedra with another detail",
+                row=row,
+                name="cells",
+                value=volume,
             )
+
+
+def no_tetrahedra() -> SimulationError:
+    """Return the error of a body without volume."""
+    return SimulationError(
+        "expected tetrahedra, got none: the body has no volume; give a sheet a thickness", name="cells", value=0
+    )
 
 
 def _volumes(points: Float64[Tensor, "points 3"], cells: Int[Tensor, "cells 4"]) -> Float64[Tensor, " cells"]:

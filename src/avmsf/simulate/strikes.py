@@ -85,7 +85,11 @@ def _reached(
     """Return `_CANDIDATES` times `count` places that a hammer reaches, drawn evenly by area, and their normals."""
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
     if not (len(mesh.faces) and math.isfinite(mesh.area) and mesh.area > 0.0):
-        raise SimulationError(f"a surface of {len(mesh.faces)} triangles has no area to strike: give a mesh with faces")
+        raise SimulationError(
+            f"surface: expected triangles with an area, got {len(mesh.faces)} without; give a mesh with faces",
+            name="surface",
+            value=len(mesh.faces),
+        )
     generator = stream(seed, "contacts")
     wanted = _CANDIDATES * count
     places, normals, drawn = np.zeros((0, 3)), np.zeros((0, 3)), 0
@@ -97,8 +101,10 @@ def _reached(
         drawn += 8 * wanted
     if len(places) < count:
         raise SimulationError(
-            f"a hammer reaches next to nothing of the surface from above or from the side ({len(places)} of {drawn} "
-            "places): name another axis that points up, or turn the mesh's triangles outward"
+            f"expected {count} positions that a hammer reaches from above or the side, got {len(places)} of {drawn}; "
+            "choose another upward axis, or make the mesh's triangles face outwards",
+            name="up",
+            value=len(places),
         )
     return torch.from_numpy(places[:wanted]), torch.from_numpy(normals[:wanted])
 

@@ -43,20 +43,35 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
     seconds to a minute. Raises SimulationError where pytetwild fails or takes more than `timeout`
     seconds, and for what encloses no body: points, sheets, parts that do not touch and walls too thin for the detail.
     """
-    if not 0 < detail < 1:
-        raise SimulationError(f"detail = {detail:g}: expected more than 0 and less than 1 of the body's size")
+    expect_detail(detail)
     skin = Skin.of(surface)
     advice = _advice(skin)
     # Of a sheet fTetWild makes a sliver as thin as its envelope, or nothing, as chance has it.
     if skin.open_edges and _flatness(skin) < 2.0 * _ENVELOPE * detail * skin.size:
-        raise SimulationError(f"the mesh encloses no volume, it is a flat sheet: {advice}")
+        raise SimulationError(
+            f"expected a mesh that encloses a volume, got a flat sheet; {advice}", name="volume", value=0
+        )
     coarse = skin.coarsened(_SHORTEST * detail * skin.size, turn=_TURN)
     points, cells = _tetrahedralize(coarse, detail, timeout)
     if not len(cells):
-        raise SimulationError(f"the mesh encloses no volume ({skin.open_edges} of its edges are open): {advice}")
+        raise SimulationError(
+            f"expected a mesh that encloses a volume, got {skin.open_edges} open edges; {advice}",
+            name="volume",
+            value=skin.open_edges,
+        )
     solid = _largest(Solid.build(torch.from_numpy(points), torch.from_numpy(cells)))
     _expect_likeness(solid, skin, tolerance=4.0 * _ENVELOPE * detail * skin.size, advice=advice)
     return solid
+
+
+def expect_detail(detail: float) -> None:
+    """Raise SimulationError for what is no length of edges over the body's size."""
+    if not 0 < detail < 1:
+        raise SimulationError(
+            f"detail: expected a part of the body's size, above 0 and below 1, got {detail:g}",
+            name="detail",
+            value=detail,
+        )
 
 
 def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
@@ -78,14 +93,18 @@ def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarr
             ended = subprocess.run(command, capture_output=True, timeout=timeout, env=single, cwd=name, check=False)
         except subprocess.TimeoutExpired as error:
             raise SimulationError(
-                f"filling {len(skin.faces)} triangles took more than {timeout:g} s: simplify the mesh, or ask for "
-                "coarser tetrahedra, by a larger detail or fewer freedoms"
+                f"expected tetrahedra of {len(skin.faces)} triangles within {timeout:g} s, got none; simplify the "
+                "mesh, or use a larger detail or fewer freedoms",
+                name="timeout",
+                value=timeout,
             ) from error
         if ended.returncode != 0 or not result.is_file():
-            last = ended.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["it said nothing"]
+            last = ended.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
             raise SimulationError(
-                f"pytetwild broke off (exit status {ended.returncode}; {last[0][:200]}): simplify the mesh, or ask "
-                "for coarser or finer tetrahedra, by detail or freedoms"
+                f"pytetwild: expected exit status 0, got {ended.returncode} ({last[0][:200]}); simplify the mesh, or "
+                "change detail or freedoms",
+                name="pytetwild",
+                value=ended.returncode,
             )
         with np.load(result) as arrays:
             return arrays["points"], arrays["cells"]
@@ -95,10 +114,12 @@ def _largest(solid: Solid) -> Solid:
     """Return the largest part. Raises SimulationError where the others are more than loose bits."""
     volumes = torch.bincount(solid.parts, weights=solid.volumes)
     if float(volumes[0]) < (1.0 - _LOST) * float(volumes.sum()):
-        told = ", ".join(f"{volume:.3g}" for volume in volumes[:4].tolist())
+        sizes = ", ".join(f"{volume:.3g}" for volume in volumes[:4].tolist())
         raise SimulationError(
-            f"the mesh encloses {len(volumes)} parts that do not touch ({told}{', ...' if len(volumes) > 4 else ''} "
-            "m3): one body sounds as one; join them, or give one of them"
+            f"expected a connected body, got {len(volumes)} parts of {sizes}{', ...' if len(volumes) > 4 else ''} m3; "
+            "join them, or give one of them",
+            name="parts",
+            value=len(volumes),
         )
     return Solid.build(solid.points, solid.cells[solid.parts == 0])
 
@@ -112,15 +133,19 @@ def _expect_likeness(solid: Solid, skin: Skin, *, tolerance: float, advice: str)
     lost = float(((found.distances > tolerance) & ~_behind(outside, found, places)).mean())
     if lost > _LOST:
         raise SimulationError(
-            f"{lost:.0%} of the mesh encloses nothing ({skin.open_edges} of its edges are open), or walls too thin for "
-            f"the detail, which may be off by {tolerance:.2g} m: ask for finer tetrahedra, by a "
-            f"smaller detail or more freedoms, close the mesh, or {advice}"
+            f"expected tetrahedra within {tolerance:.2g} m of the mesh, got {lost:.0%} of it without "
+            f"({skin.open_edges} open edges, or thin walls); use a smaller detail or more freedoms, close the mesh, or "
+            f"{advice}",
+            name="detail",
+            value=lost,
         )
     lids = float((ClosestPoints(skin.points[skin.faces])(outside.spread()).distances > tolerance).mean())
     if lids > _LID:
         raise SimulationError(
-            f"{lids:.0%} of the surface would be lids over holes ({skin.open_edges} edges of the mesh are open): close "
-            f"the mesh, or {advice}"
+            f"expected a nearly closed mesh, got {skin.open_edges} open edges whose holes are {lids:.0%} of the "
+            f"surface; close the mesh, or {advice}",
+            name="holes",
+            value=lids,
         )
 
 
@@ -140,4 +165,4 @@ def _flatness(skin: Skin) -> float:
 
 
 def _advice(skin: Skin) -> str:
-    return f"give it a wall, of {0.015 * skin.size:.1g} m perhaps"
+    return f"give a wall thickness, such as {0.015 * skin.size:.1g} m"

@@ -42,7 +42,7 @@ def main(job_path: str, result_path: str) -> None:
 def _load_core(folder: str) -> ModuleType:
     found = FileFinder(folder, (ExtensionFileLoader, EXTENSION_SUFFIXES)).find_spec("PyfTetWildWrapper")
     if found is None or found.loader is None:
-        raise ImportError(f"{folder} holds no PyfTetWildWrapper: pip install --force-reinstall pytetwild")
+        raise ImportError(f"{folder}: expected PyfTetWildWrapper, got none; pip install --force-reinstall pytetwild")
     core = module_from_spec(found)
     found.loader.exec_module(core)
     return core

@@ -88,7 +88,10 @@ def write_truth(truth: Truth, path: str | Path) -> None:
         words = json.dumps(record, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise SimulationError(
-            f"{path}: expected a recipe of finite numbers, words, lists and dicts ({error}): take the rest out of it"
+            f"{path}: expected a recipe of finite numbers, strings, lists and dicts, got others ({error})",
+            file=path,
+            name="recipe",
+            value=str(error),
         ) from error
     content = to_bytes(tensors, {_KEY: words})
     write_whole(path, lambda place: place.write_bytes(content), raising=SimulationError)
@@ -109,7 +112,7 @@ def read_truth(path: str | Path) -> Truth:
 
 
 def _read(path: Path) -> tuple[str, dict[str, Tensor]]:
-    what, advice = "the truth of a simulated object", "simulate it: only objects that `avmsf simulate` made have one"
+    what, advice = "the ground truth of a simulated object", "make the object with avmsf simulate"
     return read_tensors(path, _KEY, what=what, advice=advice, raising=SimulationError)
 
 
@@ -123,13 +126,19 @@ def _understand(words: str, path: Path) -> dict[str, Any]:
             raise ValueError("names or recipe of another type")
     except (ValueError, TypeError, KeyError) as error:
         raise SimulationError(
-            f"{path}: expected the header of a simulated object's truth, found a damaged one ({type(error).__name__}: "
-            f"{error}): simulate the object again"
+            f"{path}: expected the header of a simulated object's ground truth, got {error!r}; simulate the object "
+            "again",
+            file=path,
+            name="header",
+            value=repr(error),
         ) from error
     if found not in (1, FORMAT):
         raise SimulationError(
-            f"{path}: expected a truth of format 1 or {FORMAT}, found format {found}, written by avmsf {writer} (this "
-            f"is avmsf {version('avmsf')}): install avmsf {writer} or newer, or simulate the object again"
+            f"{path}: expected a ground truth of format 1 or {FORMAT}, got format {found}, written by avmsf {writer} "
+            f"(this is avmsf {version('avmsf')}); install avmsf {writer} or newer, or simulate the object again",
+            file=path,
+            name="format",
+            value=found,
         )
     return record
 
@@ -141,9 +150,14 @@ def _expect_tensors(tensors: dict[str, Tensor], contacts: int, path: Path) -> No
     found = {name: tuple(tensor.shape) for name, tensor in tensors.items() if tensor.dtype == torch.float64}
     if found != expected or tensors.keys() != expected.keys():
         raise SimulationError(
-            f"{path}: expected the float64 tensors {expected}, found "
-            f"{ {name: tuple(tensor.shape) for name, tensor in tensors.items()} }: simulate the object again"
+            f"{path}: expected the float64 tensors {expected}, got "
+            f"{ {name: tuple(tensor.shape) for name, tensor in tensors.items()} }; simulate the object again",
+            file=path,
+            name="tensors",
+            value=sorted(name for name in expected.keys() | tensors.keys() if expected.get(name) != found.get(name)),
         )
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
-            raise SimulationError(f"{path}: expected {name} to be finite numbers, found otherwise: simulate it again")
+            raise SimulationError(
+                f"{path}: expected finite {name}, got others; simulate the object again", file=path, name=name
+            )

@@ -73,10 +73,12 @@ def damped(
     ringing = (poles.imag > 0.0) & (-poles.real <= MOST_DAMPED * poles.abs())
     heard = torch.nonzero(ringing & (poles.imag <= 2.0 * math.pi * highest)).flatten()
     if len(heard) == 0:
+        lowest = float(frequency.min())
         raise SimulationError(
-            f"none of {count} modes sounds up to {highest:g} Hz: undamped, the lowest lies at "
-            f"{float(frequency.min()):.4g} Hz: make the object larger or thinner, its material softer or less damped, "
-            "or raise the sample rate"
+            f"expected damped modes up to {highest:g} Hz, got none of {count}, the lowest at {lowest:.4g} Hz undamped; "
+            "make the object larger or thinner, its material softer or less damped, or raise the sample rate",
+            name="frequency",
+            value=lowest,
         )
     heard = heard[torch.argsort(poles.imag[heard])]
     return Vibration(

@@ -92,9 +92,17 @@ class StrikeBook:
             journal = self.files.journal()
             known = journal.get(key)
             if known is not None and known["digest"] != digest:
-                raise RefusedError(409, "this key was used for another strike: reload the page and record again")
+                raise RefusedError(
+                    409,
+                    "Idempotency-Key: expected a new key, got that of another impact; reload the page and record again",
+                    name="Idempotency-Key",
+                    value=key,
+                )
             if known is not None and self._is_taken_out(known):
-                raise RefusedError(409, f"{known['file']} was taken out again: record it anew to have it back")
+                removed = known["file"]
+                raise RefusedError(
+                    409, f"{removed}: expected a recording, got a deleted one; record it again", file=removed
+                )
             if known is None or not self._rows_of(known["file"]):
                 recording = read_upload(content)
                 _, settings = self._expect_usable(recording, newtons=place.newtons)
@@ -171,7 +179,9 @@ class StrikeBook:
         settings = self.settings
         for number, row in self._rows_of(file):
             return self._described(number, row, settings)
-        raise RefusedError(404, f"{file[:80]!r}: expected a recording of {TABLE}, found no such row: reload the page")
+        raise RefusedError(
+            404, f"{TABLE}: expected a row of {file[:80]!r}, got none; reload the page", file=TABLE, value=file
+        )
 
     def _rows_of(self, file: str) -> list[tuple[int, Row]]:
         return [(number, row) for number, row in enumerate(self.table.rows()) if file_of(row) == file]
@@ -183,18 +193,25 @@ class StrikeBook:
     def _expect_own(self, file: str, match: str | None) -> None:
         """Raise RefusedError unless one row has this recording, no link leads to it, and it is the one of `match`."""
         self._found(file)
-        lines = [str(row.line) for _, row in self._rows_of(file)]
+        lines = [row.line for _, row in self._rows_of(file)]
         if len(lines) > 1:
             raise RefusedError(
                 409,
-                f"{file} stands in lines {', '.join(lines)} of {TABLE}, and one of them must be wrong: mend it there",
+                f"{TABLE}, rows {', '.join(map(str, lines))}: expected one row of {file}, got {len(lines)}; correct "
+                "the table",
+                file=TABLE,
+                row=lines[1],
+                name=file,
+                value=lines,
             )
         self.files.own(file)
         if match is not None and match != self.files.digest(file):
             raise RefusedError(
                 409,
-                f"{file} is another recording by now: another tab or program has changed it meanwhile, and nothing was "
-                "overwritten; listen to what it is now and do it again",
+                f"{file}: expected the recording that the page shows, got another one from another tab or program; "
+                "nothing was overwritten; play it and repeat the change",
+                file=file,
+                value=match,
             )
 
     def _expect_usable(
@@ -218,8 +235,11 @@ class StrikeBook:
         usual = max(set(rates), key=rates.count) if rates else recording.sample_rate
         if recording.sample_rate != usual:
             raise CaptureError(
-                f"{recording.name}: expected {usual:g} Hz, as the {counted(len(rates), 'recording')} before, found "
-                f"{recording.sample_rate:g} Hz: record at that rate, or convert it"
+                f"{recording.name}: expected {usual:g} Hz, as in the {counted(len(rates), 'recording')} before, got "
+                f"{recording.sample_rate:g} Hz; record at that rate, or convert it",
+                file=recording.name,
+                name="sample_rate",
+                value=recording.sample_rate,
             )
         return report, settings
 
@@ -240,5 +260,8 @@ class StrikeBook:
 def _expect_key(key: str) -> None:
     if not _KEY.fullmatch(key):
         raise RefusedError(
-            400, "Idempotency-Key: expected 8 to 128 characters that belong to this strike alone: reload the page"
+            400,
+            "Idempotency-Key: expected 8 to 128 printable ASCII characters, got others; reload the page",
+            name="Idempotency-Key",
+            value=key,
         )

@@ -19,7 +19,7 @@ from avmsf.tasks.recast import LAWS, recast
 from avmsf.tasks.retune import retune
 
 _MATERIAL, _MODE = ("from", "to"), ("mode", "db", "pitch", "decay")
-_OLD_CONTROL = '"Material it is of"'
+_OLD_CONTROL = '"Present material"'
 """What the page calls its choice of the old material."""
 _LIMITS = {
     # Lengths of struck objects lie between a millimeter and tens of meters; frequencies go with 1 / size.
@@ -88,16 +88,28 @@ class Sliders:
         _expect_keys(material, _MATERIAL, "material")
         rows = words.get("modes") or []
         if not isinstance(rows, list):
-            raise RefusedError(400, f"modes: expected a list, found {echo(rows)}: reload the page")
+            raise RefusedError(
+                400, f"modes: expected a list, got {echo(rows)}; reload the page", name="modes", value=rows
+            )
         if modes is not None and len(rows) > modes:
-            raise RefusedError(400, f"modes: expected at most {modes} rows, one a mode, found {len(rows)}")
+            raise RefusedError(
+                400,
+                f"modes: expected at most {modes} rows, one per mode, got {len(rows)}",
+                name="modes",
+                value=len(rows),
+            )
         changes = tuple(_mode(row) for row in rows)
         repeated = [mode for mode, count in Counter(change.mode for change in changes).items() if count > 1]
         if repeated:
-            raise RefusedError(400, f"modes: expected one row a mode, found several of mode {repeated[0]}")
+            raise RefusedError(
+                400,
+                f"modes: expected one row per mode, got several of mode {repeated[0]}",
+                row=repeated[0],
+                name="modes",
+            )
         law = words.get("law", "displacement")
         if not isinstance(law, str) or law not in LAWS:
-            raise RefusedError(400, f"law: expected one of {', '.join(LAWS)}, found {echo(law)}")
+            raise RefusedError(400, f"law: expected one of {', '.join(LAWS)}, got {echo(law)}", name="law", value=law)
         return cls(
             _name(material.get("to"), "to"),
             _name(material.get("from"), "from"),
@@ -136,7 +148,9 @@ class Sliders:
         pitch, decay = torch.full_like(levels, self.pitch), torch.full_like(levels, self.decay)
         for row in self.modes:
             if row.mode >= count:
-                raise EditError(f"mode {row.mode}: expected a row of the field's {count} modes, counted from 0")
+                raise EditError(
+                    f"mode: expected 0 to {count - 1}, got {row.mode}; reload the page", name="mode", value=row.mode
+                )
             levels[row.mode] += row.db
             pitch[row.mode] *= row.pitch
             decay[row.mode] *= row.decay
@@ -154,7 +168,9 @@ def _mode(row: Any) -> ModeChange:
     _expect_keys(row, _MODE, "a mode")
     mode = row.get("mode")
     if not isinstance(mode, int) or isinstance(mode, bool) or not 0 <= mode < _MAX_ROW:
-        raise RefusedError(400, f"mode: expected a row counted from 0, found {echo(mode)}: reload the page")
+        raise RefusedError(
+            400, f"mode: expected an index from 0, got {echo(mode)}; reload the page", name="mode", value=mode
+        )
     mute = "db" in row and row["db"] is None
     return ModeChange(
         mode, MUTE if mute else _number(row, "db", 0.0), _number(row, "pitch", 1.0), _number(row, "decay", 1.0)
@@ -164,11 +180,19 @@ def _mode(row: Any) -> ModeChange:
 def _expect_keys(words: Any, known: tuple[str, ...], what: str) -> None:
     if not isinstance(words, Mapping):
         raise RefusedError(
-            400, f"{what}: expected an object with {', '.join(known)}, found {echo(words)}: reload the page"
+            400,
+            f"{what}: expected an object with {', '.join(known)}, got {echo(words)}; reload the page",
+            name=what,
+            value=words,
         )
     unknown = sorted(set(words) - set(known))
     if unknown:
-        raise RefusedError(400, f"{what}: expected {', '.join(known)}, found {echo(unknown)}: reload the page")
+        raise RefusedError(
+            400,
+            f"{what}: expected {', '.join(known)}, got {echo(unknown)}; reload the page",
+            name=what,
+            value=unknown,
+        )
 
 
 def _number(words: Mapping[str, Any], name: str, rest: float) -> float:
@@ -180,14 +204,16 @@ def _number(words: Mapping[str, Any], name: str, rest: float) -> float:
         with suppress(OverflowError):
             number = float(value)
     if not math.isfinite(number):
-        raise RefusedError(400, f"{name}: expected a number, found {echo(value)}")
+        raise RefusedError(400, f"{name}: expected a number, got {echo(value)}", name=name, value=value)
     least, greatest = _LIMITS[name]
     if not least <= number <= greatest:
-        raise RefusedError(400, f"{name}: expected {least:g} to {greatest:g}, found {number:g}")
+        raise RefusedError(400, f"{name}: expected {least:g} to {greatest:g}, got {number:g}", name=name, value=number)
     return number
 
 
 def _name(value: Any, what: str) -> str | None:
     if value is not None and not (isinstance(value, str) and len(value) <= _MAX_NAME):
-        raise RefusedError(400, f'material "{what}": expected a name, found {echo(value)}')
+        raise RefusedError(
+            400, f'material "{what}": expected a name, got {echo(value)}', name=f"material.{what}", value=value
+        )
     return value or None

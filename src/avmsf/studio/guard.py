@@ -19,7 +19,7 @@ from avmsf.studio.policy import NOTHING
 from avmsf.studio.refusal import RefusedError, response_to
 
 NOTHING_HERE = "there is nothing at this address"
-"""By this the page knows that its studio has moved: `server.js` has the same words."""
+"""By this the page knows that its studio has moved: `server.js` has the same text."""
 LARGEST_UPLOAD = 64 << 20
 """Bytes of one request: a minute of stereo sound at 96 kHz, 32 bits."""
 LARGEST_WORDS = 1 << 20
@@ -75,10 +75,14 @@ class Guard:
         hosts = headers.getlist("host")
         if len(hosts) != 1 or hosts[0].lower() not in self.hosts:
             raise RefusedError(
-                403, "expected this machine's own name as host, found another: open the address as printed"
+                403,
+                f"host: expected {' or '.join(LOOPBACK)}, got another; open the address as printed",
+                name="host",
+                value=hosts,
             )
-        if any(each.lower() != f"http://{hosts[0].lower()}" for each in headers.getlist("origin")):
-            raise RefusedError(403, "expected a request of the studio's own page, found another site's")
+        origins = headers.getlist("origin")
+        if any(each.lower() != f"http://{hosts[0].lower()}" for each in origins):
+            raise RefusedError(403, "origin: expected the studio's own page, got another", name="origin", value=origins)
         first, slash, rest = scope["path"].removeprefix("/").partition("/")
         if not secrets.compare_digest(first.encode(), self.token.encode()):
             raise nothing_here()
@@ -119,7 +123,7 @@ def _hardened(send: Send) -> Send:
 def too_large(largest: int) -> RefusedError:
     """Return what to raise for a request of more than `largest` bytes."""
     return RefusedError(
-        413, f"expected at most {largest >> 10} KiB in one request, found more: send a shorter recording"
+        413, f"expected at most {largest >> 10} KiB in one request, got more; send a shorter recording", name="request"
     )
 
 
@@ -147,10 +151,11 @@ async def read_words(request: Request, *, largest: int = LARGEST_WORDS) -> dict[
         words = parse_json(body.decode())
     except ValueError as error:
         raise RefusedError(
-            400, f"expected a JSON object, found what is none ({str(error)[:100]}): reload the page"
+            400, f"expected a JSON object, got other data ({str(error)[:100]}); reload the page", name="request"
         ) from error
     if not isinstance(words, dict):
-        raise RefusedError(400, f"expected a JSON object, found {type(words).__name__}: reload the page")
+        kind = type(words).__name__
+        raise RefusedError(400, f"expected a JSON object, got {kind}; reload the page", name="request", value=kind)
     return words
 
 

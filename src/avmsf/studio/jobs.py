@@ -58,7 +58,7 @@ class Job:
         except Exception as error:  # whatever it is, the next job must be able to start
             traceback.print_exception(error)
             words = " ".join(f"{type(error).__name__}: {error}".split())[:_LAST_WORDS]
-            last = {"error": f"{self.kind} failed ({words}): the server's terminal shows more; start it again"}
+            last = {"error": f"{self.kind} failed ({words}); see the server's terminal, and start it again"}
         finally:
             self._end_process(signal.SIGKILL)
             await self._tell(last, last=True)
@@ -141,11 +141,11 @@ class Job:
         if result is None and status < 0:
             print(printable(words), end="", file=sys.stderr)
             return {
-                "error": f"{self.kind}: the work was ended from outside or crashed ({_signal_name(-status)}): try it "
-                "again, and close other programs first where memory is short"
+                "error": f"{self.kind} was stopped by the system or crashed ({_signal_name(-status)}); close other "
+                "programs if memory is short, and start it again"
             }
         if result is None:
-            ending = words.strip().splitlines()[-1:] or ["it said nothing"]
+            ending = words.strip().splitlines()[-1:] or ["no message"]
             return {"error": f"{self.kind} ended with status {status} and no result: {ending[0]}"}
         if "error" in result:
             return result
@@ -192,8 +192,10 @@ class Jobs:
         if current is not None:
             raise RefusedError(
                 409,
-                f"{current.kind} is under way, and one job runs at a time: wait for it or stop it",
-                job=current.identifier,
+                f"expected no running job, got {current.kind}; wait for it or stop it",
+                name="job",
+                value=current.kind,
+                more={"job": current.identifier},
             )
 
     def start(self, kind: str, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> Job:
@@ -207,7 +209,7 @@ class Jobs:
     def named(self, identifier: str) -> Job:
         """Return a job. Raises RefusedError (404)."""
         if identifier not in self._jobs:
-            raise RefusedError(404, "there is no such job: start it again")
+            raise RefusedError(404, "expected a known job, got another; start it again", name="job", value=identifier)
         return self._jobs[identifier]
 
     async def close(self) -> None:

@@ -30,19 +30,23 @@ class Wish:
         if unknown:
             raise RefusedError(
                 400,
-                f"expected {', '.join(_KEYS)} alone, found {echo(unknown)} too: set the sliders before or after",
+                f"expected only {', '.join(_KEYS)}, got {echo(unknown)} too; set the sliders before or after",
+                name="prompt",
+                value=unknown,
             )
         if model is None:
             raise EditError(
-                "editing by words needs the extra and the model: pip install 'avmsf[text]' and start avmsf studio with "
-                "--model FOLDER"
+                "expected the extra and the model for edits by text, got none; pip install 'avmsf[text]' and start "
+                "avmsf studio with --model FOLDER",
+                name="model",
             )
         prompt = words.get("prompt")
         if not isinstance(prompt, str) or not prompt.strip() or len(prompt) > _MAX_PROMPT:
             raise RefusedError(
                 400,
-                f'prompt: expected a description of at most {_MAX_PROMPT} characters, such as "a wooden bowl is hit", '
-                f"found {echo(prompt)}",
+                f'prompt: expected 1 to {_MAX_PROMPT} characters, such as "a wooden bowl is hit", got {echo(prompt)}',
+                name="prompt",
+                value=prompt,
             )
         return cls(prompt=prompt)
 

@@ -40,9 +40,12 @@ def find_modules() -> Path | None:
     lacking = [name for name, version in PINNED.items() if _version(folder / name) != version]
     if named and lacking:
         raise StudioError(
-            f"{MODULES_VARIABLE} = {named}: expected the folder node_modules with "
-            f"{', '.join(f'{name} {PINNED[name]}' for name in lacking)}, found it without: run avmsf studio "
-            "--fetch-modules and leave the variable out"
+            f"{MODULES_VARIABLE}: expected a folder node_modules with "
+            f"{', '.join(f'{name} {PINNED[name]}' for name in lacking)}, got {named}; run avmsf studio "
+            "--fetch-modules and unset the variable",
+            file=named,
+            name=MODULES_VARIABLE,
+            value=lacking,
         )
     return None if lacking else folder
 
@@ -52,8 +55,9 @@ def fetch_modules() -> Path:
     npm = shutil.which("npm")
     if npm is None:
         raise StudioError(
-            "expected npm to fetch the page's libraries with, found none: install Node.js, or leave --fetch-modules "
-            "out, and the page takes them from a network"
+            "expected npm for --fetch-modules, got none; install Node.js, or leave the option out to load the "
+            "libraries from a network",
+            name="npm",
         )
     home = cache_folder()
     home.mkdir(parents=True, exist_ok=True)
@@ -62,13 +66,19 @@ def fetch_modules() -> Path:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_SECONDS, check=False)
     except subprocess.TimeoutExpired as error:
-        raise StudioError(f"npm did not end within {_SECONDS:g} s: check the network and try again") from error
+        raise StudioError(
+            f"npm: expected an end within {_SECONDS:g} s, got none; check the network and try again",
+            name="npm",
+            value=_SECONDS,
+        ) from error
     found = find_modules() if done.returncode == 0 else None
     if found is None:
         lines = (done.stderr or done.stdout).strip().splitlines()
         raise StudioError(
-            f"npm could not bring {', '.join(wanted)} ({lines[-1] if lines else 'it said nothing'}): check the network "
-            "and try again"
+            f"npm: expected {', '.join(wanted)}, got {lines[-1] if lines else 'no message'}; check the network and try "
+            "again",
+            name="npm",
+            value=done.returncode,
         )
     return found
 
@@ -77,7 +87,11 @@ def with_local_modules(page: str) -> str:
     """Return the page's HTML with its import map pointing to `modules/` beside it. Raises StudioError."""
     found = IMPORT_MAP.findall(page)
     if len(found) != 1:
-        raise StudioError(f"expected one import map in the page, found {len(found)}: install avmsf again")
+        raise StudioError(
+            f"expected one import map in the page, got {len(found)}; install avmsf again",
+            name="importmap",
+            value=len(found),
+        )
     imports = {name: _local(address) for name, address in json.loads(found[0][1])["imports"].items()}
     words = json.dumps({"imports": imports}, indent=2)
     return IMPORT_MAP.sub(lambda script: f"{script[1]}\n{words}\n{script[3]}", page)
@@ -90,8 +104,10 @@ def _local(address: str) -> str:
         return address
     if PINNED.get(remote["package"]) != remote["version"]:
         raise StudioError(
-            f"expected the page to ask for {', '.join(f'{name} {version}' for name, version in PINNED.items())}, found "
-            f"{address}: install avmsf again"
+            f"expected {', '.join(f'{name} {version}' for name, version in PINNED.items())} in the page, got "
+            f"{address}; install avmsf again",
+            name="importmap",
+            value=address,
         )
     return f"./modules/{remote['package']}/{remote['rest']}"
 

@@ -53,14 +53,21 @@ def open_target(target: Path, *, object: Path | None = None, capture: Path | Non
     folder that it lies in.
     """
     if object is not None and not object.is_file():
-        raise StudioError(f"{object}: expected a mesh or Gaussians to show, found no such file: check --object")
+        raise StudioError(
+            f"{object}: expected a mesh or Gaussians, got no such file; check --object", file=object, name="object"
+        )
     if capture is not None and target.suffix.lower() not in MESHES and not capture.is_dir():
-        raise StudioError(f"{capture}: expected a capture folder, found none: check --capture")
+        raise StudioError(
+            f"{capture}: expected a capture folder, got none; check --capture", file=capture, name="capture"
+        )
     if target.is_dir():
         return _open_folder(target, object)
     if not target.is_file():
         raise StudioError(
-            f"{target}: expected a field, a capture folder, a folder of images or a mesh, found nothing: check the path"
+            f"{target}: expected a field, a capture folder, a folder of images or a mesh, got no such file; check the "
+            "path",
+            file=target,
+            name="target",
         )
     if target.suffix.lower() in MESHES:
         return _open_mesh(target, object, capture)
@@ -107,8 +114,10 @@ def _open_folder(folder: Path, object: Path | None) -> Opened:
     opened = Opened(folder.name, folder, field if field.is_file() else None, folder, object)
     if not ((folder / TABLE).is_file() or find_object(opened) is not None or shows_more(opened)):
         raise StudioError(
-            f"{folder}: expected a capture folder with {TABLE}, or with what shows the object (images/, a video, "
-            f"{', '.join(f'surface{suffix}' for suffix in MESHES)}, splats.ply), found none of these: put one there"
+            f"{folder}: expected a capture folder with {TABLE}, images/, a video, "
+            f"{', '.join(f'surface{suffix}' for suffix in MESHES)} or splats.ply, got none of these; add one",
+            file=folder,
+            name=TABLE,
         )
     return opened
 
@@ -117,8 +126,10 @@ def _open_mesh(mesh: Path, object: Path | None, capture: Path | None) -> Opened:
     size = mesh.stat().st_size
     if size > LARGEST_MESH:
         raise StudioError(
-            f"{mesh}: expected a mesh of at most {LARGEST_MESH >> 20} MiB, found {size >> 20}: reduce it first, a "
-            "hundred thousand triangles show all that is heard"
+            f"{mesh}: expected a mesh of at most {LARGEST_MESH >> 20} MiB, got {size >> 20}; reduce it to a hundred "
+            "thousand triangles",
+            file=mesh,
+            value=size,
         )
     if capture is None and (mesh.stem == "surface" or mesh.name in SPLATS):
         return _open_folder(mesh.resolve().parent, object)
@@ -127,11 +138,18 @@ def _open_mesh(mesh: Path, object: Path | None, capture: Path | None) -> Opened:
     names = (*(f"surface{suffix}" for suffix in MESHES), *SPLATS)
     others = [folder / name for name in names if (folder / name).is_file()]
     if folder.exists() and not folder.is_dir():
-        raise StudioError(f"{folder}: expected a capture folder or nothing, found a file: name one by --capture")
+        raise StudioError(
+            f"{folder}: expected a capture folder or none, got a file; name a folder by --capture",
+            file=folder,
+            name="capture",
+        )
     if others and not (surface in others and _same(surface, mesh)):
         raise StudioError(
-            f"{folder}: has another object, {others[0].name}, and its strikes belong to that one: open the folder, or "
-            "name another by --capture"
+            f"{folder}: expected a capture of this mesh, got one of {others[0].name}; open the folder, or name another "
+            "by --capture",
+            file=folder,
+            name="capture",
+            value=others[0].name,
         )
     if not others:
         _copy(_named_by(mesh), folder)
@@ -162,8 +180,10 @@ def _copy(files: Iterable[Path], folder: Path) -> None:
             lacking[place] = path
         elif not _same(place, path):
             raise StudioError(
-                f"{place}: expected no file, or the {path.name} that the mesh names, found another one: move it away, "
-                "or name another folder by --capture"
+                f"{place}: expected no file, or the mesh's own {path.name}, got another one; move it away, or name "
+                "another folder by --capture",
+                file=place,
+                name="capture",
             )
     for place, path in lacking.items():
         copy_whole(path, place, raising=StudioError)

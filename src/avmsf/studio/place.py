@@ -24,17 +24,28 @@ class Place:
         """Return the place of a request's query x, y, z, perhaps nx, ny, nz, newtons. Raises RefusedError (400)."""
         contact = _vector(query, REQUIRED[1:])
         if contact is None:
-            raise RefusedError(400, "expected the contact as x, y and z in meters, found none: click the object first")
+            raise RefusedError(
+                400, "expected the contact as x, y and z in meters, got none; click the object first", name="contact"
+            )
         if max(map(abs, contact)) > FARTHEST:
-            raise RefusedError(400, f"expected a contact within {FARTHEST:g} m of the origin, found {contact}")
+            raise RefusedError(
+                400,
+                f"expected a contact within {FARTHEST:g} m of the origin, got {contact}",
+                name="contact",
+                value=contact,
+            )
         direction = _vector(query, DIRECTION)
         if direction is not None and math.hypot(*direction) == 0:
-            raise RefusedError(400, "nx, ny, nz: expected a direction, found the zero vector")
+            raise RefusedError(
+                400, "nx, ny, nz: expected a direction, got the zero vector", name="direction", value=direction
+            )
         newtons = None
         if "newtons" in query:
             newtons = _finite(query, "newtons")
             if newtons <= 0:
-                raise RefusedError(400, f"newtons: expected a peak force above 0, found {newtons:g}")
+                raise RefusedError(
+                    400, f"newtons: expected a peak force above 0, got {newtons:g}", name="newtons", value=newtons
+                )
         return cls(contact, direction, newtons)
 
 
@@ -51,5 +62,6 @@ def _finite(query: Mapping[str, str], name: str) -> float:
     except (KeyError, ValueError):
         value = math.nan
     if not math.isfinite(value):
-        raise RefusedError(400, f"{name}: expected a number, found {echo(query.get(name, 'none'))}")
+        found = query.get(name)
+        raise RefusedError(400, f"{name}: expected a number, got {echo(found)}", name=name, value=found)
     return value

@@ -1,8 +1,10 @@
-"""What the page is told where something cannot be done: a sentence that says how it can, and a status."""
+"""Answers to requests that cannot be done: a message that says what to do, and an HTTP status."""
 
 import errno
 import json
 import reprlib
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -29,11 +31,21 @@ _repr.maxlevel = 3
 
 
 class RefusedError(StudioError):
-    """A request that is not done, with its HTTP status and perhaps more than words."""
+    """A request that is not done, with its HTTP status and `more` entries for the answer."""
 
-    def __init__(self, status: int, words: str, **more: Any) -> None:
-        super().__init__(words)
-        self.status, self.more = status, more
+    def __init__(
+        self,
+        status: int,
+        message: str,
+        *,
+        file: Path | str | None = None,
+        row: int | None = None,
+        name: str | None = None,
+        value: Any = None,
+        more: Mapping[str, Any] | None = None,
+    ) -> None:
+        super().__init__(message, file=file, row=row, name=name, value=value)
+        self.status, self.more = status, more or {}
 
 
 class Answer(JSONResponse):
@@ -45,7 +57,7 @@ class Answer(JSONResponse):
 
 
 def response_to(error: AvmsfError) -> Answer:
-    """Return what the page is answered: the error's words, and what more a `RefusedError` has to say."""
+    """Return the answer to the page: the error's message, and the `more` of a `RefusedError`."""
     status = error.status if isinstance(error, RefusedError) else UNUSABLE
     more = error.more if isinstance(error, RefusedError) else {}
     return Answer({"error": " ".join(str(error).split()), **more}, status)
@@ -57,16 +69,20 @@ def refusal_of(error: Exception) -> RefusedError:
     The page sends a recording again after a status of 500 or more, and not after a lower one.
     """
     if lacks_memory(error):
-        return RefusedError(503, "there is not enough memory for this: close other programs, or send less")
+        return RefusedError(503, "expected more free memory; close other programs, or send less", name="memory")
     if isinstance(error, OSError):
         where = "" if error.filename is None else f"{error.filename}: "
-        what = f"{where}cannot be read or written ({error.strerror or error}): {way_out(error)}"
-        return RefusedError(507 if error.errno in _FULL else 503, what)
+        reason = error.strerror or str(error)
+        return RefusedError(
+            507 if error.errno in _FULL else 503,
+            f"{where}expected a file to read or write, got {reason!r}; {way_out(error)}",
+            file=error.filename if isinstance(error.filename, str | Path) else None,
+            value=reason,
+        )
     if isinstance(error, RecursionError):
-        return RefusedError(400, "expected a request of few levels, got one nested too deeply: reload the page")
-    return RefusedError(
-        UNUSABLE, f"the computation failed ({type(error).__name__}: {str(error)[:_MAX_ECHO]}): try other values"
-    )
+        return RefusedError(400, "expected a request of few levels, got too many; reload the page")
+    reason = f"{type(error).__name__}: {str(error)[:_MAX_ECHO]}"
+    return RefusedError(UNUSABLE, f"expected values that give a result, got {reason}; try other values", value=reason)
 
 
 def echo(value: Any) -> str:

@@ -20,8 +20,8 @@ from avmsf.studio.guard import contained, nothing_here, read_words
 from avmsf.studio.modules import find_modules, with_local_modules
 from avmsf.studio.place import Place
 from avmsf.studio.policy import policy_of
-from avmsf.studio.refusal import FORESEEN_ERRORS, Answer, RefusedError, echo, refusal_of, response_to
-from avmsf.studio.studio import Studio
+from avmsf.studio.refusal import FORESEEN_ERRORS, Answer, refusal_of, response_to
+from avmsf.studio.studio import Studio, unknown_base
 
 PAGE = Path(__file__).parent / "page"
 _SOUNDS = tuple(suffix for suffix, kind in MEDIA_TYPES.items() if kind.startswith("audio/"))
@@ -132,7 +132,7 @@ class Calls:
         """Lead the sound towards a recording."""
         base = request.query_params.get("base", "")
         if not (base.isascii() and base.isdigit() and len(base) < 10):
-            raise RefusedError(400, f"base: expected the revision that the change is of, found {echo(base)}")
+            raise unknown_base(base)
         return Answer(await self.studio.lead(int(base), await request.body()), 202)
 
     async def undo(self, request: Request) -> Response:
@@ -227,7 +227,7 @@ async def _answer_refused(request: Request, error: Exception) -> Response:
 
 async def _answer_unknown(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    return Answer({"error": f"{request.method}: there is nothing of the kind at this address"}, error.status_code)
+    return Answer({"error": f"{request.method}: nothing found at this address"}, error.status_code)
 
 
 async def _answer_nobody(request: Request, error: Exception) -> Response:
@@ -243,5 +243,5 @@ async def _answer_broken(request: Request, error: Exception) -> Response:
         return response_to(refusal_of(error))
     # The server's own word on it is hidden with all that it says of ordinary requests.
     traceback.print_exception(error)
-    words = f"the server failed at this ({type(error).__name__}): its terminal shows more; reload to see what was done"
+    words = f"the server failed ({type(error).__name__}); see its terminal, and reload the page for the current state"
     return Answer({"error": words}, 500)

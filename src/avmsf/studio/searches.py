@@ -66,4 +66,4 @@ def _report(error: Exception) -> None:
     if not isinstance(error, (AvmsfError, *FORESEEN_ERRORS)):
         traceback.print_exception(error)
     words = printable(" ".join(str(error).split()))
-    print(f"blows cannot be located on this revision ({type(error).__name__}: {words})", file=sys.stderr)
+    print(f"impacts cannot be located on this revision ({type(error).__name__}: {words})", file=sys.stderr)

@@ -54,7 +54,7 @@ class PageServer(uvicorn.Server):
             loop.default_exception_handler(context)
         elif not self._exhausted:
             self._exhausted = True
-            print(f"no more connections can be accepted for now ({error.strerror})", file=sys.stderr)
+            print(f"cannot accept more connections for now ({error.strerror})", file=sys.stderr)
 
 
 def serve(
@@ -103,8 +103,10 @@ def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
         return tempfile.TemporaryDirectory(prefix="avmsf-studio-")
     except OSError as error:
         raise StudioError(
-            f"no temporary folder can be made ({error.strerror or error}): free some space, or name another place in "
-            "the environment variable TMPDIR"
+            f"expected a temporary folder, got {error.strerror or error}; free some space, or set the environment "
+            "variable TMPDIR to another folder",
+            name="TMPDIR",
+            value=error.strerror or str(error),
         ) from error
 
 
@@ -131,15 +133,18 @@ def _listening(port: int | None) -> socket.socket:
             listener.close()
             if error.errno == errno.EADDRINUSE and number == PORT and port is None:
                 continue
-            why = "taken by another program" if error.errno == errno.EADDRINUSE else error.strerror
             raise StudioError(
-                f"port {number}: expected a free one, found it {why}: leave --port out, or give --port 0 for any that "
-                "is free"
+                f"port {number}: expected a free port, got {error.strerror!r}; leave --port out, or give --port 0 for "
+                "any free one",
+                name="port",
+                value=number,
             ) from error
         except OverflowError as error:
             listener.close()
-            raise StudioError(f"port {number}: expected 0 to 65535, found another: leave --port out") from error
-    raise AssertionError("a port that is asked for by 0 is free")
+            raise StudioError(
+                f"port: expected 0 to 65535, got {number}; leave --port out", name="port", value=number
+            ) from error
+    raise AssertionError("port 0 gives a free port")
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

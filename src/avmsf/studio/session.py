@@ -50,7 +50,9 @@ class Revision:
     def expect_field(self) -> SoundField:
         """Return what is heard. Raises RefusedError (409) before there is a field."""
         if self.field is None:
-            raise RefusedError(409, "expected a field, found none yet: record strikes and reconstruct it first")
+            raise RefusedError(
+                409, "expected a field, got none yet; record impacts and reconstruct it first", name="field"
+            )
         return self.field
 
 
@@ -102,7 +104,7 @@ class Session:
         with self._lock:
             self.expect_current(base)
             if not self._past:
-                raise RefusedError(409, "there is nothing to undo: the field is as it was opened")
+                raise RefusedError(409, "expected a change to undo, got none since the field was opened", name="undo")
             undone = self._advance(self._past[-1])
             self._past.pop()
             return undone
@@ -134,16 +136,22 @@ class Session:
             except RefusedError:
                 continue
             return path
-        raise StudioError(f"{self.home}: has {_MOST_ALIKE} files called {stem}: move them away")
+        raise StudioError(
+            f"{self.home}: expected fewer than {_MOST_ALIKE} files called {stem}, got more; move them away",
+            file=self.home,
+            name=stem,
+        )
 
     def expect_current(self, base: int) -> None:
         """Raise RefusedError (409), with the current revision, where `base` is another one."""
         if base != self._current.number:
             raise RefusedError(
                 409,
-                "another tab has changed the field meanwhile, and nothing was overwritten: look at what it is now and "
+                "expected the current field, got an older one: another tab has changed it; nothing was overwritten; "
                 "make the change again",
-                revision=self._current.number,
+                name="base",
+                value=base,
+                more={"revision": self._current.number},
             )
 
     def _remember(self, revision: Revision) -> Revision:
@@ -164,10 +172,14 @@ def _write_new(field: SoundField, path: Path) -> None:
     try:
         os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except FileExistsError as error:
-        raise RefusedError(409, f"{path.name} is there already and stays: choose another name") from error
+        raise RefusedError(
+            409, f"{path.name}: expected a new name, got an existing file; choose another name", file=path
+        ) from error
     except OSError as error:
-        advice = way_out(error) if path.parent.is_dir() else "the folder is gone: put it back"
-        raise StudioError(f"{path}: cannot be written ({error.strerror}): {advice}") from error
+        advice = way_out(error) if path.parent.is_dir() else "restore the folder"
+        raise StudioError(
+            f"{path}: expected a writable path, got {error.strerror!r}; {advice}", file=path, value=error.strerror
+        ) from error
     try:
         save(field, path)
     except BaseException:
@@ -180,10 +192,17 @@ def file_name(name: str) -> str:
     stem = name.strip().removesuffix(SUFFIX)
     if not _NAME.fullmatch(stem) or _DEVICES.fullmatch(stem) or stem.endswith((".", " ")):
         raise RefusedError(
-            400, f"expected a name of letters, digits, spaces, - and _, such as bowl in wood, found {name[:120]!r}"
+            400,
+            f"name: expected letters, digits, spaces, - and _, such as bowl in wood, got {name[:120]!r}",
+            name="name",
+            value=name,
         )
-    if len(stem.encode()) > _LONGEST_NAME:
+    size = len(stem.encode())
+    if size > _LONGEST_NAME:
         raise RefusedError(
-            400, f"expected a name of at most {_LONGEST_NAME} bytes, found {len(stem.encode())}: choose a shorter one"
+            400,
+            f"name: expected at most {_LONGEST_NAME} bytes, got {size}; choose a shorter one",
+            name="name",
+            value=size,
         )
     return f"{stem}{SUFFIX}"

@@ -149,7 +149,8 @@ class Showcase:
                 points = torch.zeros(0 if self.opened.capture is None else 1, 3)
         if not len(points):
             raise StudioError(
-                f"{self.opened.name}: expected the object's geometry, found none: give a mesh or Gaussians by --object"
+                f"{self.opened.name}: expected the object's geometry, got none; give a mesh or Gaussians by --object",
+                name="object",
             )
         points = _thinned(points.float(), _CLICKED)
         return points, outward_normals(points)
@@ -160,7 +161,7 @@ class Showcase:
         return 1.0 if self.opened.object is not None else self.opened.settings.surface_meters
 
     def _strikes(self, field: SoundField | None) -> tuple[Impacts | None, tuple[str, ...]]:
-        """Return the capture's strikes each from its own onset, or a word on why they cannot be compared."""
+        """Return the capture's impacts, each from its own onset, or the reason why they cannot be compared."""
         if field is None or self.opened.capture is None:
             return None, ()
         try:
@@ -168,11 +169,11 @@ class Showcase:
                 warnings.simplefilter("ignore", CaptureWarning)
                 impacts = read_capture(self.opened.capture).impacts
         except CaptureError as error:
-            return None, (f"measured strikes are not shown: {error}",)
+            return None, (f"recorded impacts are not shown: {error}",)
         if impacts.sample_rate != field.sample_rate:
             return None, (
-                f"measured strikes are not shown: they are at {impacts.sample_rate:g} Hz and the field is at "
-                f"{field.sample_rate:g} Hz",
+                f"recorded impacts are not shown: expected the field's {field.sample_rate:g} Hz, got "
+                f"{impacts.sample_rate:g} Hz",
             )
         return impacts, ()
 

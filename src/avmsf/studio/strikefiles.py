@@ -50,14 +50,18 @@ class StrikeFiles:
             try:
                 held.enter_context(write_lock(self.folder / CACHE, "capture", command=COMMAND, wait=_WAIT))
             except FolderInUseError as error:
-                raise RefusedError(503, f"{error}, and try again; nothing was changed") from error
+                raise RefusedError(
+                    503, f"{error}, and try again; nothing was changed", file=error.file, value=error.value
+                ) from error
             yield
 
     def readable(self, file: str) -> Path:
         """Return a recording's path. Raises RefusedError (404) for one that leads out of the folder by a link."""
         path = (self.folder / file).resolve()
         if not path.is_relative_to(self.folder):
-            raise RefusedError(404, f"{file}: lies outside the capture folder: copy it there")
+            raise RefusedError(
+                404, f"{file}: expected a file in the capture folder, got one outside; copy it there", file=file
+            )
         return path
 
     def own(self, file: str) -> Path:
@@ -67,7 +71,9 @@ class StrikeFiles:
         """
         path = self.folder / file
         if path.resolve() != path:
-            raise RefusedError(409, f"{file}: expected the recording itself, found a link to it: copy it there first")
+            raise RefusedError(
+                409, f"{file}: expected a file, got a link; copy the file there first", file=file, value="link"
+            )
         return path
 
     def digest(self, file: str) -> str | None:

@@ -40,10 +40,22 @@ class StrikeTable:
         header = [name.lower() for name in lines[0][1]]
         lacking = [name for name in REQUIRED if name not in header]
         if lacking:
-            raise CaptureError(f"{self.path}: the column {lacking[0]} is missing: mend the table, or move it away")
+            raise CaptureError(
+                f"{self.path}, row 1: expected the column {lacking[0]}, got {', '.join(header)}; correct the table, or "
+                "move it away",
+                file=self.path,
+                row=1,
+                name=lacking[0],
+                value=header,
+            )
         for line, cells in lines[1:]:
             if len(cells) != len(header):
-                raise CaptureError(f"{TABLE} line {line}: {len(cells)} cells where the header has {len(header)}")
+                raise CaptureError(
+                    f"{self.path}, row {line}: expected {len(header)} cells as in the header, got {len(cells)}",
+                    file=self.path,
+                    row=line,
+                    value=len(cells),
+                )
         return [Row(line, dict(zip(header, cells, strict=True)), separator != ",") for line, cells in lines[1:]]
 
     def expect_room(self, place: Place) -> None:
@@ -51,7 +63,12 @@ class StrikeTable:
         names = [name.lower() for name in self._header()]
         for column, value, what in ((DIRECTION[0], place.direction, "direction"), (FORCE, place.newtons, "force")):
             if column in names and value is None:
-                raise RefusedError(422, f"{self.path}: every row has a {what} and this strike has none: give it one")
+                raise RefusedError(
+                    422,
+                    f"{self.path}: expected a {what} as in all rows, got none; add it",
+                    file=self.path,
+                    name=what,
+                )
 
     def add(self, file: str, place: Place, settings: CaptureSettings) -> None:
         """Write a row after the last; a table that is not there yet gets columns for what is known of the strike."""

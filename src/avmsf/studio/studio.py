@@ -26,7 +26,7 @@ from avmsf.tasks.edits import EDITS, remarks
 MODES = 128
 STEER_STEPS = 150
 """Steps of a descent in the page: half of the command line's, after which little changes."""
-_MAKING = "make the object of its pictures"
+_MAKING = "reconstruct the object from its images"
 """The kind of job that has something to click for its result."""
 _NAME = 50
 """Characters of what is opened in the name of a field that is kept."""
@@ -111,7 +111,7 @@ class Studio:
         """Write the field to a new file."""
         name = words.get("name")
         if not isinstance(name, str):
-            raise RefusedError(400, f'"name": expected the new file\'s name, found {echo(name)}')
+            raise RefusedError(400, f"name: expected the new file's name, got {echo(name)}", name="name", value=name)
         path, revision = await self.threads.compute(self.session.save, base_of(words), name)
         return {"file": str(path), **self._changed(revision)}
 
@@ -133,11 +133,14 @@ class Studio:
     def expect_book(self) -> StrikeBook:
         """Return the capture's strikes. Raises RefusedError: 404 without a capture, 503 while its folder is missing."""
         if self.book is None:
-            raise RefusedError(404, "expected a capture folder, found a field alone: start avmsf studio with --capture")
+            raise RefusedError(
+                404, "expected a capture folder, got only a field; start avmsf studio with --capture", name="capture"
+            )
         if not self.book.folder.is_dir():
             # Not 4xx: the page keeps a recording and sends it again.
+            folder = self.book.folder
             raise RefusedError(
-                503, f"{self.book.folder}: the capture folder is gone, renamed or deleted: put it back and try again"
+                503, f"{folder}: expected the capture folder, got none; restore it and try again", file=folder
             )
         return self.book
 
@@ -146,8 +149,10 @@ class Studio:
         book = self.expect_book()
         strikes = await self.threads.read(book.strikes)
         if not strikes:
-            raise RefusedError(409, "expected one or more recordings, got none: strike more places first")
-        # One place is enough: the next job starts when this one's field is open.
+            raise RefusedError(
+                409, "expected one or more recordings, got none; record impacts first", name="recordings", value=0
+            )
+        # One output is enough: the next job starts when this one's field is open.
         output = str(self.folder / "reconstructed")
         task = {"task": "make_field", "folder": str(book.folder), "modes": self.config.modes, "output": output}
         return self.jobs.start("reconstruct", task, self._take_field)
@@ -166,7 +171,7 @@ class Studio:
         try:
             task = wish.task(place, steps=self.config.steps, model=self.model)
             await self.threads.compute(save, field, place / "field")
-            return {"job": self.jobs.start("lead the sound", task, partial(self._take_led, base)).identifier}
+            return {"job": self.jobs.start("guided edit", task, partial(self._take_led, base)).identifier}
         except BaseException:
             shutil.rmtree(place, ignore_errors=True)
             raise
@@ -197,8 +202,10 @@ class Studio:
                 revision = self.session.lead(base, led, tuple(remarks(led.origin.report[EDITS][-1:], led)))
             except RefusedError:
                 # Minutes of work; what the other tab has done since is not to be overwritten either.
-                kept = self.session.keep(led, f"{self.opened.name[:_NAME]} led")
-                words = f"the field was changed while its sound was led, so that is kept beside it: open {kept}"
+                kept = self.session.keep(led, f"{self.opened.name[:_NAME]} edited")
+                words = (
+                    f"the field was changed during the guided edit, whose result was saved to {kept}: open that file"
+                )
                 now = self.session.current
                 return {"file": str(kept), "revision": now.number, "remarks": [words, *now.remarks]}
             return {"revision": revision.number, "remarks": list(revision.remarks)}
@@ -240,7 +247,12 @@ def base_of(words: dict[str, Any]) -> int:
     """Return the revision that a change is of. Raises RefusedError (400) where the page does not say."""
     base = words.get("base")
     if not isinstance(base, int) or isinstance(base, bool):
-        raise RefusedError(
-            400, f'"base": expected the revision that the change is of, found {echo(base)}: reload the page'
-        )
+        raise unknown_base(base)
     return base
+
+
+def unknown_base(base: Any) -> RefusedError:
+    """Return the error of a request that does not give the revision which it changes."""
+    return RefusedError(
+        400, f"base: expected the number of a revision, got {echo(base)}; reload the page", name="base", value=base
+    )

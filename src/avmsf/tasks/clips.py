@@ -1,4 +1,4 @@
-"""Sounds brought to a common rate, length and level, so that one can be compared with another."""
+"""Sounds at a common rate, length and level, for comparison."""
 
 from fractions import Fraction
 
@@ -8,7 +8,7 @@ from scipy.signal import resample_poly
 from torch import Tensor
 
 _ATTACK = 0.02
-"""Seconds over which a sound's level is taken: about what the ear adds up to one loudness of a click."""
+"""Window of a sound's level, s: about the temporal integration of loudness for a click."""
 
 
 def resampled(
@@ -32,9 +32,9 @@ def lasting(sounds: Float[Tensor, "contacts samples"], samples: int) -> Float[Te
 
 
 def level(sounds: Float[Tensor, "contacts samples"], *, sample_rate: float) -> Float[Tensor, " contacts"]:
-    """Return each sound's root mean square over its loudest 20 ms: how hard a blow sounds, however long it rings.
+    """Return each sound's root mean square over its loudest 20 ms, which does not depend on its decay time.
 
-    Differentiable; never zero, so that it can be divided by.
+    Differentiable; never zero, so that it can be a divisor.
     """
     window = min(sounds.shape[1], max(1, round(_ATTACK * sample_rate)))
     power = torch.nn.functional.avg_pool1d(sounds.square()[:, None], window, max(1, window // 4))[:, 0]

@@ -13,64 +13,67 @@ _LARGEST_SEED = 1 << 40
 
 @dataclass(frozen=True)
 class SteerConfig:
-    """How an edit descends."""
+    """Optimization of a guided edit."""
 
     steps: int = 300
-    """Steps; Audio-SDS is said to take about 1,000."""
+    """Steps; Audio-SDS reports about 1,000."""
     contacts: int = 10
-    """Places struck in each step, drawn anew from all over the surface."""
+    """Contacts of each step, drawn again from the whole surface."""
     modes: int = 128
-    """Most modes that move by themselves, the loudest; the others follow the common factors."""
+    """Number of modes, the loudest, with own factors; the others follow the common factors."""
     seconds: float | None = None
-    """How much of each sound is compared; as long as the field's sounds where it is not given."""
+    """Duration of each sound that is compared; by default that of the field's sounds."""
     fft_sizes: tuple[int, ...] = (2048, 1024, 512, 256)
     """Resolutions of the loss, samples at 44.1 kHz; frames are a quarter of each apart."""
     seed: int = 0
-    """Of all chance: places, noise levels, noise; at most 2^40."""
+    """Random seed of contacts, noise levels and noise; at most 2^40."""
     preview_every: int = 50
-    """Steps between previews that can be listened to; 0 for none."""
+    """Steps between preview sounds; 0 for none."""
 
     def __post_init__(self) -> None:
-        """Raise `EditError` for values that cannot be meant."""
+        """Raise `EditError` for values out of range."""
         for name, least in (("steps", 1), ("contacts", 1), ("modes", 1), ("preview_every", 0), ("seed", 0)):
             if getattr(self, name) < least:
-                raise EditError(f"{name} = {getattr(self, name)}: expected {least} or more")
+                raise _unfit(self, name, f"{least} or more")
         if self.seed > _LARGEST_SEED:
-            raise EditError(f"seed = {self.seed}: expected at most {_LARGEST_SEED}: choose a smaller number")
+            raise _unfit(self, "seed", f"at most {_LARGEST_SEED}")
         if self.seconds is not None and not 0 < self.seconds < math.inf:
-            raise EditError(f"seconds = {self.seconds:g}: expected more than 0")
+            raise _unfit(self, "seconds", "more than 0")
         if not self.fft_sizes or any(size < 4 or size % 4 for size in self.fft_sizes):
-            raise EditError(f"fft_sizes = {self.fft_sizes}: expected multiples of 4, such as 2048, 1024, 512, 256")
+            raise _unfit(self, "fft_sizes", "multiples of 4, such as 2048, 1024, 512, 256")
         longest = max(self.fft_sizes) / 44100
         if self.seconds is not None and self.seconds < longest:
-            raise EditError(
-                f"seconds = {self.seconds:g}: expected at least {longest:.2g}, what a window of {max(self.fft_sizes)} "
-                "samples at 44.1 kHz hears: compare more of the sounds, or leave the largest of fft_sizes out"
+            raise _unfit(
+                self, "seconds", f"at least {longest:.2g}, the largest of fft_sizes at 44.1 kHz, or smaller fft_sizes"
             )
 
 
 @dataclass(frozen=True)
 class DistillationConfig:
-    """How targets are drawn from a model."""
+    """Targets from a diffusion model."""
 
     guidance: float = 15.0
-    """How many times the step from the negative words, or from none, to the prompt is taken; Audio-SDS is said to have
-    gone up to 60."""
+    """Classifier-free guidance scale; Audio-SDS reports values up to 60."""
     denoising: int = 4
     """Partial denoising steps for a target, 2 to 10."""
     lowest: float = 0.025
-    """Least noise level that a target begins at, above 0."""
+    """Lowest initial noise level, above 0."""
     highest: float = 0.875
-    """Greatest noise level that a target begins at, below 1."""
+    """Highest initial noise level, below 1."""
     batch: int = 10
-    """Sounds that the model is given at once; halved where memory runs out."""
+    """Sounds in one batch of the model; halved when memory runs out."""
 
     def __post_init__(self) -> None:
-        """Raise `EditError` for values that cannot be meant."""
+        """Raise `EditError` for values out of range."""
         if not 0 < self.lowest <= self.highest < 1:
-            raise EditError(f"noise levels {self.lowest:g} to {self.highest:g}: expected 0 < lowest <= highest < 1")
+            raise _unfit(self, "lowest" if not 0 < self.lowest < 1 else "highest", "0 < lowest <= highest < 1")
         for name in ("denoising", "batch"):
             if getattr(self, name) < 1:
-                raise EditError(f"{name} = {getattr(self, name)}: expected 1 or more")
+                raise _unfit(self, name, "1 or more")
         if not (self.guidance >= 0 and math.isfinite(self.guidance)):
-            raise EditError(f"guidance = {self.guidance:g}: expected a number that is not negative, such as 15")
+            raise _unfit(self, "guidance", "0 or more, such as 15")
+
+
+def _unfit(settings: SteerConfig | DistillationConfig, name: str, expected: str) -> EditError:
+    value = getattr(settings, name)
+    return EditError(f"{name}: expected {expected}, got {value}", name=name, value=value)

@@ -97,7 +97,7 @@ class ContactMap:
     def position(self) -> Float32[Tensor, " 3"]:
         """Where the most probable point is, object frame, meters. Raises LocationError after a `refusal`."""
         if self.refusal is not None:
-            raise LocationError(self.refusal)
+            raise LocationError(self.refusal, name="position", value=self.misfit)
         return self.points[self.most_probable]
 
     def region(self, level: float = LEVEL) -> Bool[Tensor, " points"]:
@@ -106,7 +106,9 @@ class ContactMap:
         Raises LocationError for a level that is not between 0 and 1.
         """
         if not 0.0 < level < 1.0:
-            raise LocationError(f"level = {level:g}: expected a probability between 0 and 1, as .9")
+            raise LocationError(
+                f"level: expected a probability between 0 and 1, such as 0.9, got {level:g}", name="level", value=level
+            )
         order = torch.argsort(self.probability, descending=True, stable=True)
         before = torch.cumsum(self.probability[order], 0) - self.probability[order]
         inside = torch.zeros(len(self.points), dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""Pull a sound towards words: noise it, let a text-to-audio diffusion model clean it up, take that for the target.
+"""Targets from a text prompt: add noise to a sound, let a text-to-audio diffusion model denoise it.
 
 Noise level t from 0 to 1 turns latents z by the angle a = pi t / 2: z_t = cos(a) z + sin(a) noise. A deterministic
 (DDIM) step estimates the clean latents and the noise from z_t and puts them together again at a lower level; partial
@@ -22,11 +22,11 @@ from avmsf.tasks.modaledit import ModalEdit, Struck
 
 @runtime_checkable
 class AudioDiffusion(Protocol):
-    """A frozen latent diffusion model that makes sound from words."""
+    """A frozen latent diffusion model from text to audio."""
 
     @property
     def name(self) -> str:
-        """What reports and checkpoints call it."""
+        """Name in reports and checkpoints."""
         ...
 
     @property
@@ -50,7 +50,7 @@ class AudioDiffusion(Protocol):
         ...
 
     def describe(self) -> dict[str, Any]:
-        """Return what tells it from other models of its name, its weights, window and precision, as plain values."""
+        """Return its weights, window and precision, which identify it, as plain values."""
         ...
 
     def encode(self, waveforms: Float[Tensor, "contacts channels samples"]) -> Float[Tensor, "contacts dim frames"]:
@@ -64,9 +64,9 @@ class AudioDiffusion(Protocol):
         ...
 
     def embed(self, prompt: str, negative: str | None, *, seconds: float) -> Any:
-        """Return what `denoised` is conditioned on: words for a sound of so many seconds.
+        """Return the conditioning of `denoised`: a prompt for a sound of this duration.
 
-        `negative` is what to move away from; None is no words at all.
+        `negative` is a text to move away from; None is no text.
         """
         ...
 
@@ -80,7 +80,7 @@ class AudioDiffusion(Protocol):
     ) -> Float[Tensor, "contacts dim frames"]:
         """Return the clean latents that the model sees in noisy ones, float32 (see the module's text).
 
-        With classifier-free guidance g the estimate is u + g (c - u), c with the words and u with the negative ones.
+        With classifier-free guidance g the estimate is u + g (c - u), c with the prompt and u with the negative one.
         """
         ...
 
@@ -115,14 +115,16 @@ def partial_denoising(
 
 
 def expect_prompt(prompt: str) -> str:
-    """Return a prompt without the blanks around it. Raises `EditError` for an empty one."""
+    """Return a prompt without surrounding blanks. Raises `EditError` for an empty one."""
     if not prompt.strip():
-        raise EditError('expected a prompt, found an empty one: describe the sound, such as "a wooden bowl is hit"')
+        raise EditError(
+            'expected a prompt, such as "a wooden bowl is struck", got an empty one', name="prompt", value=prompt
+        )
     return prompt.strip()
 
 
 class DecoderDistillation:
-    """A guide towards words (Audio-SDS's decoder variant with partial multi-step denoising)."""
+    """A guide towards a prompt (Audio-SDS's decoder variant with partial multi-step denoising)."""
 
     def __init__(
         self,
@@ -133,7 +135,7 @@ class DecoderDistillation:
         negative: str | None = None,
         config: DistillationConfig | None = None,
     ) -> None:
-        """Set a prompt for sounds of `sample_rate` Hz, that of the field, and words to lead away from.
+        """Set a prompt for sounds of `sample_rate` Hz, that of the field, and a negative prompt.
 
         Raises `EditError` for an empty prompt.
         """
@@ -144,7 +146,7 @@ class DecoderDistillation:
         self._conditioning: tuple[int, Any] | None = None
 
     def describe(self) -> dict[str, Any]:
-        """Return what tells it from other guides, as plain values."""
+        """Return its identifying settings, as plain values."""
         return {
             "prompt": self.prompt,
             "negative": self.negative,
@@ -162,16 +164,16 @@ class DecoderDistillation:
     def targets(
         self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator
     ) -> Float[Tensor, "contacts samples"]:
-        """Return what the model makes of rendered sounds, at their own level; a row that it spoils is not finite.
+        """Return the model's denoised versions of rendered sounds, at their level; failed rows are not finite.
 
-        A batch that does not fit into the GPU's memory is halved, with a warning, and stays so. Raises `EditError`
-        where not even one sound fits, and for sounds too long for the model.
+        A batch that does not fit into the GPU's memory is halved, with a warning, for all later steps too. Raises
+        `EditError` where one sound does not fit, and for sounds too long for the model.
         """
         with torch.no_grad():
             heard = resampled(sounds, sample_rate=self.sample_rate, wanted=self.model.sample_rate)
             lowest, highest = self.config.lowest, self.config.highest
             level = lowest + (highest - lowest) * torch.rand(len(sounds), generator=generator)
-            # One seed a sound: what is drawn depends neither on the batch nor on the device.
+            # One seed a sound, so that the noise depends neither on the batch nor on the device.
             seeds = torch.randint(1 << 62, (len(sounds),), generator=generator).tolist()
             made: list[Tensor] = []
             while len(made) < len(sounds):
@@ -182,8 +184,10 @@ class DecoderDistillation:
                 except torch.OutOfMemoryError as error:
                     if self.batch == 1:
                         raise EditError(
-                            f"{self.model.name} runs out of memory on {self.model.device} with one sound at a time: "
-                            "give it fewer seconds to work at, free memory there, or choose the device cpu"
+                            f"{self.model.name}: out of memory on {self.model.device} with a batch of 1; use fewer "
+                            "seconds, free memory, or choose the device cpu",
+                            name="batch",
+                            value=1,
                         ) from error
                 # Not before the error is gone: its traceback holds the tensors that filled the memory.
                 self._halve()
@@ -197,7 +201,7 @@ class DecoderDistillation:
         if self._conditioning is None or self._conditioning[0] != samples:
             words = model.embed(self.prompt, self.negative, seconds=samples / model.sample_rate)
             self._conditioning = (samples, words)
-        # A model of sound has heard music at full scale, not newtons: the loudest sample becomes .5.
+        # The model was trained on audio at full scale: the peak becomes .5.
         peak = heard.abs().amax(dim=1, keepdim=True).clamp_min(torch.finfo(heard.dtype).tiny)
         waveforms = (0.5 * heard / peak)[:, None].expand(-1, model.channels, -1).to(model.device)
         latents = model.encode(waveforms)
@@ -218,7 +222,10 @@ class DecoderDistillation:
         if self.model.device.type == "cuda":
             torch.cuda.empty_cache()
         warnings.warn(
-            f"{self.model.name} runs out of memory on {self.model.device}: going on with batches of {self.batch}",
-            AvmsfWarning,
+            AvmsfWarning(
+                f"{self.model.name}: out of memory on {self.model.device}; continuing with batches of {self.batch}",
+                name="batch",
+                value=self.batch,
+            ),
             stacklevel=3,
         )

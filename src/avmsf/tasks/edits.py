@@ -1,4 +1,4 @@
-"""What all edits of a field have in common: other modes, factors on the gains, and a word in the field's report."""
+"""The common part of all edits of a field: other modes, factors on the gains, and an entry in the field's report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,7 +15,7 @@ from avmsf.field.uncertainty import scale_of
 from avmsf.modal.bank import ModalBank
 
 EDITS = "edits"
-"""Where a field's report lists what was done to it, in this order."""
+"""Key of a field's report that lists its edits, in order."""
 
 
 def edited(
@@ -37,8 +37,11 @@ def edited(
         if not bool(fine.all()):
             row = int(torch.nonzero(~fine)[0])
             raise EditError(
-                f"the edit gives mode {row} (counted from 0, {float(field.bank.frequency[row]):.4g} Hz) the {name} "
-                f"{float(values[row]):g}: expected a finite one{'' if name == 'gain factor' else ' above 0'}; edit less"
+                f"mode {row} ({float(field.bank.frequency[row]):.4g} Hz): expected a finite {name}"
+                f"{'' if name == 'gain factor' else ' above 0'} after the edit, got {float(values[row]):g}; edit less",
+                row=row,
+                name=name,
+                value=float(values[row]),
             )
     changed = replace(field, bank=bank, gain_field=ScaledGains(field.gain_field, scale, length))
     silent = bank.frequency[silenced(changed)].tolist()
@@ -48,28 +51,27 @@ def edited(
 
 
 def muted(field: SoundField) -> Bool[Tensor, " modes"]:
-    """Return which modes edits have taken all gains of: nothing brings these back."""
+    """Return which modes edits have given gains of zero; no edit restores them."""
     return scale_of(field) == 0
 
 
 def silenced(field: SoundField) -> Bool[Tensor, " modes"]:
     """Return which modes are silent because they lie at half the sample rate or above.
 
-    They stay in the bank for edits that bring them back.
+    They stay in the bank for edits that restore them.
     """
     return ~field.audible & ~muted(field)
 
 
 def remarks(entries: Sequence[Mapping[str, Any]], field: SoundField) -> list[str]:
-    """Return what the owner of an edited field should know of the edits `entries` and of it as it is, in sentences."""
+    """Return messages on the edits `entries` and on modes of the field that are silent."""
     words = [remark for entry in entries for remark in entry.get("remarks", [])]
     silent = field.bank.frequency[silenced(field)].tolist()
     if silent:
         words.append(
-            f"{len(silent)} of {len(field.bank)} modes lie at or above half the sample rate of "
-            f"{field.sample_rate:g} Hz and are silent, from {min(silent):.4g} Hz to {max(silent):.4g} Hz; an edit that "
-            "lowers them brings them back"
+            f"{len(silent)} of {len(field.bank)} modes, from {min(silent):.4g} Hz to {max(silent):.4g} Hz, are silent "
+            f"because they are not below half the sample rate of {field.sample_rate:g} Hz; lower them to restore them"
         )
     if not bool((field.audible & ~muted(field)).any()):
-        words.append("nothing but noise is left of the sound: edit less")
+        words.append("no mode is audible, only residual noise; edit less")
     return words

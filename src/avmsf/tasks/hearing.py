@@ -1,4 +1,4 @@
-"""A recorded blow as the recordings were that a field was fitted to: its channel, its onset, its rate."""
+"""A recorded impact, read like the recordings that a field was fitted to: its channel, its onset, its rate."""
 
 import math
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from avmsf.capture.onset import Pulse, find_second_blow, find_second_push
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import latest_start
-from avmsf.errors import CaptureError, LocationError
+from avmsf.errors import AvmsfError, CaptureError, LocationError
 from avmsf.field.soundfield import SoundField
 
 Sound = str | Path | Recording | ArrayLike
@@ -31,16 +31,16 @@ _FINEST = 2000
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """One blow, prepared."""
+    """One impact, prepared."""
 
     sound: Float32[Tensor, " samples"]
-    """From its onset on, at the field's rate, up to the next blow or the recording's end."""
+    """From its onset on, at the field's rate, up to the next impact or the recording's end."""
     onset: int
-    """Sample of the recording at which the blow begins, at the recording's own rate."""
+    """Sample of the recording at which the impact begins, at the recording's own rate."""
     highest: float | None
     """Frequency in Hz up to which the recording holds the sound; None where that is half the field's rate."""
     notes: tuple[str, ...]
-    """What a user should know, in sentences."""
+    """Messages for the user."""
 
 
 def hear(
@@ -50,14 +50,14 @@ def hear(
     sample_rate: float | int | None = None,
     settings: CaptureSettings | None = None,
 ) -> Heard:
-    """Prepare a recorded blow for a field as the recordings were that it was fitted to.
+    """Prepare a recorded impact for a field like the recordings that it was fitted to.
 
-    By the settings of that capture, which the field keeps, but that the blow is sought wherever it begins, unless the
-    capture was not cut and this recording starts with its impact, too; `settings` take their place. Bare samples are at
-    `sample_rate` Hz, or at the field's rate, and taken as they are. Nothing is divided by a force, but a pulse that was
-    divided out of the capture's sounds is divided out here too where the recording holds it; channels that the
-    recording lacks are not asked for. Raises LocationError for recordings that are silent, too short, not finite, or
-    never sudden enough to hold a blow.
+    By the settings of that capture, which the field stores, or by `settings`. The impact is searched for in all of the
+    recording, unless the capture was not cut and this recording starts with its impact, too. Bare samples are at
+    `sample_rate` Hz, or at the field's rate, and not changed. Nothing is divided by a force, but a pulse that was
+    divided out of the capture's sounds is divided out here too if the recording has it; settings of channels that the
+    recording lacks are ignored. Raises LocationError for recordings that are silent, too short, not finite, or without
+    a sudden rise.
     """
     recording = read_if_path(recording)
     whole = as_recording(recording, field, sample_rate=sample_rate)
@@ -68,20 +68,20 @@ def hear(
         if settings is None and not field.origin.settings.align and prepared.onset < latest_start(whole.sample_rate):
             # It starts with its impact as those did that the field was fitted to, which were not cut.
             prepared = prepare(whole, replace(chosen, align=False))
-        # Of one channel all is heard, the quiet before the blow too.
+        # Of one channel all is used, the silence before the impact too.
         heard = whole.response() if len(whole.channels) == 1 else prepared.sound
         expect_sudden(heard, sample_rate=whole.sample_rate, name=whole.name)
     except CaptureError as error:
-        raise LocationError(str(error)) from error
-    # A pulse that was divided out took the force with it, which says how hard the blow was.
+        raise location_error(error) from error
+    # A pulse that was divided out took the force of the impact with it.
     sound = prepared.sound if prepared.newtons is None else prepared.sound * prepared.newtons
     begin = prepared.onset if chosen.align else 0
     second = _second(whole, sound, begin, prepared.pulse, chosen)
     if second is not None:
         rate = whole.sample_rate
         notes.append(
-            f"{whole.name} holds more than one blow, at {prepared.onset / rate:.3f} s and at {second / rate:.3f} s: "
-            "only the first was located; --several, in Python locate_blows, takes them all"
+            f"{whole.name}: expected one impact, got more, at {prepared.onset / rate:.3f} s and at {second / rate:.3f} "
+            "s: only the first was located; --several (in Python locate_blows) locates all"
         )
         sound = sound[: max(second - begin, shortest_allowed(rate))]
     at_rate, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
@@ -96,48 +96,92 @@ def read_if_path(recording: Sound) -> Recording | ArrayLike:
 def as_recording(
     recording: Recording | ArrayLike, field: SoundField, *, sample_rate: float | int | None = None
 ) -> Recording:
-    """Return a recording that can be listened to.
+    """Return a recording that can be located.
 
-    Raises LocationError for samples of more than one channel, rates that are none, silence and what is not finite.
+    Raises LocationError for samples of more than one channel, rates that are not above 0, silence and samples that are
+    not finite.
     """
     if not isinstance(recording, Recording):
         samples = as_floats(recording, "recording").double().numpy()
         if samples.ndim != 1:
+            shape = list(samples.shape)
             raise LocationError(
-                f"expected the samples of one channel, found the shape {samples.shape}: give one row or column of it, "
-                "or a Recording"
+                f"recording: expected the samples of one channel, got the shape {shape}; give one channel, or a "
+                "Recording",
+                name="recording",
+                value=shape,
             )
         rate = field.sample_rate if sample_rate is None else sample_rate
         recording = Recording("the recording", samples[None], rate, "FLOAT")
     elif sample_rate is not None and sample_rate != recording.sample_rate:
         raise LocationError(
-            f"{recording.name} is at {recording.sample_rate:g} Hz and sample_rate says {sample_rate:g} Hz: leave "
-            "sample_rate out, a recording knows its own"
+            f"{recording.name}: expected the recording's sample rate, {recording.sample_rate:g} Hz, got sample_rate = "
+            f"{sample_rate:g} Hz; leave sample_rate out",
+            file=recording.name,
+            name="sample_rate",
+            value=sample_rate,
         )
     if not (math.isfinite(recording.sample_rate) and recording.sample_rate > 0.0):
-        raise LocationError(f"{recording.name} is at {recording.sample_rate:g} Hz: expected a sample rate above 0")
+        raise LocationError(
+            f"{recording.name}: expected a sample rate above 0, got {recording.sample_rate:g} Hz",
+            file=recording.name,
+            name="sample_rate",
+            value=recording.sample_rate,
+        )
     channels = recording.channels
     least = shortest_allowed(recording.sample_rate)
     if recording.frames < least:
-        raise LocationError(
-            f"{recording.name} is too short, {recording.frames} samples "
-            f"({1e3 * recording.duration:.3g} ms), expected at least {least}: record the blow until it has died away"
-        )
-    if not np.isfinite(channels).all():
-        raise LocationError(
-            f"{recording.name}: {int((~np.isfinite(channels)).sum())} samples are not finite numbers: export it again"
-        )
+        raise too_short(recording.name, recording.frames, least, recording.sample_rate)
+    wrong = int((~np.isfinite(channels)).sum())
+    if wrong:
+        raise not_finite(recording.name, wrong)
     if not np.ptp(channels, axis=1).any():
-        raise LocationError(f"{recording.name} is silent: record the blow again")
+        raise silent(recording.name)
     return recording
 
 
+def location_error(error: AvmsfError) -> LocationError:
+    """Return an error of a recording, with its attributes, as a LocationError."""
+    return LocationError(str(error), **error.attributes)
+
+
+def too_short(recording: str | None, samples: int, least: int, sample_rate: float) -> LocationError:
+    """Return the error for a sound with too few samples."""
+    return LocationError(
+        f"{recording or 'the sound'}: expected {least} samples or more, got {samples} "
+        f"({1e3 * samples / sample_rate:.3g} ms); record the impact until it has decayed",
+        file=recording,
+        name="samples",
+        value=samples,
+    )
+
+
+def not_finite(recording: str | None, count: int) -> LocationError:
+    """Return the error for a sound of which `count` samples are NaN or infinite."""
+    return LocationError(
+        f"{recording or 'the sound'}: expected finite samples, got {count} that are not; export it again",
+        file=recording,
+        name="finite",
+        value=count,
+    )
+
+
+def silent(recording: str | None) -> LocationError:
+    """Return the error for a sound that does not vary."""
+    return LocationError(
+        f"{recording or 'the sound'}: expected a sound, got silence; record the impact again",
+        file=recording,
+        name="sound",
+        value="silence",
+    )
+
+
 def describe(recording: Recording, settings: CaptureSettings) -> list[str]:
-    """Return what is wrong with a recording that can be listened to nevertheless."""
+    """Return messages on faults of a recording that can be located nevertheless."""
     try:
         response = recording.response(settings.response_channel, force_channel=settings.force_channel)
     except CaptureError as error:
-        raise LocationError(str(error)) from error
+        raise location_error(error) from error
     clipped = clipping(response, name=recording.name)
     return [] if clipped is None else [clipped]
 
@@ -145,9 +189,9 @@ def describe(recording: Recording, settings: CaptureSettings) -> list[str]:
 def at_field_rate(
     sound: Float64[np.ndarray, " frames"], recording: Recording, field: SoundField, *, speed: float = 1.0
 ) -> tuple[Float32[Tensor, " samples"], float | None, list[str]]:
-    """Return samples of a recording at the field's rate, up to which frequency they hold the sound, and words about it.
+    """Return samples of a recording at the field's rate, up to which frequency they hold the sound, and messages.
 
-    Raises LocationError for a rate at which nothing of the object's modes is held.
+    Raises LocationError for a rate too low for all of the object's modes.
     """
     own, rate = recording.sample_rate * speed, field.sample_rate
     if own == rate:
@@ -157,8 +201,11 @@ def at_field_rate(
     held = int((frequency < highest).sum())
     if not held:
         raise LocationError(
-            f"{recording.name} is at {own:g} Hz and holds sound up to {highest:.4g} Hz, and the lowest of the object's "
-            f"{len(frequency)} modes is at {float(frequency.min()):.4g} Hz: record at {rate:g} Hz"
+            f"{recording.name}: expected sound at {float(frequency.min()):.4g} Hz, the lowest of the object's "
+            f"{len(frequency)} modes, got {own:g} Hz samples with sound up to {highest:.4g} Hz; record at {rate:g} Hz",
+            file=recording.name,
+            name="sample_rate",
+            value=own,
         )
     ratio = Fraction(rate / own).limit_denominator(_FINEST)
     resampled = scipy.signal.resample_poly(sound, ratio.numerator, ratio.denominator, padtype="line")
@@ -170,12 +217,12 @@ def at_field_rate(
 
 
 def own_settings(recording: Recording | ArrayLike, field: SoundField) -> CaptureSettings:
-    """Return the settings by which a field's own capture was read; bare samples are read already."""
+    """Return the settings by which a field's own capture was read; bare samples have none."""
     return replace(field.origin.settings, align=True) if isinstance(recording, Recording) else CaptureSettings()
 
 
 def settings_for(recording: Recording, settings: CaptureSettings) -> CaptureSettings:
-    """Return settings that ask for nothing which a recording of a single blow may lack."""
+    """Return settings without those that a recording of a single impact may lack."""
     count = len(recording.channels)
     force, response = settings.force_channel, settings.response_channel
     kept = replace(
@@ -197,7 +244,7 @@ def _second(
     pulse: Pulse | None,
     settings: CaptureSettings,
 ) -> int | None:
-    """Return the sample of the recording at which a second blow begins, if there is one."""
+    """Return the sample of the recording at which a second impact begins, if there is one."""
     rate, seconds = recording.sample_rate, len(sound) / recording.sample_rate
     if pulse is not None and settings.force_channel is not None:
         force = recording.channel(settings.force_channel)

@@ -130,25 +130,35 @@ class Listener:
         rate = field.sample_rate
         if sample_rate is not None and sample_rate != rate:
             raise LocationError(
-                f"the stream comes at {sample_rate:g} Hz and the field is of {rate:g} Hz: open the stream at that "
-                "rate, or locate finished recordings, which are resampled"
+                f"sample_rate: expected the field's {rate:g} Hz, got {sample_rate:g} Hz; open the stream at this rate, "
+                "or locate finished recordings, which are resampled",
+                name="sample_rate",
+                value=sample_rate,
             )
-        if not 0.0 < window < 10.0 or not (later is None or window < later < 10.0):
-            raise LocationError(
-                f"window = {window:g} s and later = {later}: expected more than 0, the second longer, below 10 s"
-            )
+        if not 0.0 < window < 10.0:
+            raise LocationError(f"window: expected 0 to 10 s, got {window:g} s", name="window", value=window)
+        if not (later is None or window < later < 10.0):
+            raise LocationError(f"later: expected {window:g} s to 10 s, got {later:g} s", name="later", value=later)
         lowest = min(_RUMBLE * float(field.bank.frequency.min()), _HIGHEST_RUMBLE)
         cut = lowest if rumble is None else rumble
         if not 0.0 <= cut < rate / 2:
-            raise LocationError(f"rumble = {cut:g} Hz: expected 0 for none, or less than half of {rate:g} Hz")
+            raise LocationError(
+                f"rumble: expected 0 for no filter, or less than {rate / 2:g} Hz, got {cut:g} Hz",
+                name="rumble",
+                value=cut,
+            )
         if round(window * rate) < shortest_allowed(rate):
             raise LocationError(
-                f"window = {window:g} s is {round(window * rate)} samples: expected {shortest_allowed(rate)} or more, "
-                "in fewer modes cannot be told apart"
+                f"window: expected {shortest_allowed(rate)} samples or more to resolve the modes, got "
+                f"{round(window * rate)} ({window:g} s)",
+                name="window",
+                value=window,
             )
         audible = torch.nonzero(field.audible).flatten()
         if not len(audible):
-            raise LocationError(f"none of the object's {len(field.bank)} modes lies below half of {rate:g} Hz")
+            raise LocationError(
+                f"field: expected modes below {rate / 2:g} Hz, got none of {len(field.bank)}", name="field", value=0
+            )
         self.locator, self.rate = locator, rate
         self.hop = max(_FEWEST, round(_HOP * rate))
         self.window = min(round(window * rate), field.samples)
@@ -169,7 +179,9 @@ class Listener:
         """
         begun = time.perf_counter()
         if not bool(torch.isfinite(block).all()):
-            raise LocationError("the block holds samples that are not finite numbers: leave them out or send zeros")
+            raise LocationError(
+                "block: expected finite samples, got NaN or infinity; leave them out or send zeros", name="block"
+            )
         clear, rumble = self._without_rumble(block.detach().double().cpu(), self.ears.rumble)
         ears = replace(self.ears, rest=torch.cat([self.ears.rest, clear]), rumble=rumble)
         came = ears.clock + len(ears.rest)
@@ -245,7 +257,7 @@ class Listener:
         try:
             found = judged(self.locator.locate(sound.float()))
             if found.refusal is not None:
-                raise LocationError(f"the blow: {found.refusal}")
+                raise LocationError(f"the impact: {found.refusal}", name="impact", value=pending.onset / self.rate)
         except LocationError as error:
             return replace(ears, strangers=ears.strangers + 1, refusal=str(error)), None
         return ears, Blow(pending.onset / self.rate, found, length / self.rate, 0.0, final)

@@ -79,7 +79,7 @@ def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: flo
 
 
 def not_located(reason: str) -> dict[str, Any]:
-    """Return what is said of a recording that has no place."""
+    """Return the values for a recording that could not be located."""
     return {"status": NOT_LOCATED, "reason": " ".join(reason.split()), "place": None}
 
 

@@ -20,6 +20,7 @@ from avmsf.tasks.amplitudes import Amplitudes, Extractor
 from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.detuning import OutOfTune
 from avmsf.tasks.foretelling import foretell, patches, unknown, widened
+from avmsf.tasks.hearing import not_finite, silent, too_short
 from avmsf.tasks.heed import heed_of
 from avmsf.tasks.posterior import Force, Foretold, Judgement, judge
 from avmsf.tasks.slack import contacts_of, spread_by
@@ -150,15 +151,12 @@ class Locator:
         rate = self.field.sample_rate
         least = shortest_allowed(rate)
         if len(sound) < least:
-            raise LocationError(
-                f"the sound is too short: {len(sound)} samples ({len(sound) / rate * 1e3:.3g} ms) from its onset on, "
-                f"expected at least {least}: record the blow until it has died away"
-            )
-        if not bool(torch.isfinite(sound).all()):
-            count = int((~torch.isfinite(sound)).sum())
-            raise LocationError(f"{count} samples of the sound are not finite numbers: export it again")
+            raise too_short(None, len(sound), least, rate)
+        wrong = int((~torch.isfinite(sound)).sum())
+        if wrong:
+            raise not_finite(None, wrong)
         if float(sound.max()) == float(sound.min()):
-            raise LocationError("the sound is silent: record the blow again")
+            raise silent(None)
 
     def _length(self, samples: int, highest: float) -> "_Length":
         key = (samples, highest)
@@ -193,8 +191,10 @@ class _Length:
         heard = torch.nonzero(whole.frequency < highest).flatten()
         if not len(heard):
             raise LocationError(
-                f"none of the object's {len(whole)} modes lies below {highest:g} Hz, the lowest is at "
-                f"{float(whole.frequency.min()):g} Hz: record at a higher sample rate"
+                f"expected modes below {highest:g} Hz, got {len(whole)} from {float(whole.frequency.min()):g} Hz on; "
+                "record at a higher sample rate",
+                name="modes",
+                value=highest,
             )
         bank = ModalBank(whole.frequency[heard].double(), whole.damping[heard].double())
         extractor = Extractor.of(bank, sample_rate=rate, samples=samples, highest=highest)
@@ -203,7 +203,11 @@ class _Length:
             gains = gains * _seen_through(bank.damping, locator.dampings[:, heard], samples / rate)
         unit = float(gains.abs().square().mean().sqrt())
         if unit == 0.0:
-            raise LocationError("the field is silent at all points: fit it to sounds that are not")
+            raise LocationError(
+                "field: expected gains above 0, got 0 at all points; fit it to other recordings",
+                name="field",
+                value=0.0,
+            )
         gains = gains / unit
         parts = torch.nn.functional.normalize(torch.view_as_real(gains).flatten(1), dim=1)
         foretold = _mixed(gains, locator.variance[:, heard] / unit**2, extractor)
@@ -278,8 +282,10 @@ def _expect_more_than_noise(values: Complex128[Tensor, " modes"], noise: Float64
     chance, clear = 1.0 + 5.0 / modes**0.5, 12.0 + float(torch.log(torch.tensor(float(modes))))
     if float(surplus.mean()) < chance and float(surplus.max()) < clear:
         raise LocationError(
-            f"the sound is noise: the object's {modes} modes are {float(surplus.mean()):.2g} times as strong in it as "
-            f"chance makes them, and a blow is heard from {chance:.2g} on: record it louder, or in a quieter place"
+            f"expected the object's {modes} modes at {chance:.2g} times the noise or more, got "
+            f"{float(surplus.mean()):.2g} times; record it louder, or with less noise",
+            name="noise",
+            value=float(surplus.mean()),
         )
 
 
@@ -289,24 +295,34 @@ def _expect_points(
     areas: Float[Tensor, "..."] | None,
 ) -> None:
     if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not bool(torch.isfinite(points).all()):
+        wrong, shape = int((~torch.isfinite(points)).sum()), list(points.shape)
         raise LocationError(
-            f"expected points [points, 3] that are finite, found the shape {tuple(points.shape)} and "
-            f"{int((~torch.isfinite(points)).sum())} numbers that are not finite: give others"
+            f"points: expected finite positions [points, 3], got the shape {shape} with {wrong} values that are not "
+            "finite",
+            name="points",
+            value=shape,
         )
     if directions is not None and directions.shape != points.shape:
         raise LocationError(
-            f"directions of the shape {tuple(directions.shape)} do not go with points of {tuple(points.shape)}: give "
-            "one a point"
+            f"directions: expected the shape of the points, {list(points.shape)}, got {list(directions.shape)}",
+            name="directions",
+            value=list(directions.shape),
         )
     if directions is not None:
         length = directions.double().norm(dim=1)
         # Not "> _UNIT": NaN is no unit vector either.
         bad = torch.nonzero(~((length - 1.0).abs() <= _UNIT)).flatten()
         if len(bad):
+            row = int(bad[0])
             raise LocationError(
-                f"direction {int(bad[0])} is {directions[int(bad[0])].tolist()}, of length {float(length[bad[0]]):g}: "
-                "expected unit vectors, divide each by its length"
+                f"directions, row {row}: expected a unit vector, got {directions[row].tolist()} of length "
+                f"{float(length[row]):g}; divide each by its length",
+                name="directions",
+                row=row,
+                value=float(length[row]),
             )
     fit = areas is None or (areas.shape == points.shape[:1] and bool((areas > 0).all() & torch.isfinite(areas).all()))
     if not fit:
-        raise LocationError(f"expected a positive area for each of {len(points)} points: mend or leave out `areas`")
+        raise LocationError(
+            f"areas: expected a number above 0 for each of {len(points)} points; leave areas out", name="areas"
+        )

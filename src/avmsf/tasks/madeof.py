@@ -1,4 +1,4 @@
-"""What a field is of before an edit: what it was recast to, or what its dampings tell."""
+"""The material of a field before an edit: that of its last material edit, or the one nearest to its dampings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ from avmsf.tasks.edits import EDITS
 from avmsf.tasks.materialguess import guess_materials
 
 _CLOSE = 1.2
-"""How much farther off the second-best material may be and still be as likely."""
+"""Ratio of the errors up to which the second-best material is as likely."""
 _KEEPING = ("recast", "retune")
-"""Edits that leave no doubt what a field is made of."""
+"""Edits after which a field's material is known."""
 
 
 @dataclass(frozen=True)
@@ -21,34 +21,35 @@ class MadeOf:
 
     material: Material
     words: str
-    """One sentence."""
+    """The message."""
 
 
 def made_of(field: SoundField, *, option: str) -> MadeOf:
-    """Return what a field is made of: what it was recast to or guessed for, or what damps as its modes do.
+    """Return a field's material: that of its last material edit or of its guess, or the one nearest to its dampings.
 
-    `option` is what a user says the material by, for the words. Raises `EditError` where no material fits.
+    `option` is the option for the material, named in messages. Raises `EditError` where no material fits.
     """
     known = _recast_to(field.origin.report.get(EDITS, []))
     if known is not None:
-        return MadeOf(known, f"the object is of {known.name}, which it was recast to before")
+        return MadeOf(known, f"old material: {known.name}, from the last material edit")
     report = field.origin.report
     if "guess" in report and not report.get(EDITS):
         guessed = Material(**report["material"])
-        return MadeOf(guessed, f"the object is of {guessed.name}, which the field was guessed for")
+        return MadeOf(guessed, f"old material: {guessed.name}, for which the field was guessed")
     best, second, *_ = guess_materials(field.bank)
     if not best.fits:
         raise EditError(
-            f"{option} is not given, and no material's damping is that of the field's modes: {best.material.name} "
-            f"comes nearest, which half of them miss by a factor of {best.off:.3g} or more: say by {option} what the "
-            "object is of"
+            f"expected {option}, got none, and no material has the dampings of the modes: the nearest, "
+            f"{best.material.name}, differs by a median factor of {best.off:.3g}; give {option}",
+            name=option,
+            value=best.material.name,
         )
     close = second.off < _CLOSE * best.off
-    alike = f", and {second.material.name} fits as well ({second.off:.3g}), with which the loudness would differ"
+    alike = f"; {second.material.name} fits equally well ({second.off:.3g}) and would give another level"
     return MadeOf(
         best.material,
-        f"the object is taken to be of {best.material.name}: half of its modes have that material's damping within a "
-        f"factor of {best.off:.3g}{alike if close else ''}; say {option} where you know",
+        f"old material: {best.material.name} assumed, whose dampings differ by a median factor of {best.off:.3g} from "
+        f"those of the modes{alike if close else ''}; give {option} if known",
     )
 
 

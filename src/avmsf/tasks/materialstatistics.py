@@ -1,4 +1,4 @@
-"""What objects of one material have in common: where their modes lie, how long these ring, how bright they are."""
+"""Statistics of the objects of one material: distribution of modal frequencies, damping law, and brightness."""
 
 import math
 from collections.abc import Sequence
@@ -22,18 +22,18 @@ from avmsf.tasks.reference import Reference, read_clip, wav_files
 
 _QUANTILES = 64
 _POINTS = 64
-"""Places at which a field's brightness is taken."""
+"""Contacts at which a field's brightness is computed."""
 _MODES = 40
-"""Modes of a sound that is made up."""
+"""Modes of a synthetic sound."""
 _HEARD = 1e-3
-"""Gain over the object's largest below which a mode says nothing of its brightness."""
+"""Gain relative to the object's largest below which a mode does not count for its brightness."""
 _SCATTER = 0.5
-"""Standard deviation of a mode's gain about the slope, logarithm: places and shapes differ."""
+"""Standard deviation of a mode's gain about the slope, logarithm: contacts and shapes differ."""
 
 
 @dataclass(frozen=True, eq=False)
 class MaterialStatistics:
-    """How a material sounds, on the whole."""
+    """Statistics of a material's sounds."""
 
     name: str
     frequency: Float64[Tensor, " quantiles"]
@@ -57,19 +57,28 @@ class MaterialStatistics:
         number of gains.
         """
         if not banks or any(len(bank) == 0 for bank in banks):
-            raise EditError(f"{name}: expected modes of every object, found none: there is nothing to sum up")
+            raise EditError(f"{name}: expected modes of every object, found none", name="banks", value=0)
         if len(banks) != len(gains):
-            raise EditError(f"{name}: expected gains of all {len(banks)} objects, found those of {len(gains)}")
+            raise EditError(
+                f"{name}: expected gains of all {len(banks)} objects, got those of {len(gains)}",
+                name="gains",
+                value=len(gains),
+            )
         for row, (bank, size) in enumerate(zip(banks, gains, strict=True)):
             if len(bank) != len(size):
                 raise EditError(
-                    f"{name}: expected a gain for each of the {len(bank)} modes of object {row} (counted from 0), "
-                    f"found {len(size)}"
+                    f"{name}, object {row}: expected a gain for each of {len(bank)} modes, got {len(size)}",
+                    row=row,
+                    name="gains",
+                    value=len(size),
                 )
             if not (bool(torch.isfinite(size).all()) and bool(size.any())):
                 raise EditError(
-                    f"{name}: expected finite gains, not all zero, of object {row} (counted from 0), found "
-                    f"{'others' if bool(size.any()) else 'silence'}: leave the object out"
+                    f"{name}, object {row}: expected finite gains, not all zero, got a sum of "
+                    f"{float(size.abs().sum()):g}; omit the object",
+                    row=row,
+                    name="gains",
+                    value=float(size.abs().sum()),
                 )
         sizes = [size.double().abs() / size.double().abs().sum() for size in gains]
         frequency, damping = (torch.cat([getattr(bank, each) for bank in banks]) for each in ("frequency", "damping"))
@@ -83,7 +92,7 @@ class MaterialStatistics:
         # Scaled alike, for the second constant is a billionth of the first.
         columns = np.abs(terms).max(axis=0)
         law, _ = nnls(root * terms / columns, root[:, 0])
-        # What is hardly heard would decide a slope of logarithms.
+        # Inaudible gains would dominate a slope of logarithms.
         heard = [each > _HEARD * each.max() for each in sizes]
         octaves = [torch.log2(bank.frequency[kept]) for bank, kept in zip(banks, heard, strict=True)]
         levels = [20 * torch.log10(each[kept]) for each, kept in zip(sizes, heard, strict=True)]
@@ -98,9 +107,9 @@ class MaterialStatistics:
     def of_recordings(
         cls, paths: str | Path | Sequence[str | Path], *, name: str | None = None, sample_rate: float = 44100.0
     ) -> "MaterialStatistics":
-        """Sum up the modes in recordings of blows on things of one material; a folder stands for its wav files.
+        """Summarize the modes in recordings of impacts on objects of one material; a folder means its wav files.
 
-        They are brought to `sample_rate`, Hz. Raises `EditError` for what cannot be read, is silent or too short, and
+        They are resampled to `sample_rate`, Hz. Raises `EditError` for what cannot be read, is silent or too short, and
         where a recording holds no modes.
         """
         found = wav_files(paths)
@@ -110,7 +119,10 @@ class MaterialStatistics:
             try:
                 modes = extract_sounds(clip[None], sample_rate=sample_rate, method=HighResolution(modes=_MODES))
             except ExtractionError as error:
-                raise EditError(f"{path}: expected a blow that rings: {error}; or leave the file out") from error
+                raise EditError(
+                    f"{path}: expected an impact with modes, got {error}",
+                    **{**error.attributes, "file": path},
+                ) from error
             banks.append(modes.bank)
             gains.append(torch.hypot(modes.gains[0], modes.quadrature[0]))
         return cls.of_modes(banks, gains, name=name or found[0].parent.name)
@@ -132,7 +144,7 @@ class MaterialStatistics:
     def sounds(
         self, count: int, *, samples: int, sample_rate: float, generator: torch.Generator
     ) -> Float[Tensor, "count samples"]:
-        """Return made-up blows: modes drawn evenly from the distribution, decays by the law, gains about the slope.
+        """Return synthetic impacts: stratified frequencies, dampings by the law, gains by the slope.
 
         Raises `EditError` where all modes lie at half the sample rate or above.
         """
@@ -148,8 +160,10 @@ class MaterialStatistics:
             heard = frequency < 0.5 * sample_rate
             if not bool(heard.any()):
                 raise EditError(
-                    f"{self.name}: its modes lie at {float(self.frequency[0]):.4g} Hz and above, out of reach of a "
-                    f"field at {sample_rate:g} Hz"
+                    f"{self.name}: expected modes below half the sample rate of {sample_rate:g} Hz, got "
+                    f"{float(self.frequency[0]):.4g} Hz and above",
+                    name="frequency",
+                    value=float(self.frequency[0]),
                 )
             octave = torch.log2(frequency / frequency[0])
             size = torch.exp(_SCATTER * scatter) * 10 ** (self.brightness * octave / 20)
@@ -161,7 +175,7 @@ class MaterialStatistics:
         return torch.cat(made)
 
     def reference(self, *, samples: int, sample_rate: float, count: int = 8, seed: int = 0) -> Reference:
-        """Return made-up blows as what a field shall sound like."""
+        """Return synthetic impacts as the reference of an edit."""
         generator = torch.Generator().manual_seed(seed)
         sounds = self.sounds(count, samples=samples, sample_rate=sample_rate, generator=generator)
         return Reference.of(sounds, sample_rate=sample_rate, name=self.name)

@@ -1,4 +1,4 @@
-"""What an edit of an object's modes is: its pitch and damping as a whole, a little for each mode, never for a place."""
+"""An edit of an object's modes: common factors and one set of factors a mode, the same at all contacts."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -18,7 +18,7 @@ from avmsf.tasks.edits import edited
 
 @dataclass(frozen=True, eq=False)
 class ModalEdit:
-    """An edit of every mode, on a logarithmic scale, zero for what stays (paper, section 3.6: object sound editing).
+    """An edit of every mode, on a logarithmic scale, zero for no change (paper, section 3.6: object sound editing).
 
     f_i = exp(log alpha + log f_i,init + delta_i), d_i = d_i,init exp(log kappa + epsilon_i), and one factor gamma_i on
     the gains of mode i at all contacts, so that their ratios between contacts, the spatial field, stay as they are.
@@ -28,33 +28,33 @@ class ModalEdit:
     pitch: Float64[Tensor, ""]
     """log alpha, of all frequencies."""
     shift: Float64[Tensor, " modes"]
-    """delta, of each mode's frequency beside it."""
+    """delta, of each mode's frequency in addition."""
     damping: Float64[Tensor, ""]
     """log kappa, of all dampings."""
     damping_shift: Float64[Tensor, " modes"]
-    """epsilon, of each mode's damping beside it."""
+    """epsilon, of each mode's damping in addition."""
     scale: Float64[Tensor, " modes"]
     """log gamma, of each mode's gains."""
 
     @classmethod
     def none(cls, bank: ModalBank, *, pitch: float = 0.0, damping: float = 0.0) -> "ModalEdit":
-        """Return what leaves a bank's modes as they are, but for the logarithms of the factors common to all."""
+        """Return an edit of a bank by common factors only, given by their logarithms."""
         zero = torch.zeros_like(bank.frequency)
         return cls(zero.new_tensor(pitch), zero, zero.new_tensor(damping), zero, zero)
 
     @property
     def pitch_factor(self) -> float:
-        """What all frequencies are multiplied by, their own shifts left out: alpha."""
+        """Common factor on all frequencies, without their own shifts: alpha."""
         return float(self.pitch.detach().exp())
 
     @property
     def damping_factor(self) -> float:
-        """What all dampings are multiplied by, their own shifts left out: kappa."""
+        """Common factor on all dampings, without their own shifts: kappa."""
         return float(self.damping.detach().exp())
 
     @property
     def decay_factor(self) -> float:
-        """What the times in which all modes die away are multiplied by, as `retune`'s `decay`: 1 / kappa."""
+        """Common factor on all decay times, as `retune`'s `decay`: 1 / kappa."""
         return 1.0 / self.damping_factor
 
     def to(self, device: torch.device | str) -> "ModalEdit":
@@ -79,12 +79,16 @@ class ModalEdit:
     def of(self, field: SoundField, *, told: Mapping[str, Any] | None = None) -> SoundField:
         """Return the edited field, an ordinary one: it renders, saves, localises and can be edited again.
 
-        `told`, plain values, joins the common factors in the last entry of `origin.report["edits"]`. Modes that come to
-        lie at half the sample rate or above are silent. Raises `EditError` for another number of modes, and for what
-        makes a mode's frequency, damping or gain no number.
+        `told`, plain values, joins the common factors in the last entry of `origin.report["edits"]`. Modes at half the
+        sample rate or above are silent. Raises `EditError` for another number of modes, and for a frequency, damping or
+        gain that is not finite.
         """
         if len(self.shift) != len(field.bank):
-            raise EditError(f"expected an edit of the field's {len(field.bank)} modes, found one of {len(self.shift)}")
+            raise EditError(
+                f"expected an edit of the field's {len(field.bank)} modes, got one of {len(self.shift)}",
+                name="shift",
+                value=len(self.shift),
+            )
         bank = self.bank(field.bank)
         return edited(
             field,
@@ -96,7 +100,7 @@ class ModalEdit:
 
 @dataclass(frozen=True, eq=False)
 class Struck:
-    """A field struck at some contacts, with its modes still open: what an edit is heard on."""
+    """A field at some contacts, whose modes can be edited."""
 
     bank: ModalBank
     """The field's own modes."""
@@ -118,7 +122,7 @@ class Struck:
         samples: int,
         device: torch.device | None = None,
     ) -> "Struck":
-        """Strike a field straight into its surface at contacts (object frame, meters)."""
+        """Evaluate a field at contacts (object frame, meters) for impacts along the inward normals."""
         known = field.known(contacts)
         place = torch.device("cpu") if device is None else device
         parts = (known.mean, known.quadrature, known.damping)
@@ -131,7 +135,7 @@ class Struck:
         )
 
     def first(self, count: int) -> "Struck":
-        """Return the field struck at the first `count` of the contacts."""
+        """Return the field at the first `count` of the contacts."""
         parts = (self.known.mean, self.known.quadrature, self.known.damping)
         return replace(self, known=Gains(*(None if part is None else part[:count] for part in parts)))  # type: ignore[arg-type]
 
@@ -163,5 +167,5 @@ class Struck:
         return torch.where(self.audible(self.bank), (self.known.power / (4 * damping)).mean(dim=0), 0.0)
 
     def loudest(self, count: int) -> Int[Tensor, " edited"]:
-        """Return which modes are loudest, at most `count` of them, ascending."""
+        """Return the indices of the strongest modes, at most `count` of them, ascending."""
         return torch.argsort(self.energy(), descending=True)[:count].sort().values

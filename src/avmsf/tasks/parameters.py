@@ -1,4 +1,4 @@
-"""What of an edit is free to move, how fast, and what holds it back."""
+"""Parameterizations of an edit: free quantities, learning rates, and penalties."""
 
 import math
 from dataclasses import dataclass, replace
@@ -15,14 +15,14 @@ _QUANTITIES = ("pitch", "shift", "damping", "damping_shift", "scale")
 
 @dataclass(frozen=True)
 class Parameterisation:
-    """Rates are those of Adam, in logarithms a step, falling to a twentieth; 0 keeps a quantity where it starts.
+    """Rates are those of Adam, in logarithms a step, falling to a twentieth; 0 fixes a quantity at its initial value.
 
-    A quantity of a single mode is held near 0 by half the mean square over modes of its value over its deviation, times
-    `stiffness`, in the unit of the loss, which is a relative error.
+    The penalty on a quantity of single modes is half the mean square over modes of its value over its standard
+    deviation, times `stiffness`, in the unit of the loss, which is a relative error.
     """
 
     name: str
-    """What the edit's report calls it."""
+    """Name in the edit's report."""
     pitch_rate: float
     """Of the common factor on frequencies."""
     damping_rate: float
@@ -34,15 +34,15 @@ class Parameterisation:
     scale_rate: float
     """Of each gain factor."""
     stiffness: float
-    """Strength of what holds single modes back."""
+    """Weight of the penalty on single modes."""
     shift_deviation: float = 0.05
-    """How far a frequency goes by itself, logarithm: .05 is almost a semitone."""
+    """Standard deviation of single frequencies, logarithm: .05 is almost a semitone."""
     damping_shift_deviation: float = 0.3
-    """How far a damping goes by itself."""
+    """Standard deviation of single dampings, logarithm."""
     scale_deviation: float = 1.0
-    """How far a gain factor goes, the common level aside."""
+    """Standard deviation of gain factors, logarithm, without the common level."""
     searches: bool = True
-    """Whether it begins where the guide proposes; else the object as it is."""
+    """Whether the guide proposes the initial edit; otherwise the unedited object."""
     gains_follow: bool = False
     """Whether gains of a mode from f1 to f2 Hz are multiplied by f1 / f2 when the edit ends (paper, section 3.6)."""
 
@@ -50,24 +50,24 @@ class Parameterisation:
 HIERARCHICAL = Parameterisation("hierarchical", 0.02, 0.02, 0.003, 0.01, 0.02, 0.05)
 """The paper's factor on all frequencies, and ours: one on all dampings, penalties on single modes, a search first."""
 PUBLISHED = Parameterisation("published", 0.02, 0.0, 0.003, 0.01, 0.02, 0.0, searches=False, gains_follow=True)
-"""The paper's: f = exp(log alpha + log f0 + delta), dampings and gains mode by mode, nothing that holds them back.
+"""The paper's: f = exp(log alpha + log f0 + delta), dampings and gains of single modes, no penalty.
 
 The rates, which the paper does not state, are those of `HIERARCHICAL`.
 """
 INDEPENDENT = Parameterisation("independent", 0.0, 0.0, 0.02, 0.02, 0.02, 0.0, searches=False)
-"""The paper's baseline, after Audio-SDS: every frequency, damping and gain by itself, nothing in common.
+"""The paper's baseline, after Audio-SDS: independent frequencies, dampings and gains, no common factors.
 
-The rates are this package's, those at which the common factors move above; Audio-SDS states .05 for its parameters.
+The rates are this package's, those of the common factors above; Audio-SDS states .05 for its parameters.
 """
 SEARCHED = replace(INDEPENDENT, name="searched", searches=True)
-"""Every mode by itself, but from where the common factors' search ends: what is left is the hierarchy's own share."""
+"""Independent modes, initialized by the search for common factors: what remains is the effect of the hierarchy."""
 
 PARAMETERISATIONS = {each.name: each for each in (HIERARCHICAL, PUBLISHED, INDEPENDENT, SEARCHED)}
 """All of them, by name."""
 
 
 class EditVariables:
-    """An edit on its way, and its optimizer."""
+    """The variables of an edit, and their optimizer."""
 
     def __init__(self, start: ModalEdit, edited: Int[Tensor, " edited"], parameters: Parameterisation) -> None:
         """Begin at `start`; the modes `edited` move by themselves, the others follow the common factors alone.
@@ -96,7 +96,7 @@ class EditVariables:
         return ModalEdit(**whole)
 
     def penalty(self) -> Float64[Tensor, ""]:
-        """Return what speaks against single modes going their own ways, in the unit of the loss."""
+        """Return the penalty on single modes, in the unit of the loss."""
         parameters, scale = self.parameters, self.values["scale"]
         parts = (
             self.values["shift"] / parameters.shift_deviation,
@@ -113,18 +113,18 @@ class EditVariables:
         return all(bool(torch.isfinite(gradient).all()) for gradient in moving)
 
     def move(self, *, done: float) -> None:
-        """Take the step that the gradient asks for, with a part `done` of all steps behind it."""
+        """Take a step of the optimizer; `done` is the fraction of finished steps."""
         for group in self.optimizer.param_groups:
             group["lr"] = group["rate"] * (0.525 + 0.475 * math.cos(math.pi * done))
         self.optimizer.step()
 
     def state(self) -> dict[str, Any]:
-        """Return all that decides how it goes on: tensors, numbers, containers of these."""
+        """Return the complete state: tensors, numbers, containers of these."""
         values = {name: value.detach().cpu().clone() for name, value in self.values.items()}
         return {"values": values, "optimizer": self.optimizer.state_dict()}
 
     def resume(self, state: dict[str, Any]) -> None:
-        """Go back to what `state` returned."""
+        """Restore what `state` returned."""
         with torch.no_grad():
             for name, value in self.values.items():
                 value.copy_(state["values"][name])

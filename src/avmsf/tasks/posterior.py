@@ -70,10 +70,10 @@ class Foretold:
 
 @dataclass(frozen=True, eq=False)
 class Force:
-    """What is known beforehand of a blow's strength. Raises LocationError for what no force can be."""
+    """The prior of an impact's force, of either polarity. Raises LocationError for values that are not above 0."""
 
     expected: float
-    """In the unit in which a blow of one is as loud as the field renders it."""
+    """Relative to the force at which the field's rendered sounds are as loud as the recording."""
     spread_db: float = 3.0
     """Standard deviation, dB."""
 
@@ -81,8 +81,9 @@ class Force:
         for name, value in (("expected", self.expected), ("spread_db", self.spread_db)):
             if not (math.isfinite(value) and value > 0.0):
                 raise LocationError(
-                    f"a force with {name} = {value:g}: expected a number above 0; blows of either polarity are looked "
-                    "for, and without a known force leave it out"
+                    f"force.{name}: expected a number above 0, got {value:g}; leave the force out if it is not known",
+                    name=f"force.{name}",
+                    value=value,
                 )
 
 

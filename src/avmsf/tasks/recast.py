@@ -50,9 +50,9 @@ def recast(
 ) -> SoundField:
     """Return the field of an object of the same shape, `size` times as large, in a new material.
 
-    The dampings of the field are multiplied by the ratio of what the two materials' Rayleigh laws say, so that what a
-    mode has of its own beside the law (its supports, what it radiates) stays in proportion; to give a material to
-    itself changes nothing, and by way of a third one comes to the same, unless the third damps a mode beyond critical.
+    The dampings of the field are multiplied by the ratio of what the two materials' Rayleigh laws say, so that
+    each mode's deviation from the law (by supports and radiation) stays in proportion; the same material changes
+    nothing, and a third material in between gives the same result, unless it overdamps a mode.
     Where neither material damps, dampings stay. Ratios of gains between places stay, the residual too. A place on the
     new object is `size` times the old one's.
 
@@ -61,8 +61,7 @@ def recast(
     damps beyond the critical damping, which have no tone: they are mute from then on, and keep the frequency and the
     damping that they had; and another Poisson's ratio, which changes shapes and takes a new solve.
 
-    Raises `EditError` for a size that is not positive, for an old material without damping where the new one has some,
-    and for the reverse, which would ring for ever.
+    Raises `EditError` for a size that is not positive, and where one of the materials has no damping and the other has.
     """
     _expect(old, new, size)
     before, mute = field.bank, muted(field)
@@ -108,34 +107,38 @@ def _damps(material: Material) -> bool:
 
 
 def _remarks(old: Material, new: Material, bank: ModalBank, dead: Bool[Tensor, " modes"]) -> list[str]:
-    """Return what the owner of the field should know of an edit, in sentences."""
+    """Return messages on neglected changes and overdamped modes."""
     remarks = []
     if new.poisson != old.poisson:
         stiffer = math.sqrt((1.0 - old.poisson**2) / (1.0 - new.poisson**2)) - 1.0
         remarks.append(
-            f"Poisson's ratio changes from {old.poisson:g} to {new.poisson:g}, which this law leaves out: a thin "
-            f"wall's bending frequencies would change by about {100 * stiffer:+.1f} %, and the shapes a little; only "
-            "a new solve shows that"
+            f"Poisson's ratio changes from {old.poisson:g} to {new.poisson:g}, which this law neglects: bending "
+            f"frequencies of a thin wall would change by about {100 * stiffer:+.1f} %, and the mode shapes slightly"
         )
     if bool(dead.any()):
         remarks.append(
-            f"{int(dead.sum())} of {len(bank)} modes are damped beyond their critical damping by alpha {new.alpha:g} "
-            f"1/s and beta {new.beta:g} s, and are mute from now on: "
-            + ", ".join(f"{each:.4g} Hz" for each in bank.frequency[dead].tolist())
+            f"{int(dead.sum())} of {len(bank)} modes are overdamped by alpha {new.alpha:g} 1/s and beta {new.beta:g} s "
+            "and stay silent: " + ", ".join(f"{each:.4g} Hz" for each in bank.frequency[dead].tolist())
         )
     return remarks
 
 
 def _expect(old: Material, new: Material, size: float) -> None:
     if not 0.0 < size < math.inf:
-        raise EditError(f"size = {size:g}: expected the new object's lengths over the old one's, more than 0, as 1.5")
+        raise EditError(
+            f"size: expected the ratio of new to old lengths, above 0, such as 1.5, got {size:g}",
+            name="size",
+            value=size,
+        )
     if _damps(old) and not _damps(new):
         raise EditError(
-            f"{new.name}: alpha and beta are 0, so that nothing would ever fall silent: give alpha (1/s) or beta (s) "
-            "a value above 0"
+            f"new material {new.name}: expected alpha (1/s) or beta (s) above 0, got 0 and 0",
+            name="new",
+            value=(new.alpha, new.beta),
         )
     if _damps(new) and not _damps(old):
         raise EditError(
-            f"{old.name}: alpha and beta are 0, so that {new.name} has nothing to be compared with: give the old "
-            "material the alpha (1/s) or beta (s) that its object has"
+            f"old material {old.name}: expected alpha (1/s) or beta (s) above 0, as for {new.name}, got 0 and 0",
+            name="old",
+            value=(old.alpha, old.beta),
         )

@@ -1,4 +1,4 @@
-"""Guides towards sounds that exist: recordings of another object, or sounds as a material makes them."""
+"""Guides towards reference sounds: recordings of another object, or synthetic sounds of a material."""
 
 import hashlib
 import warnings
@@ -30,9 +30,9 @@ _FADE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Clips to sound like: each rendered sound is pulled towards the clip whose spectrum is nearest, at its own level.
+    """Target clips: each rendered sound moves towards the clip of the nearest spectrum, at its own level.
 
-    Where a clip ends before the sound does nothing is asked of the rest.
+    Where a clip ends before the sound, the rest of the sound has no target.
     """
 
     clips: Float[Tensor, "clips samples"]
@@ -46,12 +46,26 @@ class Reference:
 
     def __post_init__(self) -> None:
         if not len(self.clips) or len(self.lengths) != len(self.clips):
-            raise EditError(f"expected clips and as many lengths, found {len(self.clips)} and {len(self.lengths)}")
+            raise EditError(
+                f"{self.name}: expected a length for each of {len(self.clips)} clips, got {len(self.lengths)}",
+                name="lengths",
+                value=len(self.lengths),
+            )
         if not bool(torch.isfinite(self.clips).all()):
-            raise EditError(f"{self.name}: expected samples that are finite numbers, found others: record it again")
+            row = int(torch.nonzero(~torch.isfinite(self.clips))[0, 0])
+            raise EditError(
+                f"{self.name}, clip {row}: expected finite samples, got NaN or inf; record it again",
+                row=row,
+                name="clips",
+            )
         silent = [row for row, clip in enumerate(self.clips) if float(clip.abs().max()) == 0.0]
         if silent:
-            raise EditError(f"{self.name}: clip {silent[0]} (counted from 0) is silent: leave it out")
+            raise EditError(
+                f"{self.name}, clip {silent[0]}: expected a sound, got silence; omit it",
+                row=silent[0],
+                name="clips",
+                value=0.0,
+            )
 
     @classmethod
     def of(cls, sounds: Float[Tensor, "clips samples"], *, sample_rate: float, name: str = "reference") -> "Reference":
@@ -60,11 +74,11 @@ class Reference:
 
     @classmethod
     def read(cls, paths: str | Path | Sequence[str | Path], *, sample_rate: float) -> "Reference":
-        """Read recordings of blows and bring them to the field's `sample_rate`, Hz; a folder stands for its wav files.
+        """Read recordings of impacts and resample them to the field's `sample_rate`, Hz; a folder means its wav files.
 
-        Each begins at its onset and ends at a second blow; of several channels the strongest is heard. Raises
-        `EditError` for what is missing, no sound file, silent, shorter than 20 ms after the onset, or never sudden
-        enough to hold a blow. Warns of a second blow, of clipping, and of a rate below the field's.
+        Each begins at its onset and ends at a second impact; of several channels the strongest is used. Raises
+        `EditError` for a file that is missing, no sound, silent, shorter than 20 ms after the onset, or without an
+        onset. Warns of a second impact, of clipping, and of a rate below the field's.
         """
         found = wav_files(paths)
         clips = [read_clip(path, sample_rate=sample_rate) for path in found]
@@ -74,7 +88,7 @@ class Reference:
         return cls(padded, tuple(len(clip) for clip in clips), sample_rate, name)
 
     def describe(self) -> dict[str, Any]:
-        """Return what tells it from other guides, as plain values."""
+        """Return its identifying settings, as plain values."""
         digest = hashlib.sha256(self.clips.detach().cpu().contiguous().numpy().tobytes()).hexdigest()
         return {"reference": self.name, "lengths": list(self.lengths), "samples_sha256": digest}
 
@@ -111,12 +125,16 @@ def wav_files(paths: str | Path | Sequence[str | Path]) -> list[Path]:
     for path in given:
         found += sorted(each for each in path.iterdir() if each.suffix.lower() == ".wav") if path.is_dir() else [path]
     if not found:
-        raise EditError(f"{', '.join(map(str, given)) or 'no path'}: expected wav files to sound like, found none")
+        raise EditError(
+            f"{', '.join(map(str, given)) or 'reference'}: expected wav files, found none",
+            file=given[0] if given else None,
+            name="reference",
+        )
     return found
 
 
 def read_clip(path: Path, *, sample_rate: float) -> Float[Tensor, " samples"]:
-    """Return a recorded blow from its onset to the next, float32 at `sample_rate` Hz, of its strongest channel.
+    """Return a recorded impact from its onset to the next, float32 at `sample_rate` Hz, of its strongest channel.
 
     Warns and raises `EditError` as `Reference.read`.
     """
@@ -127,22 +145,33 @@ def read_clip(path: Path, *, sample_rate: float) -> Float[Tensor, " samples"]:
         prepared = prepare(mono, CaptureSettings())
         expect_sudden(mono.response(), sample_rate=mono.sample_rate, name=mono.name)
     except CaptureError as error:
-        raise EditError(f"the reference cannot be used: {error}") from error
+        raise EditError(f"reference {error}", **{**error.attributes, "file": path}) from error
     sound, rate = prepared.sound, mono.sample_rate
-    notes = [clipping(mono.response(), name=mono.name)]
+    clipped = clipping(mono.response(), name=mono.name)
+    notes = [] if clipped is None else [AvmsfWarning(clipped, file=path, name="clipping")]
     second = find_second_blow(sound, 0, sample_rate=rate, seconds=len(sound) / rate)
     if second is not None:
+        at = (prepared.onset / rate, (prepared.onset + second) / rate)
         notes.append(
-            f"{mono.name} holds more than one blow, at {prepared.onset / rate:.3f} s and at "
-            f"{(prepared.onset + second) / rate:.3f} s: only the first is taken; give the others in files of their own"
+            AvmsfWarning(
+                f"{mono.name}: expected one impact, got two at {at[0]:.3f} s and {at[1]:.3f} s; only the first is used",
+                file=path,
+                name="impacts",
+                value=at,
+            )
         )
         sound = sound[: max(second, shortest_allowed(rate))]
     if rate < sample_rate:
         notes.append(
-            f"{mono.name} is at {rate:g} Hz and holds sound up to {_HELD * 0.5 * rate:.4g} Hz: what the object has "
-            f"above that is led towards silence; record at {sample_rate:g} Hz"
+            AvmsfWarning(
+                f"{mono.name}: expected {sample_rate:g} Hz or more, got {rate:g} Hz; modes above "
+                f"{_HELD * 0.5 * rate:.4g} Hz are edited towards silence",
+                file=path,
+                name="sample_rate",
+                value=rate,
+            )
         )
-    for note in filter(None, notes):
-        warnings.warn(note, AvmsfWarning, stacklevel=2)
+    for note in notes:
+        warnings.warn(note, stacklevel=2)
     clip = torch.from_numpy(np.ascontiguousarray(sound - sound.mean()))[None]
     return resampled(clip, sample_rate=rate, wanted=sample_rate)[0].float()

@@ -1,4 +1,4 @@
-"""A field by hand: every mode's pitch, how long it rings, how bright the whole is, and each mode's level."""
+"""Manual edits of a field: frequencies, decay times, brightness, and level of each mode."""
 
 import math
 from collections.abc import Sequence
@@ -28,12 +28,12 @@ def retune(
     brightness_db: float = 0.0,
     gains_db: Slider = 0.0,
 ) -> SoundField:
-    """Return the field with other frequencies, ring times and levels of its modes.
+    """Return the field with other frequencies, decay times and levels of its modes.
 
-    `pitch` multiplies frequencies, `decay` the times in which modes die away, and `gains_db` raises modes by so many
-    decibels, -inf mutes one; each is one number for all modes or one a mode, in the bank's order. `brightness_db` tilts
-    the spectrum by so many decibels an octave about `brightness_center`, at the frequencies that modes come to have.
-    Ratios of gains between places stay.
+    `pitch` multiplies frequencies, `decay` the modes' decay times, and `gains_db` raises modes by so many decibels,
+    -inf mutes one; each is one number for all modes or one a mode, in the bank's order. `brightness_db` tilts the
+    spectrum by so many decibels an octave about `brightness_center`, at the edited frequencies. Ratios of gains between
+    contacts stay.
 
     Without values nothing changes. Two edits after one another are the one with both factors and the sums of decibels,
     unless modes of a brightened field move by factors of their own. What was done is the last entry of
@@ -43,11 +43,15 @@ def retune(
     """
     factors = {name: _values(field, value, name) for name, value in (("pitch", pitch), ("decay", decay))}
     for name, values in factors.items():
-        _expect(torch.isfinite(values) & (values > 0), name, values, "factors above 0, as 1.5")
+        _expect(torch.isfinite(values) & (values > 0), name, values, "factors above 0, such as 1.5")
     levels = _values(field, gains_db, "gains_db")
     _expect(levels < math.inf, "gains_db", levels, "decibels, or -inf for silence")
     if not math.isfinite(brightness_db):
-        raise EditError(f"brightness_db = {brightness_db:g}: expected decibels an octave, as 3")
+        raise EditError(
+            f"brightness_db: expected decibels an octave, such as 3, got {brightness_db:g}",
+            name="brightness_db",
+            value=brightness_db,
+        )
     bank = ModalBank(field.bank.frequency * factors["pitch"], field.bank.damping / factors["decay"])
     if brightness_db:
         center = brightness_center(field, bank)
@@ -83,14 +87,19 @@ def _values(field: SoundField, value: Slider, name: str) -> Float64[Tensor, " mo
     values = torch.as_tensor(value, dtype=torch.float64)
     modes = len(field.bank)
     if values.ndim > 1 or (values.ndim == 1 and len(values) != modes):
-        raise EditError(f"{name} has {values.numel()} values: expected one, or one for each of the {modes} modes")
+        raise EditError(
+            f"{name}: expected one value, or one for each of {modes} modes, got the shape {list(values.shape)}",
+            name=name,
+            value=list(values.shape),
+        )
     return values.expand(modes)
 
 
 def _expect(fine: Bool[Tensor, " modes"], name: str, values: Float64[Tensor, " modes"], wanted: str) -> None:
     if not bool(fine.all()):
-        found = ", ".join(f"{each:g}" for each in dict.fromkeys(values[~fine].tolist()[:4]))
-        raise EditError(f"{name} = {found}: expected {wanted}")
+        row = int(torch.nonzero(~fine)[0])
+        value = float(values[row])
+        raise EditError(f"{name}, mode {row}: expected {wanted}, got {value:g}", row=row, name=name, value=value)
 
 
 def _told(values: Float64[Tensor, " modes"]) -> float | list[float | None] | None:

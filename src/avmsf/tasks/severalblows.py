@@ -21,7 +21,16 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.synthesis import synthesize
 from avmsf.tasks.amplitudes import Extractor
 from avmsf.tasks.contactmap import ContactMap
-from avmsf.tasks.hearing import Sound, as_recording, at_field_rate, describe, own_settings, read_if_path, settings_for
+from avmsf.tasks.hearing import (
+    Sound,
+    as_recording,
+    at_field_rate,
+    describe,
+    location_error,
+    own_settings,
+    read_if_path,
+    settings_for,
+)
 from avmsf.tasks.locate import judged
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
@@ -57,8 +66,11 @@ def locate_blows(
     chosen = settings_for(whole, own_settings(recording, field) if settings is None else settings)
     if chosen.normalize == "deconvolve":
         raise LocationError(
-            f'{whole.name}: normalize = "deconvolve" divides one push of the hammer out of a recording, not several: '
-            "cut it into a recording for each blow, and locate these"
+            f'{whole.name}: expected a recording of one impact with normalize = "deconvolve", got several; cut it into '
+            "one recording for each impact",
+            file=whole.name,
+            name="normalize",
+            value="deconvolve",
         )
     notes = describe(whole, chosen)
     try:
@@ -66,7 +78,7 @@ def locate_blows(
         refuse_silence(response, whole.name)
         sound = remove_rumble(response, chosen.highpass, whole)
     except CaptureError as error:
-        raise LocationError(str(error)) from error
+        raise location_error(error) from error
     onsets = find_blows(sound, sample_rate=whole.sample_rate)
     resampled, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
     finder = Locator.of(field) if locator is None else locator
@@ -84,7 +96,12 @@ def locate_blows(
             located = finder.locate(own.float(), highest=highest, force=force)
             located = judged(located)
             if located.refusal is not None:
-                raise LocationError(f"{whole.name}, the blow at {seconds:.3f} s: {located.refusal}")
+                raise LocationError(
+                    f"{whole.name}, impact at {seconds:.3f} s: {located.refusal}",
+                    file=whole.name,
+                    name="impact",
+                    value=seconds,
+                )
         except LocationError as error:
             refused.append((seconds, error))
             continue
@@ -94,7 +111,7 @@ def locate_blows(
     if not refused:
         return found
     times = ", ".join(f"{seconds:.3f}" for seconds, _ in refused)
-    left_out = f"{whole.name} holds {len(refused)} more, at {times} s, left out: {refused[0][1]}"
+    left_out = f"{whole.name}: {len(refused)} impacts, at {times} s, could not be located: {refused[0][1]}"
     return [(seconds, replace(each, notes=(*each.notes, left_out))) for seconds, each in found]
 
 

@@ -77,7 +77,9 @@ class StableAudio:
             pipeline = pipeline.to(place)
         except torch.OutOfMemoryError as error:
             raise EditError(
-                f"{name} does not fit into the memory of {place}: free memory there, or choose the device cpu"
+                f"{name}: out of memory on {place}; free memory, or choose the device cpu",
+                name="device",
+                value=str(place),
             ) from error
         return cls(pipeline, name=name, seconds=seconds)
 
@@ -119,8 +121,10 @@ class StableAudio:
         samples = waveforms.shape[2]
         if samples > self._frames * self._hop:
             raise EditError(
-                f"{self.name} works at {self._frames * self._hop / self.sample_rate:.4g} s, the sounds last "
-                f"{samples / self.sample_rate:.4g} s: give it more seconds, or edit with fewer"
+                f"{self.name}: expected sounds of at most {self._frames * self._hop / self.sample_rate:.4g} s, got "
+                f"{samples / self.sample_rate:.4g} s; load the model with more seconds, or edit with fewer",
+                name="seconds",
+                value=samples / self.sample_rate,
             )
         # Beyond the reach of its filters the autoencoder hears silence alone, and says the same of all of it; as far
         # from the end of what it is given, it would hear that end.
@@ -212,8 +216,9 @@ class StableAudio:
             return self.decode(latents, samples=round(seconds * self.sample_rate))[0].mean(dim=0).cpu()
         except torch.OutOfMemoryError as error:
             raise EditError(
-                f"{self.name} runs out of memory on {self.device} while it makes a sound: free memory there, or choose "
-                "the device cpu"
+                f"{self.name}: out of memory on {self.device} during generation; free memory, or choose the device cpu",
+                name="device",
+                value=str(self.device),
             ) from error
 
     def _sampled(
@@ -240,7 +245,9 @@ class StableAudio:
         longest = self._longest * self._hop / self.sample_rate
         if not 0 < seconds <= longest:
             raise EditError(
-                f"seconds = {seconds:g}: expected more than 0 and at most {longest:.4g}, which {self.name} was made for"
+                f"seconds: expected more than 0 and at most {longest:.4g} for {self.name}, got {seconds:g}",
+                name="seconds",
+                value=seconds,
             )
         return math.ceil(seconds * self.sample_rate / self._hop)
 

@@ -1,4 +1,4 @@
-"""Where Stable Audio's weights are: a folder, the hub's cache, or the hub; and what to do where they are not."""
+"""Stable Audio's weights: a folder, the hub's cache, or the hub."""
 
 import hashlib
 import json
@@ -35,19 +35,24 @@ def load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
     named = not folder.is_dir()
     if named and not is_hub_name(source):
         raise EditError(
-            f"{source}: expected a folder with a {_CLASS}, or a name of the hub such as {STABLE_AUDIO}; found no such "
-            "folder: check the path"
+            f"{source}: expected a folder with a {_CLASS}, or a name of the hub such as {STABLE_AUDIO}, found no "
+            "folder; check the path",
+            file=folder,
+            name="source",
+            value=str(source),
         )
     name = str(source) if named else folder.resolve().name
     folder = _from_hub(kind, name) if named else folder
     _expect_pipeline(folder)
     try:
         with warnings.catch_warnings():
-            # Nothing that a user of this package could mend.
+            # No user of this package can fix it.
             warnings.filterwarnings("ignore", message="`torch.nn.utils.weight_norm` is deprecated")
             pipeline = kind.from_pretrained(folder, local_files_only=True, use_safetensors=True)
     except Exception as error:  # whatever is wrong with the files, the libraries have their own errors
-        raise EditError(f"{folder}: the pipeline cannot be loaded ({error}): copy the model's files again") from error
+        raise EditError(
+            f"{folder}: expected a {_CLASS}, got files that cannot be loaded ({error}); copy them again", file=folder
+        ) from error
     for part in _NETWORKS:
         _expect_weights(folder / part, getattr(pipeline, part))
     for part in _NETWORKS:
@@ -57,8 +62,10 @@ def load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
     if lacking:
         raise EditError(
             f"{folder / 'scheduler'}: expected a scheduler of the EDM family, such as "
-            f"CosineDPMSolverMultistepScheduler, found {type(pipeline.scheduler).__name__}: copy the model's files "
-            "again"
+            f"CosineDPMSolverMultistepScheduler, got {type(pipeline.scheduler).__name__}; copy the files again",
+            file=folder / "scheduler",
+            name="scheduler",
+            value=type(pipeline.scheduler).__name__,
         )
     return pipeline, name
 
@@ -92,11 +99,12 @@ def _from_hub(kind: Any, name: str) -> Path:
         return Path(kind.download(name))
     except Exception as error:  # the hub's client raises whatever the network beneath it does
         raise EditError(
-            f"{name}: not in the cache of downloaded models, and it cannot be downloaded ({type(error).__name__}: "
-            f"{_first_line(error)}). Its weights are gated: accept the licence at https://huggingface.co/{name}, make "
-            "a token at https://huggingface.co/settings/tokens and run: hf auth login. Without a network here, run "
-            f"where there is one: hf download {name} --local-dir FOLDER --exclude 'model.*', copy FOLDER here and give "
-            "it in place of the name"
+            f"{name}: the model is not in the cache, and its download failed ({type(error).__name__}: "
+            f"{_first_line(error)}); accept the license at https://huggingface.co/{name}, create a token at "
+            "https://huggingface.co/settings/tokens and run hf auth login; or, on a computer with a network, run "
+            f"hf download {name} --local-dir FOLDER --exclude 'model.*', copy FOLDER here and give its path",
+            name="source",
+            value=name,
         ) from error
 
 
@@ -104,23 +112,39 @@ def _expect_pipeline(folder: Path) -> None:
     """Raise `EditError` for a folder that holds another model or lacks a part."""
     index = folder / _INDEX
     if not index.is_file():
-        found = ", ".join(sorted(each.name for each in folder.iterdir())[:6]) or "nothing"
+        found = sorted(each.name for each in folder.iterdir())
         raise EditError(
-            f"{folder}: expected a {_CLASS} as diffusers saves it, with {_INDEX} and the folders {', '.join(_PARTS)}; "
-            f"found {found}: give the folder that holds {_INDEX}"
+            f"{folder}: expected a {_CLASS} of diffusers, with {_INDEX} and the folders {', '.join(_PARTS)}, got "
+            f"{', '.join(found[:6]) or 'an empty folder'}; give the folder of {_INDEX}",
+            file=folder,
+            name=_INDEX,
+            value=tuple(found),
         )
-    kind = read_settings(index, raising=EditError).get("_class_name", "pipeline of no named class")
+    kind = read_settings(index, raising=EditError).get("_class_name")
     if kind != _CLASS:
-        raise EditError(f"{folder}: expected a {_CLASS}, found a {kind}: give the folder of a Stable Audio model")
+        raise EditError(
+            f"{folder}: expected a {_CLASS}, got {kind}; give the folder of a Stable Audio model",
+            file=folder,
+            name="_class_name",
+            value=kind,
+        )
     lacking = [part for part in _PARTS if not (folder / part).is_dir()]
     if lacking:
-        raise EditError(f"{folder}: the model lacks its {' and its '.join(lacking)}: copy the missing folders there")
+        raise EditError(
+            f"{folder}: expected the folders {', '.join(_PARTS)}, found no {', '.join(lacking)}; copy them again",
+            file=folder,
+            name="parts",
+            value=tuple(lacking),
+        )
     bare = [part for part in _NETWORKS if not any((folder / part).glob("*.safetensors"))]
     if bare:
         raise EditError(
-            f"{folder}: no weights (*.safetensors) in {' and '.join(bare)}: accept the licence at "
-            f"https://huggingface.co/{STABLE_AUDIO}, run: hf auth login, then: hf download {STABLE_AUDIO} --local-dir "
-            f"{folder} --exclude 'model.*'"
+            f"{folder}: expected weights (*.safetensors) in {', '.join(bare)}, found none; accept the license at "
+            f"https://huggingface.co/{STABLE_AUDIO}, run hf auth login and hf download {STABLE_AUDIO} --local-dir "
+            f"{folder} --exclude 'model.*'",
+            file=folder,
+            name="weights",
+            value=tuple(bare),
         )
 
 
@@ -138,8 +162,11 @@ def _expect_weights(folder: Path, network: nn.Module) -> None:
     missing = sorted(name for name, weight in held.items() if name not in there and weight.data_ptr() not in stored)
     if missing:
         raise EditError(
-            f"{folder}: lacks {len(missing)} of the model's weights, {missing[0]} among them: it belongs to another "
-            "config.json; copy both from one model"
+            f"{folder}: expected all weights of the model, {len(missing)} are missing such as {missing[0]}; copy them "
+            "and config.json from one model",
+            file=folder,
+            name="weights",
+            value=tuple(missing),
         )
 
 
@@ -151,11 +178,12 @@ def _pipeline_class() -> Any:
     try:
         from diffusers import StableAudioPipeline
 
-        if find_spec("torchsde") is None:  # the scheduler asks for it late, in words that name no remedy
+        if find_spec("torchsde") is None:  # the scheduler imports it late, and its error names no remedy
             raise ImportError("no module named 'torchsde'")
     except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
         raise EditError(
-            f"editing by words needs diffusers, transformers and torchsde, which cannot be imported ({error}): "
-            "pip install 'avmsf[text]', or edit towards a recording, which needs none of them"
+            f"text prompts: expected the packages diffusers, transformers and torchsde, got {error}; "
+            "pip install 'avmsf[text]', or edit towards a recording",
+            name="diffusers",
         ) from error
     return StableAudioPipeline

@@ -1,11 +1,11 @@
-"""Where a descent towards a reference begins: the common pitch and damping, searched all over their range.
+"""The initial edit towards a reference: a global search for the common pitch and damping.
 
-Modes are sparse: between one that is there and one that is wanted a third of an octave higher, a spectrum's L1 distance
-has no slope. So the pitch comes from optimal transport, which in one dimension is a match of quantiles: a common factor
+Modes are sparse: if a mode and its target are a third of an octave apart, the L1 distance of the spectra has no
+gradient. So the pitch comes from optimal transport, which in one dimension is a match of quantiles: a common factor
 on all frequencies moves the quantiles of the spectrum along a logarithmic axis by one step, and the best of them is the
 mean or median difference of two spectra's. A grid over the smoothed spectra's overlap proposes one more. The damping is
-searched on a grid for each proposal, and the loss that will be descended chooses. Only what a target says counts:
-beyond its end there is the rendered sound itself, and the longer that rang, the smaller a relative error would be.
+searched on a grid for each proposal, and the loss of the optimization chooses. Only the target's own duration counts:
+beyond its end it continues with the rendered sound, and a longer decay would reduce the relative error.
 """
 
 import math
@@ -22,17 +22,17 @@ from avmsf.tasks.modaledit import ModalEdit, Struck
 Wanted = Callable[
     [Float[Tensor, "contacts samples"]], tuple[Float[Tensor, "contacts samples"], Float[Tensor, "contacts samples"]]
 ]
-"""Gives what sounds are to be pulled towards, and the weight of each sample, 0 where nothing is asked, at most 1."""
+"""Gives the targets of sounds, and the weight of each sample, 0 where there is no target, at most 1."""
 _OCTAVES = 9
-"""Of the band that is looked at, down from half the sample rate."""
+"""Of the analyzed band, down from half the sample rate."""
 _PER_OCTAVE = 24
 _WIDTH = 3.0
 """Standard deviation of the smoothing, in bands: an eighth of an octave."""
 _MOST = math.log(8.0)
-"""How far the pitch may be moved."""
+"""Largest change of the pitch, logarithm."""
 _MOST_DAMPING = math.log(64.0)
 _STRUCK = 6
-"""Contacts that the search listens to."""
+"""Contacts of the search."""
 _FFT_SIZES = (2048, 1024, 512, 256)
 
 

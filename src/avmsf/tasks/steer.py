@@ -1,4 +1,4 @@
-"""The descent: a field's modes are moved until it sounds like what a guide asks for, the same wherever it is struck."""
+"""Guided editing: a field's modes are optimized towards a guide's target sounds, with one edit for all contacts."""
 
 import math
 import time
@@ -25,35 +25,35 @@ from avmsf.tasks.parameters import HIERARCHICAL, EditVariables, Parameterisation
 from avmsf.tasks.steercheckpoint import asked
 
 _PROBES = 16
-"""Contacts, far apart, at which the loudest modes, the start and the level are judged."""
+"""Contacts, far apart, for the strongest modes, the start and the level."""
 _LISTENED = 2000
-"""Most points of the surface that are struck."""
+"""Maximum number of points of the surface that are used as contacts."""
 _SPOILT = 20
-"""Steps in a row without a usable target after which there is no hope."""
+"""Consecutive steps without a finite target after which the edit ends with an error."""
 _CHECKPOINT_SECONDS = 30.0
 
 
 @runtime_checkable
 class Guide(Protocol):
-    """Knows what a field shall sound like."""
+    """Gives target sounds."""
 
     @property
     def sample_rate(self) -> float:
-        """Of the sounds that it takes and returns, Hz."""
+        """Sample rate of the sounds that it takes and returns, Hz."""
         ...
 
     def describe(self) -> dict[str, Any]:
-        """Return what tells it from other guides, as plain values: the edit's report and checkpoint keep it."""
+        """Return its identifying settings, as plain values, for the edit's report and checkpoint."""
         ...
 
     def start(self, struck: Struck) -> ModalEdit:
-        """Return where the descent begins, after a look at the field struck at places far apart."""
+        """Return the initial edit, given the field at contacts far apart."""
         ...
 
     def targets(
         self, sounds: Float[Tensor, "contacts samples"], step: int, generator: torch.Generator
     ) -> Float[Tensor, "contacts samples"]:
-        """Return what rendered sounds are to be pulled towards, row for row, at the level of these.
+        """Return the targets of rendered sounds, row for row, at their level.
 
         A row with a sample that is not finite is left out of the step.
         """
@@ -62,22 +62,22 @@ class Guide(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SteerProgress:
-    """Where an edit stands."""
+    """Progress of an edit."""
 
     step: int
-    """Steps done."""
+    """Number of finished steps."""
     steps: int
-    """Steps in all."""
+    """Number of all steps."""
     loss: float
-    """Mean over resolutions of the last step's relative spectral error; NaN where its targets were not usable."""
+    """Mean over resolutions of the last step's relative spectral error; NaN where its targets were not finite."""
     pitch: float
-    """Factor on all frequencies so far."""
+    """Present factor on all frequencies."""
     decay: float
-    """Factor on the times in which modes die away so far."""
+    """Present factor on all decay times."""
     preview: Float[Tensor, " samples"] | None
-    """The edited field's sound at one place, at the field's rate, every so many steps and at the end."""
+    """The edited field's sound at one contact, at the field's rate, every `preview_every` steps and at the end."""
     place: Float[Tensor, " 3"] | None = None
-    """The place of the preview, object frame, meters."""
+    """The contact of the preview, object frame, meters."""
 
 
 def steer(
@@ -90,14 +90,14 @@ def steer(
     checkpoint: str | Path | None = None,
     device: torch.device | str = "cpu",
 ) -> SoundField:
-    """Return the field with its modes moved towards what `guide` asks for; gain ratios between contacts stay.
+    """Return the field with its modes optimized towards the targets of `guide`; gain ratios between contacts stay.
 
-    Each step strikes random places, compares the sounds with the guide's targets by the multi-scale spectral loss that
-    fields are fitted with, and moves what `parameters` leaves free. How loud the object is as a whole is no part of the
-    edit: the sounds compared, and the field returned, have the level of the given one. Rendering and loss run on
-    `device`. With `checkpoint`, the state is kept there while the edit runs, on interruption and at the end, and an
-    edit of the same arguments goes on from it to the same result. Raises `EditError` for a field that is silent, for a
-    guide at another rate, for a checkpoint of another edit, and where the guide's targets or the loss are no numbers.
+    Each step renders random contacts, compares the sounds with the guide's targets by the multi-scale spectral loss of
+    fitting, and updates the free `parameters`. The level is not edited: the sounds compared, and the field returned,
+    have the level of the given one. Rendering and loss run on `device`. With `checkpoint`, the state is stored there
+    while the edit runs, on interruption and at the end, and an edit with the same arguments continues from it to the
+    same result. Raises `EditError` for a field that is silent, for a guide at another rate, for a checkpoint of another
+    edit, and where the guide's targets or the loss are not finite.
     """
     config = SteerConfig() if config is None else config
     run = _Steering(field, guide, config, parameters, None if checkpoint is None else Path(checkpoint), device)
@@ -105,7 +105,7 @@ def steer(
 
 
 class _Steering:
-    """An edit on its way."""
+    """The state of an edit."""
 
     def __init__(
         self,
@@ -118,8 +118,9 @@ class _Steering:
     ) -> None:
         if guide.sample_rate != field.sample_rate:
             raise EditError(
-                f"a guide of sounds at {guide.sample_rate:g} Hz and a field at {field.sample_rate:g} Hz: make the "
-                f"guide with sample_rate = {field.sample_rate:g}, of sounds at that rate"
+                f"guide: expected the field's sample rate of {field.sample_rate:g} Hz, got {guide.sample_rate:g} Hz",
+                name="sample_rate",
+                value=guide.sample_rate,
             )
         self.field, self.guide, self.config, self.parameters = field, guide, config, parameters
         self.checkpoint, self.device, self.saved_at = checkpoint, torch.device(device), time.monotonic()
@@ -137,7 +138,7 @@ class _Steering:
         self.whole = True
         """False while parameters are being moved: an interruption then leaves a state that nothing can go on from."""
         settings = {**asdict(config), **asdict(parameters)}
-        # How often one listens changes nothing.
+        # The interval of previews does not change the result.
         del settings["preview_every"]
         self.asked = asked(field, probes, guide.describe(), settings)
         state = (
@@ -192,8 +193,10 @@ class _Steering:
             self.spoilt += 1
             if self.spoilt >= _SPOILT:
                 raise EditError(
-                    f"the targets of {self.spoilt} steps in a row hold samples that are not finite numbers: lower the "
-                    "guidance, or compute in float32"
+                    f"expected finite target sounds, got NaN or inf in {self.spoilt} consecutive steps; lower the "
+                    "guidance, or compute in float32",
+                    name="targets",
+                    value=self.spoilt,
                 )
         self.step += 1
         self.whole = True
@@ -204,8 +207,11 @@ class _Steering:
         error = spectral_loss(sounds, target) / len(self.sizes)
         if not (self.variables.differentiate(error) and bool(torch.isfinite(error))):
             raise EditError(
-                f"the edit diverged, its loss at step {self.step} is {float(error)} or its slope is no number: lower "
-                "the rates of its parameters"
+                f"step {self.step}: expected a finite loss and gradient, got a loss of {float(error)}; lower the "
+                "learning rates",
+                row=self.step,
+                name="loss",
+                value=float(error),
             )
         self.whole = False
         self.variables.move(done=self.step / self.config.steps)
@@ -233,7 +239,9 @@ class _Steering:
     def _expect_sound(self) -> Float[Tensor, " contacts"]:
         sounds = self.probes.sounds(ModalEdit.none(self.probes.bank))
         if not bool(torch.isfinite(sounds).all()) or float(sounds.abs().max()) == 0.0:
-            raise EditError("expected a field whose modes sound, found silence at all places: fit it again")
+            raise EditError(
+                "field: expected audible modes, got silence at all contacts; fit it again", name="field", value=0.0
+            )
         return level(sounds, sample_rate=self.field.sample_rate)
 
     def _save(self) -> None:
@@ -248,5 +256,7 @@ class _Steering:
             write_checkpoint(self.checkpoint, state, self.asked, raising=EditError)
         except EditError as error:
             # A full disk costs the checkpoint, not the edit.
-            warnings.warn(f"the edit goes on without a new checkpoint: {error}", AvmsfWarning, stacklevel=2)
+            warnings.warn(
+                AvmsfWarning(f"the edit continues without a checkpoint: {error}", **error.attributes), stacklevel=2
+            )
         self.saved_at = time.monotonic()

@@ -19,6 +19,7 @@ from avmsf.modal.extraction.extract import extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ShortTime, lowest_frequency
 from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.plate import Plate, PlateModes, plate_modes, sample_contacts, strike
+from raising import raises
 
 RATE = 16000.0
 PLATE = Plate(alpha=20.0)
@@ -227,13 +228,13 @@ def test_one_recording_has_the_modes_of_its_sound():
 @pytest.mark.parametrize("contacts", [2, 8])
 def test_noise_is_blamed(seed: int, contacts: int):
     noise = 0.01 * torch.randn(contacts, 8000, generator=seeded(seed))
-    with pytest.raises(ExtractionError, match=r"in \d recordings of 0\.5 s.* noise or hum"):
+    with raises(ExtractionError, name="decay", value=pytest.approx(0.0, abs=1.0)):
         extract_modes(impacts_of(noise))
 
 
 def test_length_is_blamed():
     impacts, _ = recorded(-40.0, seconds=0.25)
-    with pytest.raises(ExtractionError, match=r"only 200 samples .* Keep more seconds"):
+    with raises(ExtractionError, name="samples", value=200):
         extract_modes(impacts_of(impacts.sounds[:, :200]))
 
 
@@ -242,18 +243,18 @@ def test_band_is_blamed():
     bank = ModalBank(torch.tensor([24.0], dtype=torch.float64), torch.tensor([12.0], dtype=torch.float64))
     sounds = make(bank, torch.ones(3, 1), rate=RATE, samples=8000, noise=1e-3)
     assert lowest_frequency(8000, RATE) == 100.0
-    with pytest.raises(ExtractionError, match=r"between 100 and 8000 Hz.* lies below that band\. Keep more seconds"):
+    with raises(ExtractionError, name="energy", value=pytest.approx(1.0, abs=0.1)):
         extract_modes(impacts_of(sounds))
 
 
 def test_a_thud_is_blamed():
-    with pytest.raises(ExtractionError, match="nothing rings above the noise"):
+    with raises(ExtractionError, name="modes", value=0):
         extract_modes(impacts_of(thud(600.0)))
 
 
 def test_what_alternates_from_sample_to_sample_is_no_mode():
-    """Sampled in sine phase it is next to nothing, so that gains of what is heard would be enormous."""
-    with pytest.raises(ExtractionError, match="nothing rings above the noise"):
+    """Sampled in sine phase it is nearly zero, so that its gains would be enormous."""
+    with raises(ExtractionError, name="modes", value=0):
         extract_modes(impacts_of(thud(RATE / 2 - 20.0)))
 
 
@@ -265,7 +266,7 @@ def thud(frequency: float) -> Tensor:
 
 
 def test_silence_is_blamed():
-    with pytest.raises(ExtractionError, match="they are silent"):
+    with raises(ExtractionError, name="sounds", row=None, value=0.0):
         extract_modes(impacts_of(torch.zeros(2, 4000)))
 
 
@@ -273,7 +274,7 @@ def test_samples_that_are_no_numbers_are_refused():
     impacts, _ = recorded(-40.0, seconds=0.25)
     broken = impacts.sounds.clone()
     broken[3, 17] = math.nan
-    with pytest.raises(ExtractionError, match=r"sound 3 .* not finite"):
+    with raises(ExtractionError, name="sounds", row=3):
         extract_modes(impacts_of(broken))
 
 
@@ -298,7 +299,7 @@ def test_the_bowls_doublet_is_resolved(shared: Path):
 
 @pytest.mark.parametrize("method", [HighResolution, ShortTime])
 def test_no_modes_at_all_cannot_be_asked_for(method) -> None:
-    with pytest.raises(ExtractionError, match="modes = 0: expected 1 or more"):
+    with raises(ExtractionError, name="modes", value=0):
         method(modes=0)
 
 

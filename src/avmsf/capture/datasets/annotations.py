@@ -1,4 +1,4 @@
-"""The two small notes beside each recording of ObjectFolder Real: the recorder's gains, and the blow's peak force."""
+"""The two YAML files of each recording of ObjectFolder Real: the recorder's gains, and the impact's peak force."""
 
 import math
 import re
@@ -38,7 +38,12 @@ def read_gains(path: Path) -> Gains:
     text = _read(path)
     gain, pad = _pair(text, "gain", path), _pair(text, "pad", path)
     if not set(pad) <= {0.0, 1.0}:
-        raise DatasetError(f"{path}: pad is {pad[0]:g} and {pad[1]:g}; expected 0 or 1, a switch for each channel")
+        raise DatasetError(
+            f"{path}: expected pad 0 or 1 for each channel, got {pad[0]:g} and {pad[1]:g}",
+            file=path,
+            name="pad",
+            value=pad,
+        )
     return Gains(gain, (pad[0] == 1.0, pad[1] == 1.0))
 
 
@@ -47,7 +52,10 @@ def read_newtons(path: Path) -> float:
     found = re.findall(rf"\bstriking_force_newtons['\"]?\s*:\s*({_NUMBER})[\s,}}\]]", _read(path) + "\n")
     if len(found) != 1 or not 0 < float(found[0]) < math.inf:
         raise DatasetError(
-            f"{path}: expected one striking_force_newtons above 0, found {', '.join(found) if found else 'none'}"
+            f"{path}: expected one striking_force_newtons above 0, got {', '.join(found) if found else 'none'}",
+            file=path,
+            name="striking_force_newtons",
+            value=tuple(map(float, found)),
         )
     return float(found[0])
 
@@ -58,7 +66,10 @@ def _pair(text: str, key: str, path: Path) -> tuple[float, float]:
     block = rf"\n\s*-\s*({_NUMBER})[ \t]*\n\s*-\s*({_NUMBER})(?![ \t]*\n\s*-)"
     found = re.search(rf"^{key}[ \t]*:[ \t]*(?:{flow}|{block})[ \t]*$", text, flags=re.MULTILINE)
     if found is None:
-        raise DatasetError(f"{path}: expected a list of two numbers called {key}, found {text.strip()[:80]!r}")
+        held = text.strip()[:80]
+        raise DatasetError(
+            f"{path}: expected {key} with a list of two numbers, got {held!r}", file=path, name=key, value=held
+        )
     first, second = (float(number) for number in found.groups() if number is not None)
     return first, second
 
@@ -68,6 +79,6 @@ def _read(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
-        raise DatasetError(f"{path}: there is no such file") from error
+        raise DatasetError(f"{path}: expected a file, found none", file=path) from error
     except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path}: not a text that can be read: {error}") from error
+        raise DatasetError(f"{path}: expected UTF-8 text, got {error}", file=path) from error

@@ -1,4 +1,4 @@
-"""NumPy files whose shape and type are known beforehand: judged by their headers, read only where they fit."""
+"""NumPy files of known shape and type: checked by their headers, read only where they fit."""
 
 from dataclasses import dataclass
 from math import prod
@@ -11,22 +11,22 @@ from avmsf.errors import DatasetError
 
 @dataclass(frozen=True)
 class ArrayForm:
-    """What a file has to hold."""
+    """Type and shape that a file has to hold."""
 
     dtype: str
     """Such as `float64`."""
     shape: tuple[int | None, ...]
-    """None where any length will do."""
+    """None for any length."""
 
     def __str__(self) -> str:
         lengths = ", ".join("any" if length is None else str(length) for length in self.shape)
         return f"{self.dtype} ({lengths}{',' * (len(self.shape) == 1)})"
 
 
-def judge_array(path: Path, form: ArrayForm, *, shown: str) -> str | None:
-    """Return what is wrong with a file, by its header and size alone, in a sentence that calls it `shown`; or None."""
+def judge_array(path: Path, form: ArrayForm, *, shown: str) -> DatasetError | None:
+    """Return the error of a file by its header and size alone, whose message calls it `shown`; or None."""
     if not path.is_file():
-        return f"{shown} is missing"
+        return DatasetError(f"{shown}: the file is missing; download or unpack it again", file=path)
     try:
         with open(path, "rb") as file:
             version = np.lib.format.read_magic(file)
@@ -35,27 +35,42 @@ def judge_array(path: Path, form: ArrayForm, *, shown: str) -> str | None:
             start = file.tell()
             size = path.stat().st_size
     except (OSError, ValueError) as error:
-        return f"{shown} is no NumPy array ({error}): download it again"
+        return DatasetError(f"{shown}: expected a NumPy array ({error}); download it again", file=path, name="header")
     fits = len(shape) == len(form.shape) and all(
         wanted in (None, length) for wanted, length in zip(form.shape, shape, strict=True)
     )
     if not fits or dtype != np.dtype(form.dtype):
-        return f"{shown} holds {dtype} {shape}, expected {form}: it is another dataset's, or was converted"
+        return DatasetError(
+            f"{shown}: expected {form}, got {dtype} {shape}; take the published file of this dataset",
+            file=path,
+            name="shape",
+            value=(str(dtype), *shape),
+        )
     if column_major and len(shape) > 1:
-        return f"{shown} is stored by columns, expected by rows: it was converted; take the published file"
+        return DatasetError(
+            f"{shown}: expected row-major order, got column-major; take the published file",
+            file=path,
+            name="order",
+            value="F",
+        )
     expected = start + prod(shape) * dtype.itemsize
     if size < expected:
-        return f"{shown} is cut short, {size} of {expected} bytes: download or unpack it again"
+        return DatasetError(
+            f"{shown}: expected {expected} bytes, got {size}; download or unpack it again",
+            file=path,
+            name="size",
+            value=size,
+        )
     return None
 
 
 def read_array(path: Path, form: ArrayForm, *, shown: str, lazily: bool = False) -> np.ndarray:
-    """Return the array of a file; `lazily` maps it into memory, so that only what is looked at is read.
+    """Return the array of a file; `lazily` maps it into memory, so that only the rows used are read.
 
-    Raises DatasetError for what `judge_array` finds wrong.
+    Raises the DatasetError of `judge_array`.
     """
     wrong = judge_array(path, form, shown=shown)
     if wrong is not None:
-        raise DatasetError(wrong)
+        raise wrong
     array: np.ndarray = np.load(path, mmap_mode="r" if lazily else None, allow_pickle=False)
     return array

@@ -55,9 +55,9 @@ def gather(
     """Prepare an object's blows one after the other, as `read_capture` does, and return the object's capture.
 
     `blows` may be read as it is asked for: only what is kept stays in memory. A recording that cannot be used (silent,
-    too short after its blow) is left out. A `CaptureWarning` tells of these, of recordings that look wrong, of contacts
-    off the surface or struck twice, and of the `remarks`. Sounds that were computed, not `recorded`, are not searched
-    for clipping, noise and second blows. Raises DatasetError, which names the `origin`, where fewer than two recordings
+    too short after its impact) is left out. A `CaptureWarning` lists these, suspicious recordings, contacts off the
+    surface or with several impacts, and the `remarks`. Computed sounds, not `recorded`, are not searched for clipping,
+    noise and second impacts. Raises DatasetError, which names the `origin`, where fewer than two recordings
     remain or they do not fit together, and where contacts and surface count different units.
     """
     kept: list[tuple[str, str, float, np.ndarray]] = []
@@ -82,7 +82,7 @@ def gather(
         rate = common_rate(rates, files)
         cut = cut_together(recordings, files, rate=rate, settings=settings)
     except CaptureError as error:
-        raise DatasetError(f"{origin}: {error}") from error
+        raise DatasetError(f"{origin}: {error}", **error.attributes) from error
     forces = [each.newtons for each in recordings]
     impacts = Impacts(
         contacts=torch.from_numpy(np.stack(contacts).astype(np.float64)),
@@ -93,9 +93,9 @@ def gather(
         before=cut.before,
         after=cut.after,
     )
-    remarks += cut.remarks + _repeated(impacts) + _misplaced(impacts, surface, origin=origin)
+    remarks += [str(each) for each in cut.remarks] + _repeated(impacts) + _misplaced(impacts, surface, origin=origin)
     if remarks:
-        warnings.warn(f"{origin}: {listed(remarks)}", CaptureWarning, stacklevel=3)
+        warnings.warn(CaptureWarning(f"{origin}: {listed(remarks)}", name=origin, value=tuple(remarks)), stacklevel=3)
     return Capture(name, impacts, surface)
 
 
@@ -104,35 +104,47 @@ def refuse_few(count: int, *, origin: str, reasons: Sequence[str]) -> None:
     if count < FEWEST:
         raise DatasetError(
             f"{origin}: expected at least {FEWEST} recordings with contacts, found {count} that can be used"
-            + (f": {listed(reasons)}" if reasons else "")
+            + (f": {listed(reasons)}" if reasons else ""),
+            name=origin,
+            value=count,
         )
 
 
-def judge_wav(path: Path, *, shown: str, rate: float, frames: int) -> str | None:
-    """Return what is wrong with a sound file, from its header alone, in a sentence that calls it `shown`; or None.
+def judge_wav(path: Path, *, shown: str, rate: float, frames: int) -> DatasetError | None:
+    """Return the error of a sound file, from its header alone, whose message calls it `shown`; or None.
 
     Expected is one channel of at least so many frames at the rate, Hz.
     """
     if not path.is_file():
-        return f"{shown} is missing"
+        return DatasetError(f"{shown}: the file is missing", file=path)
     try:
         header = soundfile.info(str(path))
     except (soundfile.LibsndfileError, OSError) as error:
         reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
-        return f"{shown} is no sound file that can be read ({reason}): unpack or download it again"
-    if header.samplerate != rate:
-        return (
-            f"{shown} has {header.samplerate} Hz, published with {rate:g} Hz: take the original, not a converted copy"
-        )
-    if header.channels != 1:
-        return f"{shown} has {header.channels} channels, published with one: take the original, not a converted copy"
+        return DatasetError(f"{shown}: expected a sound file ({reason}); unpack or download it again", file=path)
+    for name, found, expected in (
+        ("sample rate", header.samplerate, int(rate)),
+        ("number of channels", header.channels, 1),
+    ):
+        if found != expected:
+            return DatasetError(
+                f"{shown}: expected a {name} of {expected}, got {found}; take the published file",
+                file=path,
+                name=name,
+                value=found,
+            )
     if header.frames < frames:
-        return f"{shown} is cut short, {header.frames} of {frames} frames: unpack or download it again"
+        return DatasetError(
+            f"{shown}: expected {frames} frames, got {header.frames}; unpack or download it again",
+            file=path,
+            name="frames",
+            value=header.frames,
+        )
     return None
 
 
 def listed(sentences: Sequence[str]) -> str:
-    """Return the first sentences, and how many more there are."""
+    """Return the first messages, and how many more there are."""
     more = f"; and {len(sentences) - _SHOWN} more" if len(sentences) > _SHOWN else ""
     return "; ".join(sentences[:_SHOWN]) + more
 
@@ -142,7 +154,7 @@ def _repeated(impacts: Impacts) -> list[str]:
     for name, contact in zip(impacts.names, impacts.contacts.tolist(), strict=True):
         places.setdefault(tuple(round(value, 6) for value in contact), []).append(name)
     repeated = [", ".join(names) for names in places.values() if len(names) > 1]
-    return [f"struck in one and the same place: {' and '.join(repeated[:_SHOWN])}"] if repeated else []
+    return [f"impacts at the same contact: {' and '.join(repeated[:_SHOWN])}"] if repeated else []
 
 
 def _misplaced(impacts: Impacts, surface: Surface | None, *, origin: str) -> list[str]:
@@ -151,5 +163,9 @@ def _misplaced(impacts: Impacts, surface: Surface | None, *, origin: str) -> lis
     placement = judge_placement(impacts.contacts, surface_points(surface))
     found = placement.describe(impacts.names)
     if placement.other_unit:
-        raise DatasetError(f"{origin}: expected contacts and surface in one unit; {found}")
+        raise DatasetError(
+            f"{origin}: expected contacts and surface in one unit; {found}",
+            name=origin,
+            value=placement.mistake.factor if placement.mistake else None,
+        )
     return [found] if found else []

@@ -23,8 +23,8 @@ _SEEN_IN = ("*.mp4", "*.mov", "*.m4v", "*.avi", "*.mkv", "*.webm", "splats.ply",
 class CaptureCollection:
     """A folder of capture folders, or one capture folder.
 
-    Hidden folders are passed over, and so are folders without a table of impacts, which `check` names. Objects are
-    called as their folders are.
+    Hidden folders are ignored, and so are folders without a table of impacts, which `check` names. An object has the
+    name of its folder.
     """
 
     name = "captures"
@@ -51,7 +51,7 @@ class CaptureCollection:
         try:
             return read_capture(folder)
         except CaptureError as error:
-            raise DatasetError(f"{folder}: {error}") from error
+            raise DatasetError(f"{folder}: {error}", **error.attributes) from error
 
     def look(self, identifier: str) -> Look | None:
         """Return the capture's folder where there is anything in it to see. Raises DatasetError for an unknown one and
@@ -61,14 +61,14 @@ class CaptureCollection:
             settings = settings_of(folder)
             return Look(folder, settings) if _shows(folder, settings) else None
         except CaptureError as error:
-            raise DatasetError(f"{folder}: {error}") from error
+            raise DatasetError(f"{folder}: {error}", **error.attributes) from error
 
     def check(self) -> DatasetReport:
-        """Say what is there and what is missing, from tables and headers; `avmsf check` also listens to a capture."""
+        """Report what is present and what is missing, from tables and headers; `avmsf check` also reads sounds."""
         reports = tuple(self._report(identifier) for identifier in self.objects())
         known = set(self._folders.values())
         others = in_order(path.name for path in _visible(self.folder) if path not in known and self.folder not in known)
-        remarks = (f"passed over, for there is no {TABLE} in them: {', '.join(others)}",) if others else ()
+        remarks = (f"folders without {TABLE} are ignored: {', '.join(others)}",) if others else ()
         return DatasetReport(self.name, reports, (), remarks)
 
     @cached_property
@@ -101,7 +101,9 @@ class CaptureCollection:
                 problems.append(str(error))
             except (soundfile.LibsndfileError, OSError):
                 there = (folder / strikes[-1].file).is_file()
-                problems.append(f"{strikes[-1].file} {'is no sound file that can be read' if there else 'is missing'}")
+                problems.append(
+                    f"{strikes[-1].file}: {'not a readable sound file' if there else 'the file is missing'}"
+                )
             else:
                 files.append(strikes[-1].file)
                 rates.append(float(header.samplerate))
@@ -113,7 +115,7 @@ class CaptureCollection:
             problems.append(str(error))
         surface = find_surface_file(folder, settings)
         if surface is not None and not surface.is_file():
-            problems.append(f"{surface.name}, which capture.toml names as the surface, is missing")
+            problems.append(f"{surface.name}: the surface of capture.toml is missing")
         # One row that cannot be read makes `read_capture` refuse the folder.
         return ObjectReport(facts, 0 if problems else len(files), tuple(problems))
 

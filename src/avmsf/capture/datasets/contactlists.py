@@ -1,4 +1,4 @@
-"""Where the objects of ObjectFolder Real were struck: from a folder of small arrays, or from SonicGauss's lists."""
+"""The contacts of ObjectFolder Real: from a folder of small arrays, or from SonicGauss's lists."""
 
 import os
 import re
@@ -30,13 +30,13 @@ class ContactFolder:
         """Return the numbers of the objects with contacts."""
         return {path.name for path in self.folder.iterdir() if path.name.isdecimal() and path.is_dir()}
 
-    def judge(self, identifier: str, contact: str) -> str | None:
-        """Return what is wrong with a contact, in a sentence, or None."""
+    def judge(self, identifier: str, contact: str) -> DatasetError | None:
+        """Return the error of a contact that cannot be used, or None."""
         shown = f"{FOLDER}/{identifier}/{contact}.npy"
         path = self._path(identifier, contact)
         wrong = judge_array(path, CONTACT, shown=shown)
         if wrong is None and not np.isfinite(read_array(path, CONTACT, shown=shown)).all():
-            return f"{shown} holds numbers that are not finite"
+            return DatasetError(f"{shown}: expected finite coordinates, got NaN or inf", file=path, name=contact)
         return wrong
 
     def place(self, identifier: str, contact: str) -> Float64[np.ndarray, " 3"]:
@@ -61,12 +61,16 @@ class ContactLists:
     def __post_init__(self) -> None:
         places: dict[tuple[str, str], tuple[float, float, float]] = {}
         for path in self.files:
-            for where, record in _records(path):
-                key, place = _understand(record, f"{path} {where}")
+            for row, record in _records(path):
+                key, place = _understand(record, path, row)
                 if places.setdefault(key, place) != place:
                     raise DatasetError(
-                        f"{path} {where}: contact {key[1]} of object {key[0]} lies at {place}, and at {places[key]} by "
-                        "another row: leave the right one"
+                        f"{path}, row {row}: expected one position of contact {key[1]} of object {key[0]}, got {place} "
+                        f"and {places[key]}; delete one",
+                        file=path,
+                        row=row,
+                        name=key[1],
+                        value=place,
                     )
         object.__setattr__(self, "places", places)
 
@@ -74,17 +78,22 @@ class ContactLists:
         """Return the numbers of the objects with contacts."""
         return {identifier for identifier, _ in self.places}
 
-    def judge(self, identifier: str, contact: str) -> str | None:
-        """Return that a contact is in none of the lists, in a sentence, or None."""
+    def judge(self, identifier: str, contact: str) -> DatasetError | None:
+        """Return the error of a contact that is in none of the lists, or None."""
         if (identifier, contact) in self.places:
             return None
-        return f"contact {contact} stands in none of {', '.join(path.name for path in self.files)}"
+        return DatasetError(
+            f"object {identifier}: expected contact {contact} in {', '.join(path.name for path in self.files)}, "
+            "found none",
+            file=self.files[0],
+            name=contact,
+        )
 
     def place(self, identifier: str, contact: str) -> Float64[np.ndarray, " 3"]:
         """Return a contact, meters in the mesh's frame. Raises DatasetError for one that is not listed."""
         wrong = self.judge(identifier, contact)
         if wrong is not None:
-            raise DatasetError(f"object {identifier}: {wrong}")
+            raise wrong
         return np.array(self.places[identifier, contact])
 
     def __str__(self) -> str:
@@ -104,9 +113,10 @@ def read_contacts(given: Path) -> Contacts:
     found = _look_in(given, bare=True)
     if found is None:
         raise DatasetError(
-            f"{given}: expected contacts: a folder with OBJECT/CONTACT.npy, one that holds such a folder {FOLDER}/ or "
-            f"{' and '.join(LISTS)}, or one of these lists; found "
-            f"{'nothing of the kind in this folder' if given.is_dir() else 'no such file or folder'}"
+            f"{given}: expected a folder with OBJECT/CONTACT.npy, with {FOLDER}/ or with {' and '.join(LISTS)}, or one "
+            f"of these lists, got {'a folder without them' if given.is_dir() else 'no file or folder'}",
+            file=given,
+            name="contacts",
         )
     return found
 
@@ -127,30 +137,40 @@ def _look_in(folder: Path, *, bare: bool = False) -> Contacts | None:
     return ContactLists(lists) if lists else None
 
 
-def _records(path: Path) -> Iterator[tuple[str, Any]]:
-    """Yield a list's records with where they stand: one JSON list, or an object a line."""
+def _records(path: Path) -> Iterator[tuple[int, Any]]:
+    """Yield a list's records with their rows: indices of one JSON list, or lines, from 1, with an object each."""
     try:
         text = read_text(path)
         if text.lstrip().startswith("["):
-            yield from ((f"record {place}", record) for place, record in enumerate(parse_json(text), start=1))
+            yield from enumerate(parse_json(text))
             return
         for number, line in enumerate(text.splitlines(), start=1):
             if line.strip():
-                yield f"line {number}", parse_json(line)
+                yield number, parse_json(line)
     except (OSError, ValueError) as error:
-        raise DatasetError(f"{path}: not a list of contacts that can be read: {error}") from error
+        raise DatasetError(f"{path}: expected a JSON list of contacts, got {error}", file=path) from error
 
 
-def _understand(record: Any, where: str) -> tuple[tuple[str, str], tuple[float, float, float]]:
+def _understand(record: Any, path: Path, row: int) -> tuple[tuple[str, str], tuple[float, float, float]]:
     location = record.get("location") if isinstance(record, dict) else None
     found = _RECORDING.search(location) if isinstance(location, str) else None
     if found is None:
         raise DatasetError(
-            f"{where}: location is {location!r}; expected a path that ends in OBJECT_CONTACT_3sec_48000hz.wav"
+            f"{path}, row {row}: expected a location that ends in OBJECT_CONTACT_3sec_48000hz.wav, got {location!r}",
+            file=path,
+            row=row,
+            name="location",
+            value=location,
         )
     contact = record.get("contact")
     numbers = isinstance(contact, list) and all(type(value) in (int, float) for value in contact)
     if not numbers or len(contact) != 3 or not np.isfinite(contact).all():
-        raise DatasetError(f"{where}: contact is {contact!r}; expected three numbers, meters")
+        raise DatasetError(
+            f"{path}, row {row}: expected a contact of three numbers, meters, got {contact!r}",
+            file=path,
+            row=row,
+            name="contact",
+            value=contact,
+        )
     x, y, z = map(float, contact)
     return (str(int(found[1])), str(int(found[2]))), (x, y, z)

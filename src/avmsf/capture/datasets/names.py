@@ -19,23 +19,22 @@ from avmsf.capture.datasets.numbering import (
 from avmsf.errors import DatasetError
 
 _NUMBER_COLUMNS = ("id", "index")
-_HOW_TO_WRITE = (
-    "expected a CSV file with the header id,name,material and one row an object, or a JSON list of objects with these "
-    "keys"
-)
+_EXPECTED = "expected a CSV file with the header id,name,material, or a JSON list of objects with these keys"
 
 
 @dataclass(frozen=True)
 class _Entry:
     """One object of a list."""
 
+    row: int
+    """Line of a CSV file, from 1, or index in a JSON list."""
     number: int
     name: str
     material: str | None
 
 
 def read_names(path: Path, present: Collection[int]) -> dict[int, ObjectFacts]:
-    """Read a list of objects and return what it tells, by the numbers of the folders.
+    """Read a list of objects and return their names and materials, by the numbers of the folders.
 
     `path` is a CSV file with the header `id,name,material` or a JSON list of such objects (`index` serves for `id`,
     the material may be left empty). Numbers up to 100 are taken for those of the published list, which has no gaps,
@@ -50,7 +49,13 @@ def read_names(path: Path, present: Collection[int]) -> dict[int, ObjectFacts]:
         if number is None:
             continue
         if number in facts:
-            raise DatasetError(f"{path}: object {entry.number} stands there twice: leave one row of it")
+            raise DatasetError(
+                f"{path}, row {entry.row}: expected each object once, got {entry.number} again; delete one row",
+                file=path,
+                row=entry.row,
+                name="id",
+                value=entry.number,
+            )
         facts[number] = ObjectFacts(str(number), entry.name, entry.material, inferred=not of_folders)
     return facts
 
@@ -72,34 +77,39 @@ def facts_of(identifier: str, listed: Mapping[int, ObjectFacts]) -> ObjectFacts:
 def _entries(path: Path) -> list[_Entry]:
     try:
         text = read_text(path)
-        rows = _json_rows(parse_json(text)) if path.suffix.lower() == ".json" else _csv_rows(text)
+        records = _json_records(parse_json(text)) if path.suffix.lower() == ".json" else _csv_records(text)
     except FileNotFoundError as error:
-        raise DatasetError(f"{path}: there is no such list of objects; {_HOW_TO_WRITE}") from error
+        raise DatasetError(f"{path}: {_EXPECTED}, found no such file", file=path) from error
     except (OSError, ValueError, csv.Error) as error:
-        raise DatasetError(f"{path}: not a list of objects that can be read ({error}); {_HOW_TO_WRITE}") from error
-    if not rows:
-        raise DatasetError(f"{path}: the list is empty; {_HOW_TO_WRITE}")
-    return [_entry(row, f"{path} {where}") for where, row in rows]
+        raise DatasetError(f"{path}: {_EXPECTED}, got {error}", file=path) from error
+    if not records:
+        raise DatasetError(f"{path}: {_EXPECTED}, got none", file=path, value=0)
+    return [_entry(record, path, row) for row, record in records]
 
 
-def _csv_rows(text: str) -> list[tuple[str, dict[str, Any]]]:
+def _csv_records(text: str) -> list[tuple[int, dict[str, Any]]]:
     reader = csv.DictReader(io.StringIO(text))
-    return [(f"line {reader.line_num}", dict(row)) for row in reader]
+    return [(reader.line_num, dict(record)) for record in reader]
 
 
-def _json_rows(value: Any) -> list[tuple[str, dict[str, Any]]]:
-    if not isinstance(value, list) or not all(isinstance(row, dict) for row in value):
+def _json_records(value: Any) -> list[tuple[int, dict[str, Any]]]:
+    if not isinstance(value, list) or not all(isinstance(record, dict) for record in value):
         raise ValueError("no list of objects")
-    return [(f"object {place}", row) for place, row in enumerate(value, start=1)]
+    return list(enumerate(value))
 
 
-def _entry(row: Mapping[str, Any], where: str) -> _Entry:
-    cells = {str(key).strip().lower(): "" if value is None else str(value).strip() for key, value in row.items()}
+def _entry(record: Mapping[str, Any], path: Path, row: int) -> _Entry:
+    cells = {str(key).strip().lower(): "" if value is None else str(value).strip() for key, value in record.items()}
     number = next((cells[key] for key in _NUMBER_COLUMNS if key in cells), None)
     if number is None or "name" not in cells:
-        raise DatasetError(f"{where}: found the columns {', '.join(cells)}; {_HOW_TO_WRITE}")
+        raise DatasetError(
+            f"{path}, row {row}: {_EXPECTED}, got {', '.join(cells)}", file=path, row=row, value=tuple(cells)
+        )
     if not (number.isascii() and number.isdecimal() and int(number) > 0) or not cells["name"]:
         raise DatasetError(
-            f"{where}: id is {number!r} and name {cells['name']!r}; expected a whole number above 0 and a name"
+            f"{path}, row {row}: expected an id above 0 and a name, got {number!r} and {cells['name']!r}",
+            file=path,
+            row=row,
+            value=(number, cells["name"]),
         )
-    return _Entry(int(number), cells["name"].replace("_", " "), cells.get("material", "").lower() or None)
+    return _Entry(row, int(number), cells["name"].replace("_", " "), cells.get("material", "").lower() or None)

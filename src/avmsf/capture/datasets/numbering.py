@@ -1,4 +1,4 @@
-"""How the objects of ObjectFolder Real and RealImpact are numbered, and what the numbers tell of an object."""
+"""How the objects of ObjectFolder Real and RealImpact are numbered, and what the numbers say of an object."""
 
 import re
 from collections.abc import Collection, Iterable
@@ -47,13 +47,13 @@ def shared_objects() -> tuple[int, ...]:
 
 
 def shared_remarks(names: Collection[str], other: str) -> list[str]:
-    """Return what to tell the owner of objects of these names, of which some may be in the `other` dataset as well."""
+    """Return a remark where objects of these names may be in the `other` dataset as well."""
     shared = [name for name in names if number_of(name) in shared_objects()]
     if not shared:
         return []
     return [
-        f"{len(shared)} objects have a number of {other}'s and may be the same things, {', '.join(shared)}: never "
-        "train on one dataset and test on the other without leaving them out"
+        f"{len(shared)} objects have numbers of {other} and may be the same objects: {', '.join(shared)}; do not "
+        "train on one dataset and test on the other with them"
     ]
 
 
@@ -69,10 +69,10 @@ def in_words(name: str) -> str:
 
 
 def material_in(name: str) -> str | None:
-    """Return the material that a folder's name tells beyond doubt, or None.
+    """Return the material that a folder's name gives without ambiguity, or None.
 
-    A name tells it by its first word, or by its last; a glass is a thing as well, so that as the last word it tells
-    nothing. Metal may be iron or steel, and what is called plastic may be polycarbonate: these stay open.
+    It is the name's first word, or its last; "glass" as the last word may be a drinking glass and gives none. Metal may
+    be iron or steel, and plastic may be polycarbonate: for these None is returned.
     """
     words = _words(name)
     if not words:
@@ -104,10 +104,12 @@ def refuse_unknown(identifier: str, known: Collection[str], dataset: str) -> NoR
     near += [name for name in get_close_matches(identifier, known, n=3, cutoff=0.5) if name not in near]
     if not near and number is not None:
         near = sorted(known, key=lambda name: abs((number_of(name) or 0) - number))[:4]
-    meant = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(in_order(known)[:8])}"
+    meant = f"did you mean {' or '.join(near)}?" if near else f"such as {', '.join(in_order(known)[:8])};"
     raise DatasetError(
-        f"{dataset} has no object {identifier!r} here, among {len(known)} that it has; {meant} "
-        "`avmsf dataset check` lists all"
+        f"{dataset}: expected one of its {len(known)} objects, got {identifier!r}; {meant} "
+        "`avmsf dataset check` lists all",
+        name="object",
+        value=identifier,
     )
 
 

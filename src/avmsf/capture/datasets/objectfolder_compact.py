@@ -34,9 +34,9 @@ SPLITS = ("train", "val", "test")
 class ObjectFolderCompact:
     """The compact copy: `audio/<object>/<contact>.wav` with `contacts/<object>/<contact>.npy`.
 
-    There is no force, so sounds start where they leave the noise and are as loud as they were recorded: blows of
-    another strength and recordings of another gain differ in level. The surface is a mesh where there is one in the
-    folder or beside it (`find_mesh`), else the copy's own 1,024 points. `table` is a list of names (`read_names`).
+    There is no force, so sounds start where they exceed the noise and keep their recorded level: impacts of another
+    force and recordings of another gain differ in level. The surface is a mesh where there is one in the folder or
+    next to it (`find_mesh`), else the copy's own 1,024 points. `table` is a list of names (`read_names`).
     """
 
     name = "ObjectFolder Real (compact)"
@@ -60,15 +60,18 @@ class ObjectFolderCompact:
         """Read one object's recordings, in the order of their numbers.
 
         Raises DatasetError for an unknown object, where split.json names recordings that are not there, and where fewer
-        than two can be used; a warning tells of those that were left out.
+        than two can be used; a warning names those that were left out.
         """
         self._expect(identifier)
         contacts, problems, lost = self._examine(identifier)
         origin = f"{self.name}, object {identifier}"
         if lost:
             raise DatasetError(
-                f"{origin}: split.json names {len(lost)} recordings that are not there: {listed(lost)}: unpack "
-                "audio.tar.gz again"
+                f"{origin}: expected the {len(lost)} recordings {listed(lost)} of split.json, found none; unpack "
+                "audio.tar.gz again",
+                file=self.folder / "split.json",
+                name=identifier,
+                value=lost,
             )
         refuse_few(len(contacts), origin=origin, reasons=problems)
         return gather(
@@ -105,7 +108,10 @@ class ObjectFolderCompact:
         value = self._json("scale.json").get(identifier)
         if not isinstance(value, int | float) or not 0 < value < math.inf:
             raise DatasetError(
-                f"{self.folder / 'scale.json'}: {identifier} is {value!r}; expected the object's size, above 0"
+                f"{self.folder / 'scale.json'}: expected the size of object {identifier}, above 0, got {value!r}",
+                file=self.folder / "scale.json",
+                name=identifier,
+                value=value,
             )
         return float(value)
 
@@ -114,7 +120,7 @@ class ObjectFolderCompact:
         reports = []
         for identifier in self.objects():
             contacts, problems, lost = self._examine(identifier)
-            named = [f"{sentence}, and split.json names it" for sentence in lost]
+            named = [f"{file}: the file is missing, but split.json lists it" for file in lost]
             reports.append(ObjectReport(self.facts(identifier), len(contacts), (*named, *problems)))
         missing = [
             f"{part}: unpack {part}.tar.gz of the contact-localization benchmark in {self.folder}"
@@ -127,9 +133,7 @@ class ObjectFolderCompact:
             {owner for pairs in self._splits_if_any.values() for owner, _ in pairs} - set(self.objects())
         )
         if without:
-            missing.append(
-                f"recordings of objects {', '.join(without)}, which split.json names: unpack audio.tar.gz again"
-            )
+            missing.append(f"recordings of objects {', '.join(without)} of split.json: unpack audio.tar.gz again")
         return DatasetReport(self.name, tuple(reports), tuple(missing), self._remarks())
 
     @cached_property
@@ -146,13 +150,22 @@ class ObjectFolderCompact:
         for part in SPLITS:
             pairs = table.get(part)
             if not isinstance(pairs, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in pairs):
-                raise DatasetError(f"{path}: {part} holds no list of [object, contact]: download it again")
+                raise DatasetError(
+                    f"{path}: expected {part} with a list of [object, contact], got {type(pairs).__name__}; download "
+                    "it again",
+                    file=path,
+                    name=part,
+                    value=type(pairs).__name__,
+                )
             splits[part] = [(str(pair[0]), str(pair[1])) for pair in pairs]
             for pair in splits[part]:
                 if owner.setdefault(pair, part) != part:
                     raise DatasetError(
-                        f"{path}: contact {pair[1]} of object {pair[0]} is in both {owner[pair]} and {part}: training "
-                        "and test must not share recordings; download the file again"
+                        f"{path}: expected disjoint parts, got contact {pair[1]} of object {pair[0]} in {owner[pair]} "
+                        f"and {part}; download the file again",
+                        file=path,
+                        name=part,
+                        value=pair,
                     )
         return splits
 
@@ -165,21 +178,29 @@ class ObjectFolderCompact:
         try:
             value = read_json(path)
         except FileNotFoundError as error:
-            raise DatasetError(f"{path}: there is no such file; the contact-localization benchmark has it") from error
+            raise DatasetError(
+                f"{path}: the file is missing; the contact-localization benchmark has it", file=path
+            ) from error
         except (OSError, ValueError) as error:
-            raise DatasetError(f"{path}: not a JSON file that can be read ({error}): download it again") from error
+            raise DatasetError(f"{path}: expected a JSON file, got {error}; download it again", file=path) from error
         if not isinstance(value, dict):
-            raise DatasetError(f"{path}: expected a JSON object, found a {type(value).__name__}: download it again")
+            raise DatasetError(
+                f"{path}: expected a JSON object, got a {type(value).__name__}; download it again",
+                file=path,
+                value=type(value).__name__,
+            )
         return value
 
     def _expect(self, identifier: str) -> None:
         if identifier not in self.objects():
             if not self.objects():
-                raise DatasetError(f"{self.folder}: no recordings are here: unpack audio.tar.gz")
+                raise DatasetError(
+                    f"{self.folder}: expected recordings, found none; unpack audio.tar.gz", file=self.folder
+                )
             refuse_unknown(identifier, self.objects(), self.name)
 
     def _examine(self, identifier: str) -> tuple[list[str], list[str], list[str]]:
-        """Return the contacts that can be used, why others cannot, and which recordings of the split are not there."""
+        """Return the usable contacts, the problems of the others, and the missing recordings of the split."""
         folder = self.folder / "audio" / identifier
         places = ContactFolder(self.folder / "contacts")
         present = in_order(path.stem for path in folder.glob("*.wav"))
@@ -188,16 +209,16 @@ class ObjectFolderCompact:
             shown = f"audio/{identifier}/{contact}.wav"
             wrong = judge_wav(folder / f"{contact}.wav", shown=shown, rate=RATE, frames=FRAMES)
             wrong = wrong or places.judge(identifier, contact)
-            if wrong:
-                problems.append(wrong)
+            if wrong is not None:
+                problems.append(str(wrong))
             else:
                 contacts.append(contact)
         cloud = self._points_path(identifier)
         if cloud.parent.is_dir():
             wrong = judge_array(cloud, POINTS, shown=f"global_gt_points/{identifier}.npy")
-            problems += [wrong] if wrong else []
+            problems += [] if wrong is None else [str(wrong)]
         named = [contact for pairs in self._splits_if_any.values() for owner, contact in pairs if owner == identifier]
-        lost = [f"audio/{identifier}/{contact}.wav is missing" for contact in in_order(set(named) - set(present))]
+        lost = [f"audio/{identifier}/{contact}.wav" for contact in in_order(set(named) - set(present))]
         return contacts, problems, lost
 
     def _blows(self, identifier: str, contacts: list[str]) -> Iterator[Blow]:
@@ -213,7 +234,7 @@ class ObjectFolderCompact:
             try:
                 return find_surface(look.folder, look.settings)
             except CaptureError as error:
-                raise DatasetError(f"{origin}: {error}") from error
+                raise DatasetError(f"{origin}: {error}", **error.attributes) from error
         path = self._points_path(identifier)
         if judge_array(path, POINTS, shown=path.name) is not None:
             return None
@@ -224,5 +245,5 @@ class ObjectFolderCompact:
         return self.folder / "global_gt_points" / f"{identifier}.npy"
 
     def _remarks(self) -> tuple[str, ...]:
-        forces = "no forces are here: sounds are as loud as they were recorded, whatever the blow and the gain"
+        forces = "no forces: sounds keep their recorded level, which depends on the impact's force and the gain"
         return (forces, *shared_remarks(self.objects(), "RealImpact"))

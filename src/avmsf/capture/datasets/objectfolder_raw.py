@@ -43,9 +43,9 @@ class _Strike:
 class ObjectFolderRaw:
     """ObjectFolder Real, unpacked from its audio archives: `<object>/audio/<contact>/mic.wav` and so on.
 
-    The archives do not tell where the objects were struck. `contacts` names a folder of arrays or one of SonicGauss's
-    lists (`read_contacts`); by default they are sought in the folder and beside it. `table` is a list of the objects'
-    names and materials (`read_names`). Meshes are found in the folder or beside it (`find_mesh`).
+    The archives hold no contacts. `contacts` names a folder of arrays or one of SonicGauss's lists (`read_contacts`);
+    by default they are sought in the folder and its parent. `table` is a list of the objects' names and materials
+    (`read_names`). Meshes are found in the folder or its parent (`find_mesh`).
 
     Sounds start at the force's onset, are divided by the peak force in newtons and by the recorder's gain, so that one
     is the microphone's full scale at 0 dB of gain, per newton.
@@ -71,7 +71,7 @@ class ObjectFolderRaw:
 
     def capture(self, identifier: str) -> Capture:
         """Read one object's recordings, in the order of their numbers. Raises DatasetError for an unknown object, and
-        where fewer than two recordings can be used; a warning tells of those that were left out."""
+        where fewer than two recordings can be used; a warning names those that were left out."""
         self._expect(identifier)
         strikes, problems = self._examine(identifier)
         origin = f"{self.name}, object {identifier}"
@@ -80,7 +80,7 @@ class ObjectFolderRaw:
         try:
             surface = None if look is None else find_surface(look.folder, look.settings)
         except CaptureError as error:
-            raise DatasetError(f"{origin}: {error}") from error
+            raise DatasetError(f"{origin}: {error}", **error.attributes) from error
         return gather(
             self._blows(identifier, strikes),
             name=self.facts(identifier).name,
@@ -105,10 +105,7 @@ class ObjectFolderRaw:
         if self._contacts is None:
             missing.append(self._no_contacts)
         if not mesh_folders(self.folder):
-            missing.append(
-                f"meshes, without which there is nothing to see: unpack {DOWNLOAD}/mesh/mesh_16k.tar.gz in "
-                f"{self.folder}"
-            )
+            missing.append(f"meshes, the only visual input: unpack {DOWNLOAD}/mesh/mesh_16k.tar.gz in {self.folder}")
         return DatasetReport(self.name, tuple(reports), (*missing, *self._missing_archives()), self._remarks())
 
     @cached_property
@@ -133,7 +130,7 @@ class ObjectFolderRaw:
         return (
             f"contact coordinates, which the audio archives do not hold: put contacts/OBJECT/CONTACT.npy of the "
             f"contact-localization benchmark, or SonicGauss's objectfolder_real_train.json and _val.json, into "
-            f"{self.folder} or beside it"
+            f"{self.folder} or its parent"
         )
 
     def _expect(self, identifier: str) -> None:
@@ -141,7 +138,7 @@ class ObjectFolderRaw:
             refuse_unknown(identifier, self._folders, self.name)
 
     def _examine(self, identifier: str) -> tuple[list[_Strike], list[str]]:
-        """Return the recordings that can be used, and in sentences why others cannot or what is assumed."""
+        """Return the usable recordings, and a message for each problem or assumption."""
         strikes, problems, unknown_gains = [], [], []
         for folder in sorted(
             self._folders[identifier].iterdir(), key=lambda path: (number_of(path.name) or 0, path.name)
@@ -150,7 +147,7 @@ class ObjectFolderRaw:
             if not folder.is_dir() or contact.startswith(".") or contact.endswith("_deprecated"):
                 continue
             if not contact.isdecimal():
-                problems.append(f"audio/{contact} is left out: its name is no contact's number")
+                problems.append(f"audio/{contact}: expected a contact's number as name; it is left out")
                 continue
             wrong = self._judge(identifier, contact, folder)
             if wrong:
@@ -164,15 +161,15 @@ class ObjectFolderRaw:
             strikes.append(_Strike(contact, folder, read_newtons(folder / "striking_force.yaml"), gains))
         if unknown_gains:
             assumed = _usual_gain(strikes)
-            taken = "0 dB" if assumed is None else f"that of most of the object's recordings, {assumed}"
+            taken = "0 dB" if assumed is None else f"{assumed}, the most frequent of the object's recordings"
             problems.append(
-                f"metadata.yaml is missing for contact {', '.join(unknown_gains)}: the recorder's gain is taken to be "
-                f"{taken}"
+                f"metadata.yaml is missing for contact {', '.join(unknown_gains)}: the recorder's gain is assumed to "
+                f"be {taken}"
             )
         return strikes, problems
 
     def _judge(self, identifier: str, contact: str, folder: Path) -> list[str]:
-        """Return why a contact's recording cannot be used, a sentence for each reason."""
+        """Return why a contact's recording cannot be used, a message for each reason."""
         shown = f"{identifier}/audio/{contact}"
         wrong = [
             judge_wav(folder / name, shown=f"{shown}/{name}", rate=RATE, frames=FRAMES)
@@ -184,14 +181,14 @@ class ObjectFolderRaw:
                 try:
                     read(path)
                 except DatasetError as error:
-                    wrong.append(str(error))
+                    wrong.append(error)
             elif read is read_newtons:
-                wrong.append(f"{shown}/{name} is missing")
+                wrong.append(DatasetError(f"{shown}/{name}: the file is missing", file=path))
         if self._contacts is not None:
             wrong.append(self._contacts.judge(identifier, contact))
         elif not any(wrong):
-            wrong.append(f"{shown} has no contact coordinates")
-        return [sentence for sentence in wrong if sentence is not None]
+            wrong.append(DatasetError(f"{shown}: expected contact coordinates, found none", file=folder))
+        return [str(error) for error in wrong if error is not None]
 
     def _blows(self, identifier: str, strikes: list[_Strike]) -> Iterator[Blow]:
         usual = _usual_gain(strikes)
@@ -220,7 +217,7 @@ class ObjectFolderRaw:
             archive = f"audio_data_{first}_{first + 9}.tar.gz"
             if not present & set(range(first, first + 10)):
                 packed = (self.folder / archive).is_file()
-                source = f"{archive}, which lies there packed," if packed else f"{DOWNLOAD}/audio/{archive}"
+                source = archive if packed else f"{DOWNLOAD}/audio/{archive}"
                 missing.append(f"objects {first} to {first + 9}: unpack {source} in {self.folder}")
         return missing
 
@@ -230,7 +227,7 @@ class ObjectFolderRaw:
             remarks.append(f"contacts are read from {self._contacts}")
         remarks += shared_remarks(self.objects(), "RealImpact")
         if self._table is None:
-            remarks.append("names are RealImpact's for the same number, inferred; --table adds the published list")
+            remarks.append("names are inferred from RealImpact's numbers; --table adds the published list")
         return tuple(remarks)
 
 

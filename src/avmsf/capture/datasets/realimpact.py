@@ -89,10 +89,13 @@ class RealImpact:
         off = torch.cdist(contacts, surface.vertices.double()).amin(dim=1)
         if float(off.max()) > OFF_MESH:
             raise DatasetError(
-                f"{origin}: vertexXYZ.npy lies up to {float(off.max()):.3g} m off the vertices of {MESH}: one of the "
-                "two is another object's; unpack the archive again"
+                f"{origin}: expected vertexXYZ.npy within {OFF_MESH:g} m of the vertices of {MESH}, got "
+                f"{float(off.max()):.3g} m; unpack the archive again",
+                file=self.folder / identifier / FOLDER / "vertexXYZ.npy",
+                row=rows[int(off.argmax())],
+                value=float(off.max()),
             )
-        remarks = [] if common else ["no microphone stood in one place for all blows: each has its own closest one"]
+        remarks = [] if common else ["no microphone position is common to all impacts: each has its closest one"]
         capture = gather(
             self._blows(identifier, rows, vertices=vertices, places=places),
             name=in_words(identifier),
@@ -116,14 +119,14 @@ class RealImpact:
         missing = []
         if absent:
             missing.append(
-                f"{len(absent)} of {len(REALIMPACT_NAMES)} objects: unpack {DOWNLOAD}/NAME.zip in {self.folder}, NAME "
-                f"being {', '.join(absent)}"
+                f"{len(absent)} of {len(REALIMPACT_NAMES)} objects: unpack {DOWNLOAD}/NAME.zip in {self.folder}, where "
+                f"NAME is {', '.join(absent)}"
             )
         numbers = [number_of(name) for name in self.objects()]
         remarks = shared_remarks(self.objects(), "ObjectFolder Real")
         knotted = [str(number) for number in SELF_INTERSECTING if number in numbers]
         if knotted:
-            remarks.append(f"the meshes of {', '.join(knotted)} intersect themselves")
+            remarks.append(f"the meshes of {', '.join(knotted)} are self-intersecting")
         return DatasetReport(self.name, reports, tuple(missing), tuple(remarks))
 
     @cached_property
@@ -141,31 +144,33 @@ class RealImpact:
     def _mesh(self, identifier: str) -> Surface:
         shown = f"{identifier}/{FOLDER}/{MESH}"
         if not (self.folder / shown).is_file():
-            raise DatasetError(
-                f"{shown} is missing, from which the closest microphone is found: unpack {identifier}.zip again"
-            )
+            raise DatasetError(f"{shown}: the file is missing; unpack {identifier}.zip again", file=self.folder / shown)
         try:
             return read_surface(self.folder / shown)
         except CaptureError as error:
-            raise DatasetError(str(error)) from error
+            raise DatasetError(str(error), **error.attributes) from error
 
     def _blows(self, identifier: str, rows: list[int], *, vertices: np.ndarray, places: np.ndarray) -> Iterator[Blow]:
         sounds = self._array(identifier, SOUNDS, lazily=True)
         for row in rows:
-            name = f"{identifier}/{FOLDER}/{SOUNDS} row {row}"
+            name = f"{identifier}/{FOLDER}/{SOUNDS}, row {row}"
             sound = np.array(sounds[row], dtype=np.float64)
             if not np.isfinite(sound).all():
-                raise DatasetError(f"{name} holds samples that are not finite numbers: unpack {identifier}.zip again")
+                raise DatasetError(
+                    f"{name}: expected finite samples, got NaN or inf; unpack {identifier}.zip again",
+                    file=self.folder / identifier / FOLDER / SOUNDS,
+                    row=row,
+                )
             recording = Recording(name, sound[None], RATE, "FLOAT")
             yield Blow(f"vertex_{vertices[row]}.wav", recording, places[row])
 
     def _report(self, identifier: str) -> ObjectReport:
         folder = self.folder / identifier / FOLDER
         problems = {name: judge_array(folder / name, form, shown=f"{FOLDER}/{name}") for name, form in FORMS.items()}
-        wrong = [problem for problem in problems.values() if problem is not None]
+        wrong = [str(problem) for problem in problems.values() if problem is not None]
         usable = not any(problems[name] for name in NEEDED)
         if not (folder / MESH).is_file():
-            wrong.append(f"{FOLDER}/{MESH} is missing, from which the closest microphone is found")
+            wrong.append(f"{FOLDER}/{MESH}: the file is missing; the closest microphone cannot be found")
             usable = False
         count = len(np.unique(self._array(identifier, "vertexID.npy"))) if usable else 0
         return ObjectReport(self.facts(identifier), count, tuple(wrong))

@@ -1,8 +1,9 @@
-"""Which dataset a folder holds; and where it holds none, what its owner may have meant."""
+"""Which dataset a folder holds; and where it holds none, which folder may have been meant."""
 
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
+from typing import NamedTuple
 
 from avmsf.capture.datasets.collection import CaptureCollection
 from avmsf.capture.datasets.dataset import Dataset
@@ -15,28 +16,35 @@ from avmsf.errors import DatasetError
 ARCHIVES = (".zip", ".gz", ".tgz", ".tar", ".7z")
 SOUGHT = (
     f"a capture folder or a folder of them ({TABLE}), ObjectFolder Real (OBJECT/audio/CONTACT/mic.wav), its compact "
-    f"copy (audio/OBJECT/CONTACT.wav beside contacts/), or RealImpact (NUMBER_NAME/{FOLDER}/{SOUNDS})"
+    f"copy (audio/OBJECT/CONTACT.wav and contacts/), or RealImpact (NUMBER_NAME/{FOLDER}/{SOUNDS})"
 )
 
 
 def open_dataset(path: str | Path, *, contacts: str | Path | None = None, table: str | Path | None = None) -> Dataset:
-    """Return the dataset that a folder holds, recognized by what lies in it.
+    """Return the dataset that a folder holds, recognized by its files.
 
-    `contacts` says where ObjectFolder Real's contacts are, `table` where its objects' names (`ObjectFolderRaw`). Where
-    the raw and the compact form share a folder the raw one is taken, which knows the forces. Raises DatasetError for a
-    folder that holds none, with what was sought and found and what may have been meant, and for options that the
-    dataset does not take.
+    `contacts` is the path of ObjectFolder Real's contacts, `table` that of its objects' names (`ObjectFolderRaw`). Of
+    the raw and the compact form in one folder the raw one is taken, which has the forces. Raises DatasetError for a
+    folder that holds none and for options that the dataset does not take.
     """
     folder = Path(path)
     if not folder.is_dir():
-        raise DatasetError(_no_folder(folder))
+        raise _no_folder(folder)
     kind = _kind(folder)
     if kind is None:
-        raise DatasetError(f"{folder}: expected {SOUGHT}; {_guess(folder)}")
-    if contacts is not None and kind is not ObjectFolderRaw:
-        raise DatasetError(f"{folder}: holds {kind.name}, which has contacts of its own: leave `contacts` out")
-    if table is not None and kind not in (ObjectFolderRaw, ObjectFolderCompact):
-        raise DatasetError(f"{folder}: holds {kind.name}, whose objects have names of their own: leave `table` out")
+        guess = _guess(folder)
+        raise DatasetError(f"{folder}: expected {SOUGHT}; {guess.message}", file=folder, value=guess.found)
+    for name, given, takers in (
+        ("contacts", contacts, (ObjectFolderRaw,)),
+        ("table", table, (ObjectFolderRaw, ObjectFolderCompact)),
+    ):
+        if given is not None and kind not in takers:
+            raise DatasetError(
+                f"{folder}: expected no `{name}` with {kind.name}, got {given}; omit it",
+                file=folder,
+                name=name,
+                value=str(given),
+            )
     if kind is ObjectFolderRaw:
         return ObjectFolderRaw(folder, contacts=contacts, table=table)
     if kind is ObjectFolderCompact:
@@ -60,9 +68,18 @@ def _kind(folder: Path) -> Kind | None:
     return next((kind for kind, pattern in signs if _any(folder, pattern)), None)
 
 
-def _guess(folder: Path) -> str:
-    """Return what the folder holds instead, and what its owner should do."""
-    guesses: Sequence[Callable[[Path], str | None]] = (
+class _Guess(NamedTuple):
+    """What a folder holds in place of a dataset."""
+
+    message: str
+    """What was found, and what to do."""
+    found: str | tuple[str, ...]
+    """The folder to name, or the names of what was found."""
+
+
+def _guess(folder: Path) -> _Guess:
+    """Return what the folder holds instead of a dataset."""
+    guesses: Sequence[Callable[[Path], _Guess | None]] = (
         _too_low,
         _too_high,
         _half_compact,
@@ -76,11 +93,11 @@ def _guess(folder: Path) -> str:
             return found
     names = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir() if path.name[0] != ".")
     more = f" and {len(names) - 8} more" if len(names) > 8 else ""
-    return f"found {', '.join(names[:8])}{more}" if names else "the folder is empty"
+    return _Guess(f"found {', '.join(names[:8])}{more}" if names else "the folder is empty", tuple(names))
 
 
-def _too_low(folder: Path) -> str | None:
-    """The folder of one object, or a part of it."""
+def _too_low(folder: Path) -> _Guess | None:
+    """Recognize the folder of one object, or a part of it."""
     signs = (
         (f"{FOLDER}/*.npy", "one object of RealImpact", 1),
         ("vertexXYZ.npy", "the arrays of one object of RealImpact", 2),
@@ -91,60 +108,63 @@ def _too_low(folder: Path) -> str | None:
     for pattern, what, levels in signs:
         if _any(folder, pattern):
             parent = folder.resolve().parents[levels - 1]
-            return f"found {what}: name the folder {'above' if levels == 1 else f'{levels} levels above'}, {parent}"
+            return _Guess(f"found {what}; name the folder {parent}", str(parent))
     for levels, pattern in enumerate(("[0-9]*/[0-9]*.wav", "[0-9]*.wav")):
         place = [folder.resolve(), *folder.resolve().parents][levels]
         if place.name == "audio" and _any(folder, pattern):
-            return f"found recordings of the compact copy: name the folder around audio/, {place.parent}"
+            return _Guess(f"found recordings of the compact copy; name the folder {place.parent}", str(place.parent))
     return None
 
 
-def _too_high(folder: Path) -> str | None:
-    """A folder around the dataset."""
+def _too_high(folder: Path) -> _Guess | None:
+    """Recognize a parent folder of datasets."""
     below = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != "."]
     found = [(path, kind) for path in below if (kind := _kind(path)) is not None]
     if not found:
         return None
-    shown = ", ".join(f"{path} ({kind.name})" for path, kind in found[:4])
-    return f"found {'it one level below' if len(found) == 1 else 'several one level below'}: name {shown}"
+    shown = " or ".join(f"{path} ({kind.name})" for path, kind in found[:4])
+    return _Guess(f"name the folder {shown}", tuple(str(path) for path, _ in found))
 
 
-def _half_compact(folder: Path) -> str | None:
+def _half_compact(folder: Path) -> _Guess | None:
     there = [part for part in PARTS if (folder / part).exists()]
     if len(there) < 2 and "split.json" not in there:
         return None
     lacking = [f"{part}{_archive_of(folder, part)}" for part in PARTS if part not in there]
     if "audio" in there:
         lacking.append("recordings in audio/")
-    return f"found part of the compact copy ({', '.join(there)}): {', '.join(lacking)} still missing"
+    message = f"found part of the compact copy ({', '.join(there)}); {', '.join(lacking)} missing"
+    return _Guess(message, tuple(there))
 
 
-def _half_raw(folder: Path) -> str | None:
+def _half_raw(folder: Path) -> _Guess | None:
     objects = [path.name for path in folder.iterdir() if path.name.isdecimal() and path.is_dir()]
     if not objects:
         return None
     if _any(folder, "[0-9]*/audio"):
-        return "found folders of ObjectFolder Real's objects without recordings: unpack the audio archives again"
-    return (
-        f"found folders {', '.join(sorted(objects, key=int)[:5])} without audio/ in them: if these are ObjectFolder "
-        "Real's objects, unpack audio_data_1_10.tar.gz and so on here; videos and tactile data are not used"
+        return _Guess("found ObjectFolder Real without recordings; unpack the audio archives again", "audio/")
+    found = tuple(sorted(objects, key=int)[:5])
+    return _Guess(
+        f"found folders {', '.join(found)} without audio/; if they are ObjectFolder Real's objects, unpack "
+        "audio_data_1_10.tar.gz and so on here (videos and tactile data are not used)",
+        found,
     )
 
 
-def _half_realimpact(folder: Path) -> str | None:
+def _half_realimpact(folder: Path) -> _Guess | None:
     below = sorted(path.name for path in folder.glob(f"*/{FOLDER}") if path.is_dir())
-    return f"found {FOLDER}/ without arrays in it: unpack RealImpact's archives again" if below else None
+    message = f"found {FOLDER}/ without arrays; unpack RealImpact's archives again"
+    return _Guess(message, f"{FOLDER}/") if below else None
 
 
-def _packed(folder: Path) -> str | None:
+def _packed(folder: Path) -> _Guess | None:
     archives = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in ARCHIVES)
     if not archives:
         return None
     command = "unzip" if archives[0].endswith(".zip") else "tar -xf"
     more = f" and {len(archives) - 4} more" if len(archives) > 4 else ""
-    return (
-        f"found archives that are not unpacked, {', '.join(archives[:4])}{more}: `{command} {archives[0]}` in {folder}"
-    )
+    message = f"found archives, {', '.join(archives[:4])}{more}; unpack them, `{command} {archives[0]}` in {folder}"
+    return _Guess(message, tuple(archives))
 
 
 def _archive_of(folder: Path, part: str) -> str:
@@ -152,14 +172,15 @@ def _archive_of(folder: Path, part: str) -> str:
     return f" (unpack {packed.name})" if packed.is_file() else ""
 
 
-def _no_folder(path: Path) -> str:
+def _no_folder(path: Path) -> DatasetError:
     if path.is_file():
-        packed = path.suffix.lower() in ARCHIVES
-        return f"{path}: is {'an archive: unpack it and name the folder' if packed else 'a file; expected a folder'}"
+        advice = "; unpack it and name the folder" if path.suffix.lower() in ARCHIVES else ""
+        return DatasetError(f"{path}: expected a folder, got a file{advice}", file=path, value="file")
     near: list[str] = []
     if path.parent.is_dir():
         near = get_close_matches(path.name, [each.name for each in path.parent.iterdir() if each.is_dir()], n=1)
-    return f"{path}: there is no such folder" + (f" (did you mean {path.parent / near[0]}?)" if near else "")
+    meant = f"; did you mean {path.parent / near[0]}?" if near else ""
+    return DatasetError(f"{path}: expected a folder, found none{meant}", file=path, value=tuple(near))
 
 
 def _any(folder: Path, pattern: str) -> bool:

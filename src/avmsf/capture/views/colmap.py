@@ -1,17 +1,16 @@
 """COLMAP's sparse models: cameras, images and points, in text or binary, whichever lies in the folder."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from avmsf.capture.location import Location
 from avmsf.capture.views import colmap_binary, colmap_text
 from avmsf.capture.views.colmap_records import CameraRecord, ImageRecord
 from avmsf.capture.views.lenses import Lens
 from avmsf.capture.views.shots import Shot, Shots, refuse_many
-from avmsf.errors import CaptureError
 
 PLACES = ("sparse/0", "sparse", ".")
 
@@ -43,7 +42,7 @@ MODELS = {
 
 
 def find_model(folder: Path) -> Path | None:
-    """Return the folder that holds a model's cameras and images, the first of the usual places; None without any."""
+    """Return the folder that holds a model's cameras and images, the first of the usual ones; None without any."""
     for place in PLACES:
         for suffix in (".bin", ".txt"):
             if (folder / place / f"cameras{suffix}").is_file() and (folder / place / f"images{suffix}").is_file():
@@ -61,7 +60,7 @@ def read_colmap(model: Path, images: Path) -> Shots:
     suffix, reader = (".bin", colmap_binary) if binary else (".txt", colmap_text)
     cameras_file, images_file = model / f"cameras{suffix}", model / f"images{suffix}"
     lenses = {
-        record.number: _lens(record, f"{cameras_file}, camera {record.number}")
+        record.number: _lens(record, Location(cameras_file, item=f"camera {record.number}"))
         for record in reader.read_cameras(cameras_file)
     }
     records = reader.read_images(images_file)
@@ -77,21 +76,29 @@ def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
         if path.is_file():
             points, colors = reader.read_points(path)
             if not np.isfinite(points).all():
-                raise CaptureError(f"{path}: holds points that are not finite: run the reconstruction again")
+                row = int(np.isfinite(points).all(axis=1).argmin())
+                raise Location(path, row, f"point {row}").error(
+                    f"expected finite coordinates, got {points[row].tolist()}; run the reconstruction again",
+                    value=points[row].tolist(),
+                )
             return (points, colors) if len(points) else None
     return None
 
 
-def _lens(record: CameraRecord, where: str) -> Lens:
+def _lens(record: CameraRecord, where: Location) -> Lens:
     model = MODELS.get(record.model)
     if model is None:
-        raise CaptureError(
-            f"{where}: camera model {record.model} cannot be read, only {', '.join(MODELS)}: undistort the images "
-            "first (colmap image_undistorter)"
+        raise where.error(
+            f"expected a camera model among {', '.join(MODELS)}, got {record.model}; undistort the images first "
+            "(colmap image_undistorter)",
+            name=where.item,
+            value=record.model,
         )
     if len(record.parameters) != model.parameters:
-        raise CaptureError(
-            f"{where}: expected {model.parameters} parameters of {record.model}, found {len(record.parameters)}"
+        raise where.error(
+            f"expected {model.parameters} parameters of {record.model}, got {len(record.parameters)}",
+            name=where.item,
+            value=len(record.parameters),
         )
     focals, center, rest = model.focals, model.focals + 2, record.parameters[model.focals + 2 :]
     distortion = [0.0] * (4 if model.fisheye else 5)
@@ -103,17 +110,21 @@ def _lens(record: CameraRecord, where: str) -> Lens:
 
 
 def _shot(record: ImageRecord, lenses: dict[int, Lens], file: Path, images: Path) -> Shot:
-    lens = lenses.get(record.camera)
+    lens, where = lenses.get(record.camera), Location(file, item=f"image {record.name}")
     if lens is None:
-        raise CaptureError(
-            f"{file}: {record.name} was taken by camera {record.camera}, which the model's cameras lack: export all "
-            "parts of the model together"
+        raise where.error(
+            f"expected a camera of the model ({', '.join(map(str, lenses))}), got camera {record.camera}; export all "
+            "parts of the model together",
+            name=record.name,
+            value=record.camera,
         )
     pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.from_numpy(_rotation(record.quaternion, f"{file}, image {record.name}"))
+    pose[:3, :3] = torch.from_numpy(_rotation(record, where))
     pose[:3, 3] = torch.tensor(record.translation, dtype=torch.float64)
     if not bool(torch.isfinite(pose).all()):
-        raise CaptureError(f"{file}, image {record.name}: the pose holds numbers that are not finite")
+        raise where.error(
+            f"expected a finite translation, got {record.translation}", name=record.name, value=record.translation
+        )
 
     def lens_of(_width: int, _height: int) -> Lens:
         return lens
@@ -122,12 +133,16 @@ def _shot(record: ImageRecord, lenses: dict[int, Lens], file: Path, images: Path
     return Shot(name, images / name, pose, lens_of)
 
 
-def _rotation(quaternion: Sequence[float], where: str) -> np.ndarray:
+def _rotation(record: ImageRecord, where: Location) -> np.ndarray:
     """Return the matrix of a quaternion w, x, y, z of any length but zero."""
-    values = np.array(quaternion, dtype=np.float64)
+    values = np.array(record.quaternion, dtype=np.float64)
     length = float(np.linalg.norm(values))
     if not np.isfinite(length) or length < 1e-6:
-        raise CaptureError(f"{where}: expected a rotation's quaternion, found {quaternion}: run the mapper again")
+        raise where.error(
+            f"expected a rotation's quaternion, got {record.quaternion}; run the mapper again",
+            name=record.name,
+            value=record.quaternion,
+        )
     w, x, y, z = values / length
     axis = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     # Rodrigues' formula in quaternion form.

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from avmsf.capture.location import Location
 from avmsf.capture.views.colmap_records import CameraRecord, ImageRecord
 from avmsf.errors import CaptureError
 
@@ -35,7 +36,7 @@ class _Reader:
         try:
             self.content = path.read_bytes()
         except OSError as error:
-            raise CaptureError(f"{path}: cannot be read ({error.strerror})") from error
+            raise CaptureError(f"{path}: cannot be read ({error.strerror})", file=path) from error
 
     def take(self, layout: str) -> tuple[Any, ...]:
         """Return the next values, laid out as `struct` says."""
@@ -63,8 +64,10 @@ class _Reader:
 
     def short(self) -> CaptureError:
         return CaptureError(
-            f"{self.path}: ends after {len(self.content)} bytes in the middle of a row, or is no binary COLMAP file: "
-            "copy it again, all of it"
+            f"{self.path}: expected a complete binary COLMAP file, got one that ends after {len(self.content)} bytes "
+            "inside a record; copy it again",
+            file=self.path,
+            value=len(self.content),
         )
 
 
@@ -75,9 +78,11 @@ def read_cameras(path: Path) -> list[CameraRecord]:
     for _ in range(count):
         number, model, width, height = reader.take("IiQQ")
         if model not in _MODELS:
-            raise CaptureError(
-                f"{path}, camera {number}: camera model number {model} is unknown: undistort the images first (colmap "
-                "image_undistorter)"
+            raise Location(path, item=f"camera {number}").error(
+                f"expected a known camera model, got number {model}; undistort the images first (colmap "
+                "image_undistorter)",
+                name=f"camera {number}",
+                value=model,
             )
         name, parameters = _MODELS[model]
         records.append(CameraRecord(number, name, width, height, reader.take(f"{parameters}d")))

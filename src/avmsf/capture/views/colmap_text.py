@@ -7,6 +7,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from avmsf.capture.location import Location
 from avmsf.capture.views.colmap_records import CameraRecord, ImageRecord
 from avmsf.errors import CaptureError
 
@@ -32,7 +33,7 @@ def read_images(path: Path) -> list[ImageRecord]:
 
 
 def read_points(path: Path) -> tuple[Float[np.ndarray, "points 3"], UInt8[np.ndarray, "points 3"]]:
-    """Read places and colors from points3D.txt; raises CaptureError with the line that is malformed."""
+    """Read positions and colors from points3D.txt; raises CaptureError with the line that is malformed."""
     points = [_parsed(path, row, line, _point) for row, line in _lines(path) if line]
     places = np.array([place for place, _ in points], dtype=np.float64).reshape(-1, 3)
     return places, np.array([color for _, color in points], dtype=np.uint8).reshape(-1, 3)
@@ -43,7 +44,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{path}: cannot be read as text: {error}") from error
+        raise CaptureError(f"{path}: cannot be read as text ({error})", file=path) from error
     lines = [(row, line.strip()) for row, line in enumerate(text.splitlines(), start=1)]
     return [(row, line) for row, line in lines if not line.startswith("#")]
 
@@ -52,8 +53,8 @@ def _parsed(path: Path, row: int, line: str, parse: Callable[[str], _Row]) -> _R
     try:
         return parse(line)
     except (ValueError, IndexError, OverflowError) as error:
-        raise CaptureError(
-            f"{path}, line {row}: cannot be read as COLMAP writes it, found {line[:80]!r}: export the model again"
+        raise Location(path, row, f"row {row}").error(
+            f"expected a row as COLMAP writes it, got {line[:80]!r}; export the model again", value=line
         ) from error
 
 

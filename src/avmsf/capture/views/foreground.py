@@ -47,7 +47,9 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
     shape. Raises CaptureError for fewer than three views and where no plain background is found.
     """
     if len(views) < FEWEST:
-        raise CaptureError(f"expected at least {FEWEST} views, found {len(views)}: a shape needs several sides")
+        raise CaptureError(
+            f"expected at least {FEWEST} views, got {len(views)}; photograph more sides", name="views", value=len(views)
+        )
     bare = [index for index, view in enumerate(views) if view.mask is None]
     if not bare:
         return tuple(views)
@@ -63,12 +65,11 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
     for _ in range(_ROUNDS):
         outlines = _outlines(masks, cameras)
         if outlines is None:
-            warnings.warn(
-                "the views' first masks agree on no shape, so each mask stands on its own image alone: look at the "
-                "masks, and check the cameras",
-                CaptureWarning,
-                stacklevel=2,
+            message = (
+                "the first masks of the views have no common shape; each mask uses only its own image; check the masks "
+                "and the cameras"
             )
+            warnings.warn(CaptureWarning(message, name="masks"), stacklevel=2)
             break
         for index in bare:
             masks[index] = _agreed(distances[index], cut, outlines[index])
@@ -90,7 +91,11 @@ def background_color(views: Sequence[View]) -> Float[Tensor, " 3"]:
             outside = view.image.numpy()[near == 0]
             counts += np.stack([np.bincount(outside[:, channel], minlength=256) for channel in range(3)])
     if not counts.any():
-        raise CaptureError("expected views whose masks leave some background: find their foreground first")
+        raise CaptureError(
+            "expected views whose masks leave some background, got none; find their foreground first",
+            name="background",
+            value=0,
+        )
     middle = (np.cumsum(counts, axis=1) >= counts.sum(axis=1, keepdims=True) / 2).argmax(axis=1)
     return torch.from_numpy(middle.astype(np.float32) / np.float32(255))
 
@@ -186,16 +191,20 @@ def _refuse_busy(different: Sequence[Bool[np.ndarray, "height width"]], names: S
     share = float(np.concatenate(borders).mean())
     if share > _BUSY:
         raise CaptureError(
-            f"expected a plain background, found that {share:.0%} of the images' borders differ from it in color "
-            f"({listed(names)}): give masks, or photograph the object before one color and with room around it"
+            f"expected a plain background, got {share:.0%} of the images' borders in other colors ({listed(names)}); "
+            "give masks, or photograph the object in front of one color with a margin around it",
+            name="background",
+            value=share,
         )
 
 
 def _refuse_few(found: Sequence[str], count: int) -> None:
     if len(found) < FEWEST:
         raise CaptureError(
-            f"expected an object before a plain background in at least {FEWEST} views, found one in {len(found)} of "
-            f"{count}: give masks"
+            f"expected an object in front of a plain background in at least {FEWEST} views, got {len(found)} of "
+            f"{count}; give masks",
+            name="object",
+            value=len(found),
         )
 
 
@@ -210,7 +219,6 @@ def _masked(views: Sequence[View], masks: Sequence[np.ndarray]) -> tuple[View, .
             empty.append(view.name)
     _refuse_few([view.name for view in found], len(views))
     if empty:
-        warnings.warn(
-            f"{len(empty)} views show no object and are left out: {listed(empty)}", CaptureWarning, stacklevel=3
-        )
+        message = f"{len(empty)} views without an object are not used: {listed(empty)}"
+        warnings.warn(CaptureWarning(message, name="object", value=empty), stacklevel=3)
     return tuple(found)

@@ -10,13 +10,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.cameras import Camera
+from avmsf.capture.location import Location
 from avmsf.capture.views.pictures import Picture
-from avmsf.errors import CaptureError
 
 # A lens is judged on this many points along each side of the image that it would give.
 _GRID = 33
 # A straightened picture takes in at most this many times the width and height that the lens has in its middle.
 _WIDEST = 2.0
+
+
+_ANY_CAMERA = Location(None, item="the camera")
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,16 +42,18 @@ class Lens:
     distortion: tuple[float, ...] = ()
     """k1 k2 p1 p2 k3 of a perspective lens, k1 k2 k3 k4 of a fisheye; empty for a perspective lens without any."""
     fisheye: bool = False
-    origin: str = "the camera"
-    """Where it was read, for messages."""
+    origin: Location = _ANY_CAMERA
+    """Where it was read, for errors."""
 
     def __post_init__(self) -> None:
         numbers = [*self.focal, *self.principal, *self.distortion]
         if not all(map(math.isfinite, numbers)) or min(self.focal) <= 0 or min(self.width, self.height) < 1:
-            raise CaptureError(
-                f"{self.origin}: expected finite intrinsics, positive focal lengths and a size in pixels, found focal "
-                f"lengths {self.focal}, principal point {self.principal}, distortion {self.distortion}, size "
-                f"{self.width} x {self.height}: calibrate this camera again"
+            raise self.origin.error(
+                "expected finite intrinsics, positive focal lengths and a size in pixels, got focal lengths "
+                f"{self.focal}, principal point {self.principal}, distortion {self.distortion}, size {self.width} x "
+                f"{self.height}; calibrate this camera again",
+                name="intrinsics",
+                value=[*numbers, self.width, self.height],
             )
 
     @property
@@ -96,9 +101,11 @@ def _widest_pinhole(lens: Lens) -> Lens:
     """Return the pinhole of smallest focal length, by bisection, whose every pixel lies in the lens's image."""
     narrow, wide = 4.0, 1 / _WIDEST
     if not _covers(lens, narrow):
-        raise CaptureError(
-            f"{lens.origin}: the distortion {lens.distortion} folds the image or leaves nothing of it: check the "
-            f"camera model (fisheye: {lens.fisheye}) and the order of its coefficients"
+        raise lens.origin.error(
+            f"expected an invertible distortion, got {lens.distortion}; check the camera model (fisheye: "
+            f"{lens.fisheye}) and the order of its coefficients",
+            name="distortion",
+            value=lens.distortion,
         )
     if _covers(lens, wide):
         narrow = wide

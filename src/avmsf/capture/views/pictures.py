@@ -102,12 +102,17 @@ def _is_small(content: bytes, path: Path) -> bool:
             return False
         width, height = read_header(io.BytesIO(content)).size
     except Image.DecompressionBombError as error:
-        raise PictureSizeError(f"{path}: expected at most {MAX_PIXELS:,} pixels: {error}: scale it down") from error
+        raise PictureSizeError(
+            f"{path}: expected at most {MAX_PIXELS:,} pixels ({error}); scale it down", file=path
+        ) from error
     except Exception:  # Pillow raises whatever the parsing of a damaged header raises
         return False
     if width * height > MAX_PIXELS:
         raise PictureSizeError(
-            f"{path}: expected at most {MAX_PIXELS:,} pixels, got {width:,} x {height:,}: scale the picture down"
+            f"{path}: expected at most {MAX_PIXELS:,} pixels, got {width:,} x {height:,}; scale the picture down",
+            file=path,
+            name="pixels",
+            value=width * height,
         )
     return True
 
@@ -117,15 +122,26 @@ def _decode(path: Path, flags: int) -> np.ndarray:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise CaptureError(f"{path}: there is no such image file ({error.strerror})") from error
+        raise CaptureError(f"{path}: expected an image file ({error.strerror})", file=path) from error
     pixels = None
     if _is_small(content, path):
         with contextlib.suppress(cv2.error):
             pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     if pixels is None:
-        raise CaptureError(f"{path}: not a PNG, JPEG or WebP image that can be read whole: copy or export it again")
+        raise CaptureError(
+            f"{path}: expected a complete PNG, JPEG or WebP image, got {len(content)} bytes that cannot be read; copy "
+            "or export it again",
+            file=path,
+            name="bytes",
+            value=len(content),
+        )
     if pixels.dtype == np.uint16:
         return ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if pixels.dtype != np.uint8:
-        raise CaptureError(f"{path}: expected 8 or 16 bits a channel, found {pixels.dtype}: export it as PNG")
+        raise CaptureError(
+            f"{path}: expected 8 or 16 bits per channel, got {pixels.dtype}; export it as PNG",
+            file=path,
+            name="bits",
+            value=str(pixels.dtype),
+        )
     return pixels

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from avmsf.capture.views.lenses import Lens
 from avmsf.capture.views.pictures import SUFFIXES
+from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
 
 MAX_SHOTS = 10_000
@@ -20,12 +21,12 @@ class Shot:
     """A photograph that a camera file names."""
 
     name: str
-    """Its path below `images/`, with forward slashes: what messages and masks know it by."""
+    """Its path below `images/`, with forward slashes: its name in messages and for masks."""
     image: Path
     world_to_camera: Float[Tensor, "4 4"]
     """Rigid, OpenCV's axes; in the file's unit of length."""
     lens_of: Callable[[int, int], Lens]
-    """The lens, given the image's width and height, which count only where the camera file leaves out its own."""
+    """The lens, given the image's width and height, which are used only where the camera file has no size."""
     mask: Path | None = None
     """The mask that the file names for it."""
 
@@ -37,8 +38,8 @@ class Shots:
     origin: Path
     """The camera file, or the folder that holds its parts."""
     shots: tuple[Shot, ...]
-    remarks: tuple[str, ...] = ()
-    """What looks wrong but could be mended."""
+    remarks: tuple[Remark, ...] = ()
+    """What looks wrong but was corrected."""
 
 
 def without_camera(shots: Sequence[Shot], folder: Path) -> list[str]:
@@ -56,11 +57,16 @@ def without_camera(shots: Sequence[Shot], folder: Path) -> list[str]:
 def refuse_many(count: int, where: Path) -> None:
     """Raise CaptureError for more than `MAX_SHOTS` photographs."""
     if count > MAX_SHOTS:
-        raise CaptureError(f"{where}: expected at most {MAX_SHOTS:,} photographs, got {count:,}: keep some hundreds")
+        raise CaptureError(
+            f"{where}: expected at most {MAX_SHOTS:,} photographs, got {count:,}; select some hundreds",
+            file=where,
+            name="photographs",
+            value=count,
+        )
 
 
 def mask_places(shot: Shot, folder: Path) -> list[Path]:
-    """Return where a shot's mask may lie, the likeliest place first."""
+    """Return the paths where a shot's mask may be, the likeliest first."""
     name = PurePosixPath(shot.name)
     places = [folder / "masks" / name.with_suffix(".png"), folder / "masks" / f"{name}.png"]
     return places if shot.mask is None else [shot.mask, *places]

@@ -9,14 +9,15 @@ from avmsf.capture.cameras import View
 from avmsf.capture.views.lenses import Lens, straighten
 from avmsf.capture.views.pictures import Picture, PictureSizeError, read_mask, read_picture, read_upright, scale
 from avmsf.capture.views.shots import Shot, listed, mask_places
+from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
 
 
 @dataclass
 class Findings:
-    """What went wrong with single images, to be said once for all."""
+    """Problems of single images, reported together."""
 
-    remarks: list[str]
+    remarks: list[Remark]
     lost: list[str] = field(default_factory=list)
     empty: list[str] = field(default_factory=list)
     resized: list[str] = field(default_factory=list)
@@ -24,17 +25,21 @@ class Findings:
     unmasked: list[str] = field(default_factory=list)
     stretched: list[str] = field(default_factory=list)
 
-    def summary(self) -> list[str]:
-        """Return one sentence for each kind of finding."""
-        kinds = {
-            "images are missing or corrupt and are left out": self.lost,
-            "images have a mask without any object in it and are left out": self.empty,
-            "images have another size than their cameras say, whose intrinsics were scaled": self.resized,
-            "images were turned as their orientation tag says, for only so they fit their cameras": self.turned,
-            "masks are named but missing or corrupt; these images go without": self.unmasked,
-            "masks have another size than their images and were scaled": self.stretched,
-        }
-        return self.remarks + [f"{len(names)} {kind}: {listed(names)}" for kind, names in kinds.items() if names]
+    def summary(self) -> list[Remark]:
+        """Return one remark for each kind of finding; its name is the kind, its value the images."""
+        kinds = (
+            ("missing images", "images are missing or corrupt and are not used", self.lost),
+            ("empty masks", "images have a mask without an object and are not used", self.empty),
+            ("image sizes", "images have another size than their cameras, whose intrinsics were scaled", self.resized),
+            ("orientations", "images were rotated by their orientation tag to fit their cameras", self.turned),
+            ("missing masks", "masks are missing or corrupt; their images are used without", self.unmasked),
+            ("mask sizes", "masks have another size than their images and were scaled", self.stretched),
+        )
+        return self.remarks + [
+            Remark(f"{len(images)} {message}: {listed(images)}", name=name, value=images)
+            for name, message, images in kinds
+            if images
+        ]
 
 
 def read_view(shot: Shot, base: Path, longest: int | None, meters: float, findings: Findings) -> View | None:
@@ -76,8 +81,11 @@ def _fit(shot: Shot, picture: Picture, findings: Findings) -> tuple[Picture, Len
         return picture, lens
     if not _same_shape((width, height), (lens.width, lens.height)):
         raise CaptureError(
-            f"{shot.image}: the image has {width} x {height} pixels, its camera ({lens.origin}) {lens.width} x "
-            f"{lens.height}, another shape: give the images that the cameras were found for, not cropped or turned"
+            f"{shot.image}: expected an image of its camera's shape, {lens.width} x {lens.height} ({lens.origin}), got "
+            f"{width} x {height}; give the images of which the cameras were estimated, not cropped or rotated",
+            file=shot.image,
+            name="image",
+            value=[width, height],
         )
     findings.resized.append(f"{shot.name} ({width} x {height} instead of {lens.width} x {lens.height})")
     return picture, lens.resized(width, height)
@@ -103,8 +111,11 @@ def _with_mask(shot: Shot, base: Path, picture: Picture, findings: Findings) -> 
     if mask.shape != (height, width):
         if not _same_shape((mask.shape[1], mask.shape[0]), (width, height)):
             raise CaptureError(
-                f"{path}: the mask has {mask.shape[1]} x {mask.shape[0]} pixels, its image {width} x {height}, another "
-                "shape: make the mask of this very image"
+                f"{path}: expected a mask of its image's shape, {width} x {height}, got {mask.shape[1]} x "
+                f"{mask.shape[0]}; make the mask of this image",
+                file=path,
+                name="mask",
+                value=[mask.shape[1], mask.shape[0]],
             )
         findings.stretched.append(f"{shot.name} ({mask.shape[1]} x {mask.shape[0]} for {width} x {height})")
         mask = scale(mask, width, height)

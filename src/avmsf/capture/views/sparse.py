@@ -42,7 +42,12 @@ def _read_ply(transforms: Path) -> tuple[np.ndarray, np.ndarray] | None:
     path = transforms.parent / named.replace("\\", "/")
     clouds: list[Any] = load_parts(path)
     if len(clouds) != 1:
-        raise CaptureError(f"{path} ({transforms.name} names it): expected one point cloud, got {len(clouds)} parts")
+        raise CaptureError(
+            f"{path} (ply_file_path of {transforms.name}): expected one point cloud, got {len(clouds)} parts",
+            file=path,
+            name="ply_file_path",
+            value=len(clouds),
+        )
     points = np.asarray(clouds[0].vertices, dtype=np.float64)
     colors = np.full((len(points), 3), 128, dtype=np.uint8)
     painted = np.asarray(getattr(clouds[0].visual, "vertex_colors", colors))

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 
 from avmsf._utils.text_files import read_json
+from avmsf.capture.location import Location
 from avmsf.capture.views.lenses import Lens
 from avmsf.capture.views.pictures import SUFFIXES
 from avmsf.capture.views.poses import TOLERANCE, opencv_from_opengl, rigid
 from avmsf.capture.views.shots import Shot, Shots, listed, refuse_many
+from avmsf.capture.warning import Remark
 from avmsf.errors import CaptureError
 
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -30,14 +32,18 @@ def read_transforms(path: Path) -> Shots:
     record = load_record(path)
     frames = record.get("frames")
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise CaptureError(f"{path}: expected a list named 'frames', each with file_path and transform_matrix")
+        raise CaptureError(
+            f"{path}: expected a list 'frames', each with file_path and transform_matrix, got {type(frames).__name__}",
+            file=path,
+            name="frames",
+            value=type(frames).__name__,
+        )
     refuse_many(len(frames), path)
     common = {key: value for key, value in record.items() if key != "frames"}
     shots, scaled = [], []
     for row, frame in enumerate(frames):
-        where = f"{path}, frame {row}"
-        file = _text(frame, "file_path", where)
-        where = f"{where} ({file})"
+        file = _text(frame, "file_path", Location(path, row, f"frame {row}"))
+        where = Location(path, row, f"frame {row} ({file})")
         pose, scale = rigid(_matrix(frame, where), where)
         image = _with_suffix(path.parent / file)
         name = _name(file, image)
@@ -47,23 +53,27 @@ def read_transforms(path: Path) -> Shots:
         mask = path.parent / _text(frame, "mask_path", where) if frame.get("mask_path") else None
         _camera_model(settings, where)
         shots.append(Shot(name, image, opencv_from_opengl(pose), partial(_lens, settings, where), mask))
-    remarks = (f"poses with a scaled rotation, whose scale was taken out: {listed(scaled)}",) if scaled else ()
-    return Shots(path, tuple(shots), remarks)
+    message = f"poses have a scaled rotation; the scale was removed: {listed(scaled)}"
+    return Shots(path, tuple(shots), (Remark(message, name="transform_matrix", value=scaled),) if scaled else ())
 
 
 def load_record(path: Path) -> dict[str, Any]:
-    """Return the file's JSON object; raises CaptureError where it is none."""
+    """Return the file's JSON object; raises CaptureError for anything else."""
     try:
         record = read_json(path)
     except (OSError, ValueError) as error:
-        raise CaptureError(f"{path}: not a JSON file that can be read: {error}") from error
+        raise CaptureError(f"{path}: expected a JSON file, got one that cannot be read ({error})", file=path) from error
     if not isinstance(record, dict):
-        raise CaptureError(f"{path}: expected a JSON object with 'frames', found {type(record).__name__}")
+        raise CaptureError(
+            f"{path}: expected a JSON object with 'frames', got {type(record).__name__}",
+            file=path,
+            value=type(record).__name__,
+        )
     return record
 
 
-def _lens(settings: Mapping[str, Any], where: str, image_width: int, image_height: int) -> Lens:
-    """Return a frame's lens; the image's size counts where the file states none."""
+def _lens(settings: Mapping[str, Any], where: Location, image_width: int, image_height: int) -> Lens:
+    """Return a frame's lens; the image's size is used where the file has none."""
     fisheye = _camera_model(settings, where) in FISHEYE
     sized = "w" in settings and "h" in settings
     width = int(_number(settings, "w", where)) if sized else image_width
@@ -71,65 +81,76 @@ def _lens(settings: Mapping[str, Any], where: str, image_width: int, image_heigh
     across = _focal(settings, "x", width, where)
     down = _focal(settings, "y", height, where)
     if across is None and down is None:
-        raise CaptureError(f"{where}: expected fl_x or camera_angle_x, in the frame or at the top of the file")
+        raise where.error("expected fl_x or camera_angle_x, in the frame or at the top of the file", name="fl_x")
     # With one focal length alone, pixels are square.
     focal = (across or down or 0.0, down or across or 0.0)
     principal = (_number(settings, "cx", where, width / 2), _number(settings, "cy", where, height / 2))
     k1, k2, k3, k4, p1, p2 = (_number(settings, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if not fisheye and k4:
-        raise CaptureError(f"{where}: k4 = {k4} means nothing for a perspective lens: calibrate with k1 k2 p1 p2 k3")
+        raise where.error(
+            f"expected k1 k2 p1 p2 k3 of a perspective lens, got k4 = {k4}; calibrate again", name="k4", value=k4
+        )
     distortion = (k1, k2, k3, k4) if fisheye else (k1, k2, p1, p2, k3)
     return Lens(focal, principal, width, height, distortion, fisheye, where)
 
 
-def _focal(settings: Mapping[str, Any], axis: str, pixels: int, where: str) -> float | None:
+def _focal(settings: Mapping[str, Any], axis: str, pixels: int, where: Location) -> float | None:
     if f"fl_{axis}" in settings:
         return _number(settings, f"fl_{axis}", where)
     if f"camera_angle_{axis}" not in settings:
         return None
     angle = _number(settings, f"camera_angle_{axis}", where)
     if not 0 < angle < math.pi:
-        raise CaptureError(f"{where}: expected camera_angle_{axis} in radians between 0 and pi, found {angle}")
+        raise where.error(
+            f"expected camera_angle_{axis} in radians between 0 and pi, got {angle}",
+            name=f"camera_angle_{axis}",
+            value=angle,
+        )
     return pixels / 2 / math.tan(angle / 2)
 
 
-def _camera_model(settings: Mapping[str, Any], where: str) -> str:
-    """Return the name of the frame's camera model, refusing what is neither perspective nor fisheye."""
+def _camera_model(settings: Mapping[str, Any], where: Location) -> str:
+    """Return the name of the frame's camera model; raises CaptureError unless it is perspective or fisheye."""
     fallback = "OPENCV_FISHEYE" if settings.get("is_fisheye") else "OPENCV"
     name = str(settings.get("camera_model") or fallback).upper()
     if name not in PERSPECTIVE + FISHEYE:
-        raise CaptureError(
-            f"{where}: camera model {name} cannot be read, only {', '.join(PERSPECTIVE + FISHEYE)}: undistort the "
-            "images first"
+        raise where.error(
+            f"expected a camera model among {', '.join(PERSPECTIVE + FISHEYE)}, got {name}; undistort the images first",
+            name="camera_model",
+            value=name,
         )
     return name
 
 
-def _matrix(frame: dict[str, Any], where: str) -> np.ndarray:
-    if frame.get("transform_matrix") is None:
-        raise CaptureError(f"{where}: expected transform_matrix, the camera-to-world pose")
+def _matrix(frame: dict[str, Any], where: Location) -> np.ndarray:
+    key = "transform_matrix"
+    written = frame.get(key)
+    if written is None:
+        raise where.error(f"expected {key}, the camera-to-world pose, got none", name=key)
     try:
-        matrix = np.array(frame["transform_matrix"], dtype=np.float64)
+        matrix = np.array(written, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise CaptureError(f"{where}: transform_matrix is not a table of numbers: {error}") from error
+        raise where.error(f"expected {key} as 4 rows of 4 numbers ({error})", name=key, value=written) from error
     if matrix.ndim != 2:
-        raise CaptureError(f"{where}: expected 4 rows of 4 numbers in transform_matrix, found {matrix.ndim} dimensions")
+        raise where.error(
+            f"expected {key} as 4 rows of 4 numbers, got {matrix.ndim} dimensions", name=key, value=written
+        )
     return matrix
 
 
-def _number(settings: Mapping[str, Any], key: str, where: str, fallback: float | None = None) -> float:
+def _number(settings: Mapping[str, Any], key: str, where: Location, fallback: float | None = None) -> float:
     value = settings.get(key, fallback)
     # A whole number of a JSON file may be larger than any float.
     known = not isinstance(value, bool) and isinstance(value, int | float) and abs(value) <= sys.float_info.max
     if value is None or not known:
-        raise CaptureError(f"{where}: expected {key} to be a finite number, found {value!r}")
+        raise where.error(f"expected a finite number as {key}, got {value!r}", name=key, value=value)
     return float(value)
 
 
-def _text(frame: dict[str, Any], key: str, where: str) -> str:
+def _text(frame: dict[str, Any], key: str, where: Location) -> str:
     value = frame.get(key)
     if not isinstance(value, str) or not value.strip():
-        raise CaptureError(f"{where}: expected {key}, the path of a file, found {value!r}")
+        raise where.error(f"expected the path of a file as {key}, got {value!r}", name=key, value=value)
     return value.replace("\\", "/")
 
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from avmsf.capture.cameras import View
+from avmsf.capture.location import expect_free
 from avmsf.errors import CaptureError
 
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -20,17 +21,21 @@ _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 def write_views(views: Sequence[View], folder: str | Path) -> None:
     """Write `transforms.json`, `images/NAME.png` and, for views that have one, `masks/NAME.png`.
 
-    `read_views` reads back the same pixels, masks and names but for the names' suffixes, and cameras to rounding. The
-    folder appears whole or not at all. Raises CaptureError where it exists and is not empty, where two views would
-    have one file, and where it cannot be written.
+    `read_views` reads back the same pixels, masks and names except for the names' suffixes, and cameras to rounding.
+    The folder is complete or absent. Raises CaptureError where it exists and is not empty, where two views would have
+    one file, and where it cannot be written.
     """
     folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise CaptureError(f"{folder}: exists and is not an empty folder; choose another name or remove it")
+    expect_free(folder)
     names = [str(PurePosixPath(view.name).with_suffix(".png")) for view in views]
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
-        raise CaptureError(f"{folder}: more than one view would become {repeated[0]}; each needs a name of its own")
+        raise CaptureError(
+            f"{folder}: expected views with different names, got several for {repeated[0]}",
+            file=folder,
+            name=repeated[0],
+            value=repeated,
+        )
     begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
     try:
         begun.mkdir(parents=True)
@@ -44,7 +49,7 @@ def write_views(views: Sequence[View], folder: str | Path) -> None:
             folder.rmdir()
         os.rename(begun, folder)
     except OSError as error:
-        raise CaptureError(f"{folder}: the views cannot be written: {error}") from error
+        raise CaptureError(f"{folder}: the views cannot be written ({error})", file=folder) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
 

@@ -10,7 +10,7 @@ from avmsf.cli.options.common import CaptureFolder, Flag, Printing, SettingsFile
 
 @dataclass(frozen=True)
 class Options(Printing):
-    """Check the recordings of a capture: levels, noise, clipping, onsets, double hits and alignment.
+    """Check the recordings of a capture: levels, noise, clipping, onsets, second impacts and alignment.
 
     Prints one row per recording and the problems below. The delay, in samples, aligns a recording with the others. The
     exit code is 0 if the capture can be read, with or without warnings, and 2 if it cannot.

@@ -26,8 +26,8 @@ class InputError(AvmsfError):
     """An option names a file or folder that does not exist."""
 
     def __init__(self, file: Path, expected: str) -> None:
-        self.file, self.expected = file, expected
-        super().__init__(f"{file}: expected {expected}, got no such file or folder; check the name")
+        self.expected = expected
+        super().__init__(f"{file}: expected {expected}, got no such file or folder; check the name", file=file)
 
 
 @dataclass(frozen=True)

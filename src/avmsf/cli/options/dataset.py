@@ -14,8 +14,8 @@ from avmsf.cli.options.common import REGISTRY, Existing, Printing, one_column
 class Options(Printing):
     """List the objects of a published dataset: what can be read, and what is missing.
 
-    Known are ObjectFolder Real (as published, or its compact copy), RealImpact, and folders of captures. Sounds are not
-    read. The exit code is 0 if at least one object can be read, and 2 otherwise.
+    Supported are ObjectFolder Real (as published, or its compact copy), RealImpact, and folders of captures. Sounds are
+    not read. The exit code is 0 if at least one object can be read, and 2 otherwise.
     """
 
     dataset: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATASET"), Existing("a dataset's folder")]]

@@ -12,11 +12,11 @@ from avmsf.cli.options.common import Common, parse_options
 
 @dataclass(frozen=True)
 class Options(Common):
-    """Run a complete example: from photographs and recordings of a mug to its sound field, sounds and pictures.
+    """Run a complete example: from photographs and recordings of a mug to its sound field, sounds and images.
 
     A ceramic mug, made by `avmsf simulate example`: 48 photographs and 16 impacts. Gaussians are fitted to the
-    photographs, and the mug's shape is made from both. A field is fitted to 12 of the impacts, which also show how
-    thick the mug's wall is, and compared with the other 4.
+    photographs, and the mug's shape is reconstructed from both. A field is fitted to 12 of the impacts, which also
+    determine the thickness of the mug's wall, and tested on the other 4.
     """
 
     folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FOLDER")]] = Path("demo")

@@ -67,7 +67,7 @@ class GuideOptions:
     """
 
     prompt: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
-    """Text that describes the sound, such as "a wooden bowl is hit", for a text-to-audio model; needs the extra
+    """Text that describes the sound, such as "a wooden bowl is struck", for a text-to-audio model; needs the extra
     `text`."""
     like: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="WAV|FOLDER ...")] = ()
     """Recordings of impacts on another object to imitate: files or folders of them."""
@@ -93,7 +93,7 @@ class GuideOptions:
     f1/f2 at the end. independent: only single modes (Audio-SDS). searched: the same after a search for common
     factors."""
     distillation: tyro.conf.OmitArgPrefixes[DistillationConfig] = field(default_factory=DistillationConfig)
-    """How targets are drawn from the model."""
+    """Targets from the model."""
     config: tyro.conf.OmitArgPrefixes[SteerConfig] = field(default_factory=SteerConfig)
     """How the modes are optimized."""
 

@@ -58,7 +58,7 @@ class Options(Printing):
     seconds: float | None = None
     """wavs: length of the sounds; by default that of the training sounds."""
     pulse: PulseShape = "half-sine"
-    """wavs: how the force rises and falls over that time, as in `avmsf render`."""
+    """wavs: force over the contact time, as in `avmsf render`."""
     no_noise: Flag = False
     """faust: write the modes without the residual noise."""
     functions: int = 16

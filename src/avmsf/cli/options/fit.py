@@ -18,7 +18,7 @@ class Options(Printing):
     """Fit a sound field to a capture and write it to one file.
 
     Without recordings, a mesh and --material give an approximate field. Repeat an interrupted command to continue it:
-    its state is kept next to the output, and the result is the same.
+    its state is saved next to the output, and the result is the same.
     """
 
     capture: tyro.conf.Positional[
@@ -48,26 +48,26 @@ class Options(Printing):
     elastic family needs a mesh. network: the paper's attention network on the features. The others: a Gaussian process
     over one family, for study; symmetry needs a mesh, visual needs --features."""
     body: BodyConfig = field(default_factory=BodyConfig)
-    """Elastic bodies."""
+    """Finite-element models."""
     extraction: ExtractionMethod = "high-resolution"
     """How modes are extracted; see `avmsf modes --help`."""
     modes: int = 128
     """Maximum number of modes."""
     time_zero: TimeZero | None = None
-    """Start of the sounds: onset, or peak (paper); by default as capture.toml says."""
+    """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
     """Device for training end to end, its spectral loss and the network; by default the GPU if there is one. Mode
     extraction, clustering, finite elements and the Gaussian process run on the CPU."""
     preset: Preset = "default"
     """Defaults of all settings. default: takes seconds to minutes. paper: everything as published, the middle of each
-    published list; takes hours. `--preset paper --help` shows its values. `avmsf reconstruct` also uses its features;
-    here they are those of --features."""
+    published list; takes hours. `--preset paper --help` shows its values. Features are those of --features; `avmsf
+    reconstruct` computes the preset's."""
     config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)
     """How the field is fitted."""
 
     @property
     def pipeline(self) -> PipelineConfig:
-        """All settings as one; those of views and features are the features' file's own."""
+        """All settings as one; those of views and features are in the features' file."""
         scene, start = SceneConfig(), self.time_zero
         return PipelineConfig(
             self.gain_model, self.body, scene, self.config, self.extraction, self.modes, start, self.device

@@ -24,7 +24,7 @@ class Options(Printing):
     recordings: tyro.conf.Positional[Annotated[tuple[_Recording, ...], tyro.conf.arg(metavar="RECORDING.wav ...")]]
     """Recordings of impacts on the same object: wav, flac or another format that libsndfile reads."""
     capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder")] = None
-    """Read the recordings by this folder's capture.toml; by default as those of the fit were read."""
+    """Read the recordings by this folder's capture.toml; by default like the recordings of the fit."""
     settings: SettingsFile = None
     """Read the recordings by this capture.toml."""
     several: Flag = False
@@ -35,8 +35,8 @@ class Options(Printing):
     probability: float = 0.9
     """Probability that the contact lies within the region that is reported."""
     true_contact: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """True contact of every impact, in meters: its distance is printed, and the heat maps mark it red, the found one
-    blue."""
+    """True contact of every impact, in meters: its distance is printed, and the heat maps mark it red and the located
+    one blue."""
     output: OutputFolder = None
     """Folder for a heat map and a colored point cloud of every impact, NAME.png and NAME.ply."""
 

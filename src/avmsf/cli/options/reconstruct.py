@@ -27,10 +27,10 @@ from avmsf.scene.splatconfig import SplatConfig
 
 @dataclass(frozen=True)
 class Options(SceneOptions):
-    """Make a field from a capture folder with pictures or a mesh: Gaussians, features, modes, gains.
+    """Make a field from a capture folder with photographs or a mesh: Gaussians, features, modes, gains.
 
-    FOLDER also holds impacts.csv and the recordings that it names. The output of each stage is kept in the cache, only
-    what changed is computed again, and repeating an interrupted command continues it.
+    FOLDER also holds impacts.csv and the recordings that it names. The output of each stage is cached, only what
+    changed is computed again, and repeating an interrupted command continues it.
     """
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FIELD.safetensors")] = None
@@ -49,13 +49,13 @@ class Options(SceneOptions):
     modes: int = 128
     """Maximum number of modes."""
     time_zero: TimeZero | None = None
-    """Start of the sounds: onset, or peak (paper); by default as capture.toml says."""
+    """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
     seed: int | None = None
     """Seed of all stages; by default each stage's own."""
     gain_model: GainModel = "auto"
     """How gains vary over the object; see `avmsf fit --help`."""
     body: BodyConfig = field(default_factory=BodyConfig)
-    """Elastic bodies."""
+    """Finite-element models."""
     views: ViewsConfig = field(default_factory=ViewsConfig)
     """How views are made."""
     splat: SplatConfig = field(default_factory=SplatConfig)

@@ -39,10 +39,9 @@ class Options(Printing):
     """Peak force of the impact, in newtons if the field knows forces, otherwise relative to an average recorded
     impact."""
     contact_time: float = 0.0
-    """Time that a softer mallet touches the object, in seconds, with the same impulse: 0.002 is felt. 0: as
-    recorded."""
+    """Contact time of a softer hammer, in seconds, with the same impulse: 0.002 for felt. 0: as recorded."""
     pulse: PulseShape = "half-sine"
-    """How the force rises and falls. half-sine: a linear contact. hertz: a Hertzian contact of two round bodies."""
+    """Force over the contact time. half-sine: a linear contact. hertz: a Hertzian contact of two round bodies."""
     seconds: float | None = None
     """Length of the sounds; by default that of the training sounds."""
     normalize: Literal["none", "peak"] = "none"
@@ -50,7 +49,7 @@ class Options(Printing):
     level_db: float = 0.0
     """Additional gain in dB."""
     coding: Coding = "float32"
-    """Format of the samples. float32 holds any level; int16 refuses sounds that would clip."""
+    """Format of the samples. float32 holds any level; int16 rejects sounds that would clip."""
 
 
 def parse(words: Sequence[str]) -> Options:

@@ -1,4 +1,4 @@
-"""Options of the verbs that start from photographs, a video, a mesh or Gaussians."""
+"""Options of the commands that start from photographs, a video, a mesh or Gaussians."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,12 +12,12 @@ from avmsf.pipeline.config import CACHE, SceneConfig
 
 @dataclass(frozen=True)
 class SceneOptions(Printing):
-    """What is read, and where the outputs of the stages are kept."""
+    """The input, and the cache of the stages' outputs."""
 
     folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FOLDER"), Existing("a folder")]]
     """Folder with photographs (transforms.json, a COLMAP model, or only images/), a video, a mesh or Gaussians."""
     cache: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Keep the output of each stage here, by default in FOLDER/.avmsf, so that it is computed only once."""
+    """Cache the output of each stage here, by default in FOLDER/.avmsf."""
     settings: SettingsFile = None
     """Use this capture.toml instead of the folder's own."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
@@ -25,7 +25,7 @@ class SceneOptions(Printing):
 
     @property
     def kept(self) -> Path:
-        """The folder that keeps the stages' outputs."""
+        """The folder that caches the stages' outputs."""
         return self.folder / CACHE if self.cache is None else self.cache
 
 

@@ -15,9 +15,9 @@ from avmsf.simulate.sim20 import SET, sim20_recipe
 
 @dataclass(frozen=True)
 class Options(Printing):
-    """Simulate objects, their recordings and pictures, as capture folders with ground truth.
+    """Simulate objects, their recordings and images, as capture folders with ground truth.
 
-    `avmsf simulate sim-20 --output FOLDER` makes the benchmark set, one folder per object; complete objects are kept,
+    `avmsf simulate sim-20 --output FOLDER` makes the benchmark set, one folder per object. It skips complete objects,
     so repeat an interrupted command to continue it. A single object, of the set by its name or any other by --kind or
     --mesh, is written to FOLDER itself.
     """
@@ -26,13 +26,13 @@ class Options(Printing):
     """sim-20 for the benchmark set, the name of one of its objects, or example for the object of `avmsf demo`; nothing
     for an object of your own."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
-    """Folder to make."""
+    """Output folder."""
     list: Flag = False
-    """List the set's objects, the shapes and the materials, and make nothing."""
+    """Only list the set's objects, the shapes and the materials."""
     cache: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Keep elastic modes here. They take most of the time: other hammers, noises and views are then quick."""
+    """Cache of elastic modes, which take most of the time: other hammers, noises and views are then fast."""
     recipe: Annotated[ObjectRecipe, tyro.conf.arg(name="")] = field(default_factory=ObjectRecipe)
-    """The object, its impacts, recordings and pictures; for an object of the set, what differs from it."""
+    """The object, its impacts, recordings and images; for an object of the set, what differs from it."""
 
     def check_inputs(self) -> None:
         """Raise `InputError` also for a mesh that does not exist."""

@@ -17,7 +17,7 @@ from avmsf.scene.splatconfig import SplatConfig
 class Options(SceneOptions):
     """Fit 3D Gaussians to photographs, a video or a mesh, as a .ply file that any 3DGS viewer opens.
 
-    Views and Gaussians are kept in the cache. Repeat an interrupted command to continue it.
+    Views and Gaussians are cached. Repeat an interrupted command to continue it.
     """
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="CLOUD.ply")] = None

@@ -12,10 +12,11 @@ from avmsf.cli.options.common import Common, Existing, Flag, parse_options
 
 @dataclass(frozen=True)
 class Options(Common):
-    """Open a page in the browser to strike an object and hear it, locate impacts, edit fields and record captures.
+    """Open a web page that plays an object, locates impacts, edits fields and records captures.
 
-    A field is played, searched and edited; a capture folder, a folder of images or a mesh is recorded and
-    reconstructed. The page is served only to this computer, at an address that holds a secret; Ctrl-C ends it.
+    The page plays and edits a field and locates recordings with it; of a capture folder, a folder of images or a mesh
+    it records impacts and reconstructs a field. The page is served only to this computer, at an address that holds a
+    secret; Ctrl-C ends it.
     """
 
     target: tyro.conf.Positional[
@@ -31,7 +32,7 @@ class Options(Common):
     object: Annotated[Path | None, tyro.conf.arg(metavar="MESH|PLY"), Existing("a mesh or Gaussians")] = None
     """Mesh, in meters, or Gaussians to show; by default what the capture folder holds."""
     capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE")] = None
-    """Capture folder of a field, whose recordings are shown and added to; for a mesh, the folder to make."""
+    """Capture folder of a field, to show its recordings and record more; for a mesh, the folder to make."""
     port: int | None = None
     """Port to serve at; 0 for any free one. By default 8634, for which a browser remembers that the page may record, or
     any free one if that is taken."""

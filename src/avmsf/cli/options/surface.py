@@ -17,14 +17,14 @@ from avmsf.scene.splatconfig import SplatConfig
 class Options(SceneOptions):
     """Write an object's surface as a mesh: the folder's own, or one reconstructed from its views.
 
-    In meters and in the frame of the folder. Views show both sides of a wall if both were seen, and cavities as deep as
-    they were seen. `avmsf reconstruct` uses this surface as one of the bodies that may vibrate; the others have walls
-    of several thicknesses below its outer side, since views do not show how thick a wall is. Views and Gaussians are
-    made first if the cache does not have them.
+    In meters and in the frame of the folder. Both sides of a wall and the depth of cavities are reconstructed as far as
+    views show them. `avmsf reconstruct` uses this surface as one of its candidate bodies; the others have walls of
+    several thicknesses below its outer side, since views do not show the thickness. Views and Gaussians are made first
+    if the cache does not have them.
     """
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="SURFACE.ply")] = None
-    """Write the surface to this file, which ends in .ply, .obj or .glb; the cache always holds surface.ply."""
+    """Write the surface to this file, which ends in .ply, .obj or .glb; surface.ply in the cache is always written."""
     picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE.png")] = None
     """Draw the surface and two cross-sections to this file, which ends in .png, .pdf or .svg."""
     seed: int | None = None

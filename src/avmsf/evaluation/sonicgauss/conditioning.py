@@ -49,14 +49,19 @@ def normalized(cloud: GaussianCloud, rest: Float[Tensor, "points 9"]) -> Normali
     kept = cloud.logit_opacities >= LEAST_LOGIT
     if not bool(kept.any()):
         raise EvaluationError(
-            f"expected Gaussians with an opacity above .5, got {len(cloud)} fainter ones: splat the object with more "
-            "steps"
+            f"expected Gaussians with an opacity above .5, got {len(cloud)} of lower opacity; fit them with more steps",
+            name="opacity",
+            value=len(cloud),
         )
     chosen, rest = cloud.detach().take(kept), rest.detach()[kept]
     low, high = chosen.centers.amin(0), chosen.centers.amax(0)
     extent = float((high - low).max())
     if not extent > 0.0:
-        raise EvaluationError(f"expected Gaussians all over the object, got {len(chosen)} in one place: splat it again")
+        raise EvaluationError(
+            f"expected Gaussians over the whole object, got {len(chosen)} at one position; fit them again",
+            name="centers",
+            value=len(chosen),
+        )
     shift = 0.5 - 0.5 * (low + high) / extent
     centers = chosen.centers / extent + shift
     parts = [

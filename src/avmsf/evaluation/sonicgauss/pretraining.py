@@ -49,7 +49,9 @@ def pretrain(
         places.append(seen.places(each.contacts))
         logs.append(log_magnitudes(found, float(found.abs().max())))
     if not tokens:
-        raise EvaluationError("expected objects to train on, got none: make some with `training_objects`")
+        raise EvaluationError(
+            "expected objects to train on, got none; make them with `training_objects`", name="objects", value=0
+        )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = SmallSonicGauss(config.network)

@@ -198,13 +198,18 @@ def _load(part: nn.Module, path: Path) -> None:
             names = set(file.keys())
             tensors = {name: file.get_tensor(name) for name in state if name in names}
     except (SafetensorError, OSError) as error:
-        raise EvaluationError(f"{path}: expected published weights of SonicGauss, got {error}: {_DOWNLOAD}") from error
+        raise EvaluationError(
+            f"{path}: expected published weights of SonicGauss, got {error}; {_DOWNLOAD}", file=path
+        ) from error
     expect_tensors(path, tensors, {name: tuple(each.shape) for name, each in state.items()})
     unknown = sorted(name for name in names - state.keys() if not name.startswith(_UNUSED))
     if unknown:
         raise EvaluationError(
-            f"{path}: expected the tensors of the published model alone, found {unknown[0]} and {len(unknown) - 1} "
-            f"more that it does not have: it holds another model; {_DOWNLOAD}"
+            f"{path}: expected only tensors of the published model, got {unknown[0]} and {len(unknown) - 1} others; "
+            f"{_DOWNLOAD}",
+            file=path,
+            name=unknown[0],
+            value=tuple(unknown),
         )
     part.load_state_dict(tensors)
 
@@ -214,7 +219,8 @@ def _diffusers() -> tuple[Any, Any]:
         from diffusers import AutoencoderOobleck, FluxTransformer2DModel
     except (ImportError, RuntimeError) as error:
         raise EvaluationError(
-            f"the published SonicGauss needs diffusers, which cannot be imported ({error}): pip install 'avmsf[text]', "
-            "or take sonicgauss-small, which does not need it"
+            f"sonicgauss: expected the package diffusers, got {error}; pip install 'avmsf[text]', or take "
+            "sonicgauss-small",
+            name="diffusers",
         ) from error
     return AutoencoderOobleck, FluxTransformer2DModel

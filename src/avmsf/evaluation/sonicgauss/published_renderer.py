@@ -71,8 +71,10 @@ def fit_published(
     peak = float(train_impacts.sounds.abs().max())
     if not peak > 0.0:
         raise EvaluationError(
-            f"expected a recording with a sound, got {len(train_impacts)} that are silent "
-            f"({', '.join(train_impacts.names[:3])}): record the impacts again"
+            f"expected a recording with a sound, got {len(train_impacts)} silent ones "
+            f"({', '.join(train_impacts.names[:3])}); record the impacts again",
+            name="sounds",
+            value=0.0,
         )
     contacts = seen.places(train_impacts.contacts).float().to(device)
     seconds = min(train_impacts.duration, LONGEST)

@@ -160,7 +160,9 @@ class SmallWeights:
             network = SmallSonicGauss(record_of(SmallConfig(), content["config"], "config"))
             report = dict(content["report"])
         except (ValueError, TypeError, KeyError, RuntimeError) as error:
-            raise EvaluationError(f"{path}: expected {_WHAT}, got another description ({error}): {COMMAND}") from error
+            raise EvaluationError(
+                f"{path}: expected {_WHAT}, got another description ({error}); {COMMAND}", file=path, name=_KEY
+            ) from error
         shapes = {f"network.{name}": tuple(each.shape) for name, each in network.state_dict().items()}
         shapes |= {"codec.mean": (VALUES,), "codec.components": (VALUES, LATENTS), "codec.scale": (LATENTS,)}
         expect_tensors(path, tensors, shapes)

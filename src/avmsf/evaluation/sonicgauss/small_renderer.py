@@ -83,8 +83,10 @@ def fit_small(
     largest = float(found.abs().max())
     if not largest > 0.0:
         raise EvaluationError(
-            f"expected a recording with a sound, got {len(train_impacts)} that are silent "
-            f"({', '.join(train_impacts.names[:3])}): record the impacts again"
+            f"expected a recording with a sound, got {len(train_impacts)} silent ones "
+            f"({', '.join(train_impacts.names[:3])}); record the impacts again",
+            name="sounds",
+            value=0.0,
         )
     latents, contacts = weights.codec.encode(log_magnitudes(found, largest)), seen.places(train_impacts.contacts)
 

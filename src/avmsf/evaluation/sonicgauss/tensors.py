@@ -13,12 +13,17 @@ def expect_tensors(path: Path, tensors: Mapping[str, Tensor], shapes: Mapping[st
     missing = [name for name in shapes if name not in tensors]
     if missing:
         raise EvaluationError(
-            f"{path}: expected {len(shapes)} tensors, {missing[0]} among them, found none of that name, and none of "
-            f"{len(missing) - 1} others: it holds another model or a part of one; copy the whole file again"
+            f"{path}: expected {len(shapes)} tensors, {len(missing)} are missing such as {missing[0]}; copy the file "
+            "again",
+            file=path,
+            name=missing[0],
         )
     for name, shape in shapes.items():
         if tuple(tensors[name].shape) != tuple(shape):
             raise EvaluationError(
-                f"{path}: expected the tensor {name} with the shape {tuple(shape)}, found "
-                f"{tuple(tensors[name].shape)}: it belongs to another model"
+                f"{path}: expected the tensor {name} of the shape {list(shape)}, got {list(tensors[name].shape)}; copy "
+                "the file of this model",
+                file=path,
+                name=name,
+                value=list(tensors[name].shape),
             )

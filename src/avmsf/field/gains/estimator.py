@@ -74,7 +74,9 @@ class MixtureEstimator(GainRecipe):
     def __post_init__(self) -> None:
         unknown = sorted(set(self.kinds) - set(KNOWN))
         if unknown:
-            raise FitError(f"kinds: expected some of {', '.join(KNOWN)}, got {', '.join(unknown)}")
+            raise FitError(
+                f"kinds: expected some of {', '.join(KNOWN)}, got {', '.join(unknown)}", name="kinds", value=unknown
+            )
 
     @property
     def name(self) -> str:
@@ -109,9 +111,16 @@ class MixtureEstimator(GainRecipe):
         directional = bool(bodies) or (given is not None and bool(given.any()))
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
         if self.name == Symmetric.kind and not groups:
-            raise FitError("symmetry: expected symmetries of the object's shape, found none: take another gain model")
+            raise FitError(
+                "symmetry: expected symmetries of the object's shape, got none; take another gain model",
+                name=Symmetric.kind,
+            )
         if self.name == Visual.kind and case.features.encoder == GEOMETRY:
-            raise FitError("visual: expected visual features, found positions alone: give --features, or take another")
+            raise FitError(
+                "visual: expected visual features, got positions only; give --features, or take another gain model",
+                name=Visual.kind,
+                value=GEOMETRY,
+            )
         fit = _Fit(case, self.kinds, _sites(case, bodies), directional, groups)
         hold = None if self.bodies is None else self.bodies.hold
         thickness = None
@@ -162,7 +171,10 @@ class MixtureEstimator(GainRecipe):
             return [], {}
         if self.bodies is None:
             if self.name == Elastic.kind:
-                raise FitError(f"elastic mode shapes need the object's shape: {self.missing or 'give its mesh'}")
+                raise FitError(
+                    f"elastic: expected the object's shape, got none; {self.missing or 'give its mesh'}",
+                    name=Elastic.kind,
+                )
             return [], {Elastic.kind: self.missing} if self.missing else {}
         try:
             expect_placed(case.train.contacts, self.bodies.bodies.bodies[0].elastic.points, names=case.train.names)

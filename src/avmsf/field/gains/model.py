@@ -10,7 +10,7 @@ from jaxtyping import Bool, Complex128, Float, Float32, Float64, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf._utils.records import count_of, like
+from avmsf._utils.records import RecordError, count_of, like
 from avmsf._utils.summary import short_repr
 from avmsf.capture.places import places_of
 from avmsf.fem.modestate import mode_sizes, mode_skeleton, mode_tensors, restored_modes
@@ -253,11 +253,16 @@ class MixtureGains:
         kept = [count_of(each, "kernels") for each in like(record["kernels"], [], "kernels")]
         unknown = sorted(set(families) - {*_POSITIONAL, *_OF_OBJECT})
         if unknown or len(families) != len(kept):
-            raise ValueError(f"families are {families}, with {len(kept)} numbers")
+            raise RecordError(
+                f"families: expected {len(kept)} of {', '.join((*_POSITIONAL, *_OF_OBJECT))}, got {families}",
+                name="families",
+                value=families,
+            )
         for kind, name in _OF_OBJECT.items():
             given = len(like(record[name], [], name))
             if given != families.count(kind) or (kind != Elastic.kind and given > 1):
-                raise ValueError(f"families are {families}, with {given} {name}")
+                wanted = families.count(kind)
+                raise RecordError(f"{name}: expected {wanted} as in families, got {given}", name=name, value=given)
         like(record["directional"], True, "directional")
         single, double, integer = torch.float32, torch.float64, torch.int64
         sizes: dict[str, tuple[torch.dtype, *tuple[int, ...]]] = {
@@ -348,17 +353,20 @@ class MixtureGains:
 
 
 def _expect_sound(tensors: Mapping[str, Tensor]) -> None:
-    """Raise ValueError for values that no fit leaves: they would fail only when gains are asked for."""
+    """Raise RecordError for values that no fit leaves: they would fail only when gains are asked for."""
     if not bool((tensors["object_size"] > 0).all()):
-        raise ValueError(f"expected object_size above 0, got {float(tensors['object_size'].min()):g}")
+        least = float(tensors["object_size"].min())
+        raise RecordError(f"object_size: expected values above 0, got {least:g}", name="object_size", value=least)
     for name in ("weights", "noise_floor"):
         if not bool((tensors[name] >= 0).all()):
-            raise ValueError(f"expected {name} of 0 or more, got {float(tensors[name].min()):g}")
+            least = float(tensors[name].min())
+            raise RecordError(f"{name}: expected values of 0 or more, got {least:g}", name=name, value=least)
 
 
 def _expect_rows(rows: Int[Tensor, "*rows"], count: int, name: str) -> None:
     if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < count:
-        raise ValueError(f"expected {name} from 0 to {count - 1}, got {int(rows.min())} to {int(rows.max())}")
+        found = (int(rows.min()), int(rows.max()))
+        raise RecordError(f"{name}: expected 0 to {count - 1}, got {found[0]} to {found[1]}", name=name, value=found)
 
 
 def series_of(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, "contacts series"]:

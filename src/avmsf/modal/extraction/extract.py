@@ -75,11 +75,15 @@ def extract_sounds(
     """Return what `extract_modes` does, from bare sounds that start at their onset; a single one is enough here."""
     if not bool(torch.isfinite(sounds).all()):
         row = int(torch.nonzero(~torch.isfinite(sounds))[0, 0])
-        raise ExtractionError(f"sound {row} holds samples that are not finite numbers; record or export it again")
+        raise ExtractionError(
+            f"sounds, row {row}: expected finite samples, got NaN or infinity; record or export it again",
+            name="sounds",
+            row=row,
+        )
     finder = HighResolution() if method is None else method
     bank = finder.find(sounds, sample_rate)
     if len(bank) == 0:
-        raise ExtractionError(_why_no_mode(sounds, sample_rate))
+        raise _no_mode(sounds, sample_rate)
     gains, quadrature = fit_gains(sounds, bank, sample_rate=sample_rate)
     modes = synthesize(
         gains, bank.frequency, bank.damping, samples=sounds.shape[1], sample_rate=sample_rate, quadrature=quadrature
@@ -88,37 +92,50 @@ def extract_sounds(
     return Extraction(bank, gains, residual, quadrature)
 
 
-def _why_no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> str:
+def _no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ExtractionError:
+    """Return the error for sounds without modes: `name` is the property at fault, `value` how large it is."""
     samples = sounds.shape[1]
     duration = samples / sample_rate
     if samples < SHORTEST:
-        return (
-            f"no mode found in {len(sounds)} recordings of only {samples} samples ({duration:.3g} s): at least "
-            f"{SHORTEST} samples are needed. Keep more seconds after the onset"
+        return ExtractionError(
+            f"expected {SHORTEST} samples or more, got {samples} ({duration:.3g} s) in each of {len(sounds)} "
+            "recordings; use more seconds after the onset",
+            name="samples",
+            value=samples,
         )
     lowest = lowest_frequency(samples, sample_rate)
     moving = sounds.to(torch.float64) - sounds.mean(1, keepdim=True)
     tenth = samples // 10
     head, tail = (float(part.square().mean()) for part in (moving[:, :tenth], moving[:, -tenth:]))
     if head + tail == 0:
-        return f"no mode found in {len(sounds)} recordings: they are silent. Check which channel holds the sound"
+        return ExtractionError(
+            f"expected sound, got silence in all {len(sounds)} recordings; check the channel", name="sounds", value=0.0
+        )
     fall = 10 * math.log10(max(head, 1e-30) / max(tail, 1e-30))
-    found = (
-        f"no mode found between {lowest:.0f} and {sample_rate / 2:.0f} Hz in {len(sounds)} recordings of "
-        f"{duration:.3g} s, whose last tenth is {fall:.0f} dB below the first"
+    expected = (
+        f"expected modes from {lowest:.0f} to {sample_rate / 2:.0f} Hz in {len(sounds)} recordings of {duration:.3g} s"
     )
     power = torch.fft.rfft(moving).abs().square().sum(0)
     below = float(power[: math.ceil(lowest * duration)].sum() / power.sum())
     if fall < 6:
-        return (
-            f"{found}: noise or hum, they do not decay. Check the onset and the noise (avmsf check), or strike harder"
+        return ExtractionError(
+            f"{expected}, got noise or hum that decays by {fall:.0f} dB; check the onset and the noise (avmsf check), "
+            "or strike harder",
+            name="decay",
+            value=fall,
         )
     if below > 0.5:
-        return (
-            f"{found}: {100 * below:.0f} % of their energy lies below that band. Keep more seconds after the onset, "
-            "which lowers its lower end"
+        return ExtractionError(
+            f"{expected}, got {100 * below:.0f} % of the energy below {lowest:.0f} Hz; use more seconds after the "
+            "onset, which lowers this limit",
+            name="energy",
+            value=below,
         )
-    return f"{found}: nothing rings above the noise there. Record at a higher rate, closer, or a less damped object"
+    return ExtractionError(
+        f"{expected}, got none above the noise; record at a higher rate, closer, or a less damped object",
+        name="modes",
+        value=0,
+    )
 
 
 def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool = False) -> Extraction:

@@ -42,22 +42,22 @@ class ModeFinder(Protocol):
 
 @dataclass(frozen=True)
 class HighResolution:
-    """Matrix pencils in subbands over all recordings at once, sifted and refined by least squares.
+    """Matrix pencils in subbands over all recordings, selected and refined by least squares.
 
-    Tells modes apart that lie closer than the sound's length resolves in a spectrum, as the doublets of nearly round
-    objects do.
+    Resolves modes closer to each other than the sound's length resolves in a spectrum, such as the doublets of nearly
+    round objects.
     """
 
     modes: int = 128
-    """Most modes to keep: those whose absence would lose most energy."""
+    """Maximum number of modes: those whose absence would lose most energy."""
     significance: float = 1.5
-    """How many times the most that noise alone would yield anywhere a mode has to explain, in energy."""
+    """Energy that a mode has to explain, over the maximum that noise alone would yield anywhere."""
     range_db: float = 60.0
     """Modes this far below the strongest are left out, decibels of energy."""
     least_quality: float = 1.0
-    """Least quality factor, pi f / d: below it a thing is a thud, not a tone."""
+    """Minimum quality factor, pi f / d."""
     lowest_hertz: float = 0.0
-    """Lowest frequency to look at, Hz; zero for what the length of the sounds allows (about fifty periods)."""
+    """Lowest frequency, Hz; zero for what the length of the sounds allows (about fifty periods)."""
 
     def __post_init__(self) -> None:
         expect_modes(self.modes)
@@ -136,7 +136,7 @@ class ShortTime:
     """
 
     modes: int = 128
-    """Most modes to keep: those of the largest mean gain."""
+    """Maximum number of modes: those of the largest mean gain."""
     fft_seconds: float = 2048 / 44100
     """Length of the transform, rounded to a power of two in samples."""
     hop_seconds: float = 64 / 44100
@@ -172,14 +172,14 @@ class ShortTime:
 
 
 def finder_named(method: ExtractionMethod, modes: int) -> ModeFinder:
-    """Return the finder of that name, which keeps at most so many modes."""
+    """Return the finder of that name, of at most so many modes."""
     return HighResolution(modes=modes) if method == "high-resolution" else ShortTime(modes=modes)
 
 
 def expect_modes(modes: int) -> None:
     """Raise `ExtractionError` unless at least one mode is asked for."""
     if modes < 1:
-        raise ExtractionError(f"modes = {modes}: expected 1 or more, the most that are kept")
+        raise ExtractionError(f"modes: expected 1 or more, got {modes}", name="modes", value=modes)
 
 
 def lowest_frequency(samples: int, sample_rate: float) -> float:

@@ -27,14 +27,18 @@ def random_modes(train: Impacts, *, modes: int, bins: int, generator: torch.Gene
     factor of 10. All gains are equal, and so large that the modes have the energy of the mean sound. Nothing but this
     energy, the rate and the length are taken from `train`. Raises FitError for fewer than one mode or two bands.
     """
-    if modes < 1 or bins < 2:
-        raise FitError(
-            f"{modes} modes and {bins} bands of noise were asked for; a field has at least 1 mode and 2 bands"
-        )
+    if modes < 1:
+        raise FitError(f"modes: expected 1 or more, got {modes}", name="modes", value=modes)
+    if bins < 2:
+        raise FitError(f"bins: expected 2 bands of noise or more, got {bins}", name="bins", value=bins)
     rate, samples = train.sample_rate, train.sounds.shape[1]
     lowest, highest = lowest_frequency(samples, rate), _MAX_FREQUENCY * rate / 2
     if lowest >= highest:
-        raise FitError(f"sounds of {samples} samples are too short for modes; keep more seconds after the onset")
+        raise FitError(
+            f"train: expected longer recordings, got {samples} samples; use more seconds after the onset",
+            name="train",
+            value=samples,
+        )
     chance = torch.rand(2, modes, dtype=torch.float64, generator=generator)
     frequency = torch.sort(lowest * (highest / lowest) ** chance[0]).values
     slowest = rate / samples

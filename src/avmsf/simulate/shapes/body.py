@@ -73,8 +73,11 @@ class Body:
         if len(unfit):
             where = ", ".join(f"{value:.3f}" for value in points[cells[unfit[0]]].mean(axis=0))
             raise SimulationError(
-                f"the walls fold over themselves in {len(unfit)} of {len(cells)} tetrahedra, first at ({where}) m: "
-                "they are too thick for their bends; take thinner walls or a larger shape"
+                f"expected tetrahedra of positive volume, got {len(unfit)} of {len(cells)} inverted, first at "
+                f"({where}) m; use thinner walls or a larger shape",
+                row=int(unfit[0]),
+                name="cells",
+                value=len(unfit),
             )
         return Solid.build(torch.from_numpy(points), torch.from_numpy(cells))
 

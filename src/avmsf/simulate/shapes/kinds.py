@@ -40,17 +40,24 @@ def make_shape(kind: str, *, seed: int = 0, size: float | None = None, wall: flo
     themselves or leave nothing of the shape.
     """
     if kind not in KINDS:
-        raise SimulationError(f"unknown kind of shape {kind!r}: expected one of {', '.join(sorted(KINDS))}")
+        raise SimulationError(
+            f"kind: expected one of {', '.join(sorted(KINDS))}, got {kind!r}", name="kind", value=kind
+        )
     if seed < 0:
-        raise SimulationError(f"seed = {seed}: expected 0 or more")
+        raise SimulationError(f"seed: expected 0 or more, got {seed}", name="seed", value=seed)
     for name, value in (("size", size), ("wall", wall)):
         if value is not None and not 0.0 < value <= _LARGEST:
-            raise SimulationError(f"{kind}: {name} = {value:g} m: expected more than 0 and at most {_LARGEST:g}")
+            raise SimulationError(
+                f"{name}: expected more than 0 and at most {_LARGEST:g} m, got {value:g}", name=name, value=value
+            )
     draft, scale = _sized(kind, seed, size, wall)
     try:
         solid = draft.body.solid(scale=scale)
     except SimulationError as error:
-        raise SimulationError(f"{kind} of seed {seed}, walls {1000.0 * scale * draft.wall:g} mm: {error}") from error
+        thickness = scale * draft.wall
+        raise SimulationError(
+            f"{kind}, seed {seed}, wall of {1000.0 * thickness:g} mm: {error}", name="wall", value=thickness
+        ) from error
     points, faces = _skin(solid)
     # The name is part of the seed: with another one, all objects have other colors.
     colors = glaze(points, _chance(kind, seed, "colours"))

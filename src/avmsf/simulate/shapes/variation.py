@@ -31,7 +31,7 @@ def vary_thickness(solid: Solid, part: float, *, generator: np.random.Generator)
     out. Raises SimulationError for a part below 0 or above .5, and for tetrahedra so flat that they cannot move.
     """
     if not 0.0 <= part <= MOST:
-        raise SimulationError(f"thickness variation {part:g}: expected a part of the thickness from 0 to {MOST:g}")
+        raise SimulationError(f"part: expected 0 to {MOST:g} of the thickness, got {part:g}", name="part", value=part)
     if part == 0.0:
         return solid
     rows, inverse = np.unique(solid.boundary.numpy(), return_inverse=True)
@@ -78,7 +78,7 @@ def _thickness(
     reach = np.where(found["primID"] >= 0, found["tfar"], np.inf).astype(np.float64) + _APART
     hit = np.isfinite(reach)
     if not hit.any():
-        raise SimulationError("the surface has no inside: it is not closed; make the tetrahedra again")
+        raise SimulationError("expected a closed surface, got an open one; make the tetrahedra again", name="solid")
     return size * np.where(hit, reach, np.median(reach[hit]))
 
 
@@ -115,6 +115,8 @@ def _mended(solid: Solid, motion: Float64[np.ndarray, "points 3"]) -> Float64[np
         for axis in range(3):
             motion[touched, axis] = np.bincount(which.ravel(), weights=means[:, axis]) / number
     raise SimulationError(
-        f"{len(crushed)} of {len(cells)} tetrahedra would be crushed by this variation of the thickness: vary it less, "
-        "or make the tetrahedra again with another detail"
+        f"part: expected a variation that keeps all tetrahedra, got {len(crushed)} of {len(cells)} inverted; vary the "
+        "thickness less, or make the tetrahedra with another detail",
+        name="part",
+        value=len(crushed),
     )

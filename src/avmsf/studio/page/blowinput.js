@@ -26,8 +26,8 @@ export class BlowInput {
     canvas.setAttribute("role", "application");
     canvas.setAttribute(
       "aria-label",
-      "The object. Click to strike it, drag to turn it. By keys: arrows turn it, Enter strikes what is in the middle, " +
-        "Shift and Enter strikes it hardest.",
+      "The object. Click to strike it, drag to rotate it. Keys: arrows rotate, Enter strikes the center, " +
+        "Shift and Enter strikes with the greatest force.",
     );
     canvas.addEventListener("pointerdown", (event) => this.#down(event));
     canvas.addEventListener("pointermove", (event) => this.#move(event));

@@ -24,7 +24,7 @@ export function fileUrl(name, { base = document.baseURI } = {}) {
 export async function loadBundle({ base = document.baseURI } = {}) {
   const manifest = await (await fetched("manifest.json", base)).json();
   if (manifest.format !== FORMAT)
-    throw new Error(`expected a field of format ${FORMAT}, found ${manifest.format}: export it again with this version`);
+    throw new Error(`expected a field of format ${FORMAT}, got ${manifest.format}; export it again with this version`);
   live = Boolean(manifest.live);
   const files = {};
   const tensors = {};
@@ -40,23 +40,23 @@ export async function loadBundle({ base = document.baseURI } = {}) {
 async function fetched(name, base) {
   const response = await fetch(fileUrl(name, { base }), { cache: "no-cache" }).catch(() => null);
   if (response?.ok) return response;
-  const moved = "a studio that was stopped and started again prints a new address to open";
+  const moved = "a restarted studio prints a new address: open it";
   if (response === null)
-    throw new Error(`${name} cannot be reached: is the server still running?${live ? ` If not, ${moved}` : ""}`);
+    throw new Error(`${name} cannot be loaded: check that the server runs${live ? `; ${moved}` : ""}`);
   throw new Error(`${name} cannot be read (${response.status}): ${live ? moved : "export the page again"}`);
 }
 
 function readTensor(buffer, offset, dtype, shape, what) {
   const count = shape.reduce((product, size) => product * size, 1);
   const bytes = { float64: 8, float32: 4, float16: 2 }[dtype];
-  if (bytes === undefined) throw new Error(`${what} is of type ${dtype}, which this page does not know`);
+  if (bytes === undefined) throw new Error(`${what} has the unknown type ${dtype}`);
   if (offset + count * bytes > buffer.byteLength)
-    throw new Error(`${what} is cut short: expected ${offset + count * bytes} bytes, found ${buffer.byteLength}: export the page again`);
+    throw new Error(`${what}: expected ${offset + count * bytes} bytes, got ${buffer.byteLength}; export the page again`);
   const tensor = dtype === "float16"
     ? Float32Array.from(new Uint16Array(buffer, offset, count), halfToNumber) : new ARRAYS[dtype](buffer, offset, count);
   for (let place = 0; place < count; place++) {
     if (!Number.isFinite(tensor[place]))
-      throw new Error(`${what}: expected numbers, found ${tensor[place]} at place ${place}: export the page again`);
+      throw new Error(`${what}: expected numbers, got ${tensor[place]} at index ${place}; export the page again`);
   }
   return tensor;
 }

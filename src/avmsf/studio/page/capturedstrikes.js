@@ -19,7 +19,7 @@ export class CapturedStrikes {
 
   show({ folder, strikes, problems = [] }) {
     this.strikes = strikes;
-    this.count.textContent = strikes.length === 1 ? "1 strike" : `${strikes.length} strikes`;
+    this.count.textContent = strikes.length === 1 ? "1 impact" : `${strikes.length} impacts`;
     this.list.hidden = strikes.length === 0;
     this.list.replaceChildren(...strikes.map((strike) => this.#item(strike)));
     this.problems.replaceChildren(...problems.map((words) => element("p", { className: "warning" }, words)));
@@ -54,14 +54,14 @@ export class CapturedStrikes {
       button(`${file}${peak}`, () => this.#highlight(file), { className: "grow" }),
       listenButton(strikePlace(file)),
       button("Redo", () => this.redo(strike), { className: "small", "aria-label": `Record ${file} again` }),
-      button("×", () => this.#remove(strike), { className: "small", "aria-label": `Take ${file} out` }),
+      button("×", () => this.#remove(strike), { className: "small", "aria-label": `Remove ${file}` }),
       ...warnings.map((words) => element("p", { className: "warning" }, words)),
     );
   }
 
   async #remove({ file, digest }) {
     // What is taken out is gone from the table: ask first.
-    if (!confirm(`Take ${file} out of the capture?`)) return;
+    if (!confirm(`Remove ${file} from the capture?`)) return;
     await attempt(() => server.removeStrike(file, { digest }), "strike");
     await this.changed();
   }

@@ -55,7 +55,7 @@ export async function captureSheet(studio) {
   const take = async (file) => {
     const struck = place.now;
     if (!place.known) {
-      say("First click the object where this recording was struck.", { name: "take", bad: true });
+      say("First click the contact of this recording on the object.", { name: "take", bad: true });
       return;
     }
     const fine = await attempt(() => expectWav(file).then(() => true), "take");
@@ -66,7 +66,7 @@ export async function captureSheet(studio) {
   const judge = async (blob, struck) => {
     const made = { key: newKey(), made: Date.now(), blob, ...struck, kept: false };
     await outbox.put(made);
-    if (card.take) say("The recording before this one waits below: keep it or throw it away.", { name: "take" });
+    if (card.take) say("The previous recording waits below: save or discard it.", { name: "take" });
     struckPlace = struck;
     const judged = card.show(made);
     waiting.show();

@@ -39,7 +39,7 @@ export class Changes {
     this.#unsent = false;
     const answer = await this.ask(() => server.edit(this.studio.revision, this.wish()), {
       again: () => this.queue(() => this.settle()),
-      refused: [["Take it back", () => this.#take()]],
+      refused: [["Revert it", () => this.#take()]],
     });
     if (!answer) {
       this.#unsent = true;
@@ -94,32 +94,32 @@ export class Changes {
     if (sliders || (theirs && !this.#unsent)) this.#take();
     // Sliders that have moved on are of the answered revision: the server will say that it is not the last.
     else studio.revision = revision;
-    if (theirs) say("Another tab changed this field after your change: you see and hear what it is now.", { name: "edit" });
+    if (theirs) say("Another tab changed this field after your change: the page shows its current state.", { name: "edit" });
     return !theirs;
   }
 
   get #meanwhile() {
     return this.#lost
-      ? "The change whose answer was lost was made, or another tab changed this field."
-      : "Another tab changed this field meanwhile.";
+      ? "Another tab changed this field, or your last change was made although its answer was lost."
+      : "Another tab has changed this field.";
   }
 
   async #showStale({ revision }) {
     const meanwhile = this.#meanwhile;
     if (await this.show({ revision }, { sliders: true }))
-      say(`${meanwhile} You see and hear what it is now: do it again if you still want to.`, { name: "edit" });
+      say(`${meanwhile} The page shows its current state: repeat your change if you still want it.`, { name: "edit" });
   }
 
   #tellStale({ revision }, again) {
-    const answers = [["Show its change", () => this.queue(() => this.show({ revision }, { sliders: true }))]];
+    const answers = [["Show that change", () => this.queue(() => this.show({ revision }, { sliders: true }))]];
     const insist = () => {
       this.studio.revision = revision;
       // Whatever is to be done next is done with this page's sliders, not with those of the other tab.
       this.#unsent = true;
       again();
     };
-    answers.push(["Put mine in its place", insist]);
-    const choice = "Nothing was overwritten: show its change and make yours again, or put yours in its place.";
+    answers.push(["Replace it with mine", insist]);
+    const choice = "Nothing was overwritten: show that change, or replace it with yours.";
     say(`${this.#meanwhile} ${choice}`, { name: "edit", bad: true, answers });
   }
 

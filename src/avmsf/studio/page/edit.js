@@ -47,8 +47,8 @@ export function editSheet(studio, load) {
     );
   // What the object is of counts where it shall be of another material or size, and changes nothing by itself.
   const recasts = () => to.value !== "" || sliders.size.value !== sliders.size.rest;
-  const from = select("by its sound", () => recasts() && onInput());
-  const to = select("as it is", onInput);
+  const from = select("inferred from the dampings", () => recasts() && onInput());
+  const to = select("unchanged", onInput);
   const remarks = element("div", { className: "group", "aria-live": "polite" });
   const busy = element("progress", { hidden: true, "aria-label": "Editing" });
   const asked = () => ({
@@ -106,7 +106,7 @@ export function editSheet(studio, load) {
       }),
     ),
   );
-  const reset = button("All at rest", () => {
+  const reset = button("Reset all", () => {
     Object.values(sliders).forEach((slider) => slider.reset());
     [from.value, to.value] = ["", ""];
     single.clear();
@@ -118,7 +118,7 @@ export function editSheet(studio, load) {
   const save = button("Save as", async () => {
     const wanted = name.value.trim();
     if (!wanted) {
-      say("Give the new field a name first.", { name: "edit", bad: true });
+      say("Enter a name for the new field.", { name: "edit", bad: true });
       name.focus();
       return;
     }
@@ -140,7 +140,7 @@ export function editSheet(studio, load) {
     const { mode } = studio;
     modeBox.hidden = mode === null;
     const changes = [...single.values()].filter((values) => !atRest(values)).length;
-    const others = changes ? ` Changed by hand: ${changes}.` : "";
+    const others = changes ? ` Changed modes: ${changes}.` : "";
     modeTitle.textContent =
       (mode === null
         ? "Choose a mode in the tab Modes."
@@ -161,8 +161,8 @@ export function editSheet(studio, load) {
       "div",
       { className: "group" },
       element("h2", {}, "Material"),
-      // The server's words on an edit call the first of them by this name.
-      element("label", { className: "choice" }, "Material it is of", from),
+      // The server's messages use this label.
+      element("label", { className: "choice" }, "Present material", from),
       element("label", { className: "choice" }, "New material", to),
     ),
     element("div", { className: "group" }, ...Object.values(sliders).map((slider) => slider.element)),

@@ -48,8 +48,8 @@ export function findSheet(studio) {
   };
   /** Where a blow fell on another field than the one that is shown is not where it fell on this one. */
   const tellStale = (revision, { blob, name }) => {
-    const words = `The field was changed while ${name} was looked for, so what was found is not shown.`;
-    const again = ["Look for it again", () => locate(blob, name)];
+    const words = `The field changed while ${name} was located, so the result is not shown.`;
+    const again = ["Locate again", () => locate(blob, name)];
     const load = ["Show the changed field", () => location.reload()];
     say(words, { name: "locate", bad: true, answers: [revision > studio.revision ? load : again] });
   };
@@ -62,13 +62,13 @@ export function findSheet(studio) {
     };
     const several = element("div", { className: "row" });
     if (blows.length > 1) {
-      const pick = (_, place) => button(`Blow ${place + 1}`, () => paint(place), { className: "small" });
+      const pick = (_, place) => button(`Impact ${place + 1}`, () => paint(place), { className: "small" });
       several.append(...blows.map(pick));
     }
-    results.replaceChildren(element("h2", {}, `${name}: ${blows.length === 1 ? "one blow" : `${blows.length} blows`}`));
+    results.replaceChildren(element("h2", {}, `${name}: ${blows.length === 1 ? "1 impact" : `${blows.length} impacts`}`));
     results.append(several, list);
     if (blows.length) paint(0);
-    else results.append(element("p", {}, "No blow was heard in it."));
+    else results.append(element("p", {}, "No impact detected."));
   };
 
   const take = async (file) => {
@@ -101,13 +101,13 @@ function paintBlow(studio, blow) {
   studio.paint(values, {
     scale: amountScale,
     title: "Probability of the contact",
-    ends: ["÷ 10 000", "÷ 100", "greatest"],
+    ends: ["÷ 10 000", "÷ 100", "maximum"],
   });
   if (!studio.view) return values;
   clearFound(studio);
   studio.view.face(blow.place);
-  mark(studio, "found", blow.place, "here");
-  (blow.counterparts ?? []).forEach(({ place }, number) => mark(studio, `counterpart-${number}`, place, "or here"));
+  mark(studio, "found", blow.place, "estimate");
+  (blow.counterparts ?? []).forEach(({ place }, number) => mark(studio, `counterpart-${number}`, place, "equivalent"));
   return values;
 }
 
@@ -129,16 +129,16 @@ const percent = (share) => `${(100 * share).toPrecision(2)} %`;
 function describe(studio, blow) {
   const { level, radius_meters: radius, share } = blow.region;
   const facts = [
-    ["Place", `${millimeters(blow.place)} mm`],
-    [`${percent(level)} region`, `${(1000 * radius).toFixed(1)} mm about it, ${percent(share)} of the surface`],
+    ["Contact", `${millimeters(blow.place)} mm`],
+    [`${percent(level)} region`, `${(1000 * radius).toFixed(1)} mm radius, ${percent(share)} of the surface`],
   ];
   if (blow.explained !== undefined && blow.explained !== null)
-    facts.push(["Explained", `${percent(blow.explained)} of the sound's energy`]);
+    facts.push(["Explained energy", `${percent(blow.explained)} of the sound`]);
   const list = element("dl", { className: "measures" });
   for (const [name, words] of facts) list.append(element("dt", {}, name), element("dd", {}, words));
-  const parts = [list, button("Strike it here", () => studio.strike(blow.row))];
+  const parts = [list, button("Strike here", () => studio.strike(blow.row))];
   if (blow.counterparts?.length) {
-    parts.push(element("h3", {}, "Sounds alike"));
+    parts.push(element("h3", {}, "Equivalent contacts"));
     const places = element("ul", { className: "listing" });
     for (const { place, probability, words } of blow.counterparts) {
       const text = `${millimeters(place)} mm, ${percent(probability)}${words ? `: ${words}` : ""}`;

@@ -28,7 +28,7 @@ export class JobProgress {
   /** Show how a job goes; gives its last message, which holds what came of it, or "error". `heard` gets all of them. */
   follow(job, heard = () => {}) {
     this.job = job;
-    this.begin("It has begun; the first word of it takes some seconds …");
+    this.begin("Started; the first progress report takes some seconds …");
     this.stop.hidden = false;
     return new Promise((end) => {
       server.follow(job, (message, ended) => {

@@ -5,7 +5,7 @@ import { JobProgress } from "./jobprogress.js";
 import { server } from "./server.js";
 
 /** What the server calls this kind of job. */
-const KIND = "lead the sound";
+const KIND = "guided edit";
 
 /** `hold(work, "minutes")` keeps the field from being changed by hand while work goes on. */
 export function leadGroup(studio, changes, hold) {
@@ -14,7 +14,7 @@ export function leadGroup(studio, changes, hold) {
   /** `ask()` sends the request that begins it. */
   const lead = (ask) =>
     hold(async () => {
-      progress.begin("It begins …");
+      progress.begin("Starting …");
       const again = () => lead(ask);
       const begun = await changes.queue(async () => (await changes.settle()) && changes.ask(ask, { again }));
       if (begun) await follow(begun.job);
@@ -42,8 +42,8 @@ export function leadGroup(studio, changes, hold) {
   const rows = [filePicker("Towards a recording …", ".wav,audio/wav", leadLike)];
   if (studio.can("words")) {
     const placeholder = "a wooden bowl is hit";
-    const text = element("input", { type: "text", "aria-label": "What it should sound like", placeholder });
-    rows.push(text, button("Towards these words", () => lead(() => server.edit(studio.revision, { prompt: text.value }))));
+    const text = element("input", { type: "text", "aria-label": "Description of the sound", placeholder });
+    rows.push(text, button("Towards this text", () => lead(() => server.edit(studio.revision, { prompt: text.value }))));
   }
   // One that was under way before the page was loaded goes on. Without a capture there are no jobs of other kinds.
   const { job, jobKind = studio.can("reconstruct") ? null : KIND } = studio.live;
@@ -52,7 +52,7 @@ export function leadGroup(studio, changes, hold) {
   return element(
     "div",
     { className: "group" },
-    element("h2", {}, "Lead the sound"),
+    element("h2", {}, "Guided edit"),
     element("div", { className: "row" }, ...rows, progress.stop),
     progress.bar,
     progress.stage,
@@ -61,11 +61,8 @@ export function leadGroup(studio, changes, hold) {
 
 /** What a descent of these steps, {loss, pitch} each, has come to. */
 function summaryOf(steps) {
-  if (!steps.length) return "The sound was led.";
+  if (!steps.length) return "Guided edit finished.";
   const [first, last] = [steps[0], steps.at(-1)];
-  const closer = last.loss < first.loss ? "fell" : "went";
-  return (
-    `The sound was led: its pitch is × ${last.pitch.toPrecision(3)}, and how far it is off ${closer} from ` +
-    `${first.loss.toPrecision(2)} to ${last.loss.toPrecision(2)}. Undo takes it back.`
-  );
+  const losses = `${first.loss.toPrecision(2)} to ${last.loss.toPrecision(2)}`;
+  return `Guided edit finished: pitch × ${last.pitch.toPrecision(3)}, loss from ${losses}. Undo reverts it.`;
 }

@@ -32,8 +32,8 @@ async function open() {
   studio.dispatchEvent(new Event("view"));
   at("hint").hidden = !studio.view;
   at("hint").innerHTML = capturing
-    ? "<strong>Click the object</strong> where you are about to strike it"
-    : "<strong>Click the object</strong> to strike it. Hold longer: harder. Drag: turn.";
+    ? "<strong>Click the object</strong> where you will strike it"
+    : "<strong>Click the object</strong> to strike it. Hold longer for more force. Drag to rotate.";
   takeDrops(sheets);
   // Struck it can be from now on, and seen from the next frame.
   await new Promise((drawn) => requestAnimationFrame(drawn));
@@ -61,9 +61,9 @@ async function startSound(studio) {
   try {
     studio.engine = await SoundEngine.start(studio.bundle);
   } catch (error) {
-    const words = `There is no sound: ${error.message}. What is drawn is computed all the same.`;
+    const words = `No sound: ${error.message}. The charts still show the model.`;
     say(words, { name: "sound", bad: true });
-    at("heard").textContent = "heard (no sound)";
+    at("output").textContent = "output (no sound)";
   }
   studio.on("bundle", () => {
     if (studio.engine && studio.engine.bundle !== studio.bundle) studio.engine.replace(studio.bundle);
@@ -80,7 +80,7 @@ async function fieldTabs(studio) {
     { name: "strike", words: "Strike", ...strike },
     { name: "modes", words: "Modes", ...modeTable(studio) },
   ];
-  if (studio.can("locate")) sheets.push({ name: "find", words: "Find", ...findSheet(studio) });
+  if (studio.can("locate")) sheets.push({ name: "find", words: "Locate", ...findSheet(studio) });
   if (studio.can("edit")) sheets.push({ name: "edit", words: "Edit", ...editSheet(studio, () => reload(studio)) });
   if (studio.can("capture")) sheets.push({ name: "capture", words: "Capture", ...(await captureSheet(studio)) });
   const show = makeTabs(sheets);
@@ -105,17 +105,17 @@ async function captureTabs(studio) {
 }
 
 /** The job of the server that makes an object of pictures. */
-const MAKING = "make the object of its pictures";
+const MAKING = "reconstruct the object from its images";
 
 function tellOfNoObject({ job, jobKind, noObject }) {
   const name = "object";
-  const words = "There is no object to click";
+  const words = "No object to click";
   const again = async () => (await attempt(() => server.makeObject(), name)) && location.reload();
   const answers = [["Try again", again]];
   if (job && jobKind === MAKING)
-    say(`${words} yet. It is made of its pictures and appears here; until then, type places.`, { name });
-  else if (noObject) say(`${words}, for none could be made of its pictures: ${noObject}`, { name, bad: true, answers });
-  else say(`${words}: type places.`, { name });
+    say(`${words} yet: it is being reconstructed from the images. Until then, enter coordinates.`, { name });
+  else if (noObject) say(`${words}: the reconstruction from the images failed: ${noObject}`, { name, bad: true, answers });
+  else say(`${words}: enter coordinates.`, { name });
 }
 
 /** Fetch what the server now has; after an edit, say, or when another tab was faster. */
@@ -130,10 +130,10 @@ async function showObject(studio, { atPress, struck }, library) {
     const { ObjectView } = await library.catch((error) => {
       const from = studio.live
         ? "For a page that needs no network, run avmsf studio --fetch-modules once."
-        : "With a network, load the page again.";
+        : "Connect to a network and reload the page.";
       throw new Error(
-        "The 3D library could not be loaded: three and spark, which draw the object, could not be fetched from the " +
-          `network (${error.message}). All but the picture works, by the buttons in the panel. ${from}`,
+        "The libraries three and spark, which draw the object, could not be loaded from the " +
+          `network (${error.message}). Use the buttons in the panel. ${from}`,
       );
     });
     studio.view = await ObjectView.create(at("stage"), at("overlay"), studio.bundle);
@@ -194,7 +194,7 @@ function takeDrops({ take }) {
     const [file] = event.dataTransfer?.files ?? [];
     if (!file) return;
     if (take) take(file);
-    else say("This page has no server that could find a blow: open the field by avmsf studio to drop recordings on it.");
+    else say("This page has no server to locate impacts: open the field with avmsf studio.");
   });
 }
 
@@ -218,6 +218,6 @@ window.avmsf = {
 
 window.avmsf.ready = open().catch((error) => {
   at("name").textContent = "Nothing to show";
-  say(error.message, { name: "open", bad: true, answers: [["Load again", () => location.reload()]] });
+  say(error.message, { name: "open", bad: true, answers: [["Reload", () => location.reload()]] });
   throw error;
 });

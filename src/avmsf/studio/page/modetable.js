@@ -4,10 +4,10 @@ import { signScale } from "./colors.js";
 import { button, element, seconds } from "./dom.js";
 
 const COLUMNS = [
-  ["mode", "#", "Rows of the field's bank, counted from 0"],
-  ["frequency", "Pitch, Hz", "Frequency"],
-  ["decay", "Decay, s", "Seconds in which the mode falls by 60 dB"],
-  ["level", "Level, dB", "Below the loudest mode, at the contact struck last"],
+  ["mode", "#", "Index of the mode in the field, from 0"],
+  ["frequency", "Frequency, Hz", "Damped frequency"],
+  ["decay", "Decay, s", "Time in which the mode decays by 60 dB"],
+  ["level", "Level, dB", "Relative to the loudest mode, at the last contact"],
 ];
 
 const lineOf = (part) => part.closest("tr");
@@ -32,7 +32,7 @@ export function modeTable(studio) {
     const row = studio.row ?? modes.loudestRow;
     const levels = modes.levels(row);
     where.textContent =
-      studio.row === null ? "Levels at the contact that is loudest." : `Levels and decays at contact ${row}.`;
+      studio.row === null ? "Levels at the loudest contact." : `Levels and decays at contact ${row}.`;
     const rows = levels.map((level, mode) => ({
       mode,
       frequency: modes.frequency(mode),
@@ -47,7 +47,7 @@ export function modeTable(studio) {
     const focused = body.contains(document.activeElement) ? lineOf(document.activeElement).dataset.mode : null;
     body.replaceChildren(
       ...rows.map(({ mode, frequency, decay, level }) => {
-        const title = `Paint where the mode at ${frequency.toFixed(1)} Hz is loud`;
+        const title = `Color the object by the gain of the mode at ${frequency.toFixed(1)} Hz`;
         const pressed = String(mode === studio.mode);
         const numbers = [frequency.toFixed(1), decay.toPrecision(3), level.toFixed(1)];
         // The button is for keys and for who does not see; a click anywhere in its line presses it.
@@ -76,7 +76,7 @@ export function modeTable(studio) {
       const title = `Mode at ${modes.frequency(mode).toFixed(1)} Hz, ${seconds(
         modes.decayTime(mode, studio.row ?? 0),
       )}: gain`;
-      const options = { scale: signScale, title, ends: ["−1", "0, a node", "+1"] };
+      const options = { scale: signScale, title, ends: ["−1", "0", "+1"] };
       studio.paint(modes.shape(mode), options);
     }
   });
@@ -90,7 +90,7 @@ export function modeTable(studio) {
     element: element(
       "section",
       {},
-      element("p", { className: "faint" }, "Choose a mode to see where on the object it is loud."),
+      element("p", { className: "faint" }, "Choose a mode to color the object by its gain."),
       tableBox,
       where,
     ),

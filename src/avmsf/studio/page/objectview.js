@@ -20,9 +20,9 @@ export class ObjectView {
       renderer = new THREE.WebGLRenderer({ antialias: bundle.manifest.object.kind !== "gaussians", alpha: true });
     } catch {
       throw new ViewError(
-        "This browser shows no 3D (WebGL is missing or switched off), so the object cannot be seen." +
+        "This browser shows no 3D (WebGL is missing or off), so the object is not shown." +
           (bundle.tensors.points?.length
-            ? " Sounds work all the same: strike contacts by the buttons in the panel."
+            ? " Sound still works: use the buttons in the panel."
             : ""),
       );
     }
@@ -62,7 +62,7 @@ export class ObjectView {
     const points = bundle.tensors.points;
     if (!points?.length) {
       throw new ViewError(
-        "This field has no geometry: it holds no place on an object that could be shown. Give it one with " +
+        "This field has no geometry to show. Add it with " +
           "`avmsf studio FIELD --object MESH`.",
       );
     }

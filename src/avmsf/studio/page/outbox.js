@@ -70,9 +70,9 @@ export class Outbox {
   /** Where the entries are safe, in a sentence. */
   get refuge() {
     return this.#lasting
-      ? "What the server lacks is kept in this browser, even if you close the page; the page of a studio that is " +
-          "started again under the same port shows it again."
-      : "What the server lacks is kept in this open page alone: leave it open.";
+      ? "Unsent recordings are stored in this browser, even if you close the page; a studio restarted at the same " +
+          "port shows them again."
+      : "Unsent recordings are stored only in this open page: do not close it.";
   }
 
   get entries() {

@@ -9,8 +9,8 @@ const PANELS = 4;
 /** Return the part of the impulse that falls into each sample's time; their sum is 1. `contactTime` in seconds. */
 export function pulseSamples(contactTime, sampleRate, shape = "half-sine") {
   const exponent = EXPONENTS[shape];
-  if (exponent === undefined) throw new RangeError(`a pulse is half-sine or hertz, not ${shape}`);
-  if (!(contactTime >= 0 && contactTime < 10)) throw new RangeError(`a contact of ${contactTime} s: expected 0 to 10`);
+  if (exponent === undefined) throw new RangeError(`pulse: expected half-sine or hertz, got ${shape}`);
+  if (!(contactTime >= 0 && contactTime < 10)) throw new RangeError(`contact time: expected 0 to 10 s, got ${contactTime}`);
   const length = contactTime * sampleRate;
   const count = Math.max(1, Math.ceil(length));
   if (count === 1) return Float64Array.of(1);

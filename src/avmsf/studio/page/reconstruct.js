@@ -6,7 +6,7 @@ import { server } from "./server.js";
 
 const FEWEST = 2;
 /** Another kind of job, which the tab that began it shows. */
-const LEADING = "lead the sound";
+const LEADING = "guided edit";
 
 export function reconstructGroup(studio) {
   const words = element("p", { className: "faint" });
@@ -17,7 +17,7 @@ export function reconstructGroup(studio) {
     go.disabled = !ready || progress.job !== null;
   };
   const go = button(
-    "Make the sound field",
+    "Reconstruct the field",
     async () => {
       go.disabled = true;
       const begun = await attempt(() => server.reconstruct(), "job");
@@ -36,12 +36,12 @@ export function reconstructGroup(studio) {
     else if (last.object) location.reload();
   };
   const tell = async (field) => {
-    progress.stage.textContent = `The field is written: ${field}`;
+    progress.stage.textContent = `Field saved: ${field}`;
     const manifest = await server.manifest().catch(() => null);
     if (manifest?.live?.mode === "field") {
-      const answers = [["Strike it", () => location.reload()]];
+      const answers = [["Open it", () => location.reload()]];
       say("The sound field is ready.", { name: "job", answers });
-    } else say(`The sound field is ready. Open it by: avmsf studio ${field}`, { name: "job" });
+    } else say(`The sound field is ready. Open it with: avmsf studio ${field}`, { name: "job" });
   };
 
   // A job that was under way before the page was loaded goes on.
@@ -62,10 +62,10 @@ export function reconstructGroup(studio) {
     setReady(count, readable = true) {
       const lacking = Math.max(0, FEWEST - count);
       words.textContent = lacking
-        ? `Add ${lacking} more ${lacking === 1 ? "strike" : "strikes"}; a dozen, spread over the object, sound well.`
+        ? `Add at least ${lacking} more ${lacking === 1 ? "impact" : "impacts"}; use about a dozen, spread over the object.`
         : readable
-          ? "Learns from these strikes how the object sounds everywhere. Takes minutes; more strikes can follow."
-          : "Mend what is said above first.";
+          ? "Fits a sound field to these recordings. Takes minutes; you can add impacts later."
+          : "First correct the problems listed above.";
       ready = lacking === 0 && readable;
       allow();
     },

@@ -11,7 +11,7 @@ export class RecordButton {
     this.button = button("● Record", () => this.#press(), { className: main ? "main" : "" });
     this.meter = element("meter", { min: 0, max: 1, high: 0.95, "aria-label": "Microphone level" });
     this.words = element("small");
-    this.clipped = element("p", { className: "warning", role: "alert", hidden: true }, "Clipped: strike more softly.");
+    this.clipped = element("p", { className: "warning", role: "alert", hidden: true }, "Clipped: strike with less force.");
     this.level = element("div", { className: "group" }, this.meter, this.words, this.clipped);
     prepareRecorder().catch(() => {});
   }
@@ -51,7 +51,7 @@ export class RecordButton {
 
   #tell({ level, seconds, struck, clipped }) {
     this.meter.value = level;
-    this.words.textContent = `${seconds.toFixed(1)} s, ${struck ? "blow heard" : "waiting for the blow"}`;
+    this.words.textContent = `${seconds.toFixed(1)} s, ${struck ? "impact detected" : "waiting for the impact"}`;
     this.clipped.hidden = !clipped;
   }
 }

@@ -12,21 +12,21 @@ const CLIPPED_LEVEL = 0.999;
 
 const REASONS = {
   NotAllowedError:
-    "The browser does not let this page use the microphone. Allow it in the address bar, or drop a WAV file instead.",
-  NotFoundError: "There is no microphone here. Plug one in, or drop a WAV file instead.",
-  NotReadableError: "Another program holds the microphone. Close it, or drop a WAV file instead.",
+    "The browser blocks the microphone for this page. Allow it in the address bar, or drop a WAV file.",
+  NotFoundError: "No microphone found. Connect one, or drop a WAV file.",
+  NotReadableError: "Another program uses the microphone. Close it, or drop a WAV file.",
 };
 
 async function openMicrophone() {
   if (!navigator.mediaDevices?.getUserMedia || typeof AudioWorkletNode === "undefined") {
-    throw new Error("This browser cannot record here (it wants https or localhost): drop a WAV file.");
+    throw new Error("This browser records only on pages from https or localhost: drop a WAV file.");
   }
   try {
     // What makes speech pleasant falsifies a blow.
     const audio = { echoCancellation: false, noiseSuppression: false, autoGainControl: false, channelCount: 1 };
     return await navigator.mediaDevices.getUserMedia({ audio });
   } catch (error) {
-    const other = `The microphone cannot be used (${error.message}). Drop a WAV file instead.`;
+    const other = `The microphone cannot be used (${error.message}). Drop a WAV file.`;
     throw new Error(REASONS[error.name] ?? other);
   }
 }
@@ -52,7 +52,7 @@ async function openContext() {
   } catch {
     context.close();
     throw new Error(
-      "The recorder could not be fetched from the server. Is `avmsf studio` still running? Then record again.",
+      "The recorder could not be loaded from the server. Check that `avmsf studio` runs, then record again.",
     );
   }
   if (!recordings) context.suspend();
@@ -163,7 +163,7 @@ class Recording {
 
   #sound(sampleRate) {
     const samples = new Float32Array(this.#blocks.reduce((sum, block) => sum + block.length, 0));
-    if (!samples.length) throw new Error("The microphone gave no sound. Is it switched on? Or drop a WAV file instead.");
+    if (!samples.length) throw new Error("The microphone recorded no samples. Check that it is on, or drop a WAV file.");
     let at = 0;
     for (const block of this.#blocks) {
       samples.set(block, at);

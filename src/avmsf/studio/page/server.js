@@ -25,13 +25,13 @@ export class ServerError extends Error {
 }
 
 const GONE =
-  "The server does not answer. Is `avmsf studio` still running? Nothing is lost here: try again. One that was stopped " +
-  "and started again prints a new address: open that one.";
+  "The server does not answer. Check that `avmsf studio` runs and try again; nothing is lost. A restarted studio " +
+  "prints a new address: open it.";
 /** What a server says to whoever does not know its present secret. */
 const NOTHING = "there is nothing at this address";
 const MOVED =
-  "The studio is no longer at this page's address: one that was stopped and started again prints a new address. Open " +
-  "that one.";
+  "The studio is no longer at this page's address: a restarted studio prints a new address. " +
+  "Open it.";
 
 async function ask(method, place, { body, headers, signal } = {}) {
   let answer;
@@ -116,7 +116,7 @@ export const server = {
     // The source tries again by itself while it is connecting; only a source that has given up is closed.
     source.onerror = () => {
       if (source.readyState === EventSource.CLOSED) heard({ error: GONE }, true);
-      else heard({ words: "The connection broke; listening again …" }, false);
+      else heard({ words: "Connection lost; reconnecting …" }, false);
     };
   },
 };

@@ -37,8 +37,8 @@ class Tuned {
 
   blow(row, { force = 1, contactTime = 0, shape = "half-sine" }, frame, id = 0) {
     if (!(Number.isInteger(row) && row >= 0 && row < this.points))
-      throw new RangeError(`there is no contact ${row} among ${this.points}`);
-    if (!Number.isFinite(force)) throw new RangeError(`a blow of force ${force}: expected a number`);
+      throw new RangeError(`contact: expected 0 to ${this.points - 1}, got ${row}`);
+    if (!Number.isFinite(force)) throw new RangeError(`force: expected a number, got ${force}`);
     const sine = this.pick(this.tensors.sine, row), cosine = this.pick(this.tensors.cosine, row);
     const pulse = pulseSamples(contactTime, this.rate, shape);
     let loudest = 0;
@@ -94,7 +94,7 @@ function bankNode(context, tuned, { level, voices = VOICES, blows = [], ahead = 
 
 async function addBank(context) {
   if (context.audioWorklet === undefined)
-    throw new Error("this browser offers no AudioWorklet here: open the page by https or from localhost, in a current browser");
+    throw new Error("this browser has no AudioWorklet: open the page from https or localhost in a current browser");
   // A page that is one file carries the processor; as data, for browsers load no worklet from a file's blobs.
   const inlined = globalThis.avmsfInlined?.["page/bank.js"];
   const url = inlined === undefined
@@ -128,7 +128,7 @@ export class SoundEngine {
    * the first blow that follows a touch. Throws with words for the reader where there is no sound to be had.
    */
   static async start(bundle, { context } = {}) {
-    if (typeof AudioContext === "undefined") throw new Error("this browser cannot play computed sound (no AudioContext)");
+    if (typeof AudioContext === "undefined") throw new Error("this browser has no AudioContext");
     const used = context ?? new AudioContext({ latencyHint: "interactive" });
     await addBank(used);
     return new SoundEngine(bundle, used);

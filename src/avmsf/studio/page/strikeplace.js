@@ -22,11 +22,11 @@ export class StrikePlace {
       element("input", { type: "number", step: "any", oninput: () => this.#typed() }),
     );
     const labels = ["x", "y", "z"].map((axis, at) => element("label", {}, `${axis}, mm`, this.inputs[at]));
-    this.stopRedo = button("Leave it as it is", () => this.set(NOWHERE));
+    this.stopRedo = button("Cancel", () => this.set(NOWHERE));
     this.element = element(
       "div",
       { className: "group" },
-      element("h2", {}, "1. Where"),
+      element("h2", {}, "1. Contact"),
       this.words,
       element("div", { className: "place" }, ...labels),
       element("div", { className: "row" }, this.stopRedo),
@@ -42,7 +42,7 @@ export class StrikePlace {
   /** Choose where; gives whether that was possible, which it is not while a blow is recorded there. */
   set(place) {
     if (this.locked) {
-      say("The place stays as it is while a blow is recorded.", { name: "place", seconds: 4 });
+      say("The contact cannot change during a recording.", { name: "place", seconds: 4 });
       return false;
     }
     this.now = place === NOWHERE ? NOWHERE : Object.freeze({ ...NOWHERE, ...place });
@@ -92,10 +92,10 @@ export class StrikePlace {
   #show() {
     const { redo } = this.now;
     this.words.textContent = redo
-      ? `Strike again where ${redo} was struck.`
+      ? `Strike the contact of ${redo} again.`
       : this.known
-        ? "Now record the blow, or attach its recording."
-        : "Click the object where you are about to strike.";
+        ? "Record the impact, or attach its recording."
+        : "Click the object where you will strike it.";
     // A strike that is recorded again stays where it is.
     for (const input of this.inputs) input.disabled = this.locked || redo !== null;
     this.stopRedo.hidden = redo === null || this.locked;

@@ -14,10 +14,10 @@ export function measuredStrikes(studio) {
   const box = element(
     "div",
     { className: "group" },
-    element("h2", {}, "Measured strikes"),
-    element("small", {}, "Choose one to hear its recording, then the model at the same contact."),
+    element("h2", {}, "Recorded impacts"),
+    element("small", {}, "Choose one to play its recording, then the model at the same contact."),
     list,
-    element("label", { className: "check" }, shown, "Mark them on the object"),
+    element("label", { className: "check" }, shown, "Show them on the object"),
   );
   const comparison = new Comparison(studio);
   let strikes = [];
@@ -161,7 +161,7 @@ class Comparison {
   }
 
   #expectSound() {
-    if (!this.studio.engine) throw new Error("This browser plays no sound here, so there is nothing to compare.");
+    if (!this.studio.engine) throw new Error("This browser plays no sound, so there is nothing to compare.");
   }
 
   async #buffer(strike) {
@@ -173,7 +173,7 @@ class Comparison {
       try {
         this.#buffers.set(strike, await new OfflineAudioContext(1, 1, rate).decodeAudioData(bytes));
       } catch {
-        throw new Error(`${strike.sound}: expected a WAV file, found what the browser cannot read.`);
+        throw new Error(`${strike.sound}: expected a WAV file, got data that the browser cannot read.`);
       }
     }
     return this.#buffers.get(strike);

@@ -13,7 +13,7 @@ const MALLETS = [
 
 export function strikeSheet(studio) {
   const unit = studio.forceUnit;
-  const counted = studio.bundle.manifest.perNewton ? "" : ", × a recorded blow";
+  const counted = studio.bundle.manifest.perNewton ? "" : ", × a recorded impact";
   const force = new Slider(`Force of a click${counted}`, {
     low: 0.05,
     high: 20,
@@ -42,8 +42,8 @@ export function strikeSheet(studio) {
   const shape = element(
     "select",
     { "aria-label": "Shape of the force over the contact time", onchange: () => (studio.pulse = shape.value) },
-    element("option", { value: "half-sine" }, "force: half a sine"),
-    element("option", { value: "hertz" }, "force: Hertz's contact"),
+    element("option", { value: "half-sine" }, "force: half-sine"),
+    element("option", { value: "hertz" }, "force: Hertzian contact"),
   );
   const pulse = element("div", { className: "group", hidden: true }, contact.element, shape);
   const volume = new Slider("Volume", {
@@ -74,7 +74,7 @@ export function strikeSheet(studio) {
       "div",
       { className: "row" },
       button("Strike again", () => studio.strike(studio.row ?? studio.modes.loudestRow)),
-      button("Strike somewhere", () => studio.strike(Math.floor(Math.random() * studio.modes.points))),
+      button("Strike at random", () => studio.strike(Math.floor(Math.random() * studio.modes.points))),
     ),
     measuredStrikes(studio),
     volume.element,

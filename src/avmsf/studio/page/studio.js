@@ -43,7 +43,7 @@ export class Studio extends EventTarget {
   /** Strike a contact, with `factor` times the force that is set. */
   strike(row, { factor = 1, force = this.force * factor, contactTime = this.contactTime } = {}) {
     if (!this.modes.points) {
-      say("This field holds no contact that could be struck.", { name: "strike", bad: true });
+      say("This field has no contacts to strike.", { name: "strike", bad: true });
       return;
     }
     this.row = row;
@@ -90,7 +90,7 @@ export class Studio extends EventTarget {
   /** Paint values of the contacts, with a legend: `ends` are the words below it. Null takes the paint off. */
   paint(values, { scale, title, ends } = {}) {
     if (!this.view) {
-      if (values) say("The object cannot be seen here, so nothing can be painted on it.", { seconds: 6 });
+      if (values) say("The object is not shown, so it cannot be colored.", { seconds: 6 });
       return;
     }
     this.view.paint(values, scale);

@@ -22,7 +22,7 @@ export class TakeCard {
       this.hide();
       return action(take);
     };
-    const keep = button(take.redo ? "Put it in place" : "Keep it", answer(this.keep), { className: "main" });
+    const keep = button(take.redo ? "Replace" : "Save recording", answer(this.keep), { className: "main" });
     const redo = button("Redo", answer(this.drop));
     this.element.hidden = false;
     this.element.replaceChildren(
@@ -43,8 +43,8 @@ export class TakeCard {
       // still take what it refuses here.
       const barred = refused && !take.redo;
       let words = `${error.message} ${error.unreachable ? this.refuge() : ""}`;
-      if (barred) words = `It cannot be kept: ${error.message}`;
-      else if (refused) words = `${error.message}. That is said of a further strike; try it in place of ${take.redo}.`;
+      if (barred) words = `It cannot be saved: ${error.message}`;
+      else if (refused) words = `${error.message}. This holds for a new impact; the recording may still replace ${take.redo}.`;
       verdict.replaceChildren(element("p", { className: "warning" }, words));
       if (!refused) verdict.append(again);
       // What the server would not take shall not look like what is to be done next.

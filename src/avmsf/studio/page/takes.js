@@ -7,7 +7,7 @@ export function measures(report) {
   const rows = [
     ["Peak", report.peak_db === null ? "silence" : `${report.peak_db.toFixed(1)} dB re full scale`],
     ["Clipping", report.clipped ? "yes: the loudest samples are cut off" : "none"],
-    ["Onset", report.onset_seconds === null ? "no blow found" : `at ${seconds(report.onset_seconds)}`],
+    ["Onset", report.onset_seconds === null ? "no impact found" : `at ${seconds(report.onset_seconds)}`],
     ["Length", seconds(report.seconds)],
   ];
   const list = element("dl", { className: "measures" });
@@ -15,7 +15,7 @@ export function measures(report) {
   const warnings = report.warnings ?? [];
   const verdict = warnings.length
     ? warnings.map((words) => element("p", { className: "warning" }, words))
-    : [element("p", { className: "fine" }, "✓ A good recording.")];
+    : [element("p", { className: "fine" }, "✓ No problems found.")];
   return element("div", { className: "group" }, list, ...verdict);
 }
 
@@ -39,7 +39,7 @@ export async function drawTake(canvas, blob, onset) {
     context.fillRect(x, y(high), 1, Math.max(1, y(low) - y(high)));
   }
   if (onset === null || onset === undefined) return;
-  context.fillStyle = style.getPropertyValue("--accent");
+  context.fillStyle = style.getPropertyValue("--first");
   context.fillRect((onset * sampleRate * width) / samples.length, 0, 2 * devicePixelRatio, height);
 }
 
@@ -75,6 +75,6 @@ async function listen(sound) {
     // Another was begun before this one was read.
     if (playing !== mine) return;
     mine.end();
-    throw new Error(`The recording cannot be played here (${error.message}).`);
+    throw new Error(`The recording cannot be played (${error.message}).`);
   }
 }

@@ -67,10 +67,10 @@ export class Waiting {
   #row(entry) {
     const place = placeInWords(entry);
     const words = !entry.kept
-      ? `The recording ${place} is not kept yet.`
+      ? `The recording ${place} is not saved yet.`
       : entry.refused
-        ? `The recording ${place} was not taken: ${entry.refused}`
-        : `A recording waits for the server: the one ${place} …`;
+        ? `The recording ${place} was rejected: ${entry.refused}`
+        : `The recording ${place} waits for the server …`;
     const throwAway = () => this.outbox.remove(entry.key).then(() => this.show());
     return element(
       "div",
@@ -81,7 +81,7 @@ export class Waiting {
         { className: "row" },
         ...this.#answers(entry),
         listenButton(entry.blob),
-        button("Throw away", throwAway, { className: "small" }),
+        button("Discard", throwAway, { className: "small" }),
       ),
     );
   }
@@ -89,13 +89,13 @@ export class Waiting {
   /** What can be done with a recording; one that came too late for its strike never takes its place unasked. */
   #answers(entry) {
     const answer = (words, changed = {}) => button(words, () => this.keep({ ...entry, ...changed }), { className: "small" });
-    if (!entry.kept) return [answer("Keep it")];
+    if (!entry.kept) return [answer("Save recording")];
     if (!entry.redo || !entry.refused) return [answer("Send again")];
     const strike = this.strikes().find(({ file }) => file === entry.redo);
     const answers = [];
-    if (entry.status === 409 && strike) answers.push(answer("Put mine in its place", { digest: strike.digest }));
+    if (entry.status === 409 && strike) answers.push(answer("Replace it with mine", { digest: strike.digest }));
     else if (strike) answers.push(answer("Send again"));
-    if (entry.contact) answers.push(answer("Add it as a new strike", { redo: null, digest: null }));
+    if (entry.contact) answers.push(answer("Add it as a new impact", { redo: null, digest: null }));
     return answers;
   }
 }

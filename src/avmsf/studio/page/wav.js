@@ -32,6 +32,6 @@ export async function expectWav(file) {
   const letters = String.fromCharCode(...head);
   if (letters.startsWith("RIFF") && letters.endsWith("WAVE")) return;
   throw new Error(
-    `${file.name}: expected a WAV file, found another kind. Save the sound as WAV and choose it again.`,
+    `${file.name}: expected a WAV file, got another kind; save the sound as WAV and choose it again.`,
   );
 }
