@@ -120,7 +120,7 @@ def _no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> E
     if fall < 6:
         return ExtractionError(
             f"{expected}, got noise or hum that decays by {fall:.0f} dB; check the onset and the noise (avmsf check), "
-            "or strike harder",
+            "or record louder impacts",
             name="decay",
             value=fall,
         )
