@@ -14,12 +14,14 @@ from matplotlib.figure import Figure
 import avmsf
 from avmsf.bench.baselines import MeanWaveform
 from avmsf.modal.spectra import magnitude_stft
+from avmsf.plotting.style import SEQUENTIAL, styled
 
 HERE = Path(__file__).parent
 CONTACTS = ("012.wav", "014.wav")
 FFT_SIZE, HOP, SECONDS, MAX_HZ, RANGE_DB = 1024, 128, 0.35, 12_000, 70
 
 
+@styled
 def main() -> None:
     """Read the field and the capture, draw, write the picture."""
     field, capture = avmsf.SoundField.load(sys.argv[1]), avmsf.Capture.read(sys.argv[2])
@@ -34,7 +36,7 @@ def main() -> None:
     left, right = figure.subfigures(1, 2, width_ratios=(0.36, 0.64))
     axes = left.subplots()
     axes.imshow(matplotlib.image.imread(HERE / "studio/modes.png")[120:620, 200:710])
-    axes.set_title("gain of the mode at 2762 Hz;\ndots: recorded contacts", fontsize=11)
+    axes.set_title("gain of the mode at 2762 Hz;\ndots: recorded contacts")
     axes.axis("off")
     grid = right.subplots(len(CONTACTS), len(columns), sharex=True, sharey=True)
     for column, (name, sounds) in enumerate(columns.items()):
@@ -44,11 +46,11 @@ def main() -> None:
             axes = grid[row, column]
             extent = (0.0, level.shape[1] * HOP / field.sample_rate, 0.0, field.sample_rate / 2000)
             image = axes.imshow(
-                level.numpy(), origin="lower", aspect="auto", extent=extent, cmap="magma", vmin=-RANGE_DB, vmax=0.0
+                level.numpy(), origin="lower", aspect="auto", extent=extent, cmap=SEQUENTIAL, vmin=-RANGE_DB, vmax=0.0
             )
             axes.set_xlim(0.0, SECONDS)
             axes.set_ylim(0.0, MAX_HZ / 1000)
-        grid[0, column].set_title(name, fontsize=11)
+        grid[0, column].set_title(name)
         grid[-1, column].set_xlabel("time (s)")
     for row in range(len(CONTACTS)):
         grid[row, 0].set_ylabel(f"contact {'AB'[row]}\nfrequency (kHz)")

@@ -404,7 +404,7 @@ def test_a_studio_that_was_started_again_is_told_to_be_elsewhere(capturing: Any,
     told = page.inner_text("#sheet-capture .group:has(> .waveform) .warning")
     assert "prints a new address" in told
     assert "stored in this browser" in told
-    assert "under the same port" in told, "a browser keeps what it stores by host and port"
+    assert "at the same port" in told, "a browser keeps what it stores by host and port"
     page.click("text=Save recording")
     page.wait_for_selector("text=The recording is not lost, and is sent again until the server answers")
     assert "prints a new address" in words_on(page)

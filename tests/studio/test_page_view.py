@@ -345,7 +345,7 @@ INKED = """(name) => {
         highest[place % width] = Math.floor(place / width) / height;
     return highest;
   };
-  return { width, accent: columns("--accent", 100), second: columns("--second", 25), faint: columns("--faint", 100) };
+  return { width, first: columns("--first", 100), second: columns("--second", 25), faint: columns("--faint", 100) };
 }"""
 
 
@@ -377,17 +377,17 @@ def test_spectrum_and_decay_show_the_modes_that_were_struck(visit: Open) -> None
            }"""
     )
     page.wait_for_timeout(200)
-    accent, faint = (columns(page, "spectrum", ink) for ink in ("accent", "faint"))
+    first, faint = (columns(page, "spectrum", ink) for ink in ("first", "faint"))
     stems = [column_of(page, share_of(400.0 * order)) for order in range(1, 7)]
     for column in stems:
         # Each has fallen since, the higher the further; where it was stays to be read beside the panel's paper.
-        assert np.nanmin(faint[column - 1 : column + 2]) < np.nanmin(accent[column - 1 : column + 2]) - 0.01
-    beside = np.ones(len(accent), dtype=bool)
+        assert np.nanmin(faint[column - 1 : column + 2]) < np.nanmin(first[column - 1 : column + 2]) - 0.01
+    beside = np.ones(len(first), dtype=bool)
     for column in stems:
         beside[column - 2 : column + 3] = False
-    assert np.isnan(accent[beside]).all(), "a stem stands at a mode and nowhere else"
+    assert np.isnan(first[beside]).all(), "a stem stands at a mode and nowhere else"
     seconds = 80 / (20 / np.log(10) * 4)
-    curve = columns(page, "decay", "accent")
+    curve = columns(page, "decay", "first")
     early, late = (np.nanmin(curve[column_of(page, t / seconds) - 6 :][:12]) for t in (0.5, 1.5))
     # The slowest mode falls by 35 dB a second; the canvas has 80 dB over 76 of its 104 pixels.
     assert late - early == pytest.approx(20 / np.log(10) * 4 / 80 * 76 / 104, rel=0.15)
@@ -469,7 +469,7 @@ def test_a_recording_is_drawn_from_its_beginning_beside_the_model_of_its_own_con
     def lines() -> np.ndarray:
         """Return how far down the model's lines began at the blow, however far they have fallen; 1 for none."""
         page.wait_for_timeout(200)
-        both = np.fmin(columns(page, "spectrum", "accent"), columns(page, "spectrum", "faint"))
+        both = np.fmin(columns(page, "spectrum", "first"), columns(page, "spectrum", "faint"))
         about = [both[column_of(page, share_of(400.0 * order)) + np.arange(-1, 2)] for order in range(1, 7)]
         return np.nan_to_num(np.array(about), nan=1.0).min(axis=1)
 

@@ -478,10 +478,10 @@ def test_resampling_keeps_a_tone(any_page: "Page") -> None:
 @pytest.mark.parametrize(
     ("blow", "words"),
     [
-        ({"row": 6}, "there is no contact 6 among 6"),
-        ({"row": 0.5}, "there is no contact 0.5"),
-        ({"row": 0, "contactTime": -1}, "a contact of -1 s"),
-        ({"row": 0, "shape": "box"}, "half-sine or hertz, not box"),
+        ({"row": 6}, "expected 0 to 5, got 6"),
+        ({"row": 0.5}, "expected 0 to 5, got 0.5"),
+        ({"row": 0, "contactTime": -1}, "expected 0 to 10 s, got -1"),
+        ({"row": 0, "shape": "box"}, "expected half-sine or hertz, got box"),
     ],
 )
 def test_blows_that_are_none_are_refused(any_page: "Page", blow: dict[str, Any], words: str) -> None:
@@ -492,13 +492,16 @@ def test_blows_that_are_none_are_refused(any_page: "Page", blow: dict[str, Any],
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"format": 2}, "expected a field of format 1, found 2"),
-        ({"tensors": {"sine": {"file": "field.bin", "offset": 0, "dtype": "float32", "shape": [10**7]}}}, "cut short"),
+        ({"format": 2}, "expected a field of format 1, got 2"),
+        (
+            {"tensors": {"sine": {"file": "field.bin", "offset": 0, "dtype": "float32", "shape": [10**7]}}},
+            "expected 40000000 bytes",
+        ),
         ({"tensors": {"sine": {"file": "none.bin", "offset": 0, "dtype": "float32", "shape": [1]}}}, "cannot be read"),
-        ({"tensors": {"sine": {"file": "field.bin", "offset": 0, "dtype": "int8", "shape": [1]}}}, "of type int8"),
+        ({"tensors": {"sine": {"file": "field.bin", "offset": 0, "dtype": "int8", "shape": [1]}}}, "type int8"),
         (
             {"tensors": {"sine": {"file": "odd.bin", "offset": 0, "dtype": "float32", "shape": [3]}}},
-            "odd.bin: sine: expected numbers, found NaN at place 2",
+            "odd.bin: sine: expected numbers, got NaN at index 2",
         ),
     ],
 )

@@ -18,6 +18,7 @@ from torch import Tensor
 from avmsf.bench.sides import ABOVE, AROUND, UP, Side, name_axes, side_words, view_from
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
+from avmsf.plotting.style import FIRST, SECOND, styled
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import cluster
 from avmsf.scene.symmetry import Symmetries
@@ -29,9 +30,9 @@ _WIDTH = 1.9
 """Width of a dot over the picture's, times the root of how many there are."""
 _FEW = 400
 """Points below which dots grow no wider."""
-_AXIS, _PLANE = "#c8502d", "#1f3b5c"
 
 
+@styled
 def draw_cloud(
     points: Float[Tensor, "points 3"],
     colors: Mapping[str, Float[Tensor, "points 3"]],
@@ -64,7 +65,7 @@ def draw_cloud(
             if symmetries is not None and name == "symmetries":
                 _draw_symmetries(axes, points, symmetries, view)
             name_axes(axes, view)
-            axes.set_title(f"{name}, {side_words(side)}", fontsize=9)
+            axes.set_title(f"{name}, {side_words(side)}")
     figure.suptitle(title)
     return figure
 
@@ -117,6 +118,7 @@ def label_colors(labels: Int[Tensor, " points"]) -> Float[Tensor, "points 3"]:
     return torch.from_numpy(hsv_to_rgb(np.stack([hue, saturation, value], axis=1))).float()
 
 
+@styled
 def save_turntable(
     points: Float[Tensor, "points 3"],
     colors: Float[Tensor, "points 3"],
@@ -194,12 +196,12 @@ def _draw_symmetries(
         signs = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
         corners = np.array([center + 0.72 * radius * (a * first + b * second) for a, b in signs])
         seen = (corners - middle) @ view.T
-        axes.plot(seen[:, 0], seen[:, 1], color=_PLANE, linewidth=1.0, alpha=0.8)
+        axes.plot(seen[:, 0], seen[:, 1], color=FIRST, linewidth=1.0, alpha=0.8)
     for rotation in symmetries.rotations:
         axis, point = rotation.axis.double().numpy(), rotation.point.double().numpy()
         center = point + ((middle - point) @ axis) * axis
         ends = np.array([center - 1.05 * radius * axis, center + 1.05 * radius * axis])
         seen = (ends - middle) @ view.T
-        axes.plot(seen[:, 0], seen[:, 1], color=_AXIS, linewidth=1.6)
+        axes.plot(seen[:, 0], seen[:, 1], color=SECOND, linewidth=1.6)
         name = "∞" if rotation.order is None else f"{rotation.order}"
-        axes.annotate(name, (seen[1, 0], seen[1, 1]), color=_AXIS, fontsize=9, annotation_clip=False)
+        axes.annotate(name, (seen[1, 0], seen[1, 1]), color=SECOND, annotation_clip=False)

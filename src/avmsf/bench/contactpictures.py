@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -16,19 +16,20 @@ from avmsf.bench.clouds import draw_cloud
 from avmsf.bench.sides import ALL_SIDES, Side
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
+from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, styled
 from avmsf.tasks.contactmap import ContactMap
 
 _DECADES = 3.0
 """Powers of ten below the likeliest that colors tell apart."""
-_HEAT = "viridis"
-"""Its purple, green and yellow leave red and blue, the paper's colors of the true and the found contact, for marks."""
-_FOUND, _OTHER, _TRUTH = (0.20, 0.45, 1.00), (0.95, 0.95, 0.95), (1.00, 0.05, 0.05)
+_FOUND, _OTHER, _TRUTH = to_rgb(FIRST), (0.95, 0.95, 0.95), to_rgb(SECOND)
+"""Blue and red, the paper's colors of the found and the true contact."""
 _MARK = 0.018
 """Radius of a mark over the object's diagonal."""
 _DRAWN = 6000
 """Points in a picture, about."""
 
 
+@styled
 def draw_contact(
     contact: ContactMap,
     *,
@@ -58,8 +59,8 @@ def draw_contact(
     low, high = _span(contact)
     for line, (first, last, words, heat) in enumerate(
         (
-            (-_DECADES, 0.0, "log10 of probability / maximum", _HEAT),
-            (low, high, "cosine distance of the gains", f"{_HEAT}_r"),
+            (-_DECADES, 0.0, "log10 of probability / maximum", SEQUENTIAL),
+            (low, high, "cosine distance of the gains", f"{SEQUENTIAL}_r"),
         )
     ):
         panels = figure.axes[line * len(sides) : (line + 1) * len(sides)]
@@ -110,7 +111,7 @@ def _span(contact: ContactMap) -> tuple[float, float]:
 
 
 def _heat(level: Float[Tensor, " points"]) -> Float[Tensor, "points 3"]:
-    return torch.from_numpy(colormaps[_HEAT](level.clamp(0.0, 1.0).numpy())[:, :3]).float()
+    return torch.from_numpy(colormaps[SEQUENTIAL](level.clamp(0.0, 1.0).numpy())[:, :3]).float()
 
 
 def _marked(

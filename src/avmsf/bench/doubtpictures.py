@@ -11,8 +11,8 @@ from torch import Tensor
 
 from avmsf.bench.sides import ALL_SIDES, name_axes, view_from
 from avmsf.field.uncertainty import SpectrumBand
+from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, styled
 
-_INK, _NEXT = "#1f3b5c", "#19e0c8"
 _RANGE_DB = 100.0
 """What a spectrum shows below its highest level."""
 _FLAT = 1e-3
@@ -23,6 +23,7 @@ _INCHES = 4.0
 """Width of an object in its picture."""
 
 
+@styled
 def draw_doubt(
     points: Float[Tensor, "points 3"],
     doubt: Float[Tensor, " points"],
@@ -62,6 +63,7 @@ def draw_doubt(
     return figure
 
 
+@styled
 def draw_band(band: SpectrumBand, *, title: str) -> Figure:
     """Draw the credible band of a sound's spectrum."""
     figure = Figure(figsize=(9, 4.2), layout="constrained")
@@ -69,14 +71,14 @@ def draw_band(band: SpectrumBand, *, title: str) -> Figure:
     frequencies = band.frequencies.numpy()
     lower, middle, upper = (each.numpy() for each in (band.lower_db, band.middle_db, band.upper_db))
     inside = f"{100 * band.level:g} % credible band"
-    axes.fill_between(frequencies, lower, upper, color=_INK, alpha=0.3, linewidth=0, label=inside)
-    axes.plot(frequencies, middle, color=_INK, linewidth=1, label="median")
+    axes.fill_between(frequencies, lower, upper, color=FIRST, alpha=0.3, linewidth=0, label=inside)
+    axes.plot(frequencies, middle, color=FIRST, linewidth=1, label="median")
     axes.set_ylim(max(upper.max() - _RANGE_DB, lower.min() - 3.0), upper.max() + 3.0)
     axes.set_xlim(0.0, float(frequencies[-1]))
     axes.set_xlabel("frequency (Hz)")
     axes.set_ylabel("energy (dB re loudest band)")
-    axes.grid(alpha=0.25)
-    axes.legend(frameon=False)
+    axes.grid()
+    axes.legend()
     figure.suptitle(title)
     return figure
 
@@ -94,7 +96,7 @@ def _scatter(axes: Axes, seen: np.ndarray, values: np.ndarray) -> PathCollection
     across, along = seen[order, 0], seen[order, 1]
     top = max(float(values.max()), 1e-12)
     drawn = axes.scatter(
-        across, along, c=values[order], s=dot**2, cmap="inferno", vmin=0.0, vmax=top, linewidths=0, rasterized=True
+        across, along, c=values[order], s=dot**2, cmap=SEQUENTIAL, vmin=0.0, vmax=top, linewidths=0, rasterized=True
     )
     axes.set_aspect("equal")
     axes.set_axis_off()
@@ -127,7 +129,7 @@ def _number(
     shown[faces.argmax(axis=0)[hidden], np.flatnonzero(hidden)] = True
     for axes, frame, rows in zip(grid, frames, shown, strict=True):
         across, along = (marks @ frame)[:, 0], (marks @ frame)[:, 1]
-        colors = np.where(hidden[rows], "white", _NEXT)
+        colors = np.where(hidden[rows], "white", SECOND)
         axes.scatter(across[rows], along[rows], c=colors, s=190, edgecolors="black", linewidths=1)
         for row in np.flatnonzero(rows).tolist():
             place = (float(across[row]), float(along[row]))

@@ -13,8 +13,8 @@ from torch import Tensor
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.spectra import magnitude_stft
+from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, styled
 
-_INK, _ACCENT = "#1f3b5c", "#c8502d"
 _RANGE_DB = 80.0
 """What is shown below the loudest."""
 _POINTS = 256
@@ -47,6 +47,7 @@ class HeardModes:
         return 20.0 * torch.log10(self.size / max(reference, torch.finfo(torch.float64).tiny))
 
 
+@styled
 def draw_edit(before: HeardModes, after: HeardModes, *, sample_rate: float, title: str) -> Figure:
     """Draw levels, ring times and the number of modes over frequency (logarithmic), before and after an edit.
 
@@ -55,7 +56,7 @@ def draw_edit(before: HeardModes, after: HeardModes, *, sample_rate: float, titl
     figure = Figure(figsize=(9, 8.4), layout="constrained")
     levels, rings, counts = figure.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
     loudest = float(before.size.max())
-    drawn = [("before", before, _INK), ("after", after, _ACCENT)]
+    drawn = [("before", before, FIRST), ("after", after, SECOND)]
     tops = [each.level_db(loudest).max().item() for _, each, _ in drawn if bool((each.size > 0).any())]
     top = max([0.0, *tops])
     for name, modes, color in drawn:
@@ -71,14 +72,14 @@ def draw_edit(before: HeardModes, after: HeardModes, *, sample_rate: float, titl
     _count(counts, drawn)
     levels.set_ylim(top - _RANGE_DB, top + 6.0)
     levels.set_ylabel("level (dB re strongest mode before)")
-    levels.legend(frameon=False)
+    levels.legend()
     rings.set_yscale("log")
     rings.set_ylabel("decay time T60 (s)")
     counts.set_ylabel("modes per third-octave band")
     counts.set_xlabel("frequency (Hz); hollow: silent")
     for axes in (levels, rings, counts):
         axes.set_xscale("log")
-        axes.grid(alpha=0.25, which="both")
+        axes.grid(which="both")
         _shade(axes, 0.5 * sample_rate, max(float(each.frequency.max()) for _, each, _ in drawn))
     for axis in (counts.xaxis, rings.yaxis):
         axis.set_major_formatter(StrMethodFormatter("{x:g}"))
@@ -86,6 +87,7 @@ def draw_edit(before: HeardModes, after: HeardModes, *, sample_rate: float, titl
     return figure
 
 
+@styled
 def draw_sound_change(
     before: Float[Tensor, " samples"], after: Float[Tensor, " samples"], *, sample_rate: float, title: str
 ) -> Figure:
@@ -103,12 +105,12 @@ def draw_sound_change(
             origin="lower",
             aspect="auto",
             extent=ends,
-            cmap="magma",
+            cmap=SEQUENTIAL,
             vmin=-_RANGE_DB,
             vmax=0.0,
             interpolation="nearest",
         )
-        axes.set_title(what, fontsize=10)
+        axes.set_title(what)
         axes.set_xlabel("time (s)")
     grid[0].set_ylabel("frequency (kHz)")
     figure.colorbar(image, ax=grid, label="level (dB re maximum of each)", shrink=0.8)

@@ -11,6 +11,7 @@ from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from avmsf.bench.results import ObjectRecord
 from avmsf.errors import EvaluationError
+from avmsf.plotting.style import series_color, styled
 
 _MARKS = "os^DvPX*<>hd"
 
@@ -60,13 +61,14 @@ def curves(record: ObjectRecord, *, metric: str) -> tuple[Curve, ...]:
     return tuple(_curve(method, by_count) for method, by_count in found.items())
 
 
+@styled
 def draw_learning_curve(found: Sequence[Curve], *, metric: str, title: str) -> Figure:
     """Draw the error over the number of training contacts, both logarithmic, with the range over starts as a band."""
     figure = Figure(figsize=(8, 5.2), layout="constrained")
     axes = figure.subplots()
     order = sorted(found, key=lambda curve: -curve.mean[-1])
     for number, curve in enumerate(order):
-        color = f"C{number % 10}"
+        color = series_color(number)
         axes.plot(curve.counts, curve.mean, marker=_MARKS[number % len(_MARKS)], color=color, label=curve.method)
         axes.fill_between(curve.counts, curve.lowest, curve.highest, color=color, alpha=0.12, linewidth=0)
     counts = sorted({count for curve in found for count in curve.counts})
@@ -80,8 +82,8 @@ def draw_learning_curve(found: Sequence[Curve], *, metric: str, title: str) -> F
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("training contacts (farthest-point sampling)")
     axes.set_ylabel("relative STFT error (1 = silence)" if metric == "relative_stft" else metric)
-    axes.grid(which="major", alpha=0.25)
-    axes.legend(frameon=False)
+    axes.grid(which="major")
+    axes.legend()
     figure.suptitle(title)
     return figure
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
 from avmsf.plotting.spectrograms import RANGE_DB, log_spectrogram
+from avmsf.plotting.style import SEQUENTIAL
 
 _PEAK = 0.25
 """What recordings peak at, of full scale: louder sounds of a method have room above."""
@@ -108,7 +109,7 @@ def _levels(heard: Heard, width: int, height: int) -> Float64[Tensor, "height wi
 
 def _png(shades: UInt8[np.ndarray, "height width"]) -> str:
     picture = Image.fromarray(shades).convert("P")
-    colors = (colormaps["magma"](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
+    colors = (colormaps[SEQUENTIAL](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
     picture.putpalette(colors.tobytes())
     memory = io.BytesIO()
     picture.save(memory, format="PNG", optimize=True)

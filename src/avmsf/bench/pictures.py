@@ -21,11 +21,11 @@ from avmsf.files import write_whole
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.spectra import magnitude_stft
+from avmsf.plotting.style import DIVERGING, FIRST, SECOND, SEQUENTIAL, styled
 
 FORMATS = ("png", "pdf", "svg")
 _RANGE_DB = 80.0
 """What spectrograms show below the loudest point of the truth."""
-_INK, _ACCENT = "#1f3b5c", "#c8502d"
 
 
 def save_picture(figure: Figure, path: Path) -> None:
@@ -48,13 +48,14 @@ def expect_format(path: Path) -> str:
     return ending
 
 
+@styled
 def draw_modes(bank: ModalBank, level_db: Float[Tensor, " modes"], *, title: str) -> Figure:
     """Draw each mode's level (dB) and decay time (T60, s) over its frequency as stems."""
     figure = Figure(figsize=(9, 5.4), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     frequency, level = bank.frequency.numpy(), level_db.numpy()
     bottom = 10.0 * math.floor(float(level.min()) / 10) - 5.0
-    _stems(upper, frequency, level, bottom=bottom, color=_INK)
+    _stems(upper, frequency, level, bottom=bottom, color=FIRST)
     upper.set_ylim(bottom, float(level.max()) + 0.12 * (float(level.max()) - bottom))
     upper.set_ylabel("level (dB re strongest mode)")
     for row in _apart(frequency, level, most=8):
@@ -62,17 +63,18 @@ def draw_modes(bank: ModalBank, level_db: Float[Tensor, " modes"], *, title: str
         upper.annotate(
             f"{frequency[row]:.4g}", place, xytext=(0, 5), textcoords="offset points", ha="center", fontsize=8
         )
-    _stems(lower, frequency, math.log(1000) / bank.damping.numpy(), bottom=0.0, color=_ACCENT)
+    _stems(lower, frequency, math.log(1000) / bank.damping.numpy(), bottom=0.0, color=SECOND)
     lower.set_ylim(bottom=0.0)
     lower.set_ylabel("decay time T60 (s)")
     lower.set_xlabel("frequency (Hz)")
     lower.set_xlim(0.0, 1.05 * float(frequency.max()))
     for axes in (upper, lower):
-        axes.grid(alpha=0.25)
+        axes.grid()
     figure.suptitle(title)
     return figure
 
 
+@styled
 def draw_gains(
     points: Float[Tensor, "points 3"],
     gains: Float[Tensor, "points modes"],
@@ -97,20 +99,21 @@ def draw_gains(
     marks = None if contacts is None else contacts.double().numpy()
     for number, mode in enumerate(sorted(strongest.tolist(), key=lambda mode: float(frequency[mode]))):
         values = gains[:, mode].numpy()
-        colors = {"c": values, "cmap": "RdBu_r", "vmin": -np.abs(values).max(), "vmax": np.abs(values).max()}
+        colors = {"c": values, "cmap": DIVERGING, "vmin": -np.abs(values).max(), "vmax": np.abs(values).max()}
         place = (rows, columns, number + 1)
         if len(wide) == 2:
             axes, drawn = _scatter_in_plane(figure, place, places, marks, wide, colors)
         else:
             axes, drawn = _scatter_in_space(figure, place, places, marks, colors)
-        axes.set_title(f"{float(frequency[mode]):.4g} Hz", fontsize=11)
+        axes.set_title(f"{float(frequency[mode]):.4g} Hz")
         figure.colorbar(
             drawn, ax=axes, shrink=0.8 if len(wide) == 2 else 0.6, pad=0.02 if len(wide) == 2 else 0.16
         ).ax.tick_params(labelsize=8)
-    figure.suptitle(f"{title}\n(color: signed gain, in the unit of the recordings)", fontsize=12)
+    figure.suptitle(f"{title}\n(color: signed gain, in the unit of the recordings)")
     return figure
 
 
+@styled
 def draw_spectrograms(
     truth: Float[Tensor, "contacts samples"],
     predicted: Float[Tensor, "contacts samples"],
@@ -146,12 +149,12 @@ def draw_spectrograms(
                     0.0,
                     sample_rate / 2 / unit,
                 ),
-                cmap="magma",
+                cmap=SEQUENTIAL,
                 vmin=-_RANGE_DB,
                 vmax=0.0,
                 interpolation="nearest",
             )
-            axes.set_title(f"{name}: {what}", fontsize=10)
+            axes.set_title(f"{name}: {what}")
             axes.set_ylim(0.0, highest * sample_rate / 2 / unit)
             axes.set_xlim(0.0, max(latest * duration, 4 * hop / sample_rate))
         grid[row, 0].set_ylabel("frequency (kHz)" if unit > 1 else "frequency (Hz)")
@@ -162,6 +165,7 @@ def draw_spectrograms(
     return figure
 
 
+@styled
 def draw_scores(scores: Mapping[str, Scores], *, metric: str = "relative_stft", title: str) -> Figure:
     """Draw each method's mean error as a bar with its standard error, best on top, on a logarithmic axis."""
     means = {method: each.mean()[metric] for method, each in scores.items()}
@@ -171,7 +175,7 @@ def draw_scores(scores: Mapping[str, Scores], *, metric: str = "relative_stft", 
     axes = figure.subplots()
     heights = [means[method] for method in order]
     spread = [0.0 if math.isnan(errors[method]) else errors[method] for method in order]
-    colors = [_ACCENT if method == "field" else _INK for method in order]
+    colors = [SECOND if method == "field" else FIRST for method in order]
     axes.barh(order, heights, xerr=spread, color=colors, alpha=0.85, capsize=3)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
@@ -186,7 +190,7 @@ def draw_scores(scores: Mapping[str, Scores], *, metric: str = "relative_stft", 
             fontsize=9,
         )
     axes.set_xlabel("relative STFT error (0 = recording, 1 = silence)")
-    axes.grid(axis="x", which="both", alpha=0.25)
+    axes.grid(axis="x", which="both")
     figure.suptitle(title)
     return figure
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from avmsf.errors import EvaluationError
+from avmsf.plotting.style import FIRST
 
 Side: TypeAlias = tuple[float, float]
 """Azimuth about the direction to the sky, and elevation above the horizon, of an eye far away; degrees."""
@@ -26,7 +27,6 @@ ALL_SIDES: tuple[Side, ...] = (
     (-60.0, -75.0),
 )
 """Three sides, into what is open above, and two from below: nothing on a convex object is out of sight in all."""
-_INK = "#1f3b5c"
 _ARROW = 28.0
 """Length of the arrows along the axes, points."""
 
@@ -69,8 +69,8 @@ def name_axes(axes: Axes, view: Float[np.ndarray, "3 3"]) -> None:
                 (across, along),
                 xycoords="axes fraction",
                 textcoords="offset points",
-                arrowprops={"arrowstyle": "<-", "color": _INK},
-                color=_INK,
+                arrowprops={"arrowstyle": "<-", "color": FIRST},
+                color=FIRST,
                 ha="center",
                 va="center",
             )

@@ -9,13 +9,14 @@ from matplotlib.figure import Figure
 from avmsf.bench.sides import ALL_SIDES, name_axes, view_from
 from avmsf.capture.surface import Surface
 from avmsf.errors import EvaluationError
+from avmsf.plotting.style import FIRST, styled
 
-_INK = "#1f3b5c"
 _LIGHT = np.array([-0.4, 0.5, 0.77])
 """Direction to the light in the picture's frame: right, up, towards the eye; of unit length."""
 _MILLIMETERS = 1000.0
 
 
+@styled
 def draw_surface(surface: Surface, *, title: str) -> Figure:
     """Draw a surface of triangles (object frame, meters), and its cuts through the middle of its box, in millimeters.
 
@@ -58,10 +59,10 @@ def _cut(axes: Axes, mesh: trimesh.Trimesh, middle: np.ndarray, *, across: int) 
     """Draw where a plane along z and one other axis cuts the triangles."""
     normal = np.eye(3)[1 - across]
     lines = trimesh.intersections.mesh_plane(mesh, normal, middle)  # type: ignore[no-untyped-call]
-    axes.add_collection(LineCollection(list(lines[:, :, [across, 2]]), colors=_INK, linewidths=1.5))
+    axes.add_collection(LineCollection(list(lines[:, :, [across, 2]]), colors=FIRST, linewidths=1.5))
     axes.autoscale_view()
     axes.set_aspect("equal")
     axes.set_title(f"cut at {'xy'[1 - across]} = {middle[1 - across]:.3g} mm")
     axes.set_xlabel(f"{'xy'[across]} (mm)")
     axes.set_ylabel("z (mm)")
-    axes.grid(alpha=0.25)
+    axes.grid()

@@ -6,9 +6,10 @@ from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from avmsf.plotting.style import series_color, styled
 
 Move: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 """Where an edited object's modes lie in an embedding before and after the edit."""
@@ -18,6 +19,7 @@ _PANEL = 4.2
 """Inches."""
 
 
+@styled
 def draw_embedding(
     points: Float[np.ndarray, "objects 2"],
     materials: Sequence[str],
@@ -47,11 +49,12 @@ def draw_embedding(
         axes.set_title(method)
         axes.set_xlabel("UMAP 1")
     panels[0].set_ylabel("UMAP 2")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper")
     figure.suptitle(title)
     return figure
 
 
+@styled
 def draw_clap_curves(curves: Mapping[str, Sequence[Curve]], *, title: str) -> Figure:
     """Draw the CLAP score over the steps: a thin line for each edit, a thick one for the mean of each method.
 
@@ -60,7 +63,7 @@ def draw_clap_curves(curves: Mapping[str, Sequence[Curve]], *, title: str) -> Fi
     figure = Figure(figsize=(7.0, 4.4), layout="constrained")
     axes = figure.subplots()
     for number, (method, edits) in enumerate(curves.items()):
-        color = colormaps["tab10"](number % 10)
+        color = series_color(number)
         for edit in edits:
             axes.plot(*zip(*edit, strict=True), color=color, linewidth=0.7, alpha=0.4)
         steps = sorted(set.intersection(*(set(dict(edit)) for edit in edits)))
@@ -68,8 +71,8 @@ def draw_clap_curves(curves: Mapping[str, Sequence[Curve]], *, title: str) -> Fi
         axes.plot(steps, means, "o-", color=color, linewidth=2.2, markersize=4, label=f"{method}, {len(edits)} edits")
     axes.set_xlabel("step")
     axes.set_ylabel("CLAP score")
-    axes.grid(alpha=0.25)
-    axes.legend(frameon=False)
+    axes.grid()
+    axes.legend()
     figure.suptitle(title)
     return figure
 
@@ -77,4 +80,4 @@ def draw_clap_curves(curves: Mapping[str, Sequence[Curve]], *, title: str) -> Fi
 def _draw_objects(axes: Axes, points: Float[np.ndarray, "objects 2"], materials: Sequence[str]) -> None:
     for number, material in enumerate(sorted(set(materials))):
         own = points[[each == material for each in materials]]
-        axes.scatter(own[:, 0], own[:, 1], s=36, alpha=0.75, color=colormaps["tab10"](number % 10), label=material)
+        axes.scatter(own[:, 0], own[:, 1], s=36, alpha=0.75, color=series_color(number), label=material)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.spectra import magnitude_stft
+from avmsf.plotting.style import SEQUENTIAL, styled
 
 LOWEST_HZ, HIGHEST_HZ, SECONDS = 20.0, 20000.0, 1.0
 """Band and time of the paper's spectrograms (its figure of qualitative comparisons)."""
@@ -46,6 +47,7 @@ def log_spectrogram(
     return 20 * torch.log10(torch.stack(rows).clamp(min=1e-9))
 
 
+@styled
 def draw_method_spectrograms(
     contacts: Mapping[str, Mapping[str, Float[Tensor, " _samples"]]],
     methods: Sequence[str],
@@ -75,11 +77,11 @@ def draw_method_spectrograms(
                 loudest = float(levels.max()) if loudest is None else loudest
                 mesh = _draw(axes, levels - loudest, _hop(len(heard), _WIDTH) / sample_rate, (bottom, top))
                 longest = max(longest, len(heard) / sample_rate)
-        row[0].set_ylabel(f"{contact}\nfrequency (Hz)", fontsize=9)
+        row[0].set_ylabel(f"{contact}\nfrequency (Hz)")
     for axes in grid.flat:
         _set_axes(axes, longest or SECONDS, (bottom, top))
     for axes, method in zip(grid[0], methods, strict=True):
-        axes.set_title(method, fontsize=9, wrap=True)
+        axes.set_title(method, wrap=True)
     for axes in grid[-1]:
         axes.set_xlabel("time (s)")
     if mesh is not None:
@@ -104,7 +106,7 @@ def _draw(axes: Axes, levels: Float64[Tensor, "height frames"], step: float, ban
         (np.arange(frames + 1) - 0.5) * step,
         np.geomspace(*band, height + 1),
         levels.numpy(),
-        cmap="magma",
+        cmap=SEQUENTIAL,
         vmin=-RANGE_DB,
         vmax=0.0,
         rasterized=True,

@@ -72,7 +72,7 @@ class Voice:
             self.step("splat", progress.step, progress.steps, f"{progress.psnr:.1f} dB, {progress.gaussians} Gaussians")
 
     def _lifting(self, progress: LiftProgress) -> None:
-        self.step("lift", progress.done, progress.total, progress.view)
+        self.step("features", progress.done, progress.total, progress.view)
 
     def fitting(self, progress: Progress) -> None:
         """Hear of a fit."""

@@ -21,7 +21,7 @@ export class Chart {
     context.clearRect(0, 0, this.width, this.height);
     const style = getComputedStyle(canvas);
     this.ink = Object.fromEntries(
-      ["faint", "line", "accent", "second"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]),
+      ["faint", "line", "first", "second"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]),
     );
     context.font = `11px ${style.fontFamily}`;
     context.lineWidth = 1;

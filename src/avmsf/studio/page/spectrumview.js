@@ -139,7 +139,7 @@ export class SpectrumView {
     if (this.compared) {
       for (const [{ levels }, color, dash] of [
         [this.compared.recording, chart.ink.second, []],
-        [this.compared.model, chart.ink.accent, []],
+        [this.compared.model, chart.ink.first, []],
       ]) {
         const loudest = Math.max(...levels);
         const shares = Array.from(levels, (level, place) => [place / (levels.length - 1), down(level - loudest)]);
@@ -156,7 +156,7 @@ export class SpectrumView {
         // What it was at the blow stays to be seen, faintly.
         for (const [height, color, width] of [
           [level, chart.ink.faint, 1],
-          [now, chart.ink.accent, 2],
+          [now, chart.ink.first, 2],
         ]) {
           if (height < top - RANGE_DB) continue;
           chart.curve([[place, 1], [place, down(height)]], color, { width });
@@ -198,7 +198,7 @@ export class SpectrumView {
         );
         return [step / 100, down(10 * Math.log10(power + 1e-30))];
       });
-      chart.curve(shares, chart.ink.accent, { dash: [5, 4] });
+      chart.curve(shares, chart.ink.first, { dash: [5, 4] });
     }
   }
 }

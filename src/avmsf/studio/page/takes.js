@@ -39,7 +39,7 @@ export async function drawTake(canvas, blob, onset) {
     context.fillRect(x, y(high), 1, Math.max(1, y(low) - y(high)));
   }
   if (onset === null || onset === undefined) return;
-  context.fillStyle = style.getPropertyValue("--accent");
+  context.fillStyle = style.getPropertyValue("--first");
   context.fillRect((onset * sampleRate * width) / samples.length, 0, 2 * devicePixelRatio, height);
 }
 

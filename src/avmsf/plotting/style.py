@@ -1,0 +1,47 @@
+"""The style of every figure: sizes, and colors that color-blind people tell apart.
+
+Series have the colors of Okabe and Ito ("Color Universal Design", 2008). Amounts and levels have viridis, which grows
+evenly in lightness; signed values have a diverging map from blue to red through white. The studio's page takes the same
+colors (`studio/page/colors.js`, `style.css`).
+"""
+
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+from cycler import cycler
+from matplotlib import rc_context
+
+SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#f0e442", "#000000")
+"""Colors of curves and categories, in their order."""
+FIRST, SECOND = SERIES[:2]
+SEQUENTIAL = "viridis"
+"""Colormap of amounts and levels."""
+DIVERGING = "RdBu_r"
+"""Colormap of signed values; its middle is zero."""
+
+_Given = ParamSpec("_Given")
+_Drawn = TypeVar("_Drawn")
+
+
+def styled(draw: Callable[_Given, _Drawn]) -> Callable[_Given, _Drawn]:
+    """Return a function that draws in this style, whatever matplotlib's settings are."""
+    return rc_context(
+        {
+            "axes.prop_cycle": cycler(color=SERIES),
+            "axes.titlesize": 10,
+            "axes.labelsize": 10,
+            "figure.titlesize": 12,
+            "font.size": 10,
+            "grid.alpha": 0.25,
+            "image.cmap": SEQUENTIAL,
+            "legend.fontsize": 9,
+            "legend.frameon": False,
+            "xtick.labelsize": 9,
+            "ytick.labelsize": 9,
+        }
+    )(draw)
+
+
+def series_color(number: int) -> str:
+    """Return the color of a series, counted from 0; they repeat."""
+    return SERIES[number % len(SERIES)]
