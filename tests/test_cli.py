@@ -272,10 +272,10 @@ def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys
         "mean waveform of 3 nearest, by direction",
         "mean gains of 3 nearest",
         "white noise",
-        "floor: gains of the test recordings",
+        "lower bound: the held-out recordings' own gains",
     }
     errors = {method: each["relative_stft"] for method, each in told["scores"].items()}
-    assert min(errors, key=lambda method: errors[method]) == "floor: gains of the test recordings"
+    assert min(errors, key=lambda method: errors[method]) == "lower bound: the held-out recordings' own gains"
     assert max(errors, key=lambda method: errors[method]) == "white noise"
     assert "fit, warm-up: 12 steps, loss" in err
     assert "fit, end to end: 6 steps, loss" in err

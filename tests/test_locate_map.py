@@ -83,7 +83,7 @@ def test_a_symmetric_plate_is_ambiguous_and_each_counterpart_is_named():
         assert float((image - each.position).norm()) < 2 * found.radius
     words = " ".join(str(each) for each in others)
     assert "its image in the mirror plane with normal (1 0 0)" in words
-    assert "it turned by 180 degrees about the axis (0 0 1)" in words
+    assert "by 180 degrees about the axis (0 0 1)" in words
     assert all("no known symmetry" in str(each) for each in found.counterparts())
 
 

@@ -90,8 +90,8 @@ def read_checkpoint(
         ) from error
     if other:
         raise raising(
-            f"{path}: expected a checkpoint of this {what}, got one with another {' and another '.join(other)}; delete "
-            "it to start again, or repeat its arguments to continue it",
+            f"{path}: expected a checkpoint of {what} with the same {' and '.join(other)}, got another; delete it to "
+            "start again, or repeat its arguments to continue it",
             file=path,
             value=other,
         )

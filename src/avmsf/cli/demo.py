@@ -88,7 +88,7 @@ def _go_all_the_way(
         fitting=bar.fitting,
     )
     train, test = made.modes.aligned(train), made.modes.aligned(test)
-    bar.tell("page: a web page, sounds, pictures and scores")
+    bar.tell("page: a web page, sounds, figures and scores")
     shutil.move(made.field, folder / FIELD)
     shutil.move(folder / CACHE / CLOUD, folder / GAUSSIANS)
     field = load(folder / FIELD)
@@ -128,7 +128,7 @@ def _go_all_the_way(
 
 
 def _title(train: Impacts, test: Impacts) -> str:
-    return f"{parts_words(train, test)}; lower is better; the floor has no noise, which L1-log counts"
+    return f"{parts_words(train, test)}; lower is better; the lower bound has no noise, which L1-log counts"
 
 
 def _write_sounds(folder: Path, field: SoundField, train: Impacts, heard: Impacts) -> None:

@@ -66,7 +66,7 @@ def run(options: Options) -> int:
         screen.print(score_table(f"{len(recorded)} contacts, {what}; lower is better", scores))
         values |= {"compared_with": {"recordings": list(recorded.names), "which": what, "scores": score_values(scores)}}
     if options.plots is not None:
-        doing("drawing the pictures")
+        doing("drawing the figures")
         draw_field(field, options.plots, points=points, gains=gains, level=level, recorded=recorded)
     next_command("avmsf render", options.file, "--position X Y Z -o impact.wav")
     if options.json:

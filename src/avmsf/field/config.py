@@ -44,7 +44,7 @@ class FitConfig:
     clusters: int = 16
     """Regions of the object that the network attends to (paper: 128, 256 or 512)."""
     bands: int = 0
-    """Octaves in the encoding of offsets; 0 leaves the plain offsets."""
+    """Octaves in the encoding of offsets; 0 uses the offsets only."""
     width: int = 64
     """Size of queries, keys and values."""
     hidden: int = 512

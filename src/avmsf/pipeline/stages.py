@@ -50,7 +50,7 @@ class StageFolder:
         Hold it from the first stage until the last output is read: stages read each other's files. Raises
         FolderInUseError where another process, which is told `command`, holds it for longer than `wait` seconds.
         """
-        advice = ", or keep this one's stages in another folder (--cache)"
+        advice = ", or choose another folder by --cache"
         return write_lock(self.folder, "stages", command=command, wait=wait, advice=advice, parents=True)
 
     def path(self, name: str) -> Path:

@@ -35,7 +35,7 @@ class Counterpart:
         else:
             assert self.angle is not None
             axis = str(self.symmetry).split(" about ")[1]
-            why = f"it turned by {math.degrees(self.angle):.0f} degrees about {axis}"
+            why = f"its rotation by {math.degrees(self.angle):.0f} degrees about {axis}"
         return f"also at ({where}) m, with {100 * self.probability:.0f} %: {why}"
 
 

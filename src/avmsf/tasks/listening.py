@@ -257,7 +257,7 @@ class Listener:
         try:
             found = judged(self.locator.locate(sound.float()))
             if found.refusal is not None:
-                raise LocationError(f"the impact: {found.refusal}")
+                raise LocationError(f"the impact: {found.refusal}", name="impact", value=pending.onset / self.rate)
         except LocationError as error:
             return replace(ears, strangers=ears.strangers + 1, refusal=str(error)), None
         return ears, Blow(pending.onset / self.rate, found, length / self.rate, 0.0, final)

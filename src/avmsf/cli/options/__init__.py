@@ -1,4 +1,4 @@
-"""What each verb can be told, one module a verb: importing these imports nothing that computes.
+"""The options of each command, one module for each: importing these imports nothing that computes.
 
-So a mistake in a command is answered before the libraries are loaded that the verb itself needs.
+So a mistake in a command is reported before the libraries are loaded that the command itself needs.
 """

@@ -54,7 +54,7 @@ class Options(Printing):
     modes: int = 128
     """Maximum number of modes."""
     time_zero: TimeZero | None = None
-    """Start of the sounds: onset, or peak (paper); by default as capture.toml says."""
+    """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
     """Device for training end to end, its spectral loss and the network; by default the GPU if there is one. Mode
     extraction, clustering, finite elements and the Gaussian process run on the CPU."""

@@ -49,7 +49,7 @@ class Options(SceneOptions):
     modes: int = 128
     """Maximum number of modes."""
     time_zero: TimeZero | None = None
-    """Start of the sounds: onset, or peak (paper); by default as capture.toml says."""
+    """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
     seed: int | None = None
     """Seed of all stages; by default each stage's own."""
     gain_model: GainModel = "auto"

@@ -14,8 +14,8 @@ from avmsf.cli.options.common import Existing, FieldFile, Flag, OutputFolder, Pr
 class Options(Printing):
     """Suggest where to record next: the contacts that reduce the expected error of the field most.
 
-    Each suggestion assumes that those before it are recorded, so keep this order. Record them, fit again with all
-    recordings, and repeat. Needs a field whose gains have a posterior, as all but `--gain-model network` have.
+    Each suggestion assumes that those before it are recorded: record them in this order, fit again with all recordings,
+    and repeat. Needs a field whose gains have a posterior, as all but `--gain-model network` have.
     """
 
     field: tyro.conf.Positional[FieldFile]

@@ -212,20 +212,18 @@ class Outlier:
     """Whether the opposite direction explains it at its own place."""
 
     def describe(self, names: Sequence[str], contacts: Float[Tensor, "contacts 3"]) -> str:
-        """Return what is wrong with it in words, from the names and places (meters) of all training contacts."""
-        ratios = (
-            f"log predictive ratio {self.ratio:.2g} nats, there {self.place_ratio:.2g}; above 0 the place is plausible"
-        )
+        """Return a message on it, from the names and positions (meters) of all training contacts."""
+        ratios = f"log predictive ratio {self.ratio:.2g} nats, there {self.place_ratio:.2g}; plausible above 0"
         if self.distance == 0.0 and self.reversed:
-            return f"{names[self.row]} fits its place if its direction or its polarity is reversed ({ratios})"
+            return f"{names[self.row]} fits its contact if its direction or its polarity is reversed ({ratios})"
         if self.distance == 0.0:
-            return f"{names[self.row]} fits its place in another direction ({ratios})"
+            return f"{names[self.row]} fits its contact in another direction ({ratios})"
         place = torch.tensor(self.place, dtype=torch.float64)
         apart = (contacts.double() - place).norm(dim=1)
         own, apart[self.row] = float(apart[self.row]), torch.inf
         other = int(apart.argmin())
         where = ", ".join(f"{each + 0.0:.4g}" for each in self.place)
-        found = f"{names[self.row]} does not fit its place; it fits ({where}) m, {self.distance:.2g} m away"
+        found = f"{names[self.row]} does not fit its contact; it fits ({where}) m, {self.distance:.2g} m away"
         if float(apart[other]) < own:
             found += f", nearest to {names[other]}: their labels may have been exchanged"
         if self.reversed:

@@ -99,7 +99,7 @@ def _no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> E
     if samples < SHORTEST:
         return ExtractionError(
             f"expected {SHORTEST} samples or more, got {samples} ({duration:.3g} s) in each of {len(sounds)} "
-            "recordings; keep more seconds after the onset",
+            "recordings; use more seconds after the onset",
             name="samples",
             value=samples,
         )
@@ -120,13 +120,13 @@ def _no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> E
     if fall < 6:
         return ExtractionError(
             f"{expected}, got noise or hum that decays by {fall:.0f} dB; check the onset and the noise (avmsf check), "
-            "or strike harder",
+            "or record louder impacts",
             name="decay",
             value=fall,
         )
     if below > 0.5:
         return ExtractionError(
-            f"{expected}, got {100 * below:.0f} % of the energy below {lowest:.0f} Hz; keep more seconds after the "
+            f"{expected}, got {100 * below:.0f} % of the energy below {lowest:.0f} Hz; use more seconds after the "
             "onset, which lowers this limit",
             name="energy",
             value=below,

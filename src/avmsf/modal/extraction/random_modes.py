@@ -35,7 +35,7 @@ def random_modes(train: Impacts, *, modes: int, bins: int, generator: torch.Gene
     lowest, highest = lowest_frequency(samples, rate), _MAX_FREQUENCY * rate / 2
     if lowest >= highest:
         raise FitError(
-            f"train: expected longer recordings, got {samples} samples; keep more seconds after the onset",
+            f"train: expected longer recordings, got {samples} samples; use more seconds after the onset",
             name="train",
             value=samples,
         )
