@@ -48,7 +48,8 @@ class Impacts:
 
     def __post_init__(self) -> None:
         if (self.before is None) != (self.after is None):
-            raise ValueError("expected both before and after, or neither, got one of them")
+            name = "before" if self.before is None else "after"
+            raise ArrayError(f"{name}: expected both before and after, or neither, got only one", name=name)
 
     @classmethod
     def of(

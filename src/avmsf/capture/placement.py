@@ -203,11 +203,11 @@ def expect_placed(
     if placement.mistake is None and float(placement.distances.median()) <= placement.tolerance:
         return
     if placement.mistake is None:
-        advice = "; bring both into one frame, or take a gain model without elastic mode shapes"
+        advice = "; bring both into one frame, or use a gain model without elastic mode shapes"
     elif placement.mistake.unit_only:
-        advice = " State each one's unit, as unit and surface_unit in capture.toml do, or give both in meters"
+        advice = " State both units, as unit and surface_unit in capture.toml do, or give both in meters"
     else:
-        advice = " Undo this in one of the two, or take a gain model without elastic mode shapes"
+        advice = " Undo this in one of the two, or use a gain model without elastic mode shapes"
     raise FitError(
         f"expected contacts on the surface for elastic mode shapes, but {placement.describe(names)}{advice}",
         name="contacts",

@@ -150,7 +150,7 @@ def refuse_repeated_files(strikes: Sequence[Strike]) -> None:
     for strike in strikes:
         if strike.file in lines:
             raise Location(TABLE, strike.line, f"row {strike.line}").error(
-                f"expected a recording of its own, got {strike.file}, which row {lines[strike.file]} has already",
+                f"expected a different recording for each row, got {strike.file} as in row {lines[strike.file]}",
                 name="file",
                 value=strike.file,
             )
