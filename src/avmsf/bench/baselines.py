@@ -1,8 +1,8 @@
-"""What a field has to beat, and what no field on the same modes can beat.
+"""Baselines of a field, and lower bounds of the error for its modes.
 
-Each baseline is a `Renderer` made from the training impacts alone; nearest is by distance in a straight line, and of
-equally near contacts the one that comes first. The floors are made from the test sounds themselves: they are what
-perfect gains would score, and no renderers, for nobody has the sound of a contact before it is struck.
+Each baseline is a `Renderer` made only from the training impacts; nearest is by Euclidean distance, and of equally near
+contacts the first. The lower bounds are computed from the test sounds: they are the scores of perfect gains, and no
+renderers.
 """
 
 import zlib
@@ -25,10 +25,10 @@ from avmsf.scene.points import nearest_points
 
 @dataclass(frozen=True, eq=False)
 class WhiteNoise:
-    """Gaussian white noise as loud as the training sounds on average, for each contact its own.
+    """Gaussian white noise at the mean level of the training sounds, different for each contact.
 
-    Loudness is the root mean square over the whole sound. (The paper says the same of its own white noise, but its
-    figures for it are those of noise of peak one: see `avmsf.bench.conventions`.)
+    The level is the root mean square over the sound. (The paper says the same of its white noise, but its values are
+    those of noise of peak one: see `avmsf.bench.conventions`.)
     """
 
     train: Impacts
@@ -42,7 +42,7 @@ class WhiteNoise:
     def render(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Float[Tensor, "contacts samples"]:
-        """Return noise that depends on the seed and on where the contact is, and on nothing else."""
+        """Return noise that depends only on the seed and the contact."""
         loudness = self.train.sounds.square().mean(dim=1).sqrt().mean()
         sounds = [self._noise(contact) for contact in contacts]
         return torch.stack(sounds) * loudness if sounds else self.train.sounds[:0]
@@ -50,7 +50,7 @@ class WhiteNoise:
     def _noise(self, contact: Float[Tensor, "3"]) -> Float[Tensor, " samples"]:
         # Adding zero makes one of the two zeros, whose bytes differ.
         place = (contact.detach().double().cpu() + 0.0).numpy().tobytes()
-        # One hash of both, for torch's generator heeds the lower 32 bits of its seed alone.
+        # One hash of both, since torch's generator uses only the lower 32 bits of its seed.
         generator = torch.Generator().manual_seed(zlib.crc32(place, self.seed))
         noise = torch.randn(self.train.sounds.shape[1], generator=generator, dtype=self.train.sounds.dtype)
         return noise.to(self.train.sounds.device)

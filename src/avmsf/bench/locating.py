@@ -87,9 +87,9 @@ class LocatingScores:
     """Seed and settings of the evaluation, as plain values."""
 
     def figures(self, method: str) -> dict[str, float]:
-        """Return a method's means: `rmed`, `rmed_modulo`, `contact_error`, `refused`, the fraction of rejected recordings,
-        which count as random points, and, of the regions of the others, `covered`, `covered_modulo` and `region`.
-        Raises EvaluationError for a method without rows."""
+        """Return a method's means: `rmed`, `rmed_modulo`, `contact_error`, `refused`, the fraction of rejected
+        recordings, which count as random points, and, of the regions of the others, `covered`, `covered_modulo` and
+        `region`. Raises EvaluationError for a method without rows."""
         rows = [row for row in self.rows if row.method == method]
         if not rows:
             judged = ", ".join(dict.fromkeys(row.method for row in self.rows))

@@ -1,4 +1,4 @@
-"""What every collection of recorded objects answers, whatever its files look like."""
+"""The interface of collections of recorded objects."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,50 +10,50 @@ from avmsf.capture.settings import CaptureSettings
 
 @dataclass(frozen=True)
 class ObjectFacts:
-    """What is known of one object besides its recordings."""
+    """Name and material of one object."""
 
     identifier: str
-    """What the dataset calls it: a number, or a folder's name."""
+    """Its identifier in the dataset: a number, or a folder's name."""
     name: str
-    """In words, or the identifier again."""
+    """As words, or the identifier."""
     material: str | None = None
-    """In lower case, such as `ceramic`; None where it is not told."""
+    """In lower case, such as `ceramic`; None where it is unknown."""
     inferred: bool = False
-    """Whether name and material were concluded from tables that do not quite fit, rather than read."""
+    """Whether name and material are inferred from tables that do not fit exactly, rather than read."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """Where an object can be seen."""
+    """Visual source of an object."""
 
     folder: Path
-    """Holds photographs, Gaussians or a mesh, as a capture folder does."""
+    """Folder with photographs, Gaussians or a mesh, like a capture folder."""
     settings: CaptureSettings = field(default_factory=CaptureSettings)
-    """Names the mesh, where it is not called as in a capture folder, and the units."""
+    """Name of the mesh, where it differs from a capture folder's, and units."""
 
 
 @dataclass(frozen=True)
 class ObjectReport:
-    """What of one object is there."""
+    """Available data of one object."""
 
     facts: ObjectFacts
     recordings: int
-    """Recordings that can be used, contacts included."""
+    """Number of usable recordings with contacts."""
     problems: tuple[str, ...] = ()
-    """What is missing or cannot be used, a sentence each; empty where all is there."""
+    """Messages on missing or unusable data; empty if complete."""
 
 
 @dataclass(frozen=True)
 class DatasetReport:
-    """What of a dataset is there."""
+    """Available data of a dataset."""
 
     dataset: str
     """Its name."""
     objects: tuple[ObjectReport, ...]
     missing: tuple[str, ...] = ()
-    """Whole parts that are not there, with what to download and where to put it."""
+    """Missing parts, with what to download and where to put it."""
     remarks: tuple[str, ...] = ()
-    """What a user should know besides, such as objects shared with another dataset."""
+    """Further notes, such as objects shared with another dataset."""
 
 
 @runtime_checkable
@@ -62,7 +62,7 @@ class Dataset(Protocol):
 
     @property
     def name(self) -> str:
-        """What reports call the dataset."""
+        """Name of the dataset in reports."""
         ...
 
     def objects(self) -> tuple[str, ...]:
@@ -70,7 +70,7 @@ class Dataset(Protocol):
         ...
 
     def facts(self, identifier: str) -> ObjectFacts:
-        """Return what is known of an object. Raises DatasetError for an unknown one."""
+        """Return an object's name and material. Raises DatasetError for an unknown one."""
         ...
 
     def capture(self, identifier: str) -> Capture:
@@ -78,9 +78,9 @@ class Dataset(Protocol):
         ...
 
     def look(self, identifier: str) -> Look | None:
-        """Return where the object can be seen; None where there is neither mesh nor picture of it."""
+        """Return the object's visual source; None where there is neither mesh nor photograph."""
         ...
 
     def check(self) -> DatasetReport:
-        """Say what is there and what is missing, without reading the sounds."""
+        """Report available and missing data, without reading the sounds."""
         ...

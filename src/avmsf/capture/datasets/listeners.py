@@ -1,11 +1,11 @@
-"""Which of many microphones is the closest to an object, from where they stood."""
+"""The microphone closest to an object, from the microphones' positions."""
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 
 SAME_PLACE = 1e-3
-"""Meters within which two microphones stood in one place."""
+"""Distance within which two microphone positions are equal, meters."""
 
 
 def closest_rows(
@@ -13,12 +13,12 @@ def closest_rows(
     listeners: Float64[np.ndarray, "rows 3"],
     surface: Float64[np.ndarray, "points 3"],
 ) -> tuple[list[int], bool]:
-    """Return, for each struck vertex in the order of the rows, the row of the microphone closest to the object.
+    """Return, for each impact vertex in the order of the rows, the row of the microphone closest to the object.
 
-    That is the one whose distance to the nearest point of the surface is the least among the places at which a
-    microphone stood for every vertex: what differs between the sounds is then where the object was struck, and not
-    from where it was heard. The second value tells whether there are such places; where there are none, each vertex
-    has the closest microphone of its own. Of equally close ones the first row counts.
+    The closest is the one with the smallest distance to the nearest point of the surface among the microphone positions
+    that all vertices have in common, so that the sounds differ by the contact only. The second value is whether there
+    are such positions; otherwise each vertex has its own closest microphone. Of equally close ones the first row is
+    taken.
     """
     tree = cKDTree(surface)
     groups = [np.flatnonzero(vertices == vertex) for vertex in dict.fromkeys(vertices.tolist())]
