@@ -318,8 +318,8 @@ def test_a_picture_shows_both_maps_and_the_marks(tmp_path: Path) -> None:
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert len(titles) == 12
     assert any("elevation -" in title for title in titles)
-    assert "blue: most probable" in figure.get_suptitle()
-    assert "red: true contact" in figure.get_suptitle()
-    assert "red" not in draw_contact(contact(), title="hit.wav", sides=((0.0, 25.0),)).get_suptitle()
+    assert "blue: " in figure.get_suptitle()
+    assert "red: " in figure.get_suptitle()
+    assert "red: " not in draw_contact(contact(), title="hit.wav", sides=((0.0, 25.0),)).get_suptitle()
     save_picture(figure, tmp_path / "hit.png")
     assert (tmp_path / "hit.png").read_bytes().startswith(b"\x89PNG")

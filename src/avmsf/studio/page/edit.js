@@ -47,7 +47,7 @@ export function editSheet(studio, load) {
     );
   // What the object is of counts where it shall be of another material or size, and changes nothing by itself.
   const recasts = () => to.value !== "" || sliders.size.value !== sliders.size.rest;
-  const from = select("inferred from the dampings", () => recasts() && onInput());
+  const from = select("inferred", () => recasts() && onInput());
   const to = select("unchanged", onInput);
   const remarks = element("div", { className: "group", "aria-live": "polite" });
   const busy = element("progress", { hidden: true, "aria-label": "Editing" });
