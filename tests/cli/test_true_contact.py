@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import soundfile
 import torch
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from avmsf.bench.sides import ALL_SIDES, view_from
@@ -19,6 +20,7 @@ from avmsf.field.soundfield import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize
+from avmsf.plotting.style import FIRST, SECOND
 from avmsf.tasks.locator import Locator
 from made_fields import BANK, positional
 from raising import raises
@@ -71,8 +73,8 @@ def test_the_true_contact_is_red_at_its_place_and_the_found_one_blue(
         scatter = axes.collections[0]
         colors = scatter.get_facecolors()[:, :3]
         hue = colors / colors.max(axis=1, keepdims=True)
-        for row, mark in ((OTHER, (1.0, 0.05, 0.05)), (STRUCK, (0.2, 0.45, 1.0))):
-            marked = np.abs(hue - mark).max(axis=1) < 0.01
+        for row, mark in ((OTHER, np.array(to_rgb(SECOND))), (STRUCK, np.array(to_rgb(FIRST)))):
+            marked = np.abs(hue - mark / mark.max()).max(axis=1) < 0.01
             place = (points[row] - middle).numpy() @ view_from(side).T
             # Points are sparse here: the nearest one alone has the mark's color.
             assert np.asarray(scatter.get_offsets())[marked] == pytest.approx(place[None, :2], abs=1e-6)
