@@ -66,6 +66,7 @@ WRONG: dict[str, dict[str, Any]] = {
     f"render field.safetensors {AT} --output s --seconds nan": {"name": "--seconds"},
     f"render field.safetensors {AT} --output s --contact-time 2": {"name": "--contact-time", "value": 2.0},
     f"render field.safetensors {AT} --output s --level-db nan": {"name": "--level-db"},
+    f"render field.safetensors {AT} --output s --force -1": {"name": "--force", "value": -1.0},
     f"render field.safetensors {AT} --output s --force inf": {"name": "--force", "value": math.inf},
     f"{TABLE} nowhere.csv": {"file": "nowhere.csv"},
     f"{TABLE} no-z.csv": {"file": "no-z.csv", "row": 1, "name": "z"},

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.capture.audio import MAX_SAMPLES
-from avmsf.cli.contacts import Contacts, contacts_at, read_contacts, refuse_far
+from avmsf.cli.contacts import Contacts, contacts_at, off_surface, read_contacts, refuse_far
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.render import Options
 from avmsf.cli.printing import print_result, say
@@ -47,6 +47,12 @@ def run(options: Options) -> int:
         value, option = getattr(options, name), f"--{name.replace('_', '-')}"
         if not math.isfinite(value):
             raise OutputError(f"{option}: expected a finite number, got {value}", name=option, value=value)
+    if options.force <= 0:
+        raise OutputError(
+            f"--force: expected a force above 0, got {options.force:g}; --direction says which way it acts",
+            name="--force",
+            value=options.force,
+        )
     wrong = torch.nonzero(~torch.isfinite(contacts.places).all(1)).flatten().tolist()
     if wrong:
         found = contacts.places[wrong[0]].tolist()
@@ -55,6 +61,8 @@ def run(options: Options) -> int:
         )
     field = load(options.field)
     refuse_far(contacts, field)
+    for name, distance in off_surface(contacts, field):
+        say(f"note: the contact of {name} is {1e3 * distance:.3g} mm off the object; its nearest point is used")
     if options.force != 1 and not field.origin.per_newton:
         say(f"note: the forces are not known: {options.force:g} is relative to an average recorded impact")
     if round(field.sample_rate) != field.sample_rate:
