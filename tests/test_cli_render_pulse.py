@@ -49,17 +49,16 @@ def decibels_below(path: Path, words: tuple[str, ...], capsys: pytest.CaptureFix
 def test_a_much_softer_blow_says_by_how_much(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     below, said = decibels_below(path, ("--contact-time", "0.012"), capsys)
     assert below > 20.5
-    assert said == (
-        f"note: with a contact of 12 ms the sound peaks {below:.0f} dB lower than that of the recorded blow, and no "
-        "level was changed: add --normalize peak or --level-db, or a shorter --contact-time\n"
-    )
+    assert said.startswith("note: ")
+    assert "12 ms" in said
+    assert f"{below:.0f} dB" in said
 
 
 @pytest.mark.parametrize("words", [("0.0005",), ("0.012", "--normalize", "peak"), ("0.012", "--level-db", "12")])
 def test_no_more_is_said_of_a_little_softer_blow_and_of_a_level_that_was_chosen(
     path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
 ) -> None:
-    assert "recorded blow" not in decibels_below(path, ("--contact-time", *words), capsys)[1]
+    assert "note: " not in decibels_below(path, ("--contact-time", *words), capsys)[1]
 
 
 def test_without_a_contact_time_a_blow_is_as_recorded(path: Path, tmp_path: Path) -> None:
