@@ -58,7 +58,7 @@ def test_a_much_softer_blow_says_by_how_much(path: Path, capsys: pytest.CaptureF
 def test_no_more_is_said_of_a_little_softer_blow_and_of_a_level_that_was_chosen(
     path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
 ) -> None:
-    assert "note: " not in decibels_below(path, ("--contact-time", *words), capsys)[1]
+    assert " ms" not in decibels_below(path, ("--contact-time", *words), capsys)[1]
 
 
 def test_without_a_contact_time_a_blow_is_as_recorded(path: Path, tmp_path: Path) -> None:
