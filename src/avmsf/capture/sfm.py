@@ -12,7 +12,7 @@ import sys
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,20 +98,16 @@ def estimate_cameras(
     try:
         begun.mkdir(parents=True)
         names, lost = _stage_images(images, begun, shared_camera=shared_camera)
-        job = {
-            "folder": str(begun.resolve()),
-            "names": list(names),
-            "true_names": names,
-            "masks": (begun / "masks").is_dir(),
-            "seed": seed,
-            "camera_model": camera_model,
-            "shared_camera": shared_camera,
-            "features": features,
-            "longest": longest,
-            "threads": -1 if threads is None else threads,
-            "exhaustive": len(names) <= ALL_PAIRS,
-        }
-        (begun / "job.json").write_text(json.dumps(job), encoding="utf-8")
+        _write_job(
+            begun,
+            names,
+            seed=seed,
+            camera_model=camera_model,
+            shared_camera=shared_camera,
+            features=features,
+            longest=longest,
+            threads=-1 if threads is None else threads,
+        )
         _run_worker(begun, timeout=timeout, progress=progress)
         models = json.loads((begun / "result.json").read_text(encoding="utf-8"))
         models.sort(key=lambda model: -len(model["names"]))
@@ -225,6 +221,19 @@ def _stage_mask(images: Path, picture: Picture, name: str, staged: Path) -> None
         mask = cv2.resize(mask, picture.size, interpolation=cv2.INTER_NEAREST)
     staged.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(staged), np.where(mask >= 128, 255, 0).astype(np.uint8))
+
+
+def _write_job(folder: Path, names: Mapping[str, str], **settings: Any) -> None:
+    """Write what the worker has to do with the images staged in `folder`: their true names by their own, settings."""
+    job = {
+        "folder": str(folder.resolve()),
+        "names": list(names),
+        "true_names": names,
+        "masks": (folder / "masks").is_dir(),
+        "exhaustive": len(names) <= ALL_PAIRS,
+        **settings,
+    }
+    (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
 
 
 def _run_worker(begun: Path, *, timeout: float, progress: Callable[[MotionProgress], None] | None) -> None:

@@ -1,6 +1,6 @@
 """`avmsf evaluate`: the errors of methods on a dataset, as tables and as a page."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -92,17 +92,22 @@ def run(options: Options) -> int:
     for part in parts[1:3]:
         _print(part, screen)
     drawn = _draw_curves(results, objects, options, screen) if protocol.name == LEARNING_CURVE else {}
-    failures = len(summary["failures"])
-    if failures:
-        for each in summary["failures"][:_SHOWN]:
-            screen.print(f"failed: {each['object']}, {each['method'] or 'all'}: {each['failure']}", soft_wrap=True)
-        screen.print(f"{failures} failures, listed in {TABLES}; run the command again to retry them", soft_wrap=True)
+    _print_failures(summary["failures"], screen)
     screen.print(f"wrote {SUMMARY}, {TABLES} and {PAGE} in {folder}", soft_wrap=True)
     for path in figures:
         screen.print(f"wrote {path}", soft_wrap=True)
     if options.json:
         print_json({**summary, "results": str(folder), **({"curves": drawn} if drawn else {})})
     return 0
+
+
+def _print_failures(failures: Sequence[Mapping[str, Any]], screen: Console) -> None:
+    """Print the first failures, and how many there are."""
+    for each in failures[:_SHOWN]:
+        screen.print(f"failed: {each['object']}, {each['method'] or 'all'}: {each['failure']}", soft_wrap=True)
+    if failures:
+        count = len(failures)
+        screen.print(f"{count} failures, listed in {TABLES}; run the command again to retry them", soft_wrap=True)
 
 
 def _draw_curves(

@@ -82,16 +82,10 @@ def run(options: Options) -> int:
     if options.json:
         print_json(
             {
-                "field": str(options.output),
-                "capture": capture.name,
+                **fitted_values(fitted, train, test, scores, options.output),
                 "preset": options.preset,
                 "config": asdict(options.config),
-                "modes": len(fitted.bank),
                 "sample_rate": fitted.sample_rate,
-                "trained_on": list(train.names),
-                "tested_on": [] if test is None else list(test.names),
-                "report": fitted.origin.report,
-                "scores": score_values(scores),
             }
         )
     return 0
@@ -105,6 +99,21 @@ def print_fitted(
         screen.print(score_table(f"{parts_words(train, test)}; lower is better", scores))
     for words in (*describe_outliers(fitted), summary(fitted, len(train)), *quality_words(fitted, path)):
         screen.print(words, soft_wrap=True)
+
+
+def fitted_values(
+    fitted: SoundField, train: Impacts, test: Impacts | None, scores: Mapping[str, Scores], path: Path
+) -> dict[str, Any]:
+    """Return what `--json` prints of a field in the file `path`, whichever command fitted it."""
+    return {
+        "field": str(path),
+        "capture": fitted.origin.capture,
+        "modes": len(fitted.bank),
+        "trained_on": list(train.names),
+        "tested_on": [] if test is None else list(test.names),
+        "report": fitted.origin.report,
+        "scores": score_values(scores),
+    }
 
 
 def _run_guess(options: Options, material: str, settings: CaptureSettings) -> int:

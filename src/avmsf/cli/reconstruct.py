@@ -6,14 +6,14 @@ from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
-from avmsf.cli.fit import part_contacts, print_fitted, refuse_with_material, show_guess
+from avmsf.cli.fit import fitted_values, part_contacts, print_fitted, refuse_with_material, show_guess
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.reconstruct import Options
 from avmsf.cli.printing import console, figure, next_command, print_json, say, table
 from avmsf.cli.progress import FitBar
 from avmsf.cli.scenebar import SceneBar
 from avmsf.cli.scenes import features_words, settings_for
-from avmsf.cli.scores import compare, score_values
+from avmsf.cli.scores import compare
 from avmsf.cli.writing import expect_writable
 from avmsf.errors import FitError
 from avmsf.field.fit import Progress
@@ -73,17 +73,11 @@ def run(options: Options) -> int:
     if options.json:
         print_json(
             {
-                "field": str(options.output or made.field),
+                **fitted_values(fitted, train, test, scores, options.output or made.field),
                 "surface": None if made.surface is None else str(made.surface),
-                "capture": capture.name,
                 "preset": options.preset,
                 "features_report": made.report,
                 "stages": [asdict(each) for each in made.stages],
-                "modes": len(fitted.bank),
-                "trained_on": list(train.names),
-                "tested_on": [] if test is None else list(test.names),
-                "report": fitted.origin.report,
-                "scores": score_values(scores),
             }
         )
     return 0

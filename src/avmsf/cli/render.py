@@ -26,22 +26,7 @@ METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 
 def run(options: Options) -> int:
     """Render and write."""
-    meters = METRES[options.unit]
-    if bool(options.position) == (options.contact_table is not None):
-        raise OutputError(
-            "expected contacts either by --position X Y Z, once or more, or by --contact-table TABLE.csv",
-            name="--position",
-            value=len(options.position),
-        )
-    if options.direction and len(options.direction) != len(options.position):
-        raise OutputError(
-            f"--direction: expected one for each --position, got {len(options.direction)} for {len(options.position)}",
-            name="--direction",
-            value=len(options.direction),
-        )
-    contacts = contacts_at(options.position, meters=meters, directions=options.direction)
-    if options.contact_table is not None:
-        contacts = read_contacts(options.contact_table, meters=meters)
+    contacts = _contacts(options)
     paths = _paths(options.output, contacts)
     for name in ("force", "level_db"):
         value, option = getattr(options, name), f"--{name.replace('_', '-')}"
@@ -52,12 +37,6 @@ def run(options: Options) -> int:
             f"--force: expected a force above 0, got {options.force:g}; --direction says which way it acts",
             name="--force",
             value=options.force,
-        )
-    wrong = torch.nonzero(~torch.isfinite(contacts.places).all(1)).flatten().tolist()
-    if wrong:
-        found = contacts.places[wrong[0]].tolist()
-        raise OutputError(
-            f"--position: expected finite coordinates, got {found}", name="--position", row=wrong[0], value=found
         )
     field = load(options.field)
     refuse_far(contacts, field)
@@ -92,6 +71,33 @@ def run(options: Options) -> int:
     values = {"files": list(map(str, paths)), "sample_rate": field.sample_rate, "seconds": seconds, "peak": peak}
     print_result(text, values, json=options.json)
     return 0
+
+
+def _contacts(options: Options) -> Contacts:
+    """Return the contacts of the options or of their table; raises `OutputError` for none, both or not finite ones."""
+    meters = METRES[options.unit]
+    if bool(options.position) == (options.contact_table is not None):
+        raise OutputError(
+            "expected contacts either by --position X Y Z, once or more, or by --contact-table TABLE.csv",
+            name="--position",
+            value=len(options.position),
+        )
+    if options.direction and len(options.direction) != len(options.position):
+        raise OutputError(
+            f"--direction: expected one for each --position, got {len(options.direction)} for {len(options.position)}",
+            name="--direction",
+            value=len(options.direction),
+        )
+    if options.contact_table is not None:
+        return read_contacts(options.contact_table, meters=meters)
+    contacts = contacts_at(options.position, meters=meters, directions=options.direction)
+    wrong = torch.nonzero(~torch.isfinite(contacts.places).all(1)).flatten().tolist()
+    if wrong:
+        found = contacts.places[wrong[0]].tolist()
+        raise OutputError(
+            f"--position: expected finite coordinates, got {found}", name="--position", row=wrong[0], value=found
+        )
+    return contacts
 
 
 def _say_softer(hard: Float[Tensor, " samples"], soft: Float[Tensor, " samples"], contact_time: float) -> None:

@@ -5,6 +5,8 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
+from rich.console import Console
+
 from avmsf.bench.doubtpictures import draw_doubt
 from avmsf.bench.pictures import save_picture
 from avmsf.capture import CaptureSettings, read_capture
@@ -46,18 +48,7 @@ def run(options: Options) -> int:
         names = tuple(impacts.names[row] for row in found.rows.tolist())
     rows = _rows(found, names)
     screen = console(errors=options.json)
-    title = f"where to record next: expected error of the field now {figure(found.before)}"
-    columns = ["", *(("recording",) if names else ()), "x (m)", "y (m)", "z (m)"]
-    columns += [*(("nx", "ny", "nz") if found.directions is not None else ()), "error after"]
-    screen.print(
-        table(title, columns, [[_cell(value) for value in row.values()] for row in rows], words=1 + bool(names))
-    )
-    screen.print(
-        "error: by the field's posterior, relative to the energy of the gains; 0 = certain, 1 = the error of silence",
-        soft_wrap=True,
-    )
-    if found.unreachable:
-        screen.print(f"left out: {found.unreachable} positions that no hammer reaches from outside", soft_wrap=True)
+    _print_table(found, rows, screen)
     if found.directions is not None:
         straight = "" if given else ", as perpendicular to the surface as possible if the field has one"
         screen.print(f"nx, ny, nz: direction of the impact{straight}")
@@ -87,6 +78,21 @@ def run(options: Options) -> int:
             }
         )
     return 0
+
+
+def _print_table(found: Suggestions, rows: Sequence[dict[str, Any]], screen: Console) -> None:
+    """Print the suggested contacts with their errors, and how many positions were left out."""
+    title = f"where to record next: expected error of the field now {figure(found.before)}"
+    headings = {"order": "", "x": "x (m)", "y": "y (m)", "z": "z (m)", "error_after": "error after"}
+    columns = [headings.get(name, name) for name in rows[0]]
+    cells = [[_cell(value) for value in row.values()] for row in rows]
+    screen.print(table(title, columns, cells, words=1 + ("recording" in columns)))
+    screen.print(
+        "error: by the field's posterior, relative to the energy of the gains; 0 = certain, 1 = the error of silence",
+        soft_wrap=True,
+    )
+    if found.unreachable:
+        screen.print(f"left out: {found.unreachable} positions that no hammer reaches from outside", soft_wrap=True)
 
 
 def _rows(found: Suggestions, names: Sequence[str] | None) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ float32, dampings [M] or [N, M] in 1/s. The demo's player starts every mode as a
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -80,31 +80,9 @@ def write_demo(
             name="variant",
             value=variant,
         )
-    amplitudes = signed_amplitudes(field)
-    gains = amplitudes.numpy().astype(f"<{np.dtype(precision).str[1:]}")
-    if not np.isfinite(gains).all():
-        loudest = float(amplitudes.abs().max())
-        raise ExportError(
-            f"precision: expected gains up to 65504 for {precision}, got {loudest:.3g}; take float32",
-            name="precision",
-            value=loudest,
-        )
-    picking, places = pack(
-        {
-            "means": field.points.numpy().astype("<f4"),
-            "scales": shown.log_scales.exp().numpy().astype("<f4"),
-            "quaternions": torch.nn.functional.normalize(shown.rotations, dim=1).numpy().astype("<f4"),
-            "opacities": shown.opacities.numpy().astype("<f4"),
-        }
-    )
-    modal, tensors = pack(
-        {
-            "frequencies": field.frequency.numpy().astype("<f4"),
-            "gains": gains,
-            "dampings": field.damping.numpy().astype("<f4"),
-        }
-    )
-
+    gains = _gains(field, precision)
+    picking, places = _picking(field, shown)
+    modal, tensors = _modal(field, gains)
     others = _other_variants(folder, variant)
     stay = bool(others) and _content(folder / PICKING) == picking
     if others and not stay and not force:
@@ -129,6 +107,44 @@ def write_demo(
 
     manifest = {"name": field.name, "count": len(field), "file": PICKING, "arrays": places, "scene": SCENE}
     sizes = write_folder(folder, fill, {**manifest, "variants": sorted([variant, *kept])}, force=force)
+    written = torch.from_numpy(gains.astype(np.float32))
+    error = deviation(field, sine=None, cosine=written, damping=field.damping)
+    return Written(sizes, tuple(_remarks(field, kept, others)), error)
+
+
+def _gains(field: SampledField, precision: Precision) -> Float[np.ndarray, "points modes"]:
+    """Return the gains of modes that start as cosines; raises `ExportError` where `precision` cannot hold them."""
+    amplitudes = signed_amplitudes(field)
+    gains = amplitudes.numpy().astype(f"<{np.dtype(precision).str[1:]}")
+    if not np.isfinite(gains).all():
+        loudest = float(amplitudes.abs().max())
+        raise ExportError(
+            f"precision: expected gains up to 65504 for {precision}, got {loudest:.3g}; take float32",
+            name="precision",
+            value=loudest,
+        )
+    return gains
+
+
+def _picking(field: SampledField, shown: GaussianCloud) -> tuple[bytes, dict[str, dict[str, Any]]]:
+    """Return the content of `picking.bin`, and where its arrays are."""
+    arrays = {
+        "means": field.points,
+        "scales": shown.log_scales.exp(),
+        "quaternions": torch.nn.functional.normalize(shown.rotations, dim=1),
+        "opacities": shown.opacities,
+    }
+    return pack({name: array.numpy().astype("<f4") for name, array in arrays.items()})
+
+
+def _modal(field: SampledField, gains: Float[np.ndarray, "points modes"]) -> tuple[bytes, dict[str, dict[str, Any]]]:
+    """Return the content of `modal.bin`, and where its arrays are."""
+    frequency, damping = (array.numpy().astype("<f4") for array in (field.frequency, field.damping))
+    return pack({"frequencies": frequency, "gains": gains, "dampings": damping})
+
+
+def _remarks(field: SampledField, kept: Collection[str], others: Collection[str]) -> list[str]:
+    """Return what the user is told of the sound, and of the folder's other variants."""
     remarks = ["every mode starts as a cosine in the demo, with the field's level"]
     if field.noise.any():
         remarks.append("the residual noise is left out, since the demo has none")
@@ -136,9 +152,7 @@ def write_demo(
         remarks.append(f"the folder's other variants are unchanged: {', '.join(kept)}")
     elif others:
         remarks.append(f"variants of other Gaussians cannot be used any more: {', '.join(others)}")
-    written = torch.from_numpy(gains.astype(np.float32))
-    error = deviation(field, sine=None, cosine=written, damping=field.damping)
-    return Written(sizes, tuple(remarks), error)
+    return remarks
 
 
 def read_demo(folder: str | Path, *, variant: str | None = None, sample_rate: float | None = None) -> Demo:
@@ -156,12 +170,7 @@ def read_demo(folder: str | Path, *, variant: str | None = None, sample_rate: fl
     }
     sound_folder = folder / (_only_variant(folder) if variant is None else variant)
     sound = read_manifest(sound_folder)
-    place = described(sound, "frequencies", sound_folder / MANIFEST)
-    modes = place["shape"][0] if "shape" in place else number_in(sound, _MODES, sound_folder / MANIFEST)
-    path = sound_folder / MODAL
-    frequency = read_array(path, sound, "frequencies", (modes,), "float32")
-    gains = read_array(path, sound, "gains", (count, modes), _gain_kind(sound, path))
-    damping = read_array(path, sound, "dampings", _damping_shape(sound, path, count, modes), "float32")
+    frequency, gains, damping = _read_modes(sound, sound_folder, count)
     rate = sound.get("sampleRate", sound.get("sample_rate", sample_rate)) if sample_rate is None else sample_rate
     if not isinstance(rate, int | float) or not 1 <= rate <= _MOST_RATE:
         raise ExportError(
@@ -170,16 +179,6 @@ def read_demo(folder: str | Path, *, variant: str | None = None, sample_rate: fl
             name="sampleRate",
             value=rate,
         )
-    for name, values, ok in (("frequencies", frequency, frequency > 0), ("dampings", damping, damping >= 0)):
-        if not ok.all():
-            least = float(values.min())
-            raise ExportError(
-                f"{path}: expected {name} {'above 0' if name == 'frequencies' else 'from 0'}, got {least:g}; export it "
-                "again",
-                file=path,
-                name=name,
-                value=least,
-            )
     seconds = sound.get("duration", 3.0)
     if not isinstance(seconds, int | float) or not 0 < seconds <= _MOST_SECONDS:
         raise ExportError(
@@ -206,6 +205,29 @@ def read_demo(folder: str | Path, *, variant: str | None = None, sample_rate: fl
     )
     rest = (torch.from_numpy(picked[name].copy()) for name in ("scales", "quaternions", "opacities"))
     return Demo(field, *rest)
+
+
+def _read_modes(
+    sound: Mapping[str, Any], folder: Path, count: int
+) -> tuple[Float[np.ndarray, " modes"], Float[np.ndarray, "points modes"], Float[np.ndarray, "..."]]:
+    """Return frequencies, gains at `count` points and dampings of a variant; raises `ExportError` as `read_demo`."""
+    place = described(sound, "frequencies", folder / MANIFEST)
+    modes = place["shape"][0] if "shape" in place else number_in(sound, _MODES, folder / MANIFEST)
+    path = folder / MODAL
+    frequency = read_array(path, sound, "frequencies", (modes,), "float32")
+    gains = read_array(path, sound, "gains", (count, modes), _gain_kind(sound, path))
+    damping = read_array(path, sound, "dampings", _damping_shape(sound, path, count, modes), "float32")
+    for name, values, ok in (("frequencies", frequency, frequency > 0), ("dampings", damping, damping >= 0)):
+        if not ok.all():
+            least = float(values.min())
+            raise ExportError(
+                f"{path}: expected {name} {'above 0' if name == 'frequencies' else 'from 0'}, got {least:g}; export it "
+                "again",
+                file=path,
+                name=name,
+                value=least,
+            )
+    return frequency, gains, damping
 
 
 def is_demo(folder: Path) -> bool:

@@ -101,19 +101,8 @@ def suggest(
     kept = _weighed(pool, allowed, max(MAX_CANDIDATES, count))
     sites = gains.sites(pool[kept], None if directions is None else directions[kept])
     error = _ExpectedError(field, gains, points, sites)
-    before, allowed = error.map(), allowed[kept]
-    rows, after = list[int](), list[float]()
-    while len(rows) < count and bool(allowed.any()):
-        rows.append(int(torch.where(allowed, error.reductions(), -math.inf).argmax()))
-        error.add(rows[-1])
-        allowed &= (sites.points - sites.points[rows[-1]]).norm(dim=1) > same
-        after.append(float(error.map().square().mean().sqrt()))
-    if len(rows) < count:
-        raise FitError(
-            f"candidates: expected {count} different positions or more, got {len(rows)}; ask for fewer",
-            name="candidates",
-            value=len(rows),
-        )
+    before = error.map()
+    rows, after = _chosen(error, sites, allowed[kept], count, same)
     return Suggestions(
         sites.points[rows],
         sites.directions[rows] if gains.directional else None,
@@ -171,6 +160,28 @@ class _ExpectedError:
     def _measured(self, shared: Tensor, noise: float) -> Float64[Tensor, " candidates"]:
         own = torch.diagonal(shared[-self.candidates :]).clamp_min(0.0)
         return (own + noise).clamp_min(torch.finfo(torch.float64).tiny)
+
+
+def _chosen(
+    error: _ExpectedError, sites: Sites, allowed: Bool[Tensor, " candidates"], count: int, same: float
+) -> tuple[list[int], list[float]]:
+    """Return the rows of `count` allowed sites, each the one that lowers `error` most, and the error after each.
+
+    Adds them to `error`. Raises FitError where fewer lie farther apart than `same`.
+    """
+    rows, after = list[int](), list[float]()
+    while len(rows) < count and bool(allowed.any()):
+        rows.append(int(torch.where(allowed, error.reductions(), -math.inf).argmax()))
+        error.add(rows[-1])
+        allowed = allowed & ((sites.points - sites.points[rows[-1]]).norm(dim=1) > same)
+        after.append(float(error.map().square().mean().sqrt()))
+    if len(rows) < count:
+        raise FitError(
+            f"candidates: expected {count} different positions or more, got {len(rows)}; ask for fewer",
+            name="candidates",
+            value=len(rows),
+        )
+    return rows, after
 
 
 def _reachable(

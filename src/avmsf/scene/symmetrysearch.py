@@ -1,6 +1,7 @@
 """Finding the symmetries of a cloud: candidates, each moved to its best place, judged, and completed by one another."""
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import SceneError
-from avmsf.scene.neighborhoods import NEIGHBORS, read_neighborhoods
+from avmsf.scene.neighborhoods import NEIGHBORS, Neighborhoods, read_neighborhoods
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
 from avmsf.scene.symmetryalignment import Halves
 from avmsf.scene.symmetrycandidates import (
@@ -22,6 +23,7 @@ from avmsf.scene.symmetrycandidates import (
 )
 from avmsf.scene.symmetrygroup import Group, follows
 from avmsf.scene.symmetryjudging import MISSING, Judge, Judged
+from avmsf.scene.symmetrymotion import Motion
 
 TOLERANCE = 0.38
 """Largest error of a symmetry, in point spacings; see `find_symmetries`."""
@@ -85,20 +87,24 @@ def find_symmetries(
     halves = Halves.of(places, _QUERIES, bounds=_SPACINGS, generator=random)
     coarse = CoarseCloud.of(surface, halves.queries[:150])
     group = Group(Judge(halves, tolerance, missing))
+    for motion in _candidates(surface, coarse, random):
+        group.consider(motion)
+    for step in (group.leave_openings, group.leave_contradictions, group.complete, group.leave_openings):
+        step()
+    return _symmetries(group, halves.spacing, middle, diagonal)
+
+
+def _candidates(surface: Neighborhoods, coarse: CoarseCloud, random: np.random.Generator) -> Iterator[Motion]:
+    """Yield the rotations and mirrors to fit, by the principal axes and by pairs of points with similar surface."""
     principal = principal_motions(surface)
     axes = distinct([motion for motion in principal if motion.angle is not None], most=9)
     pairs = matching_pairs(surface, generator=random)
     axes += turns_of_pairs(surface, pairs, coarse=coarse, most=_AXES)
     turns = [axis.turning(2 * math.pi / prime) for axis in axes for prime in _PRIMES]
-    for row in np.argsort(-coarse.score_motions(turns))[:_TURNS]:
-        group.consider(turns[row])
+    yield from (turns[row] for row in np.argsort(-coarse.score_motions(turns))[:_TURNS])
     # Planes that contain an axis of any angle follow from it: axes are looked for first.
-    mirrors = [motion for motion in principal if motion.angle is None]
-    for motion in mirrors + mirrors_of_pairs(surface, pairs, coarse=coarse, most=_MIRRORS):
-        group.consider(motion)
-    for step in (group.leave_openings, group.leave_contradictions, group.complete, group.leave_openings):
-        step()
-    return _symmetries(group, halves.spacing, middle, diagonal)
+    yield from (motion for motion in principal if motion.angle is None)
+    yield from mirrors_of_pairs(surface, pairs, coarse=coarse, most=_MIRRORS)
 
 
 def _symmetries(group: Group, spacing: float, middle: Float[np.ndarray, " 3"], diagonal: float) -> Symmetries:

@@ -172,14 +172,7 @@ def elastic_modes(
     shift = _SHIFT * material.young / (material.density * solid.size**2)
     found = _vibrations(mesh, forces, weights, count=count, shift=shift, supported=bool(springs), fixed=fixed)
     frequency = torch.from_numpy(np.sqrt(found.squares) / (2.0 * math.pi))
-    kept = len(frequency) if highest is None else int((frequency <= highest).sum())
-    if not kept:
-        raise SimulationError(
-            f"highest: expected a limit above the lowest mode at {float(frequency[0]):g} Hz, got {highest:g} Hz; raise "
-            "it, or make the body larger or thinner",
-            name="highest",
-            value=highest,
-        )
+    kept = len(frequency) if highest is None else _modes_up_to(highest, frequency)
     whole = found.shapes[:, :kept].reshape(len(mesh.nodes), 3, -1)
     changes = None if not perturbed else perturbations(
         elements_of(mesh), whole, size=float(solid.size), young=material.young, poisson=material.poisson,
@@ -196,6 +189,19 @@ def elastic_modes(
         mass=float((solid.volumes * light).sum()) * material.density,
         perturbations=changes,
     )
+
+
+def _modes_up_to(highest: float, frequency: Float64[Tensor, " modes"]) -> int:
+    """Return how many of the modes, in order, lie below a limit in Hz; raises SimulationError for none."""
+    count = int((frequency <= highest).sum())
+    if not count:
+        raise SimulationError(
+            f"highest: expected a limit above the lowest mode at {float(frequency[0]):g} Hz, got {highest:g} Hz; raise "
+            "it, or make the body larger or thinner",
+            name="highest",
+            value=highest,
+        )
+    return count
 
 
 def _vibrations(

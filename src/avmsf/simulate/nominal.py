@@ -144,20 +144,7 @@ def nominal_bodies(
             likely.append(wall)
         except SimulationError as error:
             refused[wall] = str(error)
-    fine = len(likely) == 1
-    bodies = []
-    # Most of the time goes to factorizations, which release the interpreter's lock and keep one processor busy each.
-    # The limit on BLAS is the whole process's: set by each thread for itself, it would not be taken back in order.
-    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(lane_count()) as pool:
-        pending = {wall: pool.submit(maker.body, wall, freedoms, fine=fine) for wall in likely}
-        try:
-            for wall, body in pending.items():
-                try:
-                    bodies.append(body.result())
-                except SimulationError as error:
-                    refused[wall] = str(error)
-        finally:
-            pool.shutdown(cancel_futures=True)
+    bodies = maker.bodies(likely, freedoms, refused)
     reasons = _grouped(refused)
     for reason in reasons:
         told(f"skipped: {reason}")
@@ -315,6 +302,25 @@ class _Maker:
                     raise
                 self._tell(f"retrying with more tetrahedra ({error})")
         return NominalBody(wall, self._converged(wall, freedoms))
+
+    def bodies(
+        self, walls: Sequence[float | None], freedoms: int, refused: dict[float | None, str]
+    ) -> list[NominalBody]:
+        """Return the bodies with these walls, fine if it is one; `refused` gets the reason of those that fail."""
+        bodies = []
+        # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
+        # The limit on BLAS is the whole process's: set by each thread for itself, it would not be taken back in order.
+        with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(lane_count()) as pool:
+            pending = {wall: pool.submit(self.body, wall, freedoms, fine=len(walls) == 1) for wall in walls}
+            try:
+                for wall, body in pending.items():
+                    try:
+                        bodies.append(body.result())
+                    except SimulationError as error:
+                        refused[wall] = str(error)
+            finally:
+                pool.shutdown(cancel_futures=True)
+        return bodies
 
     def _converged(self, wall: float | None, freedoms: int) -> ElasticModes:
         """Return modes of one body, of twice as many degrees of freedom where their frequencies still change much."""

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from scipy.fft import irfft, next_fast_len, rfft
 from torch import Tensor
 
-from avmsf.capture.audio import refuse_silence
+from avmsf.capture.audio import Recording, refuse_silence
 from avmsf.capture.onset import find_onset
 from avmsf.capture.prepare import remove_rumble, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
@@ -73,12 +73,7 @@ def locate_blows(
             value="deconvolve",
         )
     notes = describe(whole, chosen)
-    try:
-        response = whole.response(chosen.response_channel, force_channel=chosen.force_channel)
-        refuse_silence(response, whole.name)
-        sound = remove_rumble(response, chosen.highpass, whole)
-    except CaptureError as error:
-        raise location_error(error) from error
+    sound = _without_rumble(whole, chosen)
     onsets = find_blows(sound, sample_rate=whole.sample_rate)
     resampled, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
     finder = Locator.of(field) if locator is None else locator
@@ -93,15 +88,7 @@ def locate_blows(
             own = own - still_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
         seconds = onset / whole.sample_rate
         try:
-            located = finder.locate(own.float(), highest=highest, force=force)
-            located = judged(located)
-            if located.refusal is not None:
-                raise LocationError(
-                    f"{whole.name}, impact at {seconds:.3f} s: {located.refusal}",
-                    file=whole.name,
-                    name="impact",
-                    value=seconds,
-                )
+            located = _accepted(judged(finder.locate(own.float(), highest=highest, force=force)), whole.name, seconds)
         except LocationError as error:
             refused.append((seconds, error))
             continue
@@ -113,6 +100,25 @@ def locate_blows(
     times = ", ".join(f"{seconds:.3f}" for seconds, _ in refused)
     left_out = f"{whole.name}: {len(refused)} impacts, at {times} s, could not be located: {refused[0][1]}"
     return [(seconds, replace(each, notes=(*each.notes, left_out))) for seconds, each in found]
+
+
+def _accepted(located: ContactMap, recording: str, seconds: float) -> ContactMap:
+    """Return the map of the impact at `seconds` as it is; raises LocationError for an impact on another object."""
+    if located.refusal is not None:
+        raise LocationError(
+            f"{recording}, impact at {seconds:.3f} s: {located.refusal}", file=recording, name="impact", value=seconds
+        )
+    return located
+
+
+def _without_rumble(recording: Recording, settings: CaptureSettings) -> Float64[np.ndarray, " frames"]:
+    """Return the channel of the sound, high-pass filtered; raises LocationError where it cannot be used."""
+    try:
+        response = recording.response(settings.response_channel, force_channel=settings.force_channel)
+        refuse_silence(response, recording.name)
+        return remove_rumble(response, settings.highpass, recording)
+    except CaptureError as error:
+        raise location_error(error) from error
 
 
 def find_blows(sound: Float64[np.ndarray, " frames"], *, sample_rate: float) -> list[int]:

@@ -110,17 +110,7 @@ class MixtureEstimator(GainRecipe):
         given, every = case.train.directions, torch.arange(len(case.train))
         directional = bool(bodies) or (given is not None and bool(given.any()))
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
-        if self.name == Symmetric.kind and not groups:
-            raise FitError(
-                "symmetry: expected symmetries of the object's shape, got none; take another gain model",
-                name=Symmetric.kind,
-            )
-        if self.name == Visual.kind and case.features.encoder == GEOMETRY:
-            raise FitError(
-                "visual: expected visual features, got positions only; give --features, or take another gain model",
-                name=Visual.kind,
-                value=GEOMETRY,
-            )
+        self._expect_inputs(case, groups)
         fit = _Fit(case, self.kinds, _sites(case, bodies), directional, groups)
         hold = None if self.bodies is None else self.bodies.hold
         thickness = None
@@ -161,6 +151,20 @@ class MixtureEstimator(GainRecipe):
         report = _report(bodies, families, weights, missing) | _judgment_report(judgment, case, used)
         report["thickness"] = None if thickness is None else asdict(thickness)
         return replace(model, report=report), used
+
+    def _expect_inputs(self, case: GainCase, groups: Sequence[Group]) -> None:
+        """Raise FitError where one family alone was asked for and the symmetries or features that it needs are none."""
+        if self.name == Symmetric.kind and not groups:
+            raise FitError(
+                "symmetry: expected symmetries of the object's shape, got none; take another gain model",
+                name=Symmetric.kind,
+            )
+        if self.name == Visual.kind and case.features.encoder == GEOMETRY:
+            raise FitError(
+                "visual: expected visual features, got positions only; give --features, or take another gain model",
+                name=Visual.kind,
+                value=GEOMETRY,
+            )
 
     def _usable_bodies(self, case: GainCase) -> tuple[list[NominalBody], dict[str, str]]:
         """Return the bodies that the contacts lie on, and why there are none."""
