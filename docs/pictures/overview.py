@@ -35,11 +35,11 @@ def main() -> None:
         "avmsf": field.render(test.contacts, directions=test.directions),
         "mean of 3 nearest recordings": MeanWaveform(train).render(test.contacts),
     }
-    figure = Figure(figsize=(12.8, 4.4), layout="constrained", dpi=110)
+    figure = Figure(figsize=(12.8, 4.4), layout="constrained", dpi=100)
     left, right = figure.subfigures(1, 2, width_ratios=(0.36, 0.64))
     axes = left.subplots()
-    axes.imshow(matplotlib.image.imread(HERE / "studio/modes.png")[120:620, 200:710])
-    axes.set_title("gain of one mode;\ndots: recorded contacts")
+    axes.imshow(matplotlib.image.imread(HERE / "studio/modes.png")[290:735, 150:640])
+    axes.set_title("gain of one mode;\nblue dots: recorded contacts")
     axes.axis("off")
     grid = right.subplots(len(HELD_OUT), len(columns), sharex=True, sharey=True)
     for column, (name, sounds) in enumerate(columns.items()):

@@ -19,11 +19,12 @@ from playwright.sync_api import Browser, Page, sync_playwright
 import avmsf
 
 PICTURES = Path(__file__).parent / "studio"
-VIEWPORT = {"width": 1280, "height": 960}
+VIEWPORT = {"width": 1160, "height": 1090}
+"""The longest tab fits."""
 SECONDS = 120.0
 """How long anything may take, without a GPU."""
-MODE = 2
-LOCATED = 2
+MODE = 1
+LOCATED = 0
 """Row of the located recording in the demo's held-out ones."""
 CAPTURED = ("005.wav", "010.wav", "011.wav")
 """Recordings of the picture of a capture; the last is not saved yet."""
@@ -70,14 +71,12 @@ def opened_page(browser: Browser, *arguments: object) -> Iterator[Page]:
 
 def draw_field(page: Page, capture: Path, field: avmsf.SoundField) -> None:
     """Draw all tabs of a field but the one that records."""
-    page.mouse.click(450, 520)
-    save(page, "strike")
+    page.mouse.click(310, 530)
+    save(page, "strike", seconds=0.3)
     page.click("text=Show surface")
     page.click("#tab-modes")
     page.click(f"#sheet-modes tr[data-mode='{MODE}']")
     save(page, "modes")
-    page.click("#tab-strike")
-    page.uncheck("text=Show them on the object")
     page.click("#tab-find")
     held_out = [name for name in avmsf.Capture.read(capture).impacts.names if name not in field.origin.trained_on]
     page.set_input_files("#sheet-find input[type=file]", capture / held_out[LOCATED])
@@ -85,6 +84,7 @@ def draw_field(page: Page, capture: Path, field: avmsf.SoundField) -> None:
     save(page, "locate")
     page.click("text=Clear the colors")
     page.click("text=Show Gaussians")
+    page.click("text=Reset view")
     page.click("#tab-edit")
     page.locator("#sheet-edit select").nth(1).select_option("wood")
     page.wait_for_function("avmsf.studio.live.revision > 1")
@@ -106,10 +106,10 @@ def draw_capture(page: Page, recordings: Path) -> None:
     save(page, "capture")
 
 
-def save(page: Page, name: str) -> None:
-    """Write what the page shows once it has drawn it and no animation runs any more, without a focus ring."""
+def save(page: Page, name: str, *, seconds: float = 1.5) -> None:
+    """Write what the page shows after `seconds`, by when it is drawn, without a focus ring."""
     page.evaluate("document.activeElement.blur()")
-    page.wait_for_timeout(1500)
+    page.wait_for_timeout(1000 * seconds)
     page.screenshot(path=PICTURES / f"{name}.png")
 
 
