@@ -154,11 +154,12 @@ def _gltf(field: SoundField | SampledField, options: Options) -> Written:
     if cloud is not None and source is not None:
         beside, content = options.output.with_suffix(".gaussians.ply"), source.read_bytes()
         expect_free(beside, content, force=options.overwrite)
-        written = write_gltf(sampled, options.output, look=Look.of_gaussians(cloud, sampled), force=options.overwrite)
+        seen = Look.of_gaussians(cloud, sampled)
+        written = write_gltf(sampled, options.output, look=seen, up=options.up, force=options.overwrite)
         copied = write_file(beside, content, force=options.overwrite)
         return replace(written, sizes={**written.sizes, **copied})
     shown, remarks = (None, ()) if source is None else read_look(source, sampled, meters=meters)
-    written = write_gltf(sampled, options.output, look=shown, force=options.overwrite)
+    written = write_gltf(sampled, options.output, look=shown, up=options.up, force=options.overwrite)
     return replace(written, remarks=remarks + written.remarks)
 
 

@@ -8,12 +8,12 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import Existing, Flag, Printing, Unit, parse_options
-from avmsf.export.formats import Format, Precision
+from avmsf.export.formats import Axis, Format, Precision
 from avmsf.modal.config import PulseShape
 
 _USED: dict[Format, tuple[str, ...]] = {
     "web": ("object", "object_unit", "capture"),
-    "gltf": ("object", "object_unit", "capture"),
+    "gltf": ("object", "object_unit", "capture", "up"),
     "faust": ("no_noise",),
     "avmsf-demo": ("object", "variant", "precision"),
     "wavs": ("forces", "contact_times", "pulse", "seconds"),
@@ -59,6 +59,8 @@ class Options(Printing):
     """wavs: length of the sounds; by default that of the training sounds."""
     pulse: PulseShape = "half-sine"
     """wavs: force over the contact time, as in `avmsf render`."""
+    up: Axis = "z"
+    """gltf: axis of the object's frame that points up."""
     no_noise: Flag = False
     """faust: write the modes without the residual noise."""
     functions: int = 16
