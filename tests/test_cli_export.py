@@ -19,6 +19,7 @@ from avmsf.field.store import load, save
 from avmsf.modal.residual import Residual
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats, write_splats
+from capture_folder import fill
 from made_fields import BANK, SIDES, positional
 
 Streams = pytest.CaptureFixture[str]
@@ -266,3 +267,29 @@ def test_a_captures_surface_is_shown(field_file: Path, tmp_path: Path) -> None:
     assert main(words) == 0
     shown = trimesh.load(tmp_path / "a.glb", process=False).dump()[0]
     assert shown.extents == pytest.approx([SIDES[0], SIDES[2], SIDES[1]], rel=1e-5)
+
+
+@pytest.mark.parametrize("place", ["capture/.avmsf/surface.ply", "plate-surface.ply", ".avmsf/surface.ply"])
+@pytest.mark.parametrize("to", ["gltf", "web"])
+def test_the_surface_made_from_photographs_is_shown(to: str, place: str, field_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "capture").mkdir()
+    (tmp_path / place).parent.mkdir(exist_ok=True)
+    trimesh.creation.box(SIDES).export(tmp_path / place)
+    field = (tmp_path / place).parent / "field.safetensors" if place.startswith(".") else tmp_path / "plate.safetensors"
+    field.write_bytes(field_file.read_bytes())
+    fill(tmp_path / "capture", rows=["a.wav,0,0,0"])
+    output = tmp_path / ("a.glb" if to == "gltf" else "page")
+    words = ["--to", to, "--output", str(output), "--capture", str(tmp_path / "capture")]
+    assert main(["export", str(field), *words]) == 0
+    shown = trimesh.load(output if to == "gltf" else output / "object.glb", process=False).dump()[0]
+    assert len(shown.faces) == 12
+
+
+@pytest.mark.parametrize("captured", [True, False])
+def test_points_alone_are_noted(captured: bool, field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    words = ["export", str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb")]
+    assert main([*words, *(["--capture", str(folder)] if captured else [])]) == 0
+    (note,) = [line for line in capsys.readouterr().err.splitlines() if "points are shown" in line]
+    assert (f"avmsf surface {folder}" in note) == captured

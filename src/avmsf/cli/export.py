@@ -25,6 +25,8 @@ from avmsf.export.webpage import write_webpage
 from avmsf.export.written import Written, expect_ending, expect_free, write_file
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
+from avmsf.pipeline.config import CACHE
+from avmsf.pipeline.reconstruct import SURFACE
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats
 
@@ -119,11 +121,29 @@ def _sampled(field: SoundField | SampledField, options: Options) -> SampledField
 
 
 def _object(options: Options) -> tuple[Path | None, float]:
-    """Return the file that shows the object, and what its coordinates count in meters."""
-    if options.object is not None or options.capture is None:
+    """Return the file that shows the object, and what its coordinates count in meters; print where there is none."""
+    if options.object is not None:
         return options.object, METRES[options.object_unit]
+    if options.capture is None:
+        say("note: only the field's points are shown; --object or --capture adds the surface")
+        return None, 1.0
     settings = settings_of(options.capture)
-    return find_surface_file(options.capture, settings), settings.surface_meters
+    given = find_surface_file(options.capture, settings)
+    if given is not None:
+        return given, settings.surface_meters
+    made = _reconstructed(options.field, options.capture)
+    if made is None:
+        say(
+            f"note: {options.capture} has no surface: only the field's points are shown; make one by avmsf surface "
+            f"{options.capture}, or give --object"
+        )
+    return made, 1.0
+
+
+def _reconstructed(field: Path, capture: Path) -> Path | None:
+    """Return the surface, in meters, that `reconstruct` left in a cache or `demo` next to the field."""
+    caches = [capture / CACHE / SURFACE, *([field.parent / SURFACE] if field.parent.name == CACHE else [])]
+    return next((each for each in [field.with_name(f"{field.stem}-{SURFACE}"), *caches] if each.is_file()), None)
 
 
 def _gaussians(path: Path | None, meters: float, field: SampledField) -> GaussianCloud | None:

@@ -46,7 +46,8 @@ class Options(Printing):
     object_unit: Unit = "m"
     """Unit of the coordinates of the object's mesh."""
     capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder")] = None
-    """Capture folder: its surface is shown, and a page offers its recordings next to the model's sounds."""
+    """Capture folder: its mesh is shown, or the surface made from its photographs, and a page offers its recordings
+    next to the model's sounds."""
     points: int | None = None
     """Maximum number of contacts, spread over the object; by default as many as the format's tools read easily."""
     overwrite: Flag = False
