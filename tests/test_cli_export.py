@@ -19,6 +19,7 @@ from avmsf.field.store import load, save
 from avmsf.modal.residual import Residual
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats, write_splats
+from avmsf.tasks.retune import retune
 from capture_folder import fill
 from made_fields import BANK, SIDES, positional
 
@@ -293,3 +294,17 @@ def test_points_alone_are_noted(captured: bool, field_file: Path, tmp_path: Path
     assert main([*words, *(["--capture", str(folder)] if captured else [])]) == 0
     (note,) = [line for line in capsys.readouterr().err.splitlines() if "points are shown" in line]
     assert (f"avmsf surface {folder}" in note) == captured
+
+
+def test_an_edited_field_is_not_paired_with_recordings(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    save(retune(load(field_file), pitch=2.0), tmp_path / "high.safetensors")
+    rows = ["a.wav,0,0,0", "b.wav,0.01,0,0", "c.wav,0.02,0,0"]
+    fill(tmp_path / "capture", rows=rows)
+    pairs = []
+    for field in (field_file, tmp_path / "high.safetensors"):
+        words = ["--to", "web", "--output", str(tmp_path / "page"), "--capture", str(tmp_path / "capture")]
+        assert main(["export", str(field), *words]) == 0
+        manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
+        noted = any("field is edited" in line for line in capsys.readouterr().err.splitlines())
+        pairs.append((len(manifest["strikes"]), noted))
+    assert pairs == [(3, False), (0, True)]

@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from avmsf.capture.folder import read_capture, settings_of
+from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import find_surface_file
 from avmsf.cli.options.export import Options, unused_options
 from avmsf.cli.printing import figure, print_result, say
@@ -29,6 +30,7 @@ from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.reconstruct import SURFACE
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats
+from avmsf.tasks.edits import EDITS
 
 _FILES: dict[Format, tuple[str, ...]] = {"gltf": GLTF_SUFFIXES, "faust": FAUST_SUFFIXES, "uff": UNIVERSAL_SUFFIXES}
 """Formats that are one file, and what its name may end in."""
@@ -161,10 +163,18 @@ def _web(field: SoundField | SampledField, options: Options) -> Written:
         options.output,
         object=source,
         meters=meters,
-        strikes=None if options.capture is None else read_capture(options.capture).impacts,
+        strikes=_recordings(field, options.capture),
         limit=options.points or POINTS["web"],
         force=options.overwrite,
     )
+
+
+def _recordings(field: SoundField | SampledField, capture: Path | None) -> Impacts | None:
+    """Return a capture's recordings; None for an edited field, which is not to sound like them."""
+    if capture is not None and isinstance(field, SoundField) and field.origin.report.get(EDITS):
+        say("note: the field is edited, so the page has no recordings to compare it with")
+        return None
+    return None if capture is None else read_capture(capture).impacts
 
 
 def _gltf(field: SoundField | SampledField, options: Options) -> Written:
