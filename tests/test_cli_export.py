@@ -25,6 +25,8 @@ from avmsf.field.store import load, save
 from avmsf.modal.residual import Residual
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats, write_splats
+from avmsf.tasks.retune import retune
+from capture_folder import fill
 from made_fields import BANK, SIDES, positional
 
 Streams = pytest.CaptureFixture[str]
@@ -42,14 +44,14 @@ def field_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_mesh_goes_into_the_glb(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
     trimesh.creation.box([1000 * side for side in SIDES]).export(tmp_path / "plate.stl")
-    words = ["--object", str(tmp_path / "plate.stl"), "--object-unit", "mm", "--points", "20"]
+    words = ["--object", str(tmp_path / "plate.stl"), "--object-unit", "mm", "--points", "20", "--up", "x"]
     assert main(["export", str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb"), *words]) == 0
     out, err = capsys.readouterr()
     assert f"wrote {tmp_path / 'a.glb'}: gltf, " in out
     assert "every mode starts as a sine" in err
     assert "% of its loudest sample" in err
     shown = trimesh.load(tmp_path / "a.glb", process=False).dump()[0]
-    assert shown.extents == pytest.approx(SIDES, rel=1e-5)
+    assert shown.extents == pytest.approx([SIDES[1], SIDES[0], SIDES[2]], rel=1e-5)
 
 
 def gaussians(path: Path) -> GaussianCloud:
@@ -259,4 +261,44 @@ def test_a_captures_surface_is_shown(field_file: Path, tmp_path: Path) -> None:
     words = ["export", str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb"), "--capture", str(folder)]
     assert main(words) == 0
     shown = trimesh.load(tmp_path / "a.glb", process=False).dump()[0]
-    assert shown.extents == pytest.approx(SIDES, rel=1e-5)
+    assert shown.extents == pytest.approx([SIDES[0], SIDES[2], SIDES[1]], rel=1e-5)
+
+
+@pytest.mark.parametrize("place", ["capture/.avmsf/surface.ply", "plate-surface.ply", ".avmsf/surface.ply"])
+@pytest.mark.parametrize("to", ["gltf", "web"])
+def test_the_surface_made_from_photographs_is_shown(to: str, place: str, field_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "capture").mkdir()
+    (tmp_path / place).parent.mkdir(exist_ok=True)
+    trimesh.creation.box(SIDES).export(tmp_path / place)
+    field = (tmp_path / place).parent / "field.safetensors" if place.startswith(".") else tmp_path / "plate.safetensors"
+    field.write_bytes(field_file.read_bytes())
+    fill(tmp_path / "capture", rows=["a.wav,0,0,0"])
+    output = tmp_path / ("a.glb" if to == "gltf" else "page")
+    words = ["--to", to, "--output", str(output), "--capture", str(tmp_path / "capture")]
+    assert main(["export", str(field), *words]) == 0
+    shown = trimesh.load(output if to == "gltf" else output / "object.glb", process=False).dump()[0]
+    assert len(shown.faces) == 12
+
+
+@pytest.mark.parametrize("captured", [True, False])
+def test_points_alone_are_noted(captured: bool, field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    words = ["export", str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb")]
+    assert main([*words, *(["--capture", str(folder)] if captured else [])]) == 0
+    (note,) = [line for line in capsys.readouterr().err.splitlines() if "points are shown" in line]
+    assert (f"avmsf surface {folder}" in note) == captured
+
+
+def test_an_edited_field_is_not_paired_with_recordings(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    save(retune(load(field_file), pitch=2.0), tmp_path / "high.safetensors")
+    rows = ["a.wav,0,0,0", "b.wav,0.01,0,0", "c.wav,0.02,0,0"]
+    fill(tmp_path / "capture", rows=rows)
+    pairs = []
+    for field in (field_file, tmp_path / "high.safetensors"):
+        words = ["--to", "web", "--output", str(tmp_path / "page"), "--capture", str(tmp_path / "capture")]
+        assert main(["export", str(field), *words]) == 0
+        manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
+        noted = any("field is edited" in line for line in capsys.readouterr().err.splitlines())
+        pairs.append((len(manifest["strikes"]), noted))
+    assert pairs == [(3, False), (0, True)]
