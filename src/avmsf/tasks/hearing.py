@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_floats
+from avmsf._utils.arrays import ArrayLike, as_floats, as_rate
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.blow import clipping, expect_sudden
 from avmsf.capture.onset import Pulse, find_second_blow, find_second_push
@@ -111,7 +111,7 @@ def as_recording(
                 name="recording",
                 value=shape,
             )
-        rate = field.sample_rate if sample_rate is None else sample_rate
+        rate = field.sample_rate if sample_rate is None else as_rate(sample_rate)
         recording = Recording("the recording", samples[None], rate, "FLOAT")
     elif sample_rate is not None and sample_rate != recording.sample_rate:
         raise LocationError(
