@@ -13,8 +13,8 @@ broader profile serves, g_kj = exp(-log(f_k / f_j)^2 / 2 w^2) + 1/1000: whatever
 Which shape a mode is follows from its gains and from its frequency f: given shape k and a factor c on all nominal
 frequencies (the body's material and scale are not known), log f is normal about log(c f_k); under all other families it
 is uniform over the measured range. Its standard deviation is the same for half of the modes of a body, one of several,
-and the others have any of these: so the strongest modes together tell how exact the body's frequencies are, and with one or two
-impacts these tell which shape each mode is.
+and the others have any of these: so the strongest modes together tell how exact the body's frequencies are, and with
+one or two impacts these tell which shape each mode is.
 """
 
 import math
