@@ -106,9 +106,7 @@ class ContactMap:
         Raises LocationError for a level that is not between 0 and 1.
         """
         if not 0.0 < level < 1.0:
-            raise LocationError(
-                f"level: expected a probability between 0 and 1, such as 0.9, got {level:g}", name="level", value=level
-            )
+            raise LocationError.expected("a probability between 0 and 1, such as 0.9", level, name="level")
         order = torch.argsort(self.probability, descending=True, stable=True)
         before = torch.cumsum(self.probability[order], 0) - self.probability[order]
         inside = torch.zeros(len(self.points), dtype=torch.bool)
