@@ -1,5 +1,6 @@
 """The public interface: what a user of Python starts from, end to end, with lists, arrays and paths."""
 
+import math
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,11 +15,12 @@ import torch
 import avmsf
 from avmsf.capture import Impacts
 from avmsf.cli import main
-from avmsf.errors import ArrayError, AvmsfError, EvaluationError, FitError, PositionError
+from avmsf.errors import ArrayError, AvmsfError, CaptureError, EvaluationError, FitError, PositionError
 from avmsf.field import FitConfig, SoundField
 from avmsf.pipeline import PipelineConfig
 from plate_capture import fill_plate
 from plate_field import RATE, plate_impacts
+from raising import raises
 
 NAMES = {"Capture", "SoundField", "Surface", "evaluate", "extract_modes", "locate"}
 CONTACT = [0.05, 0.06, 0.0]
@@ -238,7 +240,8 @@ def test_impacts_and_surfaces_are_made_of_arrays(tmp_path):
     made = Impacts.of(given.contacts.tolist(), given.sounds.numpy(), RATE, forces=given.forces.tolist())
     assert torch.equal(made.sounds, given.sounds)
     assert made.names[0] == "001"
-    for wrong in ({"sounds": given.sounds[:3]}, {"contacts": given.contacts[0]}, {"names": ["a"]}):
+    rates = ({"sample_rate": rate} for rate in (0, -1.0, math.nan))
+    for wrong in ({"sounds": given.sounds[:3]}, {"contacts": given.contacts[0]}, {"names": ["a"]}, *rates):
         with pytest.raises(ArrayError) as caught:
             Impacts.of(**{"contacts": given.contacts, "sounds": given.sounds, "sample_rate": RATE} | wrong)
         assert caught.value.name == next(iter(wrong))
@@ -251,6 +254,44 @@ def test_impacts_and_surfaces_are_made_of_arrays(tmp_path):
     with pytest.raises(ArrayError) as caught:
         avmsf.Surface.of(surface.vertices, [[0, 1, 1.5]])
     assert (caught.value.name, caught.value.row) == ("faces", 0)
+
+
+def test_a_long_row_that_is_not_finite_is_named_by_its_first_value():
+    given = capture().impacts
+    sounds = given.sounds.clone()
+    sounds[2, 5:] = math.inf
+    with raises(ArrayError, name="sounds", row=2, value=math.inf) as caught:
+        Impacts.of(given.contacts, sounds, RATE)
+    assert len(str(caught.value)) < 100
+
+
+def test_arguments_of_another_type_are_refused_by_name(tmp_path):
+    """In a process without the checks of types that the tests add."""
+    field().save(tmp_path / "a.safetensors")
+    code = f"""
+import avmsf
+field = avmsf.SoundField.load({str(tmp_path / "a.safetensors")!r})
+for call in (
+    lambda: avmsf.SoundField.fit("bowl"),
+    lambda: avmsf.evaluate(field, "bowl"),
+    lambda: field.suggest(2.5),
+    lambda: field.locate([0.0, 1.0] * 2000, sample_rate="48k"),
+):
+    try:
+        call()
+    except avmsf.errors.AvmsfError as error:
+        print(error.name, error.value)
+"""
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.splitlines() == ["capture str", "test str", "count 2.5", "sample_rate 48k"]
+
+
+def test_contacts_in_another_unit_are_refused_before_anything_is_computed():
+    given = capture().impacts
+    plate = avmsf.Surface.of([[0, 0, 0], [0.2, 0, 0], [0.2, 0.15, 0], [0, 0.15, 0]], [[0, 1, 2], [0, 2, 3]])
+    far = avmsf.Capture("plate", replace(given, contacts=1000.0 * given.contacts), plate)
+    with raises(CaptureError, name="contacts"):
+        SoundField.fit(far, progress=False)
 
 
 def test_paths_may_be_strings(tmp_path):

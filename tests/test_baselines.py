@@ -226,7 +226,7 @@ def test_what_does_not_fit_together_is_refused():
         MeanGains(train, true_extraction(train), count=0)
     with raises(EvaluationError, name="extraction", value=24):
         MeanGains(train, true_extraction(test))
-    with raises(EvaluationError, name="sample_rate", value=22050.0):
+    with raises(EvaluationError, name="sample_rate", value=48000.0):
         evaluate(NearestStrike(train), replace(test, sample_rate=48000.0))
     with raises(EvaluationError, name="predicted", value=[len(test), 4410]):
         evaluate(NearestStrike(train), replace(test, sounds=test.sounds[:, :4000]))

@@ -390,6 +390,14 @@ def test_render_sets_levels_by_one_factor_for_all(field: Path, tmp_path: Path) -
         assert soundfile.info(tmp_path / name).subtype == "PCM_16"
 
 
+def test_16_bits_are_filled_to_their_largest_value(field: Path, tmp_path: Path) -> None:
+    places = ["--position", "0.05", "0.06", "0", "--position", "0.02", "0.02", "0"]
+    words = ["render", str(field), *places, "--output", str(tmp_path), "--normalize", "peak", "--coding", "int16"]
+    assert main(words) == 0
+    written = [soundfile.read(tmp_path / name, dtype="int16")[0] for name in ("001.wav", "002.wav")]
+    assert max(np.abs(each.astype(int)).max() for each in written) == 32767
+
+
 def test_nothing_clips_in_silence(field: Path, tmp_path: Path, capsys: Streams) -> None:
     path = tmp_path / "loud.wav"
     words = ["render", str(field), *AT, "--output", str(path), "--normalize", "peak", "--level-db", "6"]

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 import soundfile
 import torch
 
+from avmsf.bench.editpictures import HeardModes
 from avmsf.cli import edit, main, steering
 from avmsf.cli.edit import run
 from avmsf.cli.editmaterial import old_material
@@ -153,6 +155,31 @@ def test_silent_modes_are_said(field: Path, capsys: Streams) -> None:
     assert told["edits"][0]["silent_hertz"] == pytest.approx((30 * FREQUENCY).tolist())
     assert [row["silent"] for row in told["modes"]] == [True] * 5
     assert {row["level_change_db"] for row in told["modes"]} == {None}
+
+
+def test_info_names_the_new_material(field: Path, capsys: Streams) -> None:
+    edited(field, "--material", "glass", "--from", "ceramic")
+    capsys.readouterr()
+    assert main(["info", str(field.with_name("new.safetensors"))]) == 0
+    assert "plate, glass" in capsys.readouterr().out
+
+
+def test_the_table_has_the_modes_of_most_energy(field: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(edit, "_LISTED", 1)
+    faintest = f"{float(FREQUENCY[HeardModes.of(ceramic()).size.argmin()]):g}"
+    edited(field, "--mode-decay", faintest, "1e4")
+    out = capsys.readouterr().out
+    assert re.search(rf"│ +{faintest}\b", out)
+    assert "level change" in out
+
+
+@pytest.mark.parametrize(("decay", "noted"), [("0.1", False), ("0.9", False), ("2", True)])
+def test_longer_decays_than_the_sounds_are_noted(field: Path, capsys: Streams, decay: str, noted: bool) -> None:
+    new = edited(field, "--decay", decay)
+    notes = [line for line in capsys.readouterr().out.splitlines() if "--seconds" in line]
+    longest = math.log(1000) / float(new.bank.damping.min())
+    assert bool(notes) == noted
+    assert all(longest <= float(line.split()[-1]) <= longest + 0.11 for line in notes)
 
 
 def test_towards_a_recording_and_an_interrupted_edit_goes_on(

@@ -44,6 +44,16 @@ def test_region_is_the_smallest_set_of_that_probability():
         found.region(1.5)
 
 
+def test_the_credible_radius_and_the_standard_deviation_are_those_about_the_most_probable_point():
+    found = made([0.05, 0.5, 0.3, 0.05, 0.1])
+    assert found.credible_radius(0.95) == pytest.approx(0.03, rel=1e-5)
+    assert found.credible_radius(0.85) == pytest.approx(0.01, rel=1e-5)
+    # .35 a centimeter away, .05 two and .1 three.
+    assert found.position_std == pytest.approx(0.01 * math.sqrt(0.35 + 0.05 * 4 + 0.1 * 9), rel=1e-5)
+    with raises(LocationError, name="level", value=0.0):
+        found.credible_radius(0.0)
+
+
 def test_peaks_are_places_apart_of_comparable_probability():
     chances = [0.0] * 30
     chances[3], chances[4], chances[5] = 0.2, 0.2, 0.1
@@ -80,7 +90,7 @@ def test_a_symmetric_plate_is_ambiguous_and_each_counterpart_is_named():
             if isinstance(each.symmetry, MirrorSymmetry)
             else each.symmetry.turn(found.position[None], each.angle)
         )[0]
-        assert float((image - each.position).norm()) < 2 * found.radius
+        assert float((image - each.position).norm()) < 2 * found.linking_length
     words = " ".join(str(each) for each in others)
     assert "its image in the mirror plane with normal (1 0 0)" in words
     assert "by 180 degrees about the axis (0 0 1)" in words

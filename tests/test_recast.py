@@ -140,6 +140,17 @@ def test_a_material_given_to_itself_and_one_by_way_of_another(law):
     assert len(twice.origin.report["edits"]) == 2
 
 
+def test_the_name_says_the_last_material():
+    field = plate_field(STEEL)
+    field = replace(field, origin=replace(field.origin, capture="mug"))
+    glass = recast(field, STEEL, GLASS)
+    wood = recast(retune(glass, pitch=1.1), GLASS, WOOD)
+    larger = recast(wood, WOOD, WOOD, size=2.0)
+    names = [each.origin.capture for each in (recast(field, STEEL, STEEL), glass, wood, larger)]
+    assert names == ["mug", "mug, glass", "mug, wood", "mug, wood"]
+    assert recast(larger, WOOD, GLASS).origin.capture == "mug, glass"
+
+
 def test_a_modes_own_damping_stays_in_proportion_to_the_law():
     field = plate_field(GLASS)
     own = torch.linspace(0.3, 5.0, len(field.bank), dtype=torch.float64)

@@ -1,7 +1,7 @@
-"""Draw overview.png: `python docs/pictures/overview.py mug.safetensors src/avmsf/example`.
+"""Draw overview.png: `avmsf demo demo`, then `python docs/pictures/overview.py demo`.
 
-The field is that of `avmsf fit src/avmsf/example --train-fraction 0.75 --output mug.safetensors`. The
-object at the left is cut from studio/modes.png.
+The demo's field is fitted to 12 of its 16 recordings; two of the others are shown. The object at the left is cut from
+studio/modes.png, which studio.py draws.
 """
 
 import sys
@@ -17,28 +17,31 @@ from avmsf.modal.spectra import magnitude_stft
 from avmsf.plotting.style import SEQUENTIAL, styled
 
 HERE = Path(__file__).parent
-CONTACTS = ("012.wav", "014.wav")
+HELD_OUT = (0, 1)
+"""Rows of the recordings that are shown in those that the field is not fitted to."""
 FFT_SIZE, HOP, SECONDS, MAX_HZ, RANGE_DB = 1024, 128, 0.35, 12_000, 70
 
 
 @styled
 def main() -> None:
-    """Read the field and the capture, draw, write the picture."""
-    field, capture = avmsf.SoundField.load(sys.argv[1]), avmsf.Capture.read(sys.argv[2])
-    train, test = (part.impacts for part in capture.split(0.75))
-    test = test.take([test.names.index(name) for name in CONTACTS])
+    """Read the demo's field and capture, draw, write the picture."""
+    demo = Path(sys.argv[1])
+    field, impacts = avmsf.SoundField.load(demo / "mug.safetensors"), avmsf.Capture.read(demo / "capture").impacts
+    fitted = [name in field.origin.trained_on for name in impacts.names]
+    train = impacts.take([row for row in range(len(impacts)) if fitted[row]])
+    test = impacts.take([row for row in range(len(impacts)) if not fitted[row]]).take(list(HELD_OUT))
     columns = {
         "recorded, held out": test.sounds,
         "avmsf": field.render(test.contacts, directions=test.directions),
         "mean of 3 nearest recordings": MeanWaveform(train).render(test.contacts),
     }
-    figure = Figure(figsize=(12.8, 4.4), layout="constrained", dpi=110)
+    figure = Figure(figsize=(12.8, 4.4), layout="constrained", dpi=100)
     left, right = figure.subfigures(1, 2, width_ratios=(0.36, 0.64))
     axes = left.subplots()
-    axes.imshow(matplotlib.image.imread(HERE / "studio/modes.png")[120:620, 200:710])
-    axes.set_title("gain of the mode at 2762 Hz;\ndots: recorded contacts")
+    axes.imshow(matplotlib.image.imread(HERE / "studio/modes.png")[290:735, 150:640])
+    axes.set_title("gain of one mode;\nblue dots: recorded contacts")
     axes.axis("off")
-    grid = right.subplots(len(CONTACTS), len(columns), sharex=True, sharey=True)
+    grid = right.subplots(len(HELD_OUT), len(columns), sharex=True, sharey=True)
     for column, (name, sounds) in enumerate(columns.items()):
         spectra = magnitude_stft(sounds, fft_size=FFT_SIZE, hop=HOP)
         for row, reference in enumerate(magnitude_stft(test.sounds, fft_size=FFT_SIZE, hop=HOP).amax((1, 2))):
@@ -52,7 +55,7 @@ def main() -> None:
             axes.set_ylim(0.0, MAX_HZ / 1000)
         grid[0, column].set_title(name)
         grid[-1, column].set_xlabel("time (s)")
-    for row in range(len(CONTACTS)):
+    for row in range(len(HELD_OUT)):
         grid[row, 0].set_ylabel(f"contact {'AB'[row]}\nfrequency (kHz)")
     right.colorbar(image, ax=grid, label="level (dB)", shrink=0.8)
     figure.savefig(HERE / "overview.png")

@@ -138,8 +138,24 @@ def test_viewers_show_the_mesh_or_the_points(tmp_path):
     assert document["extensionsUsed"] == ["KHR_audio_rigid_bodies"]
     field = table()
     write_gltf(field, tmp_path / "points.glb")
-    cloud = trimesh.load(tmp_path / "points.glb", process=False).dump()[0]
+    (cloud,) = trimesh.load(tmp_path / "points.glb", process=False).geometry.values()
     np.testing.assert_allclose(cloud.vertices, field.points.numpy(), atol=1e-7)
+
+
+@pytest.mark.parametrize(("words", "axis"), [({}, 2), ({"up": "x"}, 0), ({"up": "y"}, 1), ({"up": "z"}, 2)])
+def test_the_objects_axis_points_up_and_coordinates_stay_in_its_frame(tmp_path, words, axis):
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    box.apply_translation(np.eye(3)[axis])
+    vertices, faces = torch.from_numpy(np.array(box.vertices)).float(), torch.from_numpy(np.array(box.faces))
+    field = table()
+    write_gltf(field, tmp_path / "a.glb", look=Look.of_mesh(TexturedMesh.build(vertices, faces)), **words)
+    scene = trimesh.load(tmp_path / "a.glb", process=False)
+    shown = scene.dump()[0]
+    np.testing.assert_allclose(shown.centroid, [0.0, 1.0, 0.0], atol=1e-6)
+    assert shown.volume == pytest.approx(1e-3, rel=1e-4)
+    (stored,) = scene.geometry.values()
+    np.testing.assert_allclose(stored.centroid, np.eye(3)[axis], atol=1e-6)
+    np.testing.assert_array_equal(modal(*read(tmp_path / "a.glb"))["positions"], field.points.numpy())
 
 
 def test_a_texture_becomes_the_corners_colors():

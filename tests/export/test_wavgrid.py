@@ -78,12 +78,32 @@ def played(folder: Path) -> list[dict[str, str]]:
     return regions
 
 
-def test_a_layers_hardest_velocity_plays_it_as_it_is_and_no_loudness_counts_twice(tmp_path):
+def levels(folder: Path, note: int) -> np.ndarray:
+    """Return the root mean square amplitude that the instrument plays at each velocity, 1 to 127."""
+    found = np.full(128, np.nan)
+    for region in (each for each in played(folder) if int(each["key"]) == note):
+        sound = np.sqrt(np.mean(soundfile.read(folder / region["sample"])[0] ** 2))
+        for velocity in range(int(region["lovel"]), int(region["hivel"]) + 1):
+            gain = float(region[f"amp_velcurve_{velocity}"])
+            assert 0 <= gain <= 1 + 1e-6
+            found[velocity] = gain * sound
+    return found[1:]
+
+
+@pytest.mark.parametrize("layers", [LAYERS, (Layer(0.5), Layer(1.0), Layer(2.0)), (Layer(2.0), Layer(1.0))])
+def test_the_level_rises_with_the_velocity_without_steps_between_layers(tmp_path, layers):
+    write_grid(table(), tmp_path / "grid", Grid(2, layers))
+    for note in (36, 37):
+        level = levels(tmp_path / "grid", note)
+        assert (np.diff(level) >= -1e-6 * level[-1]).all()
+        # Half a decibel, where it takes the velocity's square 9.5 dB to fall from 3 to 1.
+        assert (20 * np.log10(level[42:] / level[41:-1]) < 0.5).all()
+
+
+def test_a_layers_hardest_velocity_plays_it_as_it_is(tmp_path):
     write_grid(table(), tmp_path / "grid", Grid(2, LAYERS))
     for region in played(tmp_path / "grid"):
-        low, high = int(region["lovel"]), int(region["hivel"])
-        for velocity in range(low, high + 1):
-            assert float(region[f"amp_velcurve_{velocity}"]) == pytest.approx((velocity / high) ** 2, rel=1e-5)
+        assert float(region[f"amp_velcurve_{region['hivel']}"]) == pytest.approx(1.0, rel=1e-5)
     write_grid(table(), tmp_path / "one", Grid(2))
     # One layer has the whole keyboard, and the square of the velocity as every SFZ player has it.
     assert float(played(tmp_path / "one")[0]["amp_velcurve_64"]) == pytest.approx((64 / 127) ** 2, rel=1e-5)

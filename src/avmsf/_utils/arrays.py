@@ -1,5 +1,6 @@
 """Arrays that users give, lists and numpy arrays among them, as tensors of a known shape."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -58,11 +59,17 @@ def as_floats(values: float | int | ArrayLike, name: str) -> Float[Tensor, "*sha
     return found.detach().cpu() if kept else found.detach().cpu().double()
 
 
+def as_rate(value: float | int, name: str = "sample_rate") -> float:
+    """Return a sample rate, Hz. Raises ArrayError for what is no number above 0."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0.0 < float(value) < math.inf:
+        raise ArrayError(f"{name}: expected a number above 0, in hertz, got {value!r}", name=name, value=value)
+    return float(value)
+
+
 def _finite(found: Tensor, name: str) -> Tensor:
-    wrong = torch.nonzero(~torch.isfinite(found.reshape(len(found), found[:1].numel())).all(1)).flatten()
+    wrong = torch.nonzero(~torch.isfinite(found))
     if len(wrong):
-        row = int(wrong[0])
-        value = found[row].tolist()
+        row, value = int(wrong[0, 0]), float(found[tuple(wrong[0].tolist())])
         raise ArrayError(f"{name}, row {row}: expected finite numbers, got {value}", name=name, row=row, value=value)
     return found
 

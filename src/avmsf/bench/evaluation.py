@@ -81,14 +81,18 @@ def evaluate(
     as `score`, and for a renderer at another sample rate.
     """
     impacts = test.impacts if isinstance(test, Capture) else test
+    if not isinstance(impacts, Impacts):
+        raise EvaluationError(
+            f"test: expected a Capture or Impacts, got {type(test).__name__}", name="test", value=type(test).__name__
+        )
     if isinstance(renderer, SoundField):
         impacts = renderer.aligned(impacts)
     if renderer.sample_rate != impacts.sample_rate:
         raise EvaluationError(
-            f"expected a renderer at the recordings' {impacts.sample_rate:g} Hz, got {renderer.sample_rate:g} Hz; "
-            "resample the recordings or train at their rate",
+            f"expected recordings at the field's {renderer.sample_rate:g} Hz, got {impacts.sample_rate:g} Hz; resample "
+            "them, or fit a field to recordings of their rate",
             name="sample_rate",
-            value=renderer.sample_rate,
+            value=impacts.sample_rate,
         )
     with torch.no_grad():
         sounds = renderer.render(impacts.contacts, directions=impacts.directions)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_numbers, as_rows, as_vectors
+from avmsf._utils.arrays import ArrayLike, as_numbers, as_rate, as_rows, as_vectors
 from avmsf.capture.places import rows_by_place
 from avmsf.compiled import compiled
 from avmsf.errors import ArrayError
@@ -65,17 +65,19 @@ class Impacts:
         """Return final impacts of contacts in meters and of sounds that start with them, one row each.
 
         Recordings without `names` are numbered. `forces` are those that the sounds were divided by. Raises ArrayError
-        for arrays of other shapes and values that are not finite.
+        for arrays of other shapes, values that are not finite, no row at all, and a sample rate that is not above 0.
         """
         places = as_vectors(contacts, "contacts").double()
         count = len(places)
+        if not count:
+            raise ArrayError("contacts: expected one or more, got 0", name="contacts", value=0)
         named = tuple(f"{row:03d}" for row in range(1, count + 1)) if names is None else tuple(names)
         if len(named) != count:
             raise ArrayError.expected(f"{count}, one for each contact", len(named), name="names")
         return cls(
             places,
             as_rows(sounds, "sounds", count=count).float(),
-            float(sample_rate),
+            as_rate(sample_rate),
             named,
             None if directions is None else as_vectors(directions, "directions", count=count).float(),
             None if forces is None else as_numbers(forces, "forces", count=count).float(),

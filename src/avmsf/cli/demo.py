@@ -35,7 +35,7 @@ from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
 TRAIN = 12
 """Impacts that the field is fitted to; it is evaluated at the others."""
 CONFIG = PipelineConfig(
-    # With four times as many steps, the field's error is the same within the variation of runs (.328; .321 to .340 with
+    # With four times as many steps, the field's error is the same within the variation of runs (.328; .321 to .350 with
     # these). The built-in descriptors need no download.
     scene=SceneConfig(splat=SplatConfig(steps=500), lift=LiftConfig(encoder=DESCRIPTORS)),
     # A mug's dampings hardly change with position, so the trials that would find this are left out.

@@ -31,7 +31,7 @@ MODES, SPECTROGRAMS, BEFORE, AFTER = "modes.png", "spectrograms.png", "before.wa
 CURVE = "clap.png"
 """What the folder of pictures holds."""
 _LISTED = 20
-"""Modes in the table, the loudest."""
+"""Modes in the table, those of most energy."""
 _CANDIDATES = 64
 """Points of the surface among which the loudest is looked for."""
 _NEAR = 0.02
@@ -99,6 +99,13 @@ def run(options: Options) -> int:
     screen.print(_table(before, after))
     for words in remarks(edits, new):
         screen.print(f"note: {words}", soft_wrap=True)
+    seconds, ringing = new.samples / new.sample_rate, _longest(after)
+    if ringing > max(seconds, _longest(before)):
+        screen.print(
+            f"note: the longest T60 is {figure(ringing)} s and rendered sounds last {figure(seconds)} s; render and "
+            f"export with --seconds {math.ceil(10 * ringing) / 10:g}",
+            soft_wrap=True,
+        )
     if options.plots is not None:
         _show(options.plots, (old, contact), (new, options.change.size * contact))
         if CLAP in edits[-1]:
@@ -230,6 +237,11 @@ def _rows(before: HeardModes, after: HeardModes) -> list[dict[str, Any]]:
     ]
 
 
+def _longest(modes: HeardModes) -> float:
+    """Return the longest T60 of the modes that sound, s; zero without one."""
+    return float(torch.where(modes.size > 0, modes.t60, 0.0).max())
+
+
 def _change(row: dict[str, Any]) -> str:
     if row["silent"]:
         return "silent"
@@ -237,7 +249,8 @@ def _change(row: dict[str, Any]) -> str:
 
 
 def _table(before: HeardModes, after: HeardModes) -> Table:
-    loudest = torch.argsort(torch.maximum(before.size, after.size), descending=True)[:_LISTED].sort().values.tolist()
+    energy = torch.maximum(*(modes.size.square() * modes.t60 for modes in (before, after)))
+    listed = torch.argsort(energy, descending=True)[:_LISTED].sort().values.tolist()
     rows = _rows(before, after)
     cells = [
         [
@@ -247,8 +260,8 @@ def _table(before: HeardModes, after: HeardModes) -> Table:
             figure(row["t60_after"]),
             _change(row),
         ]
-        for row in (rows[place] for place in loudest)
+        for row in (rows[place] for place in listed)
     ]
-    title = f"{len(rows)} modes" if len(rows) <= _LISTED else f"the {_LISTED} loudest of {len(rows)} modes"
-    columns = ["before (Hz)", "after (Hz)", "T60 before (s)", "T60 after (s)", "level (dB)"]
+    title = f"{len(rows)} modes" if len(rows) <= _LISTED else f"the {_LISTED} modes of most energy among {len(rows)}"
+    columns = ["before (Hz)", "after (Hz)", "T60 before (s)", "T60 after (s)", "level change (dB)"]
     return table(f"{title}, before and after", columns, cells, words=0)

@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from avmsf.capture.folder import read_capture, settings_of
+from avmsf.capture.impacts import Impacts
 from avmsf.capture.surface import find_surface_file
 from avmsf.cli.options.export import Options, unused_options
 from avmsf.cli.printing import figure, print_result, say
@@ -25,8 +26,11 @@ from avmsf.export.webpage import write_webpage
 from avmsf.export.written import Written, expect_ending, expect_free, write_file
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
+from avmsf.pipeline.config import CACHE
+from avmsf.pipeline.reconstruct import SURFACE
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats
+from avmsf.tasks.edits import EDITS
 
 _FILES: dict[Format, tuple[str, ...]] = {"gltf": GLTF_SUFFIXES, "faust": FAUST_SUFFIXES, "uff": UNIVERSAL_SUFFIXES}
 """Formats that are one file, and what its name may end in."""
@@ -119,11 +123,29 @@ def _sampled(field: SoundField | SampledField, options: Options) -> SampledField
 
 
 def _object(options: Options) -> tuple[Path | None, float]:
-    """Return the file that shows the object, and what its coordinates count in meters."""
-    if options.object is not None or options.capture is None:
+    """Return the file that shows the object, and what its coordinates count in meters; print where there is none."""
+    if options.object is not None:
         return options.object, METRES[options.object_unit]
+    if options.capture is None:
+        say("note: only the field's points are shown; --object or --capture adds the surface")
+        return None, 1.0
     settings = settings_of(options.capture)
-    return find_surface_file(options.capture, settings), settings.surface_meters
+    given = find_surface_file(options.capture, settings)
+    if given is not None:
+        return given, settings.surface_meters
+    made = _reconstructed(options.field, options.capture)
+    if made is None:
+        say(
+            f"note: {options.capture} has no surface: only the field's points are shown; make one by avmsf surface "
+            f"{options.capture}, or give --object"
+        )
+    return made, 1.0
+
+
+def _reconstructed(field: Path, capture: Path) -> Path | None:
+    """Return the surface, in meters, that `reconstruct` left in a cache or `demo` next to the field."""
+    caches = [capture / CACHE / SURFACE, *([field.parent / SURFACE] if field.parent.name == CACHE else [])]
+    return next((each for each in [field.with_name(f"{field.stem}-{SURFACE}"), *caches] if each.is_file()), None)
 
 
 def _gaussians(path: Path | None, meters: float, field: SampledField) -> GaussianCloud | None:
@@ -141,10 +163,18 @@ def _web(field: SoundField | SampledField, options: Options) -> Written:
         options.output,
         object=source,
         meters=meters,
-        strikes=None if options.capture is None else read_capture(options.capture).impacts,
+        strikes=_recordings(field, options.capture),
         limit=options.points or POINTS["web"],
         force=options.overwrite,
     )
+
+
+def _recordings(field: SoundField | SampledField, capture: Path | None) -> Impacts | None:
+    """Return a capture's recordings; None for an edited field, which is not to sound like them."""
+    if capture is not None and isinstance(field, SoundField) and field.origin.report.get(EDITS):
+        say("note: the field is edited, so the page has no recordings to compare it with")
+        return None
+    return None if capture is None else read_capture(capture).impacts
 
 
 def _gltf(field: SoundField | SampledField, options: Options) -> Written:
@@ -154,11 +184,12 @@ def _gltf(field: SoundField | SampledField, options: Options) -> Written:
     if cloud is not None and source is not None:
         beside, content = options.output.with_suffix(".gaussians.ply"), source.read_bytes()
         expect_free(beside, content, force=options.overwrite)
-        written = write_gltf(sampled, options.output, look=Look.of_gaussians(cloud, sampled), force=options.overwrite)
+        seen = Look.of_gaussians(cloud, sampled)
+        written = write_gltf(sampled, options.output, look=seen, up=options.up, force=options.overwrite)
         copied = write_file(beside, content, force=options.overwrite)
         return replace(written, sizes={**written.sizes, **copied})
     shown, remarks = (None, ()) if source is None else read_look(source, sampled, meters=meters)
-    written = write_gltf(sampled, options.output, look=shown, force=options.overwrite)
+    written = write_gltf(sampled, options.output, look=shown, up=options.up, force=options.overwrite)
     return replace(written, remarks=remarks + written.remarks)
 
 

@@ -104,6 +104,7 @@ def describe(field: SoundField) -> dict[str, Any]:
         "mode_count": len(field.bank),
         "points": len(points),
         "extent_meters": (points.amax(0) - points.amin(0)).tolist(),
+        "bounds_meters": [points.amin(0).tolist(), points.amax(0).tolist()],
         "gain_field": {"kind": field.gain_field.kind, **field.gain_field.record()},
         "residual_rms": noise,
         "per_newton": field.origin.per_newton,
@@ -183,7 +184,8 @@ def _gains_words(gains: dict[str, Any]) -> str:
 
 
 def _words(values: dict[str, Any], quality: list[str]) -> str:
-    extent = " x ".join(f"{side:.3g}" for side in values["extent_meters"])
+    sides = zip("xyz", *values["bounds_meters"], strict=True)
+    extent = ", ".join(f"{axis} {low:.3g} to {high:.3g}" for axis, low, high in sides)
     report = values["report"]
     lines = [
         f"field of {values['capture'] or 'an unnamed capture'}",

@@ -54,7 +54,7 @@ def run(options: Options) -> int:
         way = None if contacts.directions is None else contacts.directions[loudest : loudest + 1]
         hard = rendered(place, way)
         _say_softer(hard[0], sounds[loudest], pulse.contact_time)
-    sounds = sounds * Level(options.normalize, options.level_db).factor(sounds)
+    sounds = sounds * Level(options.normalize, options.level_db).factor(sounds, coding=options.coding)
     peak = float(sounds.abs().max())
     if options.coding == "float32" and peak > 1:
         say(

@@ -50,7 +50,7 @@ def run(options: Options) -> int:
     screen = console(errors=options.json)
     _print_table(found, rows, screen)
     if found.directions is not None:
-        straight = "" if given else ", as perpendicular to the surface as possible if the field has one"
+        straight = "" if given else ", as nearly perpendicular to the surface as can be reached"
         screen.print(f"nx, ny, nz: direction of the impact{straight}")
     if paths:
         write_text(paths[TABLE], _list(rows))

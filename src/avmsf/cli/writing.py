@@ -17,6 +17,9 @@ from avmsf.errors import AvmsfError
 from avmsf.files import write_whole
 
 SUBTYPES = {"float32": "FLOAT", "int16": "PCM_16"}
+_LARGEST_INT16 = 2**15 - 1
+FULL_SCALE: dict[Coding, float] = {"float32": 1.0, "int16": _LARGEST_INT16 / 2**15}
+"""Largest sample of each format."""
 
 
 class OutputError(AvmsfError):
@@ -32,11 +35,11 @@ class Level:
     level_db: float = 0.0
     """Additional gain, dB."""
 
-    def factor(self, sounds: Float[Tensor, "contacts samples"]) -> float:
+    def factor(self, sounds: Float[Tensor, "contacts samples"], *, coding: Coding = "float32") -> float:
         """Return the factor on all sounds: one for all preserves the differences in level between contacts."""
         peak = float(sounds.abs().max())
         gain = 10 ** (self.level_db / 20)
-        return gain / peak if self.normalize == "peak" and peak > 0 else gain
+        return gain * FULL_SCALE[coding] / peak if self.normalize == "peak" and peak > 0 else gain
 
 
 def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: float, coding: Coding) -> None:
@@ -57,17 +60,19 @@ def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: fl
             value=wrong,
         )
     peak = float(sound.abs().max()) if len(sound) else 0.0
-    # One step below full scale, which is as far as 16 bits reach upwards.
-    if coding == "int16" and peak > 1 - 2**-15:
+    if coding == "int16" and round(peak * 2**15) > _LARGEST_INT16:
         raise OutputError(
-            f"{path}: expected amplitudes up to 1 for 16 bits, got {peak:.3g} ({20 * math.log10(peak):+.1f} dB); add "
-            "--normalize peak --level-db -0.1, lower --level-db, or write float32",
+            f"{path}: expected amplitudes below 1 for 16 bits, got {peak:.3g} ({20 * math.log10(peak):+.1f} dB); add "
+            "--normalize peak, lower --level-db, or write float32",
             file=path,
             name="peak",
             value=peak,
         )
     memory = io.BytesIO()
-    soundfile.write(memory, sound.numpy().astype(np.float32), rate, subtype=SUBTYPES[coding], format="WAV")
+    scaled = sound.numpy().astype(np.float32)
+    # Rounded here: libsndfile rounds down.
+    samples = np.rint(scaled * 2**15).astype(np.int16) if coding == "int16" else scaled
+    soundfile.write(memory, samples, rate, subtype=SUBTYPES[coding], format="WAV")
     write_whole(path, lambda place: place.write_bytes(memory.getvalue()))
 
 

@@ -4,6 +4,7 @@ from typing import Literal
 
 Format = Literal["web", "gltf", "faust", "avmsf-demo", "wavs", "uff"]
 Precision = Literal["float16", "float32"]
+Axis = Literal["x", "y", "z"]
 MOST_POINTS = 20_000
 """Contacts that a page gets unless more are asked for: 128 modes at each are 20 MB."""
 POINTS: dict[Format, int] = {

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from avmsf.export.formats import GLTF_SUFFIXES
+from avmsf.export.formats import GLTF_SUFFIXES, Axis
 from avmsf.export.look import Look
 from avmsf.export.onephase import deviation, importance, shared_dampings, signed_amplitudes
 from avmsf.export.sampledfield import SampledField
@@ -30,12 +30,21 @@ _FLOAT, _UNSIGNED = 5126, 5125
 _POINTS, _TRIANGLES = 0, 4
 _VERTICES, _INDICES = 34962, 34963
 _GRAY = 0.7
+_TURNS: dict[Axis, tuple[float, float, float, float]] = {
+    "x": (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)),
+    "y": (0.0, 0.0, 0.0, 1.0),
+    "z": (-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)),
+}
+"""Quaternions x, y, z, w that rotate each axis to +y, which is up in glTF."""
 
 
-def write_gltf(sampled: SampledField, path: str | Path, *, look: Look | None = None, force: bool = False) -> Written:
+def write_gltf(
+    sampled: SampledField, path: str | Path, *, look: Look | None = None, up: Axis = "z", force: bool = False
+) -> Written:
     """Write the object, or its points, and one modal model, the modes that matter most first.
 
-    Raises `ExportError` for a name that does not end in .glb, and a field without modes.
+    All coordinates are in the object's frame; the node rotates its axis `up` to glTF's +y. Raises
+    `ExportError` for a name that does not end in .glb, and a field without modes.
     """
     path = Path(path)
     expect_ending(path, GLTF_SUFFIXES)
@@ -44,7 +53,7 @@ def write_gltf(sampled: SampledField, path: str | Path, *, look: Look | None = N
     damping = shared_dampings(sampled)
     order = importance(sampled, damping)
     gains = signed_amplitudes(sampled)
-    content = _glb(_document(sampled, look or Look.of_points(sampled), order, gains, damping))
+    content = _glb(_document(sampled, look or Look.of_points(sampled), up, order, gains, damping))
     sizes = write_file(path, content, force=force)
     error = deviation(sampled, sine=gains, cosine=None, damping=damping)
     return Written(sizes, _remarks(sampled), error)
@@ -80,6 +89,7 @@ class _Buffer:
 def _document(
     sampled: SampledField,
     look: Look,
+    up: Axis,
     order: Int[Tensor, " modes"],
     gains: Float[Tensor, "points modes"],
     damping: Float[Tensor, " modes"],
@@ -115,7 +125,14 @@ def _document(
         "extensions": {EXTENSION: {"modalModels": [model]}},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": model["name"], "mesh": 0, "extensions": {EXTENSION: {"modalModel": 0}}}],
+        "nodes": [
+            {
+                "name": model["name"],
+                "mesh": 0,
+                "rotation": list(_TURNS[up]),
+                "extensions": {EXTENSION: {"modalModel": 0}},
+            }
+        ],
         "meshes": [{"name": model["name"], "primitives": [primitive]}],
         "materials": [{"pbrMetallicRoughness": surface, "doubleSided": True}],
         "accessors": buffer.accessors,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import soundfile
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import ExportError
@@ -76,8 +76,10 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
     scale = 10 ** (grid.level_db / 20) / peak if peak > 0 else 1.0
     # From 1 on: a note of velocity 0 is the end of one. No range is empty, as there are no more layers than velocities.
     edges = np.linspace(1, HIGHEST_NOTE + 1, len(grid.layers) + 1).round().astype(int)
-    records = []
+    amplitudes = np.stack([each.double().square().mean(1).sqrt().numpy() for each in sounds])
+    records, curves = [], []
     for place, row in enumerate(rows.tolist()):
+        curves += _curves(amplitudes[:, place], edges)
         for number, layer in enumerate(grid.layers):
             sound = scale * sounds[number][place]
             where = [f"{value:.9g}" for value in (*field.points[row].tolist(), *field.normals[row].tolist())]
@@ -94,7 +96,7 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
         for sound, record in records:
             (place / str(record[0])).write_bytes(_wav(sound, rate))
         (place / TABLE).write_text(_table([record for _, record in records]))
-        (place / INSTRUMENT).write_text(_instrument(field.name, [record for _, record in records]))
+        (place / INSTRUMENT).write_text(_instrument(field.name, [record for _, record in records], curves))
 
     manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
     manifest["pulses"] = [layer.shape for layer in grid.layers]
@@ -142,16 +144,37 @@ def _table(records: Sequence[Sequence[object]]) -> str:
     return memory.getvalue()
 
 
-def _instrument(name: str, records: Sequence[Sequence[object]]) -> str:
-    """Return an SFZ instrument that plays each contact at its note and each layer at its velocities."""
+def _curves(amplitude: Float64[np.ndarray, " layers"], edges: Int[np.ndarray, " edges"]) -> list[str]:
+    """Return the velocity curves of one contact's layers, whose root mean square amplitudes are given.
+
+    Each layer's hardest velocity plays its sound as it is. From there down to the hardest velocity of the layer below,
+    the level falls evenly in decibels to that layer's; the lowest layer falls with the velocity's square, as SFZ
+    players do. A layer that is louder than the next one is lowered to it, so that the level never falls as the
+    velocity rises.
+    """
+    tops = np.minimum.accumulate(np.maximum(amplitude, np.finfo(float).tiny)[::-1])[::-1]
+    curves = []
+    for number, top in enumerate(tops):
+        velocity = np.arange(edges[number], edges[number + 1])
+        if number == 0:
+            level = top * (velocity / velocity[-1]) ** 2
+        else:
+            part = (velocity - edges[number] + 1) / len(velocity)
+            level = tops[number - 1] ** (1 - part) * top**part
+        gains = level / max(amplitude[number], np.finfo(float).tiny)
+        curves.append(" ".join(f"amp_velcurve_{each}={gain:.6g}" for each, gain in zip(velocity, gains, strict=True)))
+    return curves
+
+
+def _instrument(name: str, records: Sequence[Sequence[object]], curves: Sequence[str]) -> str:
+    """Return an SFZ instrument that plays each contact at its note and each layer at its velocities by its curve."""
     lines = [f"// {name or 'object'}, as exported by avmsf", "<global> loop_mode=one_shot amp_veltrack=100"]
     regions = [dict(zip(COLUMNS, record, strict=True)) for record in records]
     for low, high in sorted({(int(str(each["velocity_low"])), int(str(each["velocity_high"]))) for each in regions}):
-        # A layer's sounds are those of its own force, which its hardest velocity plays as they are; softer ones are
-        # fainter by the square of what they lack, as between layers the forces are.
-        curve = " ".join(f"amp_velcurve_{each}={(each / high) ** 2:.6g}" for each in range(low, high + 1))
-        lines.append(f"<group> lovel={low} hivel={high} {curve}")
+        lines.append(f"<group> lovel={low} hivel={high}")
         lines += [
-            f"<region> sample={each['file']} key={each['midi_note']}" for each in regions if each["velocity_low"] == low
+            f"<region> sample={each['file']} key={each['midi_note']} {curve}"
+            for each, curve in zip(regions, curves, strict=True)
+            if each["velocity_low"] == low
         ]
     return "\n".join(lines) + "\n"

@@ -237,7 +237,8 @@ class SoundField:
         """Return where on the object a recorded impact was: points with probabilities.
 
         `recording` is the path of a sound file, or the samples of one channel at `sample_rate` Hz (by default the
-        field's). `avmsf.locate` takes more arguments. Raises LocationError for a recording that is silent or too short.
+        field's). The first recording takes seconds to minutes, in which the gains over the surface are computed.
+        `avmsf.locate` takes more arguments. Raises LocationError for a recording that is silent or too short.
         """
         from avmsf.tasks.locate import locate
 
@@ -375,7 +376,7 @@ def expect_near(positions: Float[Tensor, "contacts 3"], points: Float[Tensor, "p
     outside = torch.clamp(torch.maximum(low - places, places - high), min=0).norm(dim=1)
     far = torch.nonzero(~(outside <= size)).flatten()
     if len(far):
-        row = int(far[outside[far].argmax()])
+        row = int(far[0])
         found = places[row].tolist()
         where = ", ".join(f"{value:.4g}" for value in found)
         raise PositionError(

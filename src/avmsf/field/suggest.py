@@ -78,8 +78,8 @@ def suggest(
     none of which a hammer gets to, and `unseen` without a body.
     """
     gains = unedited_mixture(field)
-    if count < 1:
-        raise FitError(f"count: expected 1 contact or more, got {count}", name="count", value=count)
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise FitError(f"count: expected a whole number of 1 or more, got {count!r}", name="count", value=count)
     surface = _body_nodes(gains) if unseen else gains.points
     points = surface[farthest_points(surface, min(PLACES, len(surface)))].double()
     _expect_directions(directions, candidates)

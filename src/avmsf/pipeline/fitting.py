@@ -54,6 +54,8 @@ def fit_capture(
     """
     config = PipelineConfig() if config is None else config
     train = capture.impacts if train is None else train
+    if capture.surface is not None:
+        expect_on_object(capture.impacts, capture.surface.vertices)
     if features is None:
         points = _points_of(capture, config, log)
     else:
@@ -105,6 +107,12 @@ def fit_with_progress(
     progress: bool,
 ) -> SoundField:
     """Return what `SoundField.fit` returns."""
+    if not isinstance(capture, Capture):
+        raise FitError(
+            f"capture: expected a Capture, got {type(capture).__name__}; read a folder by avmsf.Capture.read(folder)",
+            name="capture",
+            value=type(capture).__name__,
+        )
     config = PipelineConfig() if config is None else config
     if gain_model is not None:
         config = replace(config, gain_model=gain_model)

@@ -50,10 +50,11 @@ class ContactMap:
     def __repr__(self) -> str:
         if self.refusal is not None:
             return f"ContactMap({len(self.points)} points, no position: {self.refusal})"
-        first, *others = self.peaks()
+        _, *others = self.peaks()
         where = ", ".join(f"{value + 0.0:.3f}" for value in self.position.tolist())
         more = f", {len(others)} more positions as probable" if others else ""
-        return f"ContactMap({len(self.points)} points, most probable ({where}) m with {first.probability:.0%}{more})"
+        radius = f"{LEVEL:.0%} within {1e3 * self.credible_radius():.2g} mm"
+        return f"ContactMap({len(self.points)} points, most probable ({where}) m, {radius}{more})"
 
     points: Float32[Tensor, "points 3"]
     """Object frame, meters."""
@@ -80,7 +81,7 @@ class ContactMap:
 
     @property
     def best(self) -> int:
-        """Row of the point of least distance: the paper's answer."""
+        """Row of the point of least distance: the paper's answer. It knows no uncertainty; see `position`."""
         return int(torch.argmin(self.distance))
 
     @property
@@ -105,16 +106,34 @@ class ContactMap:
 
         Raises LocationError for a level that is not between 0 and 1.
         """
-        if not 0.0 < level < 1.0:
-            raise LocationError.expected("a probability between 0 and 1, such as 0.9", level, name="level")
+        _expect_probability(level)
         order = torch.argsort(self.probability, descending=True, stable=True)
         before = torch.cumsum(self.probability[order], 0) - self.probability[order]
         inside = torch.zeros(len(self.points), dtype=torch.bool)
         inside[order[before < level]] = True
         return inside
 
+    def credible_radius(self, level: float = LEVEL) -> float:
+        """Return the distance from `position` within which the contact lies with a probability of `level`, meters.
+
+        Raises LocationError as `region`, and after a `refusal`.
+        """
+        _expect_probability(level)
+        order = torch.argsort(self._distances, stable=True)
+        reached = torch.cumsum(self.probability[order], 0) >= level * self.probability.sum()
+        return float(self._distances[order][int(reached.double().argmax())])
+
+    @property
+    def position_std(self) -> float:
+        """Root mean square distance of the contact from `position`, meters. Raises LocationError after a `refusal`."""
+        return float((self.probability * self._distances.square()).sum().sqrt())
+
+    @property
+    def _distances(self) -> Float64[Tensor, " points"]:
+        return (self.points.double() - self.position.double()).norm(dim=1)
+
     @cached_property
-    def radius(self) -> float:
+    def linking_length(self) -> float:
         """Meters up to which two points of a region are taken to be one place.
 
         Two and a half times the distance between neighboring points, and no less than 4 % of the object's diagonal.
@@ -129,12 +148,12 @@ class ContactMap:
     def peaks(self, level: float = LEVEL, *, comparable: float = COMPARABLE) -> tuple[Peak, ...]:
         """Return the separate places in the credible region, likeliest first, whose probabilities are comparable.
 
-        A place is a set of the region's points that are linked by steps of at most `radius`. Comparable is what has at
-        least that part of the first place's probability. Raises as `region`.
+        A place is a set of the region's points that are linked by steps of at most `linking_length`. Comparable is what
+        has at least that part of the first place's probability. Raises as `region`.
         """
         rows = torch.nonzero(self.region(level)).flatten()
         places = self.points[rows].double().numpy()
-        pairs = cKDTree(places).query_pairs(self.radius, output_type="ndarray")
+        pairs = cKDTree(places).query_pairs(self.linking_length, output_type="ndarray")
         links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(rows), len(rows)))
         count, labels = connected_components(links, directed=False)
         found = []
@@ -156,12 +175,21 @@ class ContactMap:
         """Return the other places that are about as probable as the first, and how the object's symmetries explain it.
 
         Of the symmetries, that one is named which carries the first place nearest to the other, if nearer than twice
-        `radius`. Empty where the answer is not ambiguous. Raises as `region`.
+        `linking_length`. Empty where the answer is not ambiguous. Raises as `region`.
         """
         first, *others = self.peaks(level)
         return tuple(
             name_counterpart(
-                first.position, other.position, symmetries, probability=other.probability, tolerance=2.0 * self.radius
+                first.position,
+                other.position,
+                symmetries,
+                probability=other.probability,
+                tolerance=2.0 * self.linking_length,
             )
             for other in others
         )
+
+
+def _expect_probability(level: float) -> None:
+    if not 0.0 < level < 1.0:
+        raise LocationError.expected("a probability between 0 and 1, such as 0.9", level, name="level")

@@ -11,14 +11,14 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_floats
+from avmsf._utils.arrays import ArrayLike, as_floats, as_rate
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.blow import clipping, expect_sudden
 from avmsf.capture.onset import Pulse, find_second_blow, find_second_push
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.starts import latest_start
-from avmsf.errors import AvmsfError, CaptureError, LocationError
+from avmsf.errors import ArrayError, AvmsfError, CaptureError, LocationError
 from avmsf.field.soundfield import SoundField
 
 Sound = str | Path | Recording | ArrayLike
@@ -111,7 +111,10 @@ def as_recording(
                 name="recording",
                 value=shape,
             )
-        rate = field.sample_rate if sample_rate is None else sample_rate
+        try:
+            rate = field.sample_rate if sample_rate is None else as_rate(sample_rate)
+        except ArrayError as error:
+            raise LocationError(str(error), **error.attributes) from error
         recording = Recording("the recording", samples[None], rate, "FLOAT")
     elif sample_rate is not None and sample_rate != recording.sample_rate:
         raise LocationError(

@@ -3,8 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-import torch
-
 from avmsf.errors import AvmsfError
 from avmsf.field.soundfield import SoundField
 from avmsf.scene.symmetry import Symmetries
@@ -57,7 +55,7 @@ def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: flo
         "place": contact.position.tolist(),
         "region": {
             "level": level,
-            "radius_meters": _radius(contact, level),
+            "radius_meters": contact.credible_radius(level),
             "share": float(contact.region(level).double().mean()),
         },
         "explained": contact.explained,
@@ -81,11 +79,3 @@ def describe_blow(contact: ContactMap, symmetries: Symmetries | None, level: flo
 def not_located(reason: str) -> dict[str, Any]:
     """Return the values for a recording that could not be located."""
     return {"status": NOT_LOCATED, "reason": " ".join(reason.split()), "place": None}
-
-
-def _radius(contact: ContactMap, level: float) -> float:
-    """Return how far from the likeliest place the blow fell at most, with a probability of `level`, meters."""
-    apart = (contact.points.double() - contact.position.double()).norm(dim=1)
-    order = torch.argsort(apart, stable=True)
-    reached = torch.cumsum(contact.probability[order], 0) >= level * contact.probability.sum()
-    return float(apart[order][int(reached.double().argmax())])

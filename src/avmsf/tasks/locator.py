@@ -122,7 +122,7 @@ class Locator:
             probability = torch.from_numpy(self.slack @ probability.numpy())
         return ContactMap(
             self.points,
-            length.distance(values, noise),
+            length.distance(values, noise, float(found.shift[row])),
             probability,
             explained,
             amplitudes.explained,
@@ -178,8 +178,8 @@ class _Length:
     extractor: Extractor
     foretold: Foretold
     """Of the mixtures of modes that can be told apart, in units of `unit`."""
-    parts: Float32[Tensor, "points two_modes"]
-    """The modes' own gains over their length at each point, sine and cosine in turn."""
+    parts: Complex64[Tensor, "points modes"]
+    """The modes' own gains at each point, over their norm there."""
     unit: float
     detuned: OutOfTune
 
@@ -207,7 +207,7 @@ class _Length:
                 "gains above 0", 0.0, got="0 at all points", name="field", advice="fit it to other recordings"
             )
         gains = gains / unit
-        parts = torch.nn.functional.normalize(torch.view_as_real(gains).flatten(1), dim=1)
+        parts = gains / gains.norm(dim=1, keepdim=True).clamp_min(1e-30)
         foretold = _mixed(gains, locator.variance[:, heard] / unit**2, extractor)
         detuned = OutOfTune.of(bank, sample_rate=rate, samples=samples, highest=highest)
         return cls(extractor, foretold, parts, unit, detuned)
@@ -225,14 +225,19 @@ class _Length:
         return None if force is None else replace(force, expected=force.expected * self.unit)
 
     def distance(
-        self, values: Complex128[Tensor, " modes"], noise: Float64[Tensor, " modes"]
+        self, values: Complex128[Tensor, " modes"], noise: Float64[Tensor, " modes"], delay: float
     ) -> Float64[Tensor, " points"]:
-        """Return the cosine distance of each point's gains from those heard, of which what may be noise is taken."""
+        """Return the cosine distance of each point's gains from the recorded ones without their expected noise.
+
+        The recording's delay, seconds, is taken away: one sample turns high modes by more than gains differ between
+        points.
+        """
         power = values.abs().square()
         kept = ((power - noise) / power.clamp_min(1e-300)).clamp_min(0.0)
-        heard = torch.view_as_real(self.extractor.mixing @ (kept * values)).flatten()
-        heard = torch.nn.functional.normalize(heard, dim=0).float()
-        return (1.0 - (self.parts @ heard).double().abs()).clamp(0.0, 1.0)
+        recorded = self.extractor.mixing @ (kept * values)
+        recorded = recorded / recorded.norm().clamp_min(1e-300)
+        turned = recorded * torch.exp(-2.0j * torch.pi * delay * self.extractor.bank.frequency)
+        return (1.0 - (self.parts.to(torch.complex128).conj() @ turned).real.abs()).clamp(0.0, 1.0)
 
     def explained(self, amplitudes: Amplitudes, found: Judgement, row: int) -> float:
         """Return the part of the sound's energy that a blow at a point explains."""

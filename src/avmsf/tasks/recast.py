@@ -8,7 +8,7 @@ frequency where that is a displacement.
 """
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from avmsf.errors import EditError
-from avmsf.field.soundfield import SoundField
+from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.simulate.material import Material
-from avmsf.tasks.edits import edited, muted
+from avmsf.tasks.edits import EDITS, edited, muted
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,7 @@ def recast(
     Where neither material damps, dampings stay. Ratios of gains between places stay, the residual too. A place on the
     new object is `size` times the old one's.
 
+    `origin.capture` becomes the old name with the new material, such as "mug, glass".
     What was done is the last entry of `origin.report["edits"]`, with its remarks: modes that have moved to half the
     sample rate or above, which are silent and come back with an edit that lowers them; modes that the new material
     damps beyond the critical damping, which have no tone: they are mute from then on, and keep the frequency and the
@@ -86,7 +87,17 @@ def recast(
         "overdamped_hertz": bank.frequency[dead].tolist(),
         "remarks": _remarks(old, new, bank, dead),
     }
-    return edited(field, bank, torch.where(left, 0.0, scale), entry=entry, length=size)
+    changed = edited(field, bank, torch.where(left, 0.0, scale), entry=entry, length=size)
+    return replace(changed, origin=replace(changed.origin, capture=_name(field.origin, old, new)))
+
+
+def _name(origin: Origin, old: Material, new: Material) -> str:
+    """Return the object's name with its new material in place of the one of an earlier edit."""
+    if new.name == old.name:
+        return origin.capture
+    earlier = [edit["to"]["name"] for edit in origin.report.get(EDITS, []) if edit["edit"] == "recast"]
+    base = origin.capture.removesuffix(f", {earlier[-1]}") if earlier else origin.capture
+    return f"{base}, {new.name}" if base else new.name
 
 
 def rayleigh_damping(omega: Float64[Tensor, " modes"], material: Material) -> Float64[Tensor, " modes"]:

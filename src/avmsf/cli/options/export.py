@@ -8,12 +8,12 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import Existing, Flag, Printing, Unit, parse_options
-from avmsf.export.formats import Format, Precision
+from avmsf.export.formats import Axis, Format, Precision
 from avmsf.modal.config import PulseShape
 
 _USED: dict[Format, tuple[str, ...]] = {
     "web": ("object", "object_unit", "capture"),
-    "gltf": ("object", "object_unit", "capture"),
+    "gltf": ("object", "object_unit", "capture", "up"),
     "faust": ("no_noise",),
     "avmsf-demo": ("object", "variant", "precision"),
     "wavs": ("forces", "contact_times", "pulse", "seconds"),
@@ -46,7 +46,8 @@ class Options(Printing):
     object_unit: Unit = "m"
     """Unit of the coordinates of the object's mesh."""
     capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder")] = None
-    """Capture folder: its surface is shown, and a page offers its recordings next to the model's sounds."""
+    """Capture folder: its mesh is shown, or the surface made from its photographs, and a page offers its recordings
+    next to the model's sounds."""
     points: int | None = None
     """Maximum number of contacts, spread over the object; by default as many as the format's tools read easily."""
     overwrite: Flag = False
@@ -59,6 +60,8 @@ class Options(Printing):
     """wavs: length of the sounds; by default that of the training sounds."""
     pulse: PulseShape = "half-sine"
     """wavs: force over the contact time, as in `avmsf render`."""
+    up: Axis = "z"
+    """gltf: axis of the object's frame that points up."""
     no_noise: Flag = False
     """faust: write the modes without the residual noise."""
     functions: int = 16

@@ -12,9 +12,9 @@ broader profile serves, g_kj = exp(-log(f_k / f_j)^2 / 2 w^2) + 1/1000: whatever
 
 Which shape a mode is follows from its gains and from its frequency f: given shape k and a factor c on all nominal
 frequencies (the body's material and scale are not known), log f is normal about log(c f_k); under all other families it
-is uniform over the measured range. Its standard deviation is the same for most modes of a body, one of several, and a
-few modes have another: so the strongest modes together tell how exact the body's frequencies are, and with one or two
-impacts these tell which shape each mode is.
+is uniform over the measured range. Its standard deviation is the same for half of the modes of a body, one of several,
+and the others have any of these: so the strongest modes together tell how exact the body's frequencies are, and with
+one or two impacts these tell which shape each mode is.
 """
 
 import math
@@ -41,7 +41,7 @@ _FAR = 1e-3
 """Least weight of a shape in a broad profile."""
 FREQUENCY_ERRORS = (0.01, 0.03, 0.08, 0.2)
 """Standard deviations of log frequency about the nominal one, equally probable."""
-_EXCEPTIONS = 0.2
+_EXCEPTIONS = 0.5
 """Share of the modes whose standard deviation is any of these, not that of the other modes."""
 _MEMORY = 4_000_000
 """Numbers of a basis held at once."""
