@@ -5,7 +5,9 @@ And one of warnings, `AvmsfWarning`: what goes on all the same, and the user sho
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+_Kind = TypeVar("_Kind", bound="_Located")
 
 
 class _Located(Exception):  # noqa: N818 - warnings have it too
@@ -29,6 +31,29 @@ class _Located(Exception):  # noqa: N818 - warnings have it too
         """The argument, option, column, key, method or object."""
         self.value = value
         """What was found in place of what was expected: a number, a text, a shape, a list of names."""
+
+    @classmethod
+    def expected(
+        cls: type[_Kind],
+        wanted: str,
+        value: Any = None,
+        *,
+        got: str | None = None,
+        file: Path | str | None = None,
+        row: int | None = None,
+        name: str | None = None,
+        advice: str = "",
+    ) -> _Kind:
+        """Return one with the message `PLACE, row ROW: expected WANTED, got VALUE; ADVICE`.
+
+        The place is the file, else the name, and one of them is needed. `got` says what was found where the value does
+        not; without both it is none.
+        """
+        place = f"{name if file is None else file}{'' if row is None else f', row {row}'}"
+        shown = f"{value:g}" if isinstance(value, float) else repr(value) if isinstance(value, str) else str(value)
+        found = got or ("none" if value is None else shown)
+        message = f"{place}: expected {wanted}, got {found}{advice and f'; {advice}'}"
+        return cls(message, file=file, row=row, name=name, value=value)
 
     @property
     def attributes(self) -> dict[str, Any]:

@@ -88,12 +88,7 @@ class Clap:
         heard = sounds.detach().cpu().double()
         silent = torch.nonzero(heard.abs().amax(dim=1) == 0).flatten()
         if len(silent):
-            raise EvaluationError(
-                f"sounds, row {int(silent[0])}: expected a sound, got silence",
-                row=int(silent[0]),
-                name="sounds",
-                value=0.0,
-            )
+            raise EvaluationError.expected("a sound", 0.0, got="silence", row=int(silent[0]), name="sounds")
         keys = [self._key(sound, sample_rate) for sound in heard]
         missing = [row for row, key in enumerate(keys) if not self._remembered(key)]
         # A sound that is there twice is embedded once.

@@ -83,11 +83,8 @@ def _expect_clap(folder: Path) -> Path:
     if not lacking:
         kind = read_settings(folder / _CONFIG, raising=EvaluationError).get("model_type")
         if kind != "clap":
-            raise EvaluationError(
-                f"{folder / _CONFIG}: expected a model of type 'clap' (ClapModel), got {kind!r}",
-                file=folder / _CONFIG,
-                name="model_type",
-                value=kind,
+            raise EvaluationError.expected(
+                "a model of type 'clap' (ClapModel)", kind, file=folder / _CONFIG, name="model_type"
             )
     lacking += [
         " or ".join(each) for each in (_EXTRACTORS, _WEIGHTS) if not any((folder / name).is_file() for name in each)

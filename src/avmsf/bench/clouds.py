@@ -130,11 +130,8 @@ def save_turntable(
 ) -> None:
     """Write an animated GIF of the cloud turning once in three seconds. Raises EvaluationError for another ending."""
     if path.suffix.lower() != ".gif" or frames < 2:
-        raise EvaluationError(
-            f"{path}: expected a name that ends in .gif and 2 frames or more, got {frames} frames",
-            file=path,
-            name="frames",
-            value=frames,
+        raise EvaluationError.expected(
+            "a name that ends in .gif and 2 frames or more", frames, got=f"{frames} frames", file=path, name="frames"
         )
     pictures = []
     for frame in range(frames):

@@ -19,9 +19,8 @@ from avmsf.bench.spectralmean import MeanSpectra
 from avmsf.bench.task import Method, Task
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.diffsound import DiffSound
-from avmsf.evaluation.sonicgauss.published_renderer import PublishedRenderer
 from avmsf.evaluation.sonicgauss.small import COMMAND
-from avmsf.evaluation.sonicgauss.small_renderer import SmallRenderer
+from avmsf.evaluation.sonicgauss.tuning import TunedRenderer
 from avmsf.field.config import PAPER
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.finders import ShortTime
@@ -193,7 +192,7 @@ def report_of(renderer: Renderer) -> dict[str, Any]:
     """Return what a method chose on its way to a renderer, as plain values; empty where it had no choice."""
     if isinstance(renderer, SoundField):
         return renderer.origin.report
-    if isinstance(renderer, SmallRenderer | PublishedRenderer):
+    if isinstance(renderer, TunedRenderer):
         return dict(renderer.report)
     if isinstance(renderer, SplineGains | DiffSound):
         return renderer.report

@@ -119,9 +119,7 @@ def relative_stft_error(predicted: Sounds, truth: Sounds, *, fft_sizes: Sequence
     for size in fft_sizes:
         difference, weight = _stft_sums(predicted, truth, fft_size=size, hop=max(1, size // 4))
         if weight.sum() == 0.0:
-            raise EvaluationError(
-                "truth: expected sounds that are not all silent, got silence", name="truth", value=0.0
-            )
+            raise EvaluationError.expected("sounds that are not all silent", 0.0, got="silence", name="truth")
         error += difference / weight.mean()
     return error / len(fft_sizes)
 
@@ -205,10 +203,8 @@ def _expect_rows(sounds: Sounds, what: str) -> None:
             value=list(sounds.shape),
         )
     if sounds.numel() == 0:
-        raise EvaluationError(
-            f"{what}: expected one contact and one sample or more, got the shape {tuple(sounds.shape)}",
-            name=what,
-            value=list(sounds.shape),
+        raise EvaluationError.expected(
+            "one contact and one sample or more", list(sounds.shape), got=f"the shape {tuple(sounds.shape)}", name=what
         )
 
 

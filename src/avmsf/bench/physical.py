@@ -123,9 +123,7 @@ def judge_modes(
         )
     energy = true.abs().square().sum(dim=0) / (4 * truth.damping)
     if not float(energy.sum()) > 0.0:
-        raise EvaluationError(
-            "truth: expected modes with energy, got zero gains at all contacts", name="truth", value=0.0
-        )
+        raise EvaluationError.expected("modes with energy", 0.0, got="zero gains at all contacts", name="truth")
     match = match_modes(bank, ModalBank(truth.frequency, truth.damping), widths=widths, relative=relative)
     found = match >= 0
     partner = match[found]

@@ -40,10 +40,8 @@ def expect_format(path: Path) -> str:
     """Return the format that a picture's file name asks for; raises as `save_picture`."""
     ending = path.suffix.lower().lstrip(".")
     if ending not in FORMATS:
-        raise EvaluationError(
-            f"{path}: expected a name that ends in .png, .pdf or .svg, got {path.suffix or 'no ending'}",
-            file=path,
-            value=path.suffix,
+        raise EvaluationError.expected(
+            "a name that ends in .png, .pdf or .svg", path.suffix, got=str(path.suffix or "no ending"), file=path
         )
     return ending
 

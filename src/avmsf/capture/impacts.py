@@ -73,9 +73,7 @@ class Impacts:
             raise ArrayError("contacts: expected one or more, got 0", name="contacts", value=0)
         named = tuple(f"{row:03d}" for row in range(1, count + 1)) if names is None else tuple(names)
         if len(named) != count:
-            raise ArrayError(
-                f"names: expected {count}, one for each contact, got {len(named)}", name="names", value=len(named)
-            )
+            raise ArrayError.expected(f"{count}, one for each contact", len(named), name="names")
         return cls(
             places,
             as_rows(sounds, "sounds", count=count).float(),

@@ -124,9 +124,7 @@ class CaptureSettings:
         except FileNotFoundError as error:
             raise CaptureError(f"{path}: expected a file of capture settings, got none", file=path) from error
         except (OSError, ValueError) as error:
-            raise CaptureError(
-                f"{path}: expected a TOML file, got one that cannot be read: {error}", file=path
-            ) from error
+            raise CaptureError.expected("a TOML file", got=f"one that cannot be read: {error}", file=path) from error
         return cls.of(table, name=str(path), file=path)
 
     @classmethod

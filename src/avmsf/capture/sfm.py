@@ -133,11 +133,7 @@ def _expect_job(images: Path, output: Path, *, camera_model: str, timeout: float
             name="pycolmap",
         )
     if camera_model not in CAMERA_MODELS:
-        raise CaptureError(
-            f"camera_model: expected one of {', '.join(CAMERA_MODELS)}, got {camera_model!r}",
-            name="camera_model",
-            value=camera_model,
-        )
+        raise CaptureError.expected(f"one of {', '.join(CAMERA_MODELS)}", camera_model, name="camera_model")
     if not timeout > 0:
         raise CaptureError(f"timeout: expected a time above 0 s, got {timeout:g} s", name="timeout", value=timeout)
     if not images.is_dir():

@@ -86,11 +86,8 @@ def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
     if settings.surface is not None:
         named = Path(settings.surface)
         if named.is_absolute() or ".." in named.parts:
-            raise CaptureError(
-                f"surface: expected a file in the capture folder, got {settings.surface!r}; copy it there",
-                file=folder,
-                name="surface",
-                value=settings.surface,
+            raise CaptureError.expected(
+                "a file in the capture folder", settings.surface, file=folder, name="surface", advice="copy it there"
             )
         return folder / named
     return next((folder / name for name in SURFACE_FILES if (folder / name).is_file()), None)

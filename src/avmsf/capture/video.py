@@ -165,10 +165,8 @@ def _open(path: Path) -> cv2.VideoCapture:
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
         video.release()
-        raise CaptureError(
-            f"{path}: expected a video, got a file that cannot be read; convert it to MP4 (H.264)",
-            file=path,
-            name="format",
+        raise CaptureError.expected(
+            "a video", got="a file that cannot be read", file=path, name="format", advice="convert it to MP4 (H.264)"
         )
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
     return video
@@ -183,9 +181,6 @@ def _expect_enough(path: Path, total: int, count: int) -> None:
             value=0,
         )
     if total < count:
-        raise CaptureError(
-            f"{path}: expected a video of at least {count} frames, got {total}; choose at most {total}",
-            file=path,
-            name="count",
-            value=total,
+        raise CaptureError.expected(
+            f"a video of at least {count} frames", total, file=path, name="count", advice=f"choose at most {total}"
         )

@@ -74,13 +74,7 @@ def read_contacts(path: Path, *, meters: float) -> Contacts:
     repeated = next((place for place, name in enumerate(names) if name in names[:place]), None)
     if repeated is not None:
         line, name = lines[1 + repeated][0], names[repeated]
-        raise CaptureError(
-            f"{path}, row {line}: file: expected a name that no other row has, got {name}",
-            file=path,
-            row=line,
-            name="file",
-            value=name,
-        )
+        raise _cell_error(path, line, "file", "a name that no other row has", name)
     directions = torch.tensor(normals, dtype=torch.float64)
     known = directions if bool(directions.any()) else None
     return Contacts(torch.tensor(places, dtype=torch.float64) * meters, tuple(names), known)
@@ -110,24 +104,17 @@ def _number(text: str, path: Path, line: int, column: str, separator: str) -> fl
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise CaptureError(
-            f"{path}, row {line}: {column}: expected a number, got {text!r}",
-            file=path,
-            row=line,
-            name=column,
-            value=text,
-        )
+        raise _cell_error(path, line, column, "a number", text)
     return value
 
 
 def _wav_name(text: str, path: Path, line: int) -> str:
     sound = PurePosixPath(text.replace("\\", "/"))
     if not sound.name or sound.is_absolute() or ".." in sound.parts or ":" in sound.parts[0]:
-        raise CaptureError(
-            f"{path}, row {line}: file: expected the name of a wav file inside the output folder, got {text!r}",
-            file=path,
-            row=line,
-            name="file",
-            value=text,
-        )
+        raise _cell_error(path, line, "file", "the name of a wav file inside the output folder", text)
     return str(sound if sound.suffix.lower() == ".wav" else sound.with_name(f"{sound.name}.wav"))
+
+
+def _cell_error(path: Path, line: int, column: str, wanted: str, text: str) -> CaptureError:
+    message = f"{path}, row {line}: {column}: expected {wanted}, got {text!r}"
+    return CaptureError(message, file=path, row=line, name=column, value=text)

@@ -52,9 +52,7 @@ def _replacing(folder: Path) -> Iterator[Path]:
         _replace(folder, begun)
     except OSError as error:
         path, reason = error.filename or folder, error.strerror or str(error)
-        raise OutputError(
-            f"{path}: expected a writable path, got {reason!r}; {way_out(error)}", file=path, value=reason
-        ) from error
+        raise OutputError.expected("a writable path", reason, file=path, advice=way_out(error)) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)
         # Whoever waits for it looks again when a lock's file is gone.

@@ -159,15 +159,11 @@ def _expect(options: Options, asked: _Edit) -> None:
     """Raise before any work for what cannot be done or written."""
     asked.steering.expect_usable()
     if asked.change.law != MaterialChange.law and not asked.change.asked:
-        raise EditError(
-            "--law: expected --material, --size or a constant of a material with it, got none", name="--law"
-        )
+        raise EditError.expected("--material, --size or a constant of a material with it", name="--law")
     if options.position is not None and options.plots is None:
         raise EditError("--position: expected --plots with it, got none", name="--position")
     if asked.change.old is not None and not (asked.change.asked or asked.steering.like_material):
-        raise EditError(
-            "--from: expected --material, --size, a constant or --like-material with it, got none", name="--from"
-        )
+        raise EditError.expected("--material, --size, a constant or --like-material with it", name="--from")
     if not (asked.change.asked or asked.sliders.asked or asked.steering.asked):
         raise EditError(
             "expected an edit, got none: give --material, --size or a constant of a material, --pitch, --decay, "

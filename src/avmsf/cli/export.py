@@ -242,10 +242,8 @@ def _wavs(field: SoundField | SampledField, options: Options) -> Written:
     if len(times) == 1:
         times = times * len(forces)
     if not forces or len(times) != len(forces):
-        raise ExportError(
-            f"--contact-times: expected one, or one for each of {len(forces)} --forces, got {len(times)}",
-            name="--contact-times",
-            value=len(times),
+        raise ExportError.expected(
+            f"one, or one for each of {len(forces)} --forces", len(times), name="--contact-times"
         )
     layers = tuple(Layer(force, each, options.pulse) for force, each in zip(forces, times, strict=True))
     sampled = _sampled(field, options)

@@ -40,10 +40,8 @@ def run(options: Options) -> int:
     if not options.recordings:
         raise OutputError("expected one recording or more after the field, such as HIT.wav", name="recordings", value=0)
     if not 0.0 < options.probability < 1.0:
-        raise OutputError(
-            f"--probability: expected a probability between 0 and 1, such as 0.9, got {options.probability:g}",
-            name="--probability",
-            value=options.probability,
+        raise OutputError.expected(
+            "a probability between 0 and 1, such as 0.9", options.probability, name="--probability"
         )
     if options.output is not None:
         expect_writable(options.output / "impact.png")
@@ -132,10 +130,8 @@ def _settings(options: Options) -> CaptureSettings | None:
     if options.capture is None:
         return None
     if not options.capture.is_dir():
-        raise OutputError(
-            f"{options.capture}: expected a capture folder, got none; check the name, or leave it out",
-            file=options.capture,
-            name="--capture",
+        raise OutputError.expected(
+            "a capture folder", file=options.capture, name="--capture", advice="check the name, or leave it out"
         )
     return settings_of(options.capture)
 

@@ -33,10 +33,8 @@ def run(options: Options) -> int:
         if not math.isfinite(value):
             raise OutputError(f"{option}: expected a finite number, got {value}", name=option, value=value)
     if options.force <= 0:
-        raise OutputError(
-            f"--force: expected a force above 0, got {options.force:g}; --direction says which way it acts",
-            name="--force",
-            value=options.force,
+        raise OutputError.expected(
+            "a force above 0", options.force, name="--force", advice="--direction says which way it acts"
         )
     field = load(options.field)
     refuse_far(contacts, field)
@@ -94,9 +92,7 @@ def _contacts(options: Options) -> Contacts:
     wrong = torch.nonzero(~torch.isfinite(contacts.places).all(1)).flatten().tolist()
     if wrong:
         found = contacts.places[wrong[0]].tolist()
-        raise OutputError(
-            f"--position: expected finite coordinates, got {found}", name="--position", row=wrong[0], value=found
-        )
+        raise OutputError.expected("finite coordinates", found, row=wrong[0], name="--position")
     return contacts
 
 
@@ -124,21 +120,15 @@ def render_sounds(
         return field.render(places, directions=directions, forces=force, pulse=pulse)
     samples = round(seconds * field.sample_rate) if math.isfinite(seconds) else 0
     if not 1 <= samples <= MAX_SAMPLES:
-        raise OutputError(
-            f"--seconds: expected more than 0 and at most {MAX_SAMPLES / field.sample_rate:g} s, got {seconds:g}",
-            name="--seconds",
-            value=seconds,
+        raise OutputError.expected(
+            f"more than 0 and at most {MAX_SAMPLES / field.sample_rate:g} s", seconds, name="--seconds"
         )
     return field.render(places, directions=directions, forces=force, samples=samples, pulse=pulse)
 
 
 def _pulse(options: Options) -> ForcePulse | None:
     if not 0 <= options.contact_time <= LONGEST:
-        raise OutputError(
-            f"--contact-time: expected seconds from 0 to {LONGEST:g}, got {options.contact_time:g}",
-            name="--contact-time",
-            value=options.contact_time,
-        )
+        raise OutputError.expected(f"seconds from 0 to {LONGEST:g}", options.contact_time, name="--contact-time")
     return ForcePulse(options.contact_time, options.pulse) if options.contact_time else None
 
 

@@ -70,15 +70,9 @@ class Steering(GuideOptions):
             return
         expect_prompt(self.prompt)
         if self.clap is not None and self.config.preview_every == 0:
-            raise EditError(
-                "--clap: expected --preview-every 1 or more with it, such as 50, got 0", name="--clap", value=0
-            )
+            raise EditError.expected("--preview-every 1 or more with it, such as 50", 0, got="0", name="--clap")
         if self.model_seconds is not None and not 0 < self.model_seconds < math.inf:
-            raise EditError(
-                f"--model-seconds: expected more than 0, such as 3, got {self.model_seconds:g}",
-                name="--model-seconds",
-                value=self.model_seconds,
-            )
+            raise EditError.expected("more than 0, such as 3", self.model_seconds, name="--model-seconds")
 
     def apply(self, field: SoundField, *, output: Path, old: Material | None) -> SoundField:
         """Return the edited field; its state and preview are written next to `output`, its later file.

@@ -47,11 +47,8 @@ def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: fl
     are not finite and for what would clip."""
     rate = round(sample_rate)
     if rate < 1:
-        raise OutputError(
-            f"{path}: expected a sample rate of 1 Hz or more, got {sample_rate:g} Hz",
-            file=path,
-            name="sample_rate",
-            value=sample_rate,
+        raise OutputError.expected(
+            "a sample rate of 1 Hz or more", sample_rate, got=f"{sample_rate:g} Hz", file=path, name="sample_rate"
         )
     wrong = int((~torch.isfinite(sound)).sum())
     if wrong:

@@ -82,9 +82,7 @@ class DiffSoundConfig:
             material_named(self.material)
         for name in ("transport_steps", "difference_steps", "search"):
             if getattr(self, name) < 0:
-                raise EvaluationError(
-                    f"{name}: expected 0 or more, got {getattr(self, name)}", name=name, value=getattr(self, name)
-                )
+                raise EvaluationError.expected("0 or more", getattr(self, name), name=name)
 
 
 @dataclass(frozen=True)

@@ -75,11 +75,7 @@ def write_demo(
             value=len(shown),
         )
     if not variant or Path(variant).name != variant or variant.startswith("."):
-        raise ExportError(
-            f"variant: expected a name that a folder can have, got {variant!r}; use letters",
-            name="variant",
-            value=variant,
-        )
+        raise ExportError.expected("a name that a folder can have", variant, name="variant", advice="use letters")
     gains = _gains(field, precision)
     picking, places = _picking(field, shown)
     modal, tensors = _modal(field, gains)
@@ -118,10 +114,8 @@ def _gains(field: SampledField, precision: Precision) -> Float[np.ndarray, "poin
     gains = amplitudes.numpy().astype(f"<{np.dtype(precision).str[1:]}")
     if not np.isfinite(gains).all():
         loudest = float(amplitudes.abs().max())
-        raise ExportError(
-            f"precision: expected gains up to 65504 for {precision}, got {loudest:.3g}; take float32",
-            name="precision",
-            value=loudest,
+        raise ExportError.expected(
+            f"gains up to 65504 for {precision}", loudest, got=f"{loudest:.3g}", name="precision", advice="take float32"
         )
     return gains
 
@@ -169,25 +163,17 @@ def read_demo(folder: str | Path, *, variant: str | None = None, sample_rate: fl
         for name, width in _PICKED.items()
     }
     sound_folder = folder / (_only_variant(folder) if variant is None else variant)
-    sound = read_manifest(sound_folder)
+    sound, manifest = read_manifest(sound_folder), sound_folder / MANIFEST
     frequency, gains, damping = _read_modes(sound, sound_folder, count)
     rate = sound.get("sampleRate", sound.get("sample_rate", sample_rate)) if sample_rate is None else sample_rate
     if not isinstance(rate, int | float) or not 1 <= rate <= _MOST_RATE:
-        raise ExportError(
-            f"{sound_folder / MANIFEST}: expected a sample rate from 1 to {_MOST_RATE} Hz, got {rate!r}; give it",
-            file=sound_folder / MANIFEST,
-            name="sampleRate",
-            value=rate,
+        raise ExportError.expected(
+            f"a sample rate from 1 to {_MOST_RATE} Hz", rate, file=manifest, name="sampleRate", advice="give it"
         )
     seconds = sound.get("duration", 3.0)
     if not isinstance(seconds, int | float) or not 0 < seconds <= _MOST_SECONDS:
-        raise ExportError(
-            f"{sound_folder / MANIFEST}: expected a duration above 0 and up to {_MOST_SECONDS} s, got {seconds!r}; "
-            "correct it",
-            file=sound_folder / MANIFEST,
-            name="duration",
-            value=seconds,
-        )
+        wanted = f"a duration above 0 and up to {_MOST_SECONDS} s"
+        raise ExportError.expected(wanted, seconds, file=manifest, name="duration", advice="correct it")
     heard = frequency < 0.5 * rate
     points = torch.from_numpy(picked["means"].copy())
     cosine = torch.from_numpy(gains[:, heard].astype(np.float32))
@@ -217,16 +203,9 @@ def _read_modes(
     frequency = read_array(path, sound, "frequencies", (modes,), "float32")
     gains = read_array(path, sound, "gains", (count, modes), _gain_kind(sound, path))
     damping = read_array(path, sound, "dampings", _damping_shape(sound, path, count, modes), "float32")
-    for name, values, ok in (("frequencies", frequency, frequency > 0), ("dampings", damping, damping >= 0)):
-        if not ok.all():
-            least = float(values.min())
-            raise ExportError(
-                f"{path}: expected {name} {'above 0' if name == 'frequencies' else 'from 0'}, got {least:g}; export it "
-                "again",
-                file=path,
-                name=name,
-                value=least,
-            )
+    for name, least, wanted in (("frequencies", frequency.min(), "above 0"), ("dampings", damping.min(), "from 0")):
+        if least < 0 or (least == 0 and wanted == "above 0"):
+            raise ExportError.expected(f"{name} {wanted}", float(least), file=path, name=name, advice="export it again")
     return frequency, gains, damping
 
 
@@ -244,11 +223,8 @@ def _gain_kind(sound: Mapping[str, Any], path: Path) -> str:
     kind = place.get("dtype", sound.get("gains_dtype", sound.get("gainsDtype", "float32")))
     if kind not in ("float16", "float32"):
         manifest = path.with_name(MANIFEST)
-        raise ExportError(
-            f"{manifest}: expected gains in float16 or float32, got {kind!r}; correct it",
-            file=manifest,
-            name="gains",
-            value=kind,
+        raise ExportError.expected(
+            "gains in float16 or float32", kind, file=manifest, name="gains", advice="correct it"
         )
     return str(kind)
 

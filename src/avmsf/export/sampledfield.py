@@ -196,11 +196,7 @@ def _expect_places(
             value=len(places),
         )
     if normals is not None and normals.shape != places.shape:
-        raise ExportError(
-            f"normals: expected one for each of {len(places)} points, got {len(normals)}",
-            name="normals",
-            value=len(normals),
-        )
+        raise ExportError.expected(f"one for each of {len(places)} points", len(normals), name="normals")
     if limit is not None and limit < 1:
         raise ExportError(f"limit: expected 1 point or more, got {limit}", name="limit", value=limit)
 

@@ -63,10 +63,8 @@ def write_grid(field: SampledField, folder: str | Path, grid: Grid | None = None
     _expect(grid)
     rate = round(field.sample_rate)
     if rate != field.sample_rate or rate < 1:
-        raise ExportError(
-            f"sample_rate: expected whole hertz for wav files, got {field.sample_rate:g} Hz",
-            name="sample_rate",
-            value=field.sample_rate,
+        raise ExportError.expected(
+            "whole hertz for wav files", field.sample_rate, got=f"{field.sample_rate:g} Hz", name="sample_rate"
         )
     rows = field.spread(grid.contacts)
     samples = field.samples if grid.seconds is None else max(1, round(grid.seconds * rate))

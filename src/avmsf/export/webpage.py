@@ -123,10 +123,5 @@ def _carried(name: str, content: bytes) -> dict[str, str]:
 def _once(pattern: re.Pattern[str], text: str, change: Any, what: str) -> str:
     changed, count = pattern.subn(change, text)
     if count != 1:
-        raise ExportError(
-            f"index.html: expected one {what}, got {count}; install avmsf again",
-            file="index.html",
-            name=what,
-            value=count,
-        )
+        raise ExportError.expected(f"one {what}", count, file="index.html", name=what, advice="install avmsf again")
     return changed

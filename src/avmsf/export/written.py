@@ -64,11 +64,8 @@ def expect_ending(path: Path, endings: Sequence[str]) -> None:
 
 def no_modes(path: Path | None = None) -> ExportError:
     """Return the error for a field without a mode below half the sample rate."""
-    return ExportError(
-        "modes: expected 1 or more below half the sample rate, got none; fit the field again",
-        file=path,
-        name="modes",
-        value=0,
+    return ExportError.expected(
+        "1 or more below half the sample rate", 0, got="none", file=path, name="modes", advice="fit the field again"
     )
 
 
@@ -124,9 +121,7 @@ def write_folder(
             shutil.rmtree(temporary, ignore_errors=True)
     except OSError as error:
         reason = error.strerror or str(error)
-        raise ExportError(
-            f"{folder}: expected a writable folder, got {reason!r}; {way_out(error)}", file=folder, value=reason
-        ) from error
+        raise ExportError.expected("a writable folder", reason, file=folder, advice=way_out(error)) from error
     return sizes
 
 

@@ -133,9 +133,7 @@ def _of_shape(shape: Shape, count: int, freedoms: int, filled: int, tell: Callab
         try:
             surface = shape.shell(thickness, faces=round(0.5 * TRIANGLES * freedoms))
         except SceneError as error:
-            raise SimulationError(
-                str(error), file=error.file, row=error.row, name=error.name, value=error.value
-            ) from error
+            raise SimulationError(str(error), **error.attributes) from error
         return filled_solid(checked(surface, tell=tell), freedoms, wall=thickness)
 
     return _of_walls(make, np.geomspace(*between, _THICKNESSES).tolist(), count, tell)

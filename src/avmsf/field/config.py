@@ -116,21 +116,13 @@ class FitConfig:
         if self.seed >= 2**63:
             raise FitError(f"seed: expected less than 2^63, got {self.seed}", name="seed", value=self.seed)
         if not 0 <= self.validation <= 0.5:
-            raise FitError(
-                f"validation: expected 0 to 0.5 of the positions, got {self.validation}",
-                name="validation",
-                value=self.validation,
-            )
+            raise FitError.expected("0 to 0.5 of the positions", self.validation, name="validation")
         if self.warmup_steps + self.steps == 0:
             raise FitError("steps: expected warmup_steps or steps of 1 or more, got 0 for both", name="steps", value=0)
         # A rate as low as a structure's takes a quarter of each size, which has to be even.
         odd = [size for size in self.fft_sizes if size < 16 or size % 8]
         if odd or not self.fft_sizes:
-            raise FitError(
-                f"fft_sizes: expected one or more multiples of 8 from 16 on, got {self.fft_sizes}",
-                name="fft_sizes",
-                value=self.fft_sizes,
-            )
+            raise FitError.expected("one or more multiples of 8 from 16 on", self.fft_sizes, name="fft_sizes")
 
     @property
     def shape(self) -> AttentionShape:

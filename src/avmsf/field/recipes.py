@@ -223,11 +223,7 @@ def _expect_fitting(train: Impacts, modes: Extraction) -> None:
         )
     advice = "extract the modes from the recordings that the field is fitted to"
     if len(modes.gains) != len(train):
-        raise FitError(
-            f"modes: expected gains of {len(train)} recordings, got {len(modes.gains)}; {advice}",
-            name="modes",
-            value=len(modes.gains),
-        )
+        raise FitError.expected(f"gains of {len(train)} recordings", len(modes.gains), name="modes", advice=advice)
     if len(modes.bank) == 0:
         raise FitError("modes: expected 1 mode or more, got none; record longer or louder", name="modes", value=0)
     highest, limit = float(modes.bank.frequency.max()), train.sample_rate / 2

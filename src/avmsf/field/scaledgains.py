@@ -84,11 +84,7 @@ class ScaledGains:
     def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return tensors like those of a field of these sizes."""
         if not 0.0 < like(record["size_factor"], 1.0, "size_factor") < math.inf:
-            raise RecordError(
-                f"size_factor: expected a number above 0, got {record['size_factor']}",
-                name="size_factor",
-                value=record["size_factor"],
-            )
+            raise RecordError.expected("a number above 0", record["size_factor"], name="size_factor")
         inner = FITTED[_inner(record)].skeleton(record)
         scale = torch.empty(count_of(record["modes"], "modes"), dtype=torch.float64, device="meta")
         return {"mode_factors": scale, **{_INNER + name: tensor for name, tensor in inner.items()}}

@@ -47,6 +47,7 @@ _MAX = {"bank.frequency": 1e9, "bank.damping": 1e9, "residual.magnitude": MAX_PE
 """Largest values: hertz and 1/s beyond any solid's modes, and noise as loud as the loudest recording."""
 _KINDS: dict[str, type[GainField]] = {**FITTED, ScaledGains.kind: ScaledGains}
 """The gain fields that a file may hold, by what it calls them."""
+_SAVE_AGAIN = "fit and save the field again"
 _UNREADABLE = (ValueError, TypeError, KeyError, RuntimeError, AvmsfError)
 """What a record of another form raises; RuntimeError: torch, of sizes beyond 2^63 and of damaged values."""
 
@@ -149,15 +150,9 @@ class _Header:
         rate, samples = float(like(record["sample_rate"], 1.0, "sample_rate")), count_of(record["samples"], "samples")
         # Those of the recordings that a field is fitted to.
         if not LOWEST_RATE <= rate <= HIGHEST_RATE:
-            raise RecordError(
-                f"sample_rate: expected {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz, got {rate:g}",
-                name="sample_rate",
-                value=rate,
-            )
+            raise RecordError.expected(f"{LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz", rate, name="sample_rate")
         if samples > MAX_SAMPLES:
-            raise RecordError(
-                f"samples: expected at most {MAX_SAMPLES:,}, got {samples:,}", name="samples", value=samples
-            )
+            raise RecordError.expected(f"at most {MAX_SAMPLES:,}", samples, got=f"{samples:,}", name="samples")
         modes, bins = (count_of(sizes[name], f"sizes.{name}") for name in ("modes", "bins"))
         kind = like(gains.pop("kind"), "", "gains.kind")
         if kind not in _KINDS:
@@ -168,29 +163,19 @@ class _Header:
         if sizes["recordings"] is not None:
             contacts, length = (count_of(each, "sizes.recordings") for each in sizes["recordings"])
             if gains.get("contacts") != contacts:
-                raise RecordError(
-                    f"sizes.recordings: expected {gains.get('contacts')} contacts as in gains, got {contacts}",
-                    name="sizes.recordings",
-                    value=contacts,
+                raise RecordError.expected(
+                    f"{gains.get('contacts')} contacts as in gains", contacts, name="sizes.recordings"
                 )
             skeleton["residual.recordings"] = torch.empty(contacts, length, device="meta")
         skeleton |= {_GAINS + name: each for name, each in _KINDS[kind].skeleton(gains).items()}
         if (alignment := record["alignment"]) is not None:
             names, keys = (like(alignment[name], [], f"alignment.{name}") for name in ("names", "keys"))
             if len(names) != len(keys) or not all(isinstance(each, str) for each in (*names, *keys)):
-                raise RecordError(
-                    f"alignment.keys: expected {len(names)} as in alignment.names, got {len(keys)}",
-                    name="alignment.keys",
-                    value=len(keys),
-                )
+                raise RecordError.expected(f"{len(names)} as in alignment.names", len(keys), name="alignment.keys")
             aligned = Alignment.skeleton(len(names), count_of(alignment["modes"], "alignment.modes", least=0))
             skeleton |= {_ALIGNMENT + name: each for name, each in aligned.items()}
         if gains["modes"] != modes:
-            raise RecordError(
-                f"gains.modes: expected {modes}, the number of frequencies, got {gains['modes']}",
-                name="gains.modes",
-                value=gains["modes"],
-            )
+            raise RecordError.expected(f"{modes}, the number of frequencies", gains["modes"], name="gains.modes")
         read = Origin(
             capture=like(origin["capture"], "", "origin.capture"),
             trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
@@ -282,29 +267,19 @@ def _expect_tensors(tensors: dict[str, Tensor], skeleton: dict[str, Tensor], pat
         )
     for name, tensor in tensors.items():
         if tensor.shape != skeleton[name].shape or tensor.dtype != skeleton[name].dtype:
-            raise FieldFileError(
-                f"{path}: expected {name} as {_named(skeleton[name])}, got {_named(tensor)}; fit and save the field "
-                "again",
-                file=path,
-                name=name,
-                value=_named(tensor),
-            )
+            found, wanted = _named(tensor), f"{name} as {_named(skeleton[name])}"
+            raise FieldFileError.expected(wanted, found, got=found, file=path, name=name, advice=_SAVE_AGAIN)
         low, high = (float(each) for each in tensor.aminmax()) if tensor.numel() else (0.0, 0.0)
         negative = low < 0 and name == "residual.magnitude"
         if not bool(torch.isfinite(tensor).all()) or (name in _POSITIVE and low <= 0) or negative:
             wanted = "positive" if name in _POSITIVE else "not negative" if negative else "finite"
-            raise FieldFileError(
-                f"{path}: expected {name} to be {wanted}, got {low:.3g} to {high:.3g}; fit the field again",
-                file=path,
-                name=name,
-                value=(low, high),
+            found = f"{low:.3g} to {high:.3g}"
+            raise FieldFileError.expected(
+                f"{name} to be {wanted}", (low, high), got=found, file=path, name=name, advice=_SAVE_AGAIN
             )
         if high > _MAX.get(name, math.inf):
-            raise FieldFileError(
-                f"{path}: expected {name} up to {_MAX[name]:g}, got {high:.3g}; fit the field again",
-                file=path,
-                name=name,
-                value=high,
+            raise FieldFileError.expected(
+                f"{name} up to {_MAX[name]:g}", high, got=f"{high:.3g}", file=path, name=name, advice=_SAVE_AGAIN
             )
 
 

@@ -176,10 +176,8 @@ def _chosen(
         allowed = allowed & ((sites.points - sites.points[rows[-1]]).norm(dim=1) > same)
         after.append(float(error.map().square().mean().sqrt()))
     if len(rows) < count:
-        raise FitError(
-            f"candidates: expected {count} different positions or more, got {len(rows)}; ask for fewer",
-            name="candidates",
-            value=len(rows),
+        raise FitError.expected(
+            f"{count} different positions or more", len(rows), name="candidates", advice="ask for fewer"
         )
     return rows, after
 
@@ -237,11 +235,7 @@ def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates:
     if candidates is None:
         raise FitError("directions: expected candidates with them, got none; give candidates", name="directions")
     if len(directions) != len(candidates):
-        raise FitError(
-            f"directions: expected one for each of the {len(candidates)} candidates, got {len(directions)}",
-            name="directions",
-            value=len(directions),
-        )
+        raise FitError.expected(f"one for each of the {len(candidates)} candidates", len(directions), name="directions")
     zero = torch.nonzero(~(directions.norm(dim=1) > 0)).flatten().tolist()
     if zero:
         row, direction = zero[0], directions[zero[0]].tolist()
@@ -260,12 +254,7 @@ def _expect_on_surface(candidates: Float64[Tensor, "candidates 3"], surface: Flo
     if not bool(torch.isfinite(candidates).all()):
         row = int(torch.nonzero(~torch.isfinite(candidates).all(1))[0])
         found = candidates[row].tolist()
-        raise FitError(
-            f"candidates, row {row}: expected finite coordinates in meters, got {found}",
-            name="candidates",
-            row=row,
-            value=found,
-        )
+        raise FitError.expected("finite coordinates in meters", found, row=row, name="candidates")
     distance = torch.from_numpy(cKDTree(surface.numpy()).query(candidates.numpy())[0])
     worst = int(distance.argmax())
     if float(distance[worst]) > _OFF * float((surface.amax(0) - surface.amin(0)).norm()):

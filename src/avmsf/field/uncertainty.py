@@ -69,10 +69,8 @@ def has_posterior(field: SoundField) -> bool:
 def unedited_mixture(field: SoundField) -> MixtureGains:
     """Return the field's gain model, to plan measurements for. Raises as `fitted_mixture`, and for an edited field."""
     if isinstance(field.gain_field, ScaledGains):
-        raise FitError(
-            "field: expected a field as fitted, got an edited one; give the unedited field",
-            name="field",
-            value="edited",
+        raise FitError.expected(
+            "a field as fitted", "edited", got="an edited one", name="field", advice="give the unedited field"
         )
     return fitted_mixture(field)
 
@@ -90,10 +88,8 @@ def fitted_mixture(field: SoundField) -> MixtureGains:
             value=gains.kind,
         )
     if not isinstance(gains, MixtureGains):
-        raise FitError(
-            f"field: expected gains of the kind {MixtureGains.kind!r}, got {gains.kind!r}; fit with --gain-model auto",
-            name="field",
-            value=gains.kind,
+        raise FitError.expected(
+            f"gains of the kind {MixtureGains.kind!r}", gains.kind, name="field", advice="fit with --gain-model auto"
         )
     if gains.place_count < 2:
         raise FitError(
@@ -237,6 +233,4 @@ def _spectra(field: SoundField, modes: Tensor) -> Tensor:
 
 def _expect_level(level: float) -> None:
     if not 0.0 < level < 1.0:
-        raise FitError(
-            f"level: expected a probability between 0 and 1, such as 0.9, got {level:g}", name="level", value=level
-        )
+        raise FitError.expected("a probability between 0 and 1, such as 0.9", level, name="level")

@@ -29,15 +29,9 @@ class ForcePulse:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.contact_time < math.inf:
-            raise SimulationError(
-                f"contact_time: expected seconds, 0 or more, got {self.contact_time}",
-                name="contact_time",
-                value=self.contact_time,
-            )
+            raise SimulationError.expected("seconds, 0 or more", self.contact_time, name="contact_time")
         if self.shape not in _EXPONENTS:
-            raise SimulationError(
-                f"shape: expected {' or '.join(_EXPONENTS)}, got {self.shape!r}", name="shape", value=self.shape
-            )
+            raise SimulationError.expected(" or ".join(_EXPONENTS), self.shape, name="shape")
 
     def samples(self, sample_rate: float) -> Float64[Tensor, " samples"]:
         """Return the part of the impulse that falls into each sample's time; their sum is 1.

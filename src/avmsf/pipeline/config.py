@@ -116,9 +116,7 @@ class BodyConfig:
 
     def __post_init__(self) -> None:
         if self.wall is not None and not 0 <= self.wall < float("inf"):
-            raise SimulationError(
-                f"wall: expected meters, or 0 for a solid object, got {self.wall}", name="wall", value=self.wall
-            )
+            raise SimulationError.expected("meters, or 0 for a solid object", self.wall, name="wall")
         if self.shapes < 1:
             raise SimulationError(f"shapes: expected 1 or more, got {self.shapes}", name="shapes", value=self.shapes)
 

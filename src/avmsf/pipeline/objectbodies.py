@@ -47,9 +47,7 @@ class ObjectBodies:
             return self._shape(identifier)
         surface = self.dataset.capture(identifier).surface
         if surface is None or not len(surface.faces):
-            raise SceneError(
-                f"{identifier}: expected a mesh in the dataset, got none; take geometry from Gaussians", name=identifier
-            )
+            raise SceneError.expected("a mesh in the dataset", name=identifier, advice="take geometry from Gaussians")
         return surface if self.geometry == "mesh" else roughened(surface, NOISE, seed=self.seed)
 
     def _shape(self, identifier: str) -> ObjectShape:

@@ -58,9 +58,7 @@ def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["bes
     a frame of their own. Raises SceneError for more than one video, and for one or two photographs alone.
     """
     if not folder.is_dir():
-        raise SceneError(
-            f"{folder}: expected a folder with photographs, a video or a mesh, got none; check the name", file=folder
-        )
+        raise SceneError.expected("a folder with photographs, a video or a mesh", file=folder, advice="check the name")
     transforms = folder / "transforms.json"
     model = None if transforms.is_file() else find_model(folder)
     photographs = folder / "images" if (folder / "images").is_dir() else folder
@@ -75,19 +73,15 @@ def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["bes
         return Source("mesh", (surface, *beside), surface, folder)
     if len(images) >= FEWEST or (images and photographs != folder):
         if len(images) < FEWEST:
-            raise SceneError(
-                f"{photographs}: expected {FEWEST} photographs or more, got {len(images)}; take more",
-                file=photographs,
-                value=len(images),
+            raise SceneError.expected(
+                f"{FEWEST} photographs or more", len(images), file=photographs, advice="take more"
             )
         return Source("photographs", (*images, *masks), photographs, folder)
     videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
     if len(videos) > 1:
         names = [path.name for path in videos]
-        raise SceneError(
-            f"{folder}: expected one video of the object, got {', '.join(names)}; remove the others",
-            file=folder,
-            value=names,
+        raise SceneError.expected(
+            "one video of the object", names, got=", ".join(names), file=folder, advice="remove the others"
         )
     return Source("video", tuple(videos), videos[0], folder) if videos else None
 

@@ -103,10 +103,8 @@ class StageFolder:
         except OSError as error:
             reason = error.strerror or str(error)
             path = self.path(name)
-            raise CaptureError(
-                f"{path}: expected a readable and writable path, got {reason!r}; {way_out(error)} by --cache",
-                file=path,
-                value=reason,
+            raise CaptureError.expected(
+                "a readable and writable path", reason, file=path, advice=f"{way_out(error)} by --cache"
             ) from error
 
 

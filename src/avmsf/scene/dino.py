@@ -45,11 +45,7 @@ class DinoEncoder:
         model was trained to have colors normalized with.
         """
         if longest is not None and longest < 1:
-            raise SceneError(
-                f"longest: expected the pixels of the longer side, such as 518, got {longest}",
-                name="longest",
-                value=longest,
-            )
+            raise SceneError.expected("the pixels of the longer side, such as 518", longest, name="longest")
         self.model, self.name, self.longest = model.eval().requires_grad_(False), name, longest
         self._mean, self._deviation = torch.tensor(mean), torch.tensor(deviation)
 
@@ -175,11 +171,8 @@ def _load_model(folder: Path, device: torch.device, dtype: torch.dtype) -> nn.Mo
     kind = read_settings(folder / _CONFIG, raising=SceneError).get("model_type")
     classes = {"dinov2": "Dinov2Model", "dinov2_with_registers": "Dinov2WithRegistersModel"}
     if kind not in classes:
-        raise SceneError(
-            f"{folder / _CONFIG}: expected a model of type {' or '.join(classes)}, got {kind!r}",
-            file=folder / _CONFIG,
-            name="model_type",
-            value=kind,
+        raise SceneError.expected(
+            f"a model of type {' or '.join(classes)}", kind, file=folder / _CONFIG, name="model_type"
         )
     try:
         model, report = getattr(transformers, classes[kind]).from_pretrained(
@@ -211,11 +204,8 @@ def _constants(path: Path) -> tuple[Sequence[float], Sequence[float]]:
     record = read_settings(path, raising=SceneError)
     found = record.get("image_mean", list(IMAGENET_MEAN)), record.get("image_std", list(IMAGENET_DEVIATION))
     if not all(isinstance(each, list) and len(each) == 3 and all(map(_is_number, each)) for each in found):
-        raise SceneError(
-            f"{path}: expected image_mean and image_std of three numbers, got {found}; copy it again",
-            file=path,
-            name="image_mean",
-            value=found,
+        raise SceneError.expected(
+            "image_mean and image_std of three numbers", found, file=path, name="image_mean", advice="copy it again"
         )
     return found
 

@@ -70,11 +70,8 @@ def load_features(path: str | Path) -> FeatureField:
     found = {name: tuple(tensor.shape) for name, tensor in tensors.items() if tensor.dtype == torch.float32}
     if found != expected or tensors.keys() != expected.keys():
         shapes = {name: list(tensor.shape) for name, tensor in tensors.items()}
-        raise SceneError(
-            f"{path}: expected the float32 tensors {expected}, got {shapes}; compute the features again",
-            file=path,
-            name="tensors",
-            value=shapes,
+        raise SceneError.expected(
+            f"the float32 tensors {expected}", shapes, file=path, name="tensors", advice="compute the features again"
         )
     _expect_values(tensors, path)
     return FeatureField(tensors["points"], tensors["features"], record["encoder"])

@@ -115,11 +115,8 @@ def _header(path: Path, content: bytes) -> _Header:
     line_end = content.find(b"\n", end, end + len(b"end_header") + 3)
     if not content.startswith(b"ply") or end < 0 or line_end < 0:
         found = "a header without an end" if content.startswith(b"ply") else f"a file that begins with {content[:12]!r}"
-        raise SceneError(
-            f"{path}: expected a .ply of Gaussians as 3DGS writes it, got {found}",
-            file=path,
-            name="header",
-            value=content[:12],
+        raise SceneError.expected(
+            "a .ply of Gaussians as 3DGS writes it", content[:12], got=str(found), file=path, name="header"
         )
     order, elements = None, list[_Element]()
     for row, line in enumerate(content[:end].decode("latin-1").splitlines()[1:], start=2):
@@ -135,18 +132,12 @@ def _header(path: Path, content: bytes) -> _Header:
             case ["comment", *_] | ["obj_info", *_] | []:
                 pass
             case _:
-                raise SceneError(
-                    f"{path}, row {row}: expected a header line of .ply 1.0, got {line!r}; export the file again",
-                    file=path,
-                    row=row,
-                    name="header",
-                    value=line,
+                raise SceneError.expected(
+                    "a header line of .ply 1.0", line, file=path, row=row, name="header", advice="export the file again"
                 )
     if order is None:
-        raise SceneError(
-            f"{path}: expected a format in the header, ascii or binary, got none; export the file again",
-            file=path,
-            name="format",
+        raise SceneError.expected(
+            "a format in the header, ascii or binary", file=path, name="format", advice="export the file again"
         )
     return _Header(order, tuple(elements), line_end + 1)
 
@@ -174,11 +165,8 @@ def _expect_gaussians(path: Path, header: _Header) -> _Element:
         degrees = {3 * (degree + 1) ** 2 - 3: degree for degree in range(4)}
         rest = sorted(name for name in found if name.startswith("f_rest_"))
         if len(rest) not in degrees or rest != sorted(f"f_rest_{place}" for place in range(len(rest))):
-            raise SceneError(
-                f"{path}: expected 0, 9, 24 or 45 coefficients f_rest_* (degrees 0 to 3), got {len(rest)}",
-                file=path,
-                name="f_rest",
-                value=len(rest),
+            raise SceneError.expected(
+                "0, 9, 24 or 45 coefficients f_rest_* (degrees 0 to 3)", len(rest), file=path, name="f_rest"
             )
         if not vertices.count:
             raise SceneError(
@@ -252,11 +240,8 @@ def _text_table(path: Path, content: bytes, before: tuple[_Element, ...], vertic
 
 
 def _short(path: Path, found: int, expected: int) -> SceneError:
-    return SceneError(
-        f"{path}: expected {expected} vertices, got {found}; the file is truncated; copy or export it again",
-        file=path,
-        row=found,
-        value=found,
+    return SceneError.expected(
+        f"{expected} vertices", found, file=path, row=found, advice="the file is truncated; copy or export it again"
     )
 
 

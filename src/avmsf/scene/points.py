@@ -210,6 +210,4 @@ def _expect_rows(points: Float[Tensor, "points 3"], count: int, start: int) -> N
     if not 1 <= count <= len(points):
         raise EvaluationError(f"expected 1 to {len(points)} points, got {count}", name="count", value=count)
     if not 0 <= start < len(points):
-        raise EvaluationError(
-            f"start: expected a point from 0 to {len(points) - 1}, got {start}", name="start", value=start
-        )
+        raise EvaluationError.expected(f"a point from 0 to {len(points) - 1}", start, name="start")

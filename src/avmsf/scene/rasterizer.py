@@ -54,11 +54,7 @@ def choose_rasterizer(device: torch.device | str) -> Rasterizer:
 
         return NumbaRasterizer()
     if kind != "cuda":
-        raise SceneError(
-            f"device: expected cpu or cuda, got {str(device)!r}; move the Gaussians to one",
-            name="device",
-            value=str(device),
-        )
+        raise SceneError.expected("cpu or cuda", str(device), name="device", advice="move the Gaussians to one")
     if not torch.cuda.is_available():
         raise SceneError(
             "device: expected a CUDA device that PyTorch can use, got none; choose cpu, or install the PyTorch build "

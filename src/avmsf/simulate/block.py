@@ -15,10 +15,8 @@ def block(size: tuple[float, float, float], cells: tuple[int, int, int]) -> Soli
     neighboring boxes meet in whole sides. Raises SimulationError for sizes and numbers that are not positive.
     """
     if not all(0 < side < float("inf") for side in size) or min(cells) < 1:
-        raise SimulationError(
-            f"block: expected sizes above 0 and 1 box or more per axis, got {size} m in {cells} boxes",
-            name="block",
-            value=(size, cells),
+        raise SimulationError.expected(
+            "sizes above 0 and 1 box or more per axis", (size, cells), got=f"{size} m in {cells} boxes", name="block"
         )
     places = [
         torch.linspace(0.0, side, number + 1, dtype=torch.float64) for side, number in zip(size, cells, strict=True)

@@ -120,11 +120,8 @@ def _scale(recipe: ObjectRecipe, vertices: Tensor) -> float:
     """Return what makes the longest side of the bounding box as long as the recipe has it."""
     longest = float((vertices.amax(0) - vertices.amin(0)).max())
     if not longest > 0.0:
-        raise SimulationError(
-            f"{recipe.mesh}: expected a mesh with an extent, got one point; export it again",
-            file=recipe.mesh,
-            name="size",
-            value=longest,
+        raise SimulationError.expected(
+            "a mesh with an extent", longest, got="one point", file=recipe.mesh, name="size", advice="export it again"
         )
     if recipe.size is None and longest > _LARGEST:
         raise SimulationError(

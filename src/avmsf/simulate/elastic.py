@@ -157,10 +157,8 @@ def elastic_modes(
     if count < 1:
         raise SimulationError(f"count: expected 1 mode or more, got {count}", name="count", value=count)
     if perturbed and (stiffness_factor is not None or density_factor is not None):
-        raise SimulationError(
-            "perturbed: expected no stiffness or density factors, got some; leave them out",
-            name="perturbed",
-            value=True,
+        raise SimulationError.expected(
+            "no stiffness or density factors", True, got="some", name="perturbed", advice="leave them out"
         )
     expect_whole(solid)
     light = _factor(solid, density_factor, "density_factor")
@@ -256,18 +254,12 @@ def _factor(solid: Solid, factor: Float[Tensor, " cells"] | None, name: str) -> 
     if factor is None:
         return torch.ones(len(solid.cells), dtype=torch.float64)
     if len(factor) != len(solid.cells):
-        raise SimulationError(
-            f"{name}: expected {len(solid.cells)} numbers, one per cell, got {len(factor)}",
-            name=name,
-            value=len(factor),
-        )
+        raise SimulationError.expected(f"{len(solid.cells)} numbers, one per cell", len(factor), name=name)
     unfit = torch.nonzero(~((factor > 0) & torch.isfinite(factor))).flatten()
     if len(unfit):
         row = int(unfit[0])
         value = float(factor[row])
-        raise SimulationError(
-            f"{name}, row {row}: expected more than 0, got {value:g}", row=row, name=name, value=value
-        )
+        raise SimulationError.expected("more than 0", value, row=row, name=name)
     return factor.double()
 
 

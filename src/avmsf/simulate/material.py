@@ -55,7 +55,5 @@ MATERIALS = {material.name: material for material in (CERAMIC, GLASS, WOOD, PLAS
 def material_named(name: str) -> Material:
     """Return the material of this name, whatever its case. Raises SimulationError with the names there are."""
     if name.lower() not in MATERIALS:
-        raise SimulationError(
-            f"material: expected one of {', '.join(MATERIALS)}, got {name!r}", name="material", value=name
-        )
+        raise SimulationError.expected(f"one of {', '.join(MATERIALS)}", name, name="material")
     return MATERIALS[name.lower()]

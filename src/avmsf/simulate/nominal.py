@@ -387,9 +387,7 @@ class _Maker:
             try:
                 surface = self._shape.shell(wall, faces=round(0.5 * TRIANGLES * freedoms))
             except SceneError as error:
-                raise SimulationError(
-                    str(error), file=error.file, row=error.row, name=error.name, value=error.value
-                ) from error
+                raise SimulationError(str(error), **error.attributes) from error
             return filled_solid(checked(surface, tell=self._tell), freedoms, wall=wall)
         with self._lock:
             if freedoms not in self._walls:
@@ -450,12 +448,7 @@ def _expect_settings(count: int, freedoms: int, walls: Sequence[float | None] | 
         )
     for row, wall in enumerate(walls or ()):
         if wall is not None and not 0 < wall < float("inf"):
-            raise SimulationError(
-                f"walls, row {row}: expected more than 0 m, or None for a solid body, got {wall:g}",
-                row=row,
-                name="walls",
-                value=wall,
-            )
+            raise SimulationError.expected("more than 0 m, or None for a solid body", wall, row=row, name="walls")
 
 
 def _grouped(refused: Mapping[float | None, str]) -> list[str]:

@@ -134,10 +134,8 @@ def strike(
     SimulationError where a mode would alias.
     """
     if highest >= 0.5 * sample_rate:
-        raise SimulationError(
-            f"highest: expected less than half the sample rate of {sample_rate:g} Hz, got {highest:g} Hz",
-            name="highest",
-            value=highest,
+        raise SimulationError.expected(
+            f"less than half the sample rate of {sample_rate:g} Hz", highest, got=f"{highest:g} Hz", name="highest"
         )
     modes = plate_modes(plate, contacts, highest=highest, contact_time=contact_time)
     sounds = ring(modes, sample_rate=sample_rate, samples=round(seconds * sample_rate))
@@ -195,10 +193,6 @@ def _expect_on_plate(plate: Plate, places: Float64[Tensor, "contacts 3"]) -> Non
     if len(off):
         row = int(off[0])
         value = places[row].tolist()
-        raise PositionError(
-            f"contacts, row {row}: expected x from 0 to {plate.length:g} m, y from 0 to {plate.width:g} m and z = 0, "
-            f"got {value}",
-            row=row,
-            name="contacts",
-            value=value,
+        raise PositionError.expected(
+            f"x from 0 to {plate.length:g} m, y from 0 to {plate.width:g} m and z = 0", value, row=row, name="contacts"
         )

@@ -211,6 +211,4 @@ def _digest(path: Path) -> str:
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
-        raise SimulationError(
-            f"{path}: expected a mesh, got {error.strerror!r}; check the name", file=path, value=error.strerror
-        ) from error
+        raise SimulationError.expected("a mesh", error.strerror, file=path, advice="check the name") from error

@@ -41,9 +41,7 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
     than the wall would.
     """
     if not 0 < thickness < np.inf:
-        raise SimulationError(
-            f"thickness: expected more than 0 m, got {thickness:g}", name="thickness", value=thickness
-        )
+        raise SimulationError.expected("more than 0 m", thickness, name="thickness")
     expect_detail(detail)
     skin = Skin.of(surface).oriented()
     if skin.open_edges == 0 and skin.areas.sum() * thickness > abs(skin.volume):

@@ -67,11 +67,7 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
 def expect_detail(detail: float) -> None:
     """Raise SimulationError for what is no length of edges over the body's size."""
     if not 0 < detail < 1:
-        raise SimulationError(
-            f"detail: expected a part of the body's size, above 0 and below 1, got {detail:g}",
-            name="detail",
-            value=detail,
-        )
+        raise SimulationError.expected("a part of the body's size, above 0 and below 1", detail, name="detail")
 
 
 def _tetrahedralize(skin: Skin, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:

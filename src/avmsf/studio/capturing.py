@@ -26,7 +26,7 @@ from avmsf.errors import AvmsfError, CaptureError
 from avmsf.studio.judgements import Judgements, plain
 from avmsf.studio.locating import read_upload
 from avmsf.studio.place import Place
-from avmsf.studio.refusal import RefusedError
+from avmsf.studio.refusal import RefusedError, bad_request
 from avmsf.studio.strikefiles import WAV, StrikeFiles
 from avmsf.studio.striketable import StrikeTable, file_of
 from avmsf.wording import counted
@@ -259,9 +259,5 @@ class StrikeBook:
 
 def _expect_key(key: str) -> None:
     if not _KEY.fullmatch(key):
-        raise RefusedError(
-            400,
-            "Idempotency-Key: expected 8 to 128 printable ASCII characters, got others; reload the page",
-            name="Idempotency-Key",
-            value=key,
-        )
+        wanted = "8 to 128 printable ASCII characters"
+        raise bad_request("Idempotency-Key", wanted, key, got="others", advice="reload the page")

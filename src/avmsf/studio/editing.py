@@ -12,7 +12,7 @@ import torch
 from avmsf.errors import EditError
 from avmsf.field.soundfield import SoundField
 from avmsf.simulate.material import MATERIALS, material_named
-from avmsf.studio.refusal import RefusedError, echo
+from avmsf.studio.refusal import RefusedError, bad_request, echo
 from avmsf.tasks.edits import EDITS, remarks
 from avmsf.tasks.madeof import made_of
 from avmsf.tasks.recast import LAWS, recast
@@ -88,16 +88,9 @@ class Sliders:
         _expect_keys(material, _MATERIAL, "material")
         rows = words.get("modes") or []
         if not isinstance(rows, list):
-            raise RefusedError(
-                400, f"modes: expected a list, got {echo(rows)}; reload the page", name="modes", value=rows
-            )
+            raise bad_request("modes", "a list", rows, advice="reload the page")
         if modes is not None and len(rows) > modes:
-            raise RefusedError(
-                400,
-                f"modes: expected at most {modes} rows, one per mode, got {len(rows)}",
-                name="modes",
-                value=len(rows),
-            )
+            raise bad_request("modes", f"at most {modes} rows, one per mode", len(rows))
         changes = tuple(_mode(row) for row in rows)
         repeated = [mode for mode, count in Counter(change.mode for change in changes).items() if count > 1]
         if repeated:
@@ -109,7 +102,7 @@ class Sliders:
             )
         law = words.get("law", "displacement")
         if not isinstance(law, str) or law not in LAWS:
-            raise RefusedError(400, f"law: expected one of {', '.join(LAWS)}, got {echo(law)}", name="law", value=law)
+            raise bad_request("law", f"one of {', '.join(LAWS)}", law)
         return cls(
             _name(material.get("to"), "to"),
             _name(material.get("from"), "from"),
@@ -148,9 +141,7 @@ class Sliders:
         pitch, decay = torch.full_like(levels, self.pitch), torch.full_like(levels, self.decay)
         for row in self.modes:
             if row.mode >= count:
-                raise EditError(
-                    f"mode: expected 0 to {count - 1}, got {row.mode}; reload the page", name="mode", value=row.mode
-                )
+                raise EditError.expected(f"0 to {count - 1}", row.mode, name="mode", advice="reload the page")
             levels[row.mode] += row.db
             pitch[row.mode] *= row.pitch
             decay[row.mode] *= row.decay
@@ -168,9 +159,7 @@ def _mode(row: Any) -> ModeChange:
     _expect_keys(row, _MODE, "a mode")
     mode = row.get("mode")
     if not isinstance(mode, int) or isinstance(mode, bool) or not 0 <= mode < _MAX_ROW:
-        raise RefusedError(
-            400, f"mode: expected an index from 0, got {echo(mode)}; reload the page", name="mode", value=mode
-        )
+        raise bad_request("mode", "an index from 0", mode, advice="reload the page")
     mute = "db" in row and row["db"] is None
     return ModeChange(
         mode, MUTE if mute else _number(row, "db", 0.0), _number(row, "pitch", 1.0), _number(row, "decay", 1.0)
@@ -179,20 +168,10 @@ def _mode(row: Any) -> ModeChange:
 
 def _expect_keys(words: Any, known: tuple[str, ...], what: str) -> None:
     if not isinstance(words, Mapping):
-        raise RefusedError(
-            400,
-            f"{what}: expected an object with {', '.join(known)}, got {echo(words)}; reload the page",
-            name=what,
-            value=words,
-        )
+        raise bad_request(what, f"an object with {', '.join(known)}", words, advice="reload the page")
     unknown = sorted(set(words) - set(known))
     if unknown:
-        raise RefusedError(
-            400,
-            f"{what}: expected {', '.join(known)}, got {echo(unknown)}; reload the page",
-            name=what,
-            value=unknown,
-        )
+        raise bad_request(what, ", ".join(known), unknown, advice="reload the page")
 
 
 def _number(words: Mapping[str, Any], name: str, rest: float) -> float:
@@ -204,10 +183,10 @@ def _number(words: Mapping[str, Any], name: str, rest: float) -> float:
         with suppress(OverflowError):
             number = float(value)
     if not math.isfinite(number):
-        raise RefusedError(400, f"{name}: expected a number, got {echo(value)}", name=name, value=value)
+        raise bad_request(name, "a number", value)
     least, greatest = _LIMITS[name]
     if not least <= number <= greatest:
-        raise RefusedError(400, f"{name}: expected {least:g} to {greatest:g}, got {number:g}", name=name, value=number)
+        raise bad_request(name, f"{least:g} to {greatest:g}", number, got=f"{number:g}")
     return number
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from avmsf.errors import EditError
-from avmsf.studio.refusal import RefusedError, echo
+from avmsf.studio.refusal import RefusedError, bad_request, echo
 from avmsf.tasks.config import STABLE_AUDIO
 
 _KEYS = ("base", "prompt")
@@ -42,12 +42,7 @@ class Wish:
             )
         prompt = words.get("prompt")
         if not isinstance(prompt, str) or not prompt.strip() or len(prompt) > _MAX_PROMPT:
-            raise RefusedError(
-                400,
-                f'prompt: expected 1 to {_MAX_PROMPT} characters, such as "a wooden bowl is hit", got {echo(prompt)}',
-                name="prompt",
-                value=prompt,
-            )
+            raise bad_request("prompt", f'1 to {_MAX_PROMPT} characters, such as "a wooden bowl is hit"', prompt)
         return cls(prompt=prompt)
 
     def task(self, place: Path, *, steps: int, model: str | None) -> dict[str, Any]:

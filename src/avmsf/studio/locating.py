@@ -103,9 +103,7 @@ def read_upload(content: bytes, *, name: str = "the recording") -> Recording:
     try:
         return decode_recording(SoundBytes(content), name)
     except RecordingLengthError as error:
-        raise RefusedError(
-            413, str(error), file=error.file, row=error.row, name=error.name, value=error.value
-        ) from error
+        raise RefusedError(413, str(error), **error.attributes) from error
 
 
 def packed(values: Float[Tensor, " points"]) -> str:

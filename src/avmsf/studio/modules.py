@@ -66,10 +66,8 @@ def fetch_modules() -> Path:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_SECONDS, check=False)
     except subprocess.TimeoutExpired as error:
-        raise StudioError(
-            f"npm: expected an end within {_SECONDS:g} s, got none; check the network and try again",
-            name="npm",
-            value=_SECONDS,
+        raise StudioError.expected(
+            f"an end within {_SECONDS:g} s", _SECONDS, got="none", name="npm", advice="check the network and try again"
         ) from error
     found = find_modules() if done.returncode == 0 else None
     if found is None:

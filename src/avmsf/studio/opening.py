@@ -57,9 +57,7 @@ def open_target(target: Path, *, object: Path | None = None, capture: Path | Non
             f"{object}: expected a mesh or Gaussians, got no such file; check --object", file=object, name="object"
         )
     if capture is not None and target.suffix.lower() not in MESHES and not capture.is_dir():
-        raise StudioError(
-            f"{capture}: expected a capture folder, got none; check --capture", file=capture, name="capture"
-        )
+        raise StudioError.expected("a capture folder", file=capture, name="capture", advice="check --capture")
     if target.is_dir():
         return _open_folder(target, object)
     if not target.is_file():
@@ -138,10 +136,8 @@ def _open_mesh(mesh: Path, object: Path | None, capture: Path | None) -> Opened:
     names = (*(f"surface{suffix}" for suffix in MESHES), *SPLATS)
     others = [folder / name for name in names if (folder / name).is_file()]
     if folder.exists() and not folder.is_dir():
-        raise StudioError(
-            f"{folder}: expected a capture folder or none, got a file; name a folder by --capture",
-            file=folder,
-            name="capture",
+        raise StudioError.expected(
+            "a capture folder or none", got="a file", file=folder, name="capture", advice="name a folder by --capture"
         )
     if others and not (surface in others and _same(surface, mesh)):
         raise StudioError(

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from avmsf.capture.table import DIRECTION, FARTHEST, REQUIRED
-from avmsf.studio.refusal import RefusedError, echo
+from avmsf.studio.refusal import RefusedError, bad_request
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,7 @@ class Place:
         if "newtons" in query:
             newtons = _finite(query, "newtons")
             if newtons <= 0:
-                raise RefusedError(
-                    400, f"newtons: expected a peak force above 0, got {newtons:g}", name="newtons", value=newtons
-                )
+                raise bad_request("newtons", "a peak force above 0", newtons, got=f"{newtons:g}")
         return cls(contact, direction, newtons)
 
 
@@ -63,5 +61,5 @@ def _finite(query: Mapping[str, str], name: str) -> float:
         value = math.nan
     if not math.isfinite(value):
         found = query.get(name)
-        raise RefusedError(400, f"{name}: expected a number, got {echo(found)}", name=name, value=found)
+        raise bad_request(name, "a number", found)
     return value

@@ -85,6 +85,12 @@ def refusal_of(error: Exception) -> RefusedError:
     return RefusedError(UNUSABLE, f"expected values that give a result, got {reason}; try other values", value=reason)
 
 
+def bad_request(name: str, wanted: str, value: Any, *, got: str | None = None, advice: str = "") -> RefusedError:
+    """Return the answer (400) to a request with an entry that cannot be used; `got` stands for the value's echo."""
+    message = f"{name}: expected {wanted}, got {got or echo(value)}{advice and f'; {advice}'}"
+    return RefusedError(400, message, name=name, value=value)
+
+
 def echo(value: Any) -> str:
     """Return a value of a request as an answer may repeat it: at most 100 printable characters."""
     return _repr.repr(value)[:_MAX_ECHO]

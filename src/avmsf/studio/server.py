@@ -141,9 +141,7 @@ def _listening(port: int | None) -> socket.socket:
             ) from error
         except OverflowError as error:
             listener.close()
-            raise StudioError(
-                f"port: expected 0 to 65535, got {number}; leave --port out", name="port", value=number
-            ) from error
+            raise StudioError.expected("0 to 65535", number, name="port", advice="leave --port out") from error
     raise AssertionError("port 0 gives a free port")
 
 

@@ -16,7 +16,7 @@ from avmsf.field.soundfield import SoundField
 from avmsf.field.store import save
 from avmsf.files import way_out
 from avmsf.studio.editing import REST, Sliders
-from avmsf.studio.refusal import RefusedError
+from avmsf.studio.refusal import RefusedError, bad_request
 
 SUFFIX = ".safetensors"
 _NAME = re.compile(r"[\w][\w .()+-]{0,99}")
@@ -177,9 +177,7 @@ def _write_new(field: SoundField, path: Path) -> None:
         ) from error
     except OSError as error:
         advice = way_out(error) if path.parent.is_dir() else "restore the folder"
-        raise StudioError(
-            f"{path}: expected a writable path, got {error.strerror!r}; {advice}", file=path, value=error.strerror
-        ) from error
+        raise StudioError.expected("a writable path", error.strerror, file=path, advice=advice) from error
     try:
         save(field, path)
     except BaseException:
@@ -191,18 +189,8 @@ def file_name(name: str) -> str:
     """Return the file that a user's name stands for. Raises RefusedError (400) for a name that leads elsewhere."""
     stem = name.strip().removesuffix(SUFFIX)
     if not _NAME.fullmatch(stem) or _DEVICES.fullmatch(stem) or stem.endswith((".", " ")):
-        raise RefusedError(
-            400,
-            f"name: expected letters, digits, spaces, - and _, such as bowl in wood, got {name[:120]!r}",
-            name="name",
-            value=name,
-        )
+        raise bad_request("name", "letters, digits, spaces, - and _, such as bowl in wood", name)
     size = len(stem.encode())
     if size > _LONGEST_NAME:
-        raise RefusedError(
-            400,
-            f"name: expected at most {_LONGEST_NAME} bytes, got {size}; choose a shorter one",
-            name="name",
-            value=size,
-        )
+        raise bad_request("name", f"at most {_LONGEST_NAME} bytes", size, advice="choose a shorter one")
     return f"{stem}{SUFFIX}"

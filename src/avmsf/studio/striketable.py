@@ -50,11 +50,8 @@ class StrikeTable:
             )
         for line, cells in lines[1:]:
             if len(cells) != len(header):
-                raise CaptureError(
-                    f"{self.path}, row {line}: expected {len(header)} cells as in the header, got {len(cells)}",
-                    file=self.path,
-                    row=line,
-                    value=len(cells),
+                raise CaptureError.expected(
+                    f"{len(header)} cells as in the header", len(cells), file=self.path, row=line
                 )
         return [Row(line, dict(zip(header, cells, strict=True)), separator != ",") for line, cells in lines[1:]]
 

@@ -16,7 +16,7 @@ from avmsf.studio.jobs import Event, Job, Jobs
 from avmsf.studio.leading import Wish, is_wish, words_model
 from avmsf.studio.locating import read_upload
 from avmsf.studio.opening import Opened, find_object, shows_more
-from avmsf.studio.refusal import NUMERIC_ERRORS, RefusedError, echo, refusal_of
+from avmsf.studio.refusal import NUMERIC_ERRORS, RefusedError, bad_request, refusal_of
 from avmsf.studio.searches import Searches
 from avmsf.studio.session import Revision, Session
 from avmsf.studio.showing import Showcase
@@ -111,7 +111,7 @@ class Studio:
         """Write the field to a new file."""
         name = words.get("name")
         if not isinstance(name, str):
-            raise RefusedError(400, f"name: expected the new file's name, got {echo(name)}", name="name", value=name)
+            raise bad_request("name", "the new file's name", name)
         path, revision = await self.threads.compute(self.session.save, base_of(words), name)
         return {"file": str(path), **self._changed(revision)}
 
@@ -253,6 +253,4 @@ def base_of(words: dict[str, Any]) -> int:
 
 def unknown_base(base: Any) -> RefusedError:
     """Return the error of a request that does not give the revision which it changes."""
-    return RefusedError(
-        400, f"base: expected the number of a revision, got {echo(base)}; reload the page", name="base", value=base
-    )
+    return bad_request("base", "the number of a revision", base, advice="reload the page")

@@ -192,6 +192,4 @@ class ContactMap:
 
 def _expect_probability(level: float) -> None:
     if not 0.0 < level < 1.0:
-        raise LocationError(
-            f"level: expected a probability between 0 and 1, such as 0.9, got {level:g}", name="level", value=level
-        )
+        raise LocationError.expected("a probability between 0 and 1, such as 0.9", level, name="level")

@@ -142,10 +142,8 @@ class Listener:
         lowest = min(_RUMBLE * float(field.bank.frequency.min()), _HIGHEST_RUMBLE)
         cut = lowest if rumble is None else rumble
         if not 0.0 <= cut < rate / 2:
-            raise LocationError(
-                f"rumble: expected 0 for no filter, or less than {rate / 2:g} Hz, got {cut:g} Hz",
-                name="rumble",
-                value=cut,
+            raise LocationError.expected(
+                f"0 for no filter, or less than {rate / 2:g} Hz", cut, got=f"{cut:g} Hz", name="rumble"
             )
         if round(window * rate) < shortest_allowed(rate):
             raise LocationError(

@@ -203,10 +203,8 @@ class _Length:
             gains = gains * _seen_through(bank.damping, locator.dampings[:, heard], samples / rate)
         unit = float(gains.abs().square().mean().sqrt())
         if unit == 0.0:
-            raise LocationError(
-                "field: expected gains above 0, got 0 at all points; fit it to other recordings",
-                name="field",
-                value=0.0,
+            raise LocationError.expected(
+                "gains above 0", 0.0, got="0 at all points", name="field", advice="fit it to other recordings"
             )
         gains = gains / unit
         parts = gains / gains.norm(dim=1, keepdim=True).clamp_min(1e-30)
@@ -308,10 +306,8 @@ def _expect_points(
             value=shape,
         )
     if directions is not None and directions.shape != points.shape:
-        raise LocationError(
-            f"directions: expected the shape of the points, {list(points.shape)}, got {list(directions.shape)}",
-            name="directions",
-            value=list(directions.shape),
+        raise LocationError.expected(
+            f"the shape of the points, {list(points.shape)}", list(directions.shape), name="directions"
         )
     if directions is not None:
         length = directions.double().norm(dim=1)

@@ -136,11 +136,7 @@ def _remarks(old: Material, new: Material, bank: ModalBank, dead: Bool[Tensor, "
 
 def _expect(old: Material, new: Material, size: float) -> None:
     if not 0.0 < size < math.inf:
-        raise EditError(
-            f"size: expected the ratio of new to old lengths, above 0, such as 1.5, got {size:g}",
-            name="size",
-            value=size,
-        )
+        raise EditError.expected("the ratio of new to old lengths, above 0, such as 1.5", size, name="size")
     if _damps(old) and not _damps(new):
         raise EditError(
             f"new material {new.name}: expected alpha (1/s) or beta (s) above 0, got 0 and 0",

@@ -47,11 +47,7 @@ def retune(
     levels = _values(field, gains_db, "gains_db")
     _expect(levels < math.inf, "gains_db", levels, "decibels, or -inf for silence")
     if not math.isfinite(brightness_db):
-        raise EditError(
-            f"brightness_db: expected decibels an octave, such as 3, got {brightness_db:g}",
-            name="brightness_db",
-            value=brightness_db,
-        )
+        raise EditError.expected("decibels an octave, such as 3", brightness_db, name="brightness_db")
     bank = ModalBank(field.bank.frequency * factors["pitch"], field.bank.damping / factors["decay"])
     if brightness_db:
         center = brightness_center(field, bank)

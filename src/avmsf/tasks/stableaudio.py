@@ -244,11 +244,7 @@ class StableAudio:
         """Return how many frames hold a length of time. Raises `EditError` for more than the model has."""
         longest = self._longest * self._hop / self.sample_rate
         if not 0 < seconds <= longest:
-            raise EditError(
-                f"seconds: expected more than 0 and at most {longest:.4g} for {self.name}, got {seconds:g}",
-                name="seconds",
-                value=seconds,
-            )
+            raise EditError.expected(f"more than 0 and at most {longest:.4g} for {self.name}", seconds, name="seconds")
         return math.ceil(seconds * self.sample_rate / self._hop)
 
     def _encoded(self, waveforms: Float[Tensor, "contacts channels samples"]) -> Float[Tensor, "contacts dim frames"]:

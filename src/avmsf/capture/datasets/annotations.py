@@ -38,11 +38,8 @@ def read_gains(path: Path) -> Gains:
     text = _read(path)
     gain, pad = _pair(text, "gain", path), _pair(text, "pad", path)
     if not set(pad) <= {0.0, 1.0}:
-        raise DatasetError(
-            f"{path}: expected pad 0 or 1 for each channel, got {pad[0]:g} and {pad[1]:g}",
-            file=path,
-            name="pad",
-            value=pad,
+        raise DatasetError.expected(
+            "pad 0 or 1 for each channel", pad, got=f"{pad[0]:g} and {pad[1]:g}", file=path, name="pad"
         )
     return Gains(gain, (pad[0] == 1.0, pad[1] == 1.0))
 
@@ -67,9 +64,7 @@ def _pair(text: str, key: str, path: Path) -> tuple[float, float]:
     found = re.search(rf"^{key}[ \t]*:[ \t]*(?:{flow}|{block})[ \t]*$", text, flags=re.MULTILINE)
     if found is None:
         held = text.strip()[:80]
-        raise DatasetError(
-            f"{path}: expected {key} with a list of two numbers, got {held!r}", file=path, name=key, value=held
-        )
+        raise DatasetError.expected(f"{key} with a list of two numbers", held, file=path, name=key)
     first, second = (float(number) for number in found.groups() if number is not None)
     return first, second
 

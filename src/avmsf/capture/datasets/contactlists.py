@@ -155,22 +155,12 @@ def _understand(record: Any, path: Path, row: int) -> tuple[tuple[str, str], tup
     location = record.get("location") if isinstance(record, dict) else None
     found = _RECORDING.search(location) if isinstance(location, str) else None
     if found is None:
-        raise DatasetError(
-            f"{path}, row {row}: expected a location that ends in OBJECT_CONTACT_3sec_48000hz.wav, got {location!r}",
-            file=path,
-            row=row,
-            name="location",
-            value=location,
+        raise DatasetError.expected(
+            "a location that ends in OBJECT_CONTACT_3sec_48000hz.wav", location, file=path, row=row, name="location"
         )
     contact = record.get("contact")
     numbers = isinstance(contact, list) and all(type(value) in (int, float) for value in contact)
     if not numbers or len(contact) != 3 or not np.isfinite(contact).all():
-        raise DatasetError(
-            f"{path}, row {row}: expected a contact of three numbers, meters, got {contact!r}",
-            file=path,
-            row=row,
-            name="contact",
-            value=contact,
-        )
+        raise DatasetError.expected("a contact of three numbers, meters", contact, file=path, row=row, name="contact")
     x, y, z = map(float, contact)
     return (str(int(found[1])), str(int(found[2]))), (x, y, z)

@@ -107,11 +107,8 @@ class ObjectFolderCompact:
         self._expect(identifier)
         value = self._json("scale.json").get(identifier)
         if not isinstance(value, int | float) or not 0 < value < math.inf:
-            raise DatasetError(
-                f"{self.folder / 'scale.json'}: expected the size of object {identifier}, above 0, got {value!r}",
-                file=self.folder / "scale.json",
-                name=identifier,
-                value=value,
+            raise DatasetError.expected(
+                f"the size of object {identifier}, above 0", value, file=self.folder / "scale.json", name=identifier
             )
         return float(value)
 

@@ -39,11 +39,8 @@ def open_dataset(path: str | Path, *, contacts: str | Path | None = None, table:
         ("table", table, (ObjectFolderRaw, ObjectFolderCompact)),
     ):
         if given is not None and kind not in takers:
-            raise DatasetError(
-                f"{folder}: expected no `{name}` with {kind.name}, got {given}; omit it",
-                file=folder,
-                name=name,
-                value=str(given),
+            raise DatasetError.expected(
+                f"no `{name}` with {kind.name}", str(given), got=str(given), file=folder, name=name, advice="omit it"
             )
     if kind is ObjectFolderRaw:
         return ObjectFolderRaw(folder, contacts=contacts, table=table)

@@ -64,10 +64,8 @@ def load_record(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise CaptureError(f"{path}: expected a JSON file, got one that cannot be read ({error})", file=path) from error
     if not isinstance(record, dict):
-        raise CaptureError(
-            f"{path}: expected a JSON object with 'frames', got {type(record).__name__}",
-            file=path,
-            value=type(record).__name__,
+        raise CaptureError.expected(
+            "a JSON object with 'frames'", type(record).__name__, got=type(record).__name__, file=path
         )
     return record
 

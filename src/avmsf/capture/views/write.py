@@ -30,11 +30,8 @@ def write_views(views: Sequence[View], folder: str | Path) -> None:
     names = [str(PurePosixPath(view.name).with_suffix(".png")) for view in views]
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
-        raise CaptureError(
-            f"{folder}: expected views with different names, got several for {repeated[0]}",
-            file=folder,
-            name=repeated[0],
-            value=repeated,
+        raise CaptureError.expected(
+            "views with different names", repeated, got=f"several for {repeated[0]}", file=folder, name=repeated[0]
         )
     begun = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
     try:

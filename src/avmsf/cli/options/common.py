@@ -25,10 +25,6 @@ T = TypeVar("T")
 class InputError(AvmsfError):
     """An option names a file or folder that does not exist."""
 
-    def __init__(self, file: Path, expected: str) -> None:
-        self.expected = expected
-        super().__init__(f"{file}: expected {expected}, got no such file or folder; check the name", file=file)
-
 
 @dataclass(frozen=True)
 class Existing:
@@ -64,7 +60,9 @@ class Common:
                 continue
             for path in value if isinstance(value, tuple) else (value,):
                 if not path.exists():
-                    raise InputError(path, expected)
+                    raise InputError.expected(
+                        expected, got="no such file or folder", file=path, advice="check the name"
+                    )
 
 
 @dataclass(frozen=True, kw_only=True)

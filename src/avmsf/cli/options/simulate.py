@@ -38,7 +38,9 @@ class Options(Printing):
         """Raise `InputError` also for a mesh that does not exist."""
         super().check_inputs()
         if (mesh := self.recipe.mesh) is not None and not mesh.is_file():
-            raise InputError(mesh, "a mesh: obj, ply, glb or stl")
+            raise InputError.expected(
+                "a mesh: obj, ply, glb or stl", got="no such file or folder", file=mesh, advice="check the name"
+            )
 
 
 def parse(words: Sequence[str]) -> Options:

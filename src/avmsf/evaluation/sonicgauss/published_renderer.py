@@ -1,20 +1,17 @@
 """The published SonicGauss, fine-tuned to one object."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError
-from avmsf.evaluation.sonicgauss.conditioning import Normalized, first_nine, normalized
-from avmsf.evaluation.sonicgauss.flow import DROPPED, STEPS, flow_loss, integrate
+from avmsf.evaluation.sonicgauss.conditioning import first_nine, normalized
+from avmsf.evaluation.sonicgauss.flow import DROPPED, flow_loss, integrate
 from avmsf.evaluation.sonicgauss.published import FRAMES, LONGEST, PublishedSonicGauss
-from avmsf.evaluation.sonicgauss.tuning import TrainingConfig, train
+from avmsf.evaluation.sonicgauss.tuning import TrainingConfig, TunedRenderer, expect_sound, train
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.tasks.clips import lasting, resampled
 
@@ -23,38 +20,23 @@ EPOCHS, BATCH = 80, 2
 
 
 @dataclass(frozen=True, eq=False)
-class PublishedRenderer:
-    """A fine-tuned model, and what places and levels mean for its object."""
+class PublishedRenderer(TunedRenderer):
+    """A fine-tuned model, and what places and levels mean for its object; its sounds end after 2.97 s."""
 
     model: PublishedSonicGauss
-    seen: Normalized
     peak: float
     """Of the loudest training recording, in the recordings' unit."""
-    sample_rate: float
-    """Hz."""
-    samples: int
-    report: Mapping[str, Any]
-    seed: int = 0
-    steps: int = STEPS
 
-    @torch.no_grad()
-    def render(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts samples"]:
-        """Return generated sounds, all from the same noise; silence after 2.97 s. Directions are not known."""
-        rows = [self._sound(place[None]) for place in self.seen.places(contacts)]
-        return torch.cat(rows) if rows else torch.zeros(0, self.samples)
-
-    def _sound(self, place: Float[Tensor, "1 3"]) -> Float[Tensor, "1 samples"]:
+    def _sound(self, place: Float[Tensor, "3"]) -> Float[Tensor, " samples"]:
         model, device = self.model, _device_of(self.model)
         channels = int(model.sizes.transformer["in_channels"])
         noise = torch.randn(1, FRAMES, channels, generator=torch.Generator().manual_seed(self.seed)).to(device)
-        tokens = model.condition(self.seen, place.to(device))
+        tokens = model.condition(self.seen, place[None].to(device))
         seconds = self.samples / self.sample_rate
         latents = integrate(lambda z, s: model.velocity(z, s, tokens, seconds=seconds), noise, steps=self.steps)
         sound = model.autoencoder.decode(latents.mT).sample.mean(1).float().cpu()
         rate = float(model.autoencoder.config.sampling_rate)
-        return self.peak * lasting(resampled(sound, sample_rate=rate, wanted=self.sample_rate), self.samples)
+        return self.peak * lasting(resampled(sound, sample_rate=rate, wanted=self.sample_rate), self.samples)[0]
 
 
 def fit_published(
@@ -69,13 +51,7 @@ def fit_published(
     device = _device_of(model)
     seen = normalized(cloud, first_nine(cloud))
     peak = float(train_impacts.sounds.abs().max())
-    if not peak > 0.0:
-        raise EvaluationError(
-            f"expected a recording with a sound, got {len(train_impacts)} silent ones "
-            f"({', '.join(train_impacts.names[:3])}); record the impacts again",
-            name="sounds",
-            value=0.0,
-        )
+    expect_sound(peak, train_impacts)
     contacts = seen.places(train_impacts.contacts).float().to(device)
     seconds = min(train_impacts.duration, LONGEST)
     means, deviations = _encoded(model, train_impacts, peak)
@@ -97,7 +73,7 @@ def fit_published(
     losses = train(model.trained(), loss, len(train_impacts), config, seed=seed)
     report = {"steps": len(losses), "first_loss": round(losses[0], 4), "last_loss": round(losses[-1], 4)}
     rate, samples = train_impacts.sample_rate, train_impacts.sounds.shape[1]
-    return PublishedRenderer(model.eval(), seen, peak, rate, samples, report, seed)
+    return PublishedRenderer(model.eval(), peak, seen=seen, sample_rate=rate, samples=samples, report=report, seed=seed)
 
 
 @torch.no_grad()

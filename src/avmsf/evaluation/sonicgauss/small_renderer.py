@@ -1,22 +1,18 @@
 """The small SonicGauss, fine-tuned to one object."""
 
 import copy
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError
-from avmsf.evaluation.sonicgauss.conditioning import Normalized
-from avmsf.evaluation.sonicgauss.flow import STEPS, integrate
+from avmsf.evaluation.sonicgauss.flow import integrate
 from avmsf.evaluation.sonicgauss.patches import CHANNELS, PATCHES, PatchCodec, log_magnitudes, sounds_of, spectra
 from avmsf.evaluation.sonicgauss.pretraining import clip_loss
 from avmsf.evaluation.sonicgauss.small import SmallSonicGauss, SmallWeights, object_tokens, visible
-from avmsf.evaluation.sonicgauss.tuning import TrainingConfig, train
+from avmsf.evaluation.sonicgauss.tuning import TrainingConfig, TunedRenderer, expect_sound, train
 from avmsf.scene.gaussians import GaussianCloud
 
 TUNING = TrainingConfig(steps=150, batch=8, rate=5e-4, warmup=20)
@@ -25,37 +21,19 @@ TUNING = TrainingConfig(steps=150, batch=8, rate=5e-4, warmup=20)
 
 
 @dataclass(frozen=True, eq=False)
-class SmallRenderer:
+class SmallRenderer(TunedRenderer):
     """A fine-tuned network, and what places and levels mean for its object."""
 
     network: SmallSonicGauss
     codec: PatchCodec
     features: Float[Tensor, "tokens 23"]
-    seen: Normalized
-    """The object's Gaussians, in whose cube contacts are."""
     largest: float
     """Largest magnitude in the training recordings' spectra, in their unit times samples."""
     phases: Float[Tensor, "bins frames"]
     """Of the mean training recording, radians."""
-    sample_rate: float
-    """Hz."""
-    samples: int
-    report: Mapping[str, Any]
-    seed: int = 0
-    steps: int = STEPS
 
-    @torch.no_grad()
-    def render(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts samples"]:
-        """Return generated sounds, all from the same noise; directions are not known to the method."""
+    def _sound(self, place: Float[Tensor, "3"]) -> Float[Tensor, " samples"]:
         noise = torch.randn(1, PATCHES, CHANNELS, generator=torch.Generator().manual_seed(self.seed))
-        rows = [self._sound(place, noise) for place in self.seen.places(contacts)]
-        return torch.stack(rows) if rows else torch.zeros(0, self.samples)
-
-    def _sound(
-        self, place: Float[Tensor, "3"], noise: Float[Tensor, "1 patches channels"]
-    ) -> Float[Tensor, " samples"]:
         tokens = self.network.condition(self.features[None], place[None])
         latents = integrate(lambda state, times: self.network(state, times, tokens), noise, steps=self.steps)
         # Training has seen no magnitude above the largest.
@@ -81,13 +59,7 @@ def fit_small(
     features = object_tokens(seen, count=network.config.tokens)
     found = spectra(train_impacts.sounds, train_impacts.sample_rate)
     largest = float(found.abs().max())
-    if not largest > 0.0:
-        raise EvaluationError(
-            f"expected a recording with a sound, got {len(train_impacts)} silent ones "
-            f"({', '.join(train_impacts.names[:3])}); record the impacts again",
-            name="sounds",
-            value=0.0,
-        )
+    expect_sound(largest, train_impacts)
     latents, contacts = weights.codec.encode(log_magnitudes(found, largest)), seen.places(train_impacts.contacts)
 
     def loss(rows: Int[Tensor, " batch"], generator: torch.Generator) -> Tensor:
@@ -105,11 +77,11 @@ def fit_small(
         network.eval(),
         weights.codec,
         features,
-        seen,
         largest,
         found.mean(0).angle(),
-        train_impacts.sample_rate,
-        train_impacts.sounds.shape[1],
-        report,
-        seed,
+        seen=seen,
+        sample_rate=train_impacts.sample_rate,
+        samples=train_impacts.sounds.shape[1],
+        report=report,
+        seed=seed,
     )

@@ -1,11 +1,18 @@
 """Training a generator by rectified flow, from scratch or on one object: AdamW, a warm-up, then a linear decay."""
 
-from collections.abc import Callable, Iterable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import EvaluationError
+from avmsf.evaluation.sonicgauss.conditioning import Normalized
+from avmsf.evaluation.sonicgauss.flow import STEPS
 
 Loss = Callable[[Int[Tensor, " batch"], torch.Generator], Float[Tensor, ""]]
 """Loss of the clips of these rows."""
@@ -22,6 +29,43 @@ class TrainingConfig:
     """Steps; at most half of all."""
     betas: tuple[float, float] = (0.9, 0.95)
     decay: float = 1e-2
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TunedRenderer(ABC):
+    """A generator fine-tuned to one object."""
+
+    seen: Normalized
+    """The object's Gaussians, in whose cube contacts are."""
+    sample_rate: float
+    """Hz."""
+    samples: int
+    report: Mapping[str, Any]
+    seed: int = 0
+    steps: int = STEPS
+
+    @torch.no_grad()
+    def render(
+        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return generated sounds, all from the same noise; directions are not known to the method."""
+        rows = [self._sound(place) for place in self.seen.places(contacts)]
+        return torch.stack(rows) if rows else torch.zeros(0, self.samples)
+
+    @abstractmethod
+    def _sound(self, place: Float[Tensor, "3"]) -> Float[Tensor, " samples"]:
+        """Return the sound of a place in the cube."""
+
+
+def expect_sound(loudest: float, impacts: Impacts) -> None:
+    """Raise EvaluationError where the largest magnitude of the recordings is not above 0."""
+    if not loudest > 0.0:
+        raise EvaluationError(
+            f"expected a recording with a sound, got {len(impacts)} silent ones ({', '.join(impacts.names[:3])}); "
+            "record the impacts again",
+            name="sounds",
+            value=0.0,
+        )
 
 
 def train(

@@ -74,9 +74,7 @@ class MixtureEstimator(GainRecipe):
     def __post_init__(self) -> None:
         unknown = sorted(set(self.kinds) - set(KNOWN))
         if unknown:
-            raise FitError(
-                f"kinds: expected some of {', '.join(KNOWN)}, got {', '.join(unknown)}", name="kinds", value=unknown
-            )
+            raise FitError.expected(f"some of {', '.join(KNOWN)}", unknown, got=", ".join(unknown), name="kinds")
 
     @property
     def name(self) -> str:

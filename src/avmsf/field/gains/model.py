@@ -253,10 +253,8 @@ class MixtureGains:
         kept = [count_of(each, "kernels") for each in like(record["kernels"], [], "kernels")]
         unknown = sorted(set(families) - {*_POSITIONAL, *_OF_OBJECT})
         if unknown or len(families) != len(kept):
-            raise RecordError(
-                f"families: expected {len(kept)} of {', '.join((*_POSITIONAL, *_OF_OBJECT))}, got {families}",
-                name="families",
-                value=families,
+            raise RecordError.expected(
+                f"{len(kept)} of {', '.join((*_POSITIONAL, *_OF_OBJECT))}", families, name="families"
             )
         for kind, name in _OF_OBJECT.items():
             given = len(like(record[name], [], name))

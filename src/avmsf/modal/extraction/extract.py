@@ -75,10 +75,8 @@ def extract_sounds(
     """Return what `extract_modes` does, from bare sounds that start at their onset; a single one is enough here."""
     if not bool(torch.isfinite(sounds).all()):
         row = int(torch.nonzero(~torch.isfinite(sounds))[0, 0])
-        raise ExtractionError(
-            f"sounds, row {row}: expected finite samples, got NaN or infinity; record or export it again",
-            name="sounds",
-            row=row,
+        raise ExtractionError.expected(
+            "finite samples", got="NaN or infinity", row=row, name="sounds", advice="record or export it again"
         )
     finder = HighResolution() if method is None else method
     bank = finder.find(sounds, sample_rate)

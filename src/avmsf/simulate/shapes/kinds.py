@@ -40,16 +40,12 @@ def make_shape(kind: str, *, seed: int = 0, size: float | None = None, wall: flo
     themselves or leave nothing of the shape.
     """
     if kind not in KINDS:
-        raise SimulationError(
-            f"kind: expected one of {', '.join(sorted(KINDS))}, got {kind!r}", name="kind", value=kind
-        )
+        raise SimulationError.expected(f"one of {', '.join(sorted(KINDS))}", kind, name="kind")
     if seed < 0:
         raise SimulationError(f"seed: expected 0 or more, got {seed}", name="seed", value=seed)
     for name, value in (("size", size), ("wall", wall)):
         if value is not None and not 0.0 < value <= _LARGEST:
-            raise SimulationError(
-                f"{name}: expected more than 0 and at most {_LARGEST:g} m, got {value:g}", name=name, value=value
-            )
+            raise SimulationError.expected(f"more than 0 and at most {_LARGEST:g} m", value, name=name)
     draft, scale = _sized(kind, seed, size, wall)
     try:
         solid = draft.body.solid(scale=scale)
