@@ -80,20 +80,20 @@ def located(words: list[str], capsys: Streams) -> tuple[dict, str]:
 def test_a_blow_is_found_drawn_and_told(place: Place, tmp_path: Path, capsys: Streams) -> None:
     hit = place.wav("hit.wav", -place.blow(STRUCK))
     printed, err = located([place.field, hit, "--output", str(tmp_path / "maps")], capsys)
-    (blow,) = printed["blows"]
-    assert blow["place"] == pytest.approx(place.points[STRUCK].tolist(), abs=1e-6)
+    (blow,) = printed["impacts"]
+    assert blow["position"] == pytest.approx(place.points[STRUCK].tolist(), abs=1e-6)
     assert blow["recording"] == hit
-    assert blow["explained"] > 0.98
-    assert blow["misfit"] < 0.01
-    assert blow["region"]["level"] == 0.9
+    assert blow["explained_energy"] > 0.98
+    assert blow["mismatch_ratio"] < 0.01
+    assert blow["credible_region"]["probability"] == 0.9
     # The field's own contacts, left out, are badly foretold by the others: the region is as wide as that makes it.
-    assert 0.0 < blow["region"]["share"] < 0.7
+    assert 0.0 < blow["credible_region"]["surface_fraction"] < 0.7
     assert f"{hit}: impact at (" in err
-    assert f"{100 * blow['explained']:.0f} % of the sound" in err
+    assert f"{100 * blow['explained_energy']:.0f} % of the sound" in err
     assert (tmp_path / "maps" / "hit.png").read_bytes().startswith(b"\x89PNG")
     cloud = trimesh.load(tmp_path / "maps" / "hit.ply")
     likeliest = int(np.argmax(cloud.metadata["_ply_raw"]["vertex"]["data"]["probability"]))
-    assert cloud.vertices[likeliest] == pytest.approx(blow["place"], abs=1e-6)
+    assert cloud.vertices[likeliest] == pytest.approx(blow["position"], abs=1e-6)
 
 
 def test_a_surer_region_is_larger(place: Place, capsys: Streams) -> None:
@@ -101,7 +101,12 @@ def test_a_surer_region_is_larger(place: Place, capsys: Streams) -> None:
     shares = []
     for level in ("0.5", "0.999"):
         printed, _ = located([place.field, hit, "--probability", level], capsys)
-        shares.append((printed["blows"][0]["region"]["share"], printed["blows"][0]["region"]["radius_meters"]))
+        shares.append(
+            (
+                printed["impacts"][0]["credible_region"]["surface_fraction"],
+                printed["impacts"][0]["credible_region"]["radius"],
+            )
+        )
     assert shares[0][0] < shares[1][0]
     assert shares[0][1] < shares[1][1]
 
@@ -118,11 +123,11 @@ def test_several_blows_are_told_apart(place: Place, capsys: Streams) -> None:
     both = torch.cat([first, torch.zeros(len(second) - len(first), dtype=torch.float64)]) + second
     two = place.wav("two.wav", both)
     printed, _ = located([place.field, two, "--several"], capsys)
-    assert [blow["seconds"] for blow in printed["blows"]] == pytest.approx([0.1, 0.4], abs=0.002)
-    for blow, row in zip(printed["blows"], (STRUCK, SECOND), strict=True):
-        assert blow["place"] == pytest.approx(place.points[row].tolist(), abs=0.01)
+    assert [blow["seconds"] for blow in printed["impacts"]] == pytest.approx([0.1, 0.4], abs=0.002)
+    for blow, row in zip(printed["impacts"], (STRUCK, SECOND), strict=True):
+        assert blow["position"] == pytest.approx(place.points[row].tolist(), abs=0.01)
     alone, err = located([place.field, two], capsys)
-    assert len(alone["blows"]) == 1
+    assert len(alone["impacts"]) == 1
     assert "at 0.100 s and at 0." in err
 
 
@@ -133,7 +138,7 @@ def test_no_blows_files_are_anothers(place: Place, tmp_path: Path, capsys: Strea
     words = [place.field, place.wav("twin.wav", both), place.wav("twin-2.wav", first), "--several"]
     printed, _ = located([*words, "--output", str(tmp_path)], capsys)
     stems = ["twin", "twin-2", "twin-2-2"]
-    assert [Path(blow["picture"]).stem for blow in printed["blows"]] == stems
+    assert [Path(blow["picture"]).stem for blow in printed["impacts"]] == stems
     assert {path.name for path in tmp_path.iterdir()} == {f"{stem}.{end}" for stem in stems for end in ("png", "ply")}
 
 
@@ -142,7 +147,7 @@ def test_a_known_force_counts(place: Place, capsys: Streams) -> None:
     shares = []
     for words in ([], ["--force", "1"], ["--force", "1", "--several"], ["--force", "1000"]):
         printed, _ = located([place.field, hit, *words], capsys)
-        shares.append(printed["blows"][0]["region"]["share"])
+        shares.append(printed["impacts"][0]["credible_region"]["surface_fraction"])
     assert shares[1] == pytest.approx(shares[2], abs=0.05)
     assert len({round(share, 3) for share in shares}) > 1
     with raises(LocationError, name="force.expected", value=0.0):
@@ -152,7 +157,7 @@ def test_a_known_force_counts(place: Place, capsys: Streams) -> None:
 def test_another_rate_and_clipping_are_said(place: Place, capsys: Streams) -> None:
     fast = place.wav("fast.wav", place.blow(STRUCK, rate=16000), rate=16000)
     printed, err = located([place.field, fast], capsys)
-    assert printed["blows"][0]["place"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
+    assert printed["impacts"][0]["position"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
     assert "note: " in err
     assert "resampled from 16000 Hz to the field's 8000 Hz" in err
     loud = place.blow(STRUCK)
@@ -169,14 +174,14 @@ def test_recordings_without_a_blow_on_the_object_have_no_place(place: Place, tmp
     cases = {
         silent: "silence",
         place.wav("noise.wav", noise): " dB",
-        place.wav("other.wav", place.blow(STRUCK, bank=other)): "a misfit of",
+        place.wav("other.wav", place.blow(STRUCK, bank=other)): "a mismatch ratio of",
     }
     for path, reason in cases.items():
         assert run(parse([place.field, path, "--json", "--output", str(tmp_path)])) == 2
         out, err = capsys.readouterr()
-        (values,) = json.loads(out)["blows"]
+        (values,) = json.loads(out)["impacts"]
         assert values["status"] == "not located"
-        assert values["place"] is None
+        assert values["position"] is None
         assert reason in values["reason"]
         assert f"{path}: not located: " in err
     assert not list(tmp_path.iterdir())
@@ -190,8 +195,8 @@ def test_one_bad_recording_does_not_cost_the_others(place: Place, capsys: Stream
     assert run(parse([place.field, silent, str(unreadable), hit, "--json"])) == 2
     out, err = capsys.readouterr()
     printed = json.loads(out)
-    assert [blow["recording"] for blow in printed["blows"]] == [silent, hit]
-    assert [blow["status"] for blow in printed["blows"]] == ["not located", "located"]
+    assert [blow["recording"] for blow in printed["impacts"]] == [silent, hit]
+    assert [blow["status"] for blow in printed["impacts"]] == ["not located", "located"]
     assert [each["recording"] for each in printed["failures"]] == [str(unreadable)]
     assert "text.wav" in err
 
@@ -217,7 +222,7 @@ def test_a_captures_settings_say_how_recordings_are_read(place: Place, tmp_path:
     assert "response_channel" in capsys.readouterr().out
     (tmp_path / "capture.toml").write_text("response_channel = 2\n")
     printed, _ = located([place.field, str(path), "--capture", str(tmp_path)], capsys)
-    assert printed["blows"][0]["place"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
+    assert printed["impacts"][0]["position"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
     given, _ = located([place.field, str(path), "--settings", str(tmp_path / "capture.toml")], capsys)
     assert given == printed
 
@@ -227,7 +232,7 @@ def test_several_blows_are_read_as_one_is(place: Place, tmp_path: Path, capsys: 
     (tmp_path / "capture.toml").write_text("response_channel = 2\n")
     for words in ([], ["--several"]):
         printed, _ = located([place.field, hit, "--capture", str(tmp_path), *words], capsys)
-        assert printed["blows"][0]["place"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
+        assert printed["impacts"][0]["position"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
 
 
 def test_what_cannot_be_done_is_said_in_one_line(place: Place, tmp_path: Path, capsys: Streams) -> None:

@@ -39,7 +39,7 @@ def test_the_list_to_walk_by_is_what_is_printed(field: Path, tmp_path: Path, cap
     for row, known in zip(rows, printed["suggestions"], strict=True):
         for name in ("x", "y", "z", "nx", "ny", "nz", "error_after"):
             assert float(row[name]) == pytest.approx(known[name], rel=1e-5, abs=1e-9)
-    errors = [printed["before"], *(each["error_after"] for each in printed["suggestions"])]
+    errors = [printed["error_before"], *(each["error_after"] for each in printed["suggestions"])]
     assert errors == sorted(errors, reverse=True)
     assert (tmp_path / "next" / "suggested.png").read_bytes().startswith(b"\x89PNG")
 

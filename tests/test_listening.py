@@ -69,7 +69,7 @@ def test_every_blow_is_found_while_earlier_ones_ring() -> None:
     # The first swing of a sine stands out of the noise within two samples.
     assert [round(blow.seconds * RATE) for blow in blows] == pytest.approx(BEGINS, abs=2)
     # What rings of earlier blows is a tenth and more of a faint one's energy: left in it, less would be explained.
-    assert min(blow.map.explained for blow in blows) > 0.98
+    assert min(blow.map.explained_energy for blow in blows) > 0.98
     assert {blow.final for blow in blows} == {True}
 
 
@@ -155,7 +155,7 @@ def test_what_does_not_belong_to_the_object_is_counted_and_the_next_blow_found()
     foreign = heard(listener, 10 * burst)
     assert first == []
     assert listener.ears.strangers + len(foreign) == 1
-    assert all(blow.map.explained < 0.3 for blow in foreign)
+    assert all(blow.map.explained_energy < 0.3 for blow in foreign)
     assert [spot(blow) for blow in heard(listener, stream())] == list(STRUCK)
 
 

@@ -12,12 +12,12 @@ from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.positional import Smooth, ThinPlate, Unstructured
 from avmsf.field.soundfield import Origin, SoundField
+from avmsf.localization.contact_map import ContactMap
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual import Residual
 from avmsf.modal.synthesis import synthesize_phased
 from avmsf.simulate.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
-from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locate import DOUBTFUL, STRANGE, UNLIKE, judged, locate
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
@@ -138,7 +138,7 @@ def test_force_polarity_and_onset_do_not_matter():
     assert turned.force == pytest.approx(-300.0 * found.force, rel=1e-3)
     late = locator.locate(impacts.sounds[0][3:])
     assert missed(late, late.most_probable, impacts.contacts[0]) < 0.02
-    assert late.explained > 0.9
+    assert late.explained_energy > 0.9
     assert float(late.distance.min()) < 0.1
 
 
@@ -163,7 +163,7 @@ def test_phase_and_quadrature_are_what_the_field_renders():
     )[0]  # fmt: skip
     found = Locator.of(field).locate(sound)
     assert float(found.distance[123]) < 1e-6
-    assert found.explained > 0.999
+    assert found.explained_energy > 0.999
     assert found.force == pytest.approx(1.0, rel=1e-2)
 
 
@@ -250,7 +250,7 @@ def test_short_sounds_suffice_although_modes_cannot_be_told_apart():
     for sound, contact in zip(impacts.sounds, impacts.contacts, strict=True):
         found = locator.locate(sound[:400])
         assert missed(found, found.most_probable, contact) < 0.03
-        assert found.explained > 0.9
+        assert found.explained_energy > 0.9
 
 
 def test_areas_and_other_points_count():
@@ -268,10 +268,10 @@ def test_another_plate_is_refused_with_the_number(length):
     impacts = struck(4, seed=6, plate=replace(PLATE, length=length, width=length / 1.3))
     locator = locator_of()
     for sound in impacts.sounds:
-        assert locator.locate(sound).misfit > 1.5 * STRANGE
+        assert locator.locate(sound).mismatch_ratio > 1.5 * STRANGE
         found = locate(true_field(), sound, locator=locator)
-        assert f"a misfit of {found.misfit:.2f}" in found.refusal
-        with raises(LocationError, name="position", value=found.misfit):
+        assert f"a mismatch ratio of {found.mismatch_ratio:.2f}" in found.refusal
+        with raises(LocationError, name="position", value=found.mismatch_ratio):
             _ = found.position
 
 
@@ -280,19 +280,19 @@ def test_its_own_sounds_are_not_taken_for_another_plates(noise_db):
     # Noise, were it as loud as the sound, counts neither for the modes nor against them.
     for sound in struck(8, seed=6, noise_db=noise_db).sounds:
         found = locator_of().locate(sound)
-        assert found.misfit < DOUBTFUL
-        assert found.modal > 0.85
+        assert found.mismatch_ratio < DOUBTFUL
+        assert found.modal_energy > 0.85
 
 
 def test_what_falls_between_is_doubted_in_words():
     found = locator_of().locate(struck(1, seed=6).sounds[0])
     assert judged(found) is found
-    (note,) = judged(replace(found, modal=0.8, detuned=0.5)).notes
-    assert all(each in note for each in ("80 %", "50 %", "a misfit of 0.40"))
-    (note,) = judged(replace(found, explained=0.9 * UNLIKE)).notes
+    (note,) = judged(replace(found, modal_energy=0.8, null_energy=0.5)).notes
+    assert all(each in note for each in ("80 %", "50 %", "a mismatch ratio of 0.40"))
+    (note,) = judged(replace(found, explained_energy=0.9 * UNLIKE)).notes
     assert " 9 %" in note
     # Where modes out of tune explain all as well, a rounding is no misfit.
-    assert judged(replace(found, modal=1.0 - 1e-4, detuned=1.0 - 1e-5)).notes == ()
+    assert judged(replace(found, modal_energy=1.0 - 1e-4, null_energy=1.0 - 1e-5)).notes == ()
 
 
 @pytest.mark.parametrize("noise_db", [-40.0, 0.0])
@@ -322,7 +322,7 @@ def test_a_sound_whose_modes_are_so_strong_at_no_place_has_none(taps):
     for seed in range(6):
         found = judged(locator_of(taps).locate(with_the_modes_of_no_place(seed)))
         # Its frequencies and dampings are the object's: only the strengths tell.
-        assert found.misfit < 0.01
+        assert found.mismatch_ratio < 0.01
         assert found.evidence <= 0.0
         with pytest.raises(LocationError):
             _ = found.position

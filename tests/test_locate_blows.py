@@ -38,7 +38,7 @@ def test_every_blow_is_found_where_and_when_it_fell(strengths, locator):
     assert [round(seconds, 3) for seconds, _ in found] == pytest.approx(starts, abs=2e-3)
     for (_, each), contact in zip(found, contacts, strict=True):
         assert missed(each, each.most_probable, contact) < 0.05
-        assert each.explained > 0.85
+        assert each.explained_energy > 0.85
 
 
 def test_what_rings_on_is_carried_over_a_blow():
@@ -76,7 +76,7 @@ def test_blows_on_another_object_are_left_out_and_refused_where_there_are_no_oth
     mixed[begin : begin + len(other)] = (other / other.abs().max())[: len(mixed) - begin]
     ((seconds, found),) = locate_blows(true_field(), mixed, locator=locator)
     assert round(seconds, 2) == 0.1
-    assert re.search(r"the recording: 1 .*, at 0\.5\d\d s, .* a misfit of", found.notes[-1])
+    assert re.search(r"the recording: 1 .*, at 0\.5\d\d s, .* a mismatch ratio of", found.notes[-1])
     with raises(LocationError, name="impact", value=pytest.approx(3000 / RATE, abs=0.01)):
         locate_blows(true_field(), torch.cat([torch.zeros(3000), mixed[begin:]]).numpy(), locator=locator)
 

@@ -5,10 +5,9 @@ import pytest
 import torch
 
 from avmsf.errors import LocationError
+from avmsf.localization.contact_map import ContactMap, EquivalentPoint
 from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
 from avmsf.simulate.plate import plate_surface_points
-from avmsf.tasks.contactmap import ContactMap
-from avmsf.tasks.counterparts import name_counterpart
 from avmsf.tasks.locator import Locator
 from raising import raises
 from test_locate import PLATE, TrueGains, field_of, struck
@@ -65,9 +64,9 @@ def test_peaks_are_places_apart_of_comparable_probability():
     assert first.probability == pytest.approx(0.5)
     assert second.probability == pytest.approx(0.45)
     assert second.points.nonzero().flatten().tolist() == [20, 21]
-    assert found.ambiguous
+    assert found.multimodal
     assert len(found.peaks(0.99, comparable=0.05)) == 3
-    assert not made([0.1, 0.8, 0.1]).ambiguous
+    assert not made([0.1, 0.8, 0.1]).multimodal
 
 
 def test_a_symmetric_plate_is_ambiguous_and_each_counterpart_is_named():
@@ -75,9 +74,9 @@ def test_a_symmetric_plate_is_ambiguous_and_each_counterpart_is_named():
     plate = replace(PLATE, pickup=(0.5, 0.5))
     field = field_of(TrueGains(plate_surface_points(PLATE, 1600).float(), plate=plate))
     found = Locator.of(field).locate(struck(1, seed=14, noise_db=-20.0, plate=plate).sounds[0])
-    others = found.counterparts(plate_symmetries())
+    others = found.equivalent_points(plate_symmetries())
     assert len(others) == 3
-    assert found.ambiguous
+    assert found.multimodal
     assert sorted(type(each.symmetry).__name__ for each in others) == [
         "MirrorSymmetry",
         "MirrorSymmetry",
@@ -94,12 +93,12 @@ def test_a_symmetric_plate_is_ambiguous_and_each_counterpart_is_named():
     words = " ".join(str(each) for each in others)
     assert "its image in the mirror plane with normal (1 0 0)" in words
     assert "by 180 degrees about the axis (0 0 1)" in words
-    assert all("no known symmetry" in str(each) for each in found.counterparts())
+    assert all("no known symmetry" in str(each) for each in found.equivalent_points())
 
 
 def test_a_place_that_no_symmetry_reaches_is_not_explained():
     place, other = torch.tensor([0.02, 0.03, 0.0]), torch.tensor([0.1, 0.05, 0.0])
-    named = name_counterpart(place, other, plate_symmetries(), probability=0.4, tolerance=0.01)
+    named = EquivalentPoint.of(place, other, plate_symmetries(), probability=0.4, tolerance=0.01)
     assert named.symmetry is None
     assert str(named).startswith("also at (0.1 0.05 0) m, with 40 %: no known symmetry")
 
@@ -107,5 +106,5 @@ def test_a_place_that_no_symmetry_reaches_is_not_explained():
 def test_any_turn_is_found_for_a_round_object():
     turns = Symmetries((RotationalSymmetry(axis(2), torch.zeros(3).double(), None, 0.1, 0.0),), (), 0.005, 0.38, 1.0)
     place, other = torch.tensor([0.1, 0.0, 0.05]), torch.tensor([0.0, 0.1, 0.05])
-    named = name_counterpart(place, other, turns, probability=0.4, tolerance=0.01)
+    named = EquivalentPoint.of(place, other, turns, probability=0.4, tolerance=0.01)
     assert named.angle == pytest.approx(math.pi / 2, abs=0.02)

@@ -24,9 +24,9 @@ def test_broad_modes_explain_a_stranger_and_it_is_refused(material, other, lengt
     locator, shares = damped_locator(material), []
     for sound in damped_blows(other, length=length, heard_by=material):
         found = locator.locate(sound)
-        shares.append(found.modal)
-        assert found.misfit > STRANGE
-        assert "a misfit of" in locate(damped_field(material), recorded(sound), locator=locator).refusal
+        shares.append(found.modal_energy)
+        assert found.mismatch_ratio > STRANGE
+        assert "mismatch ratio" in locate(damped_field(material), recorded(sound), locator=locator).refusal
     # What the modes explain tells nothing here: of strangers half and more.
     assert max(shares) > 0.5
 
@@ -35,7 +35,7 @@ def test_broad_modes_explain_a_stranger_and_it_is_refused(material, other, lengt
 @pytest.mark.parametrize("noise_db", [-40.0, 0.0])
 def test_own_sounds_of_damped_plates_fit(material, noise_db):
     for sound in damped_blows(material, heard_by=material, noise_db=noise_db):
-        assert damped_locator(material).locate(sound).misfit <= DOUBTFUL
+        assert damped_locator(material).locate(sound).mismatch_ratio <= DOUBTFUL
 
 
 @pytest.mark.parametrize(("material", "other", "length"), FOREIGN)
@@ -54,8 +54,8 @@ def test_a_stream_refuses_strangers_or_doubts_them(material, other, length):
     assert listener.ears.strangers + len(blows) == len(foreign)
     # In 40 ms broad modes are told apart less than in all of a sound.
     assert len(blows) <= 1
-    assert all("a misfit of" in note for blow in blows for note in blow.map.notes)
-    assert "a misfit of" in listener.ears.refusal
+    assert all("mismatch ratio" in note for blow in blows for note in blow.map.notes)
+    assert "mismatch ratio" in listener.ears.refusal
 
 
 @pytest.mark.parametrize("material", ["wood", "plastic"])
@@ -91,5 +91,5 @@ def test_a_sound_beneath_noise_is_no_less_than_its_modes() -> None:
         estimated = modes.extract(sound, color=field.residual)
         if 0.3 < estimated.energy / estimated.fitted < 0.6:
             found, judged = locator.locate(sound), judged + 1
-            assert 0.0 < found.detuned < 1.0
+            assert 0.0 < found.null_energy < 1.0
     assert judged

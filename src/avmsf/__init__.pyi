@@ -6,6 +6,7 @@ from . import export as export
 from . import fem as fem
 from . import field as field
 from . import geometry as geometry
+from . import localization as localization
 from . import modal as modal
 from . import pipeline as pipeline
 from . import plotting as plotting

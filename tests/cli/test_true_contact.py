@@ -58,11 +58,11 @@ def test_the_true_contact_is_red_at_its_place_and_the_found_one_blue(
     monkeypatch.setattr(verb, "save_picture", lambda figure, path: figures.append(figure))
     true = [f"{value:.9g}" for value in points[OTHER].tolist()]
     assert run(parse([field, recording, "--output", str(tmp_path), "--true-contact", *true, "--json"])) == 0
-    (blow,) = json.loads(capsys.readouterr().out)["blows"]
+    (blow,) = json.loads(capsys.readouterr().out)["impacts"]
     distance = float((points[STRUCK] - points[OTHER]).norm())
     diagonal = float((points.amax(0) - points.amin(0)).norm())
     assert blow["true_contact"] == pytest.approx(points[OTHER].tolist(), abs=1e-6)
-    assert blow["error_meters"] == pytest.approx(distance, abs=1e-6)
+    assert blow["error"] == pytest.approx(distance, abs=1e-6)
     assert blow["rmed_posterior"] == pytest.approx(distance / diagonal, abs=1e-6)
     assert blow["rmed"] == pytest.approx(distance / diagonal, abs=1e-6)
     (figure,) = figures

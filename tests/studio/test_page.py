@@ -146,20 +146,20 @@ def test_a_dropped_recording_is_located_and_painted(visit: Open) -> None:
     probability = torch.exp(-((table.points - table.points[77]).norm(dim=1) ** 2) / 0.0004)
     probability /= probability.sum()
     blow = {
-        "place": table.points[77].tolist(),
+        "position": table.points[77].tolist(),
         "row": 77,
         "probability": packed(probability),
         "distance": packed(1 - probability),
-        "region": {"level": 0.9, "radius_meters": 0.012, "share": 0.031},
-        "explained": 0.97,
-        "ambiguous": True,
-        "counterparts": [{"place": table.points[300].tolist(), "probability": 0.2, "words": "mirrored"}],
+        "credible_region": {"probability": 0.9, "radius": 0.012, "surface_fraction": 0.031},
+        "explained_energy": 0.97,
+        "multimodal": True,
+        "equivalent_points": [{"position": table.points[300].tolist(), "probability": 0.2, "message": "mirrored"}],
         "notes": ["Quiet: the answer is less sure."],
     }
 
     def locate(route: "Route", request: "Request") -> None:
         sent.append(request.post_data_buffer or b"")
-        answer(route, {"blows": [blow]})
+        answer(route, {"impacts": [blow]})
 
     page = visit(live=LIVE, before=lambda page: page.route("**/locate", locate))
     page.evaluate(
@@ -323,7 +323,7 @@ def test_the_microphone_records_what_is_heard(visit: Open) -> None:
 
     def locate(route: "Route", request: "Request") -> None:
         sent.append(request.post_data_buffer or b"")
-        answer(route, {"blows": []})
+        answer(route, {"impacts": []})
 
     def before(page: "Page") -> None:
         page.route("**/locate", locate)
@@ -507,10 +507,10 @@ def test_all_fits_on_a_telephone(visit: Open) -> None:
 
 def test_what_was_found_goes_when_another_recording_is_looked_for(visit: Open) -> None:
     probability = torch.exp(-torch.arange(plate_table().points.shape[0]) / 50.0)
-    region = {"level": 0.9, "radius_meters": 0.012, "share": 0.031}
-    found = {"place": [0.0, 0.0, 0.01], "row": 5, "probability": packed(probability), "region": region}
+    region = {"probability": 0.9, "radius": 0.012, "surface_fraction": 0.031}
+    found = {"position": [0.0, 0.0, 0.01], "row": 5, "probability": packed(probability), "credible_region": region}
     silence = {"error": "the recording: expected a blow, found noise alone: record it again"}
-    answers = [({"blows": [found]}, 200), (silence, 422), ({"blows": [found]}, 200)]
+    answers = [({"impacts": [found]}, 200), (silence, 422), ({"impacts": [found]}, 200)]
     page = visit(live=LIVE, before=lambda page: page.route("**/locate", lambda route: answer(route, *answers.pop(0))))
     page.click("#tab-find")
 

@@ -294,9 +294,12 @@ def test_a_place_found_on_another_field_is_not_painted_and_searches_do_not_meet(
         held.append(route)
 
     def found(row: int, revision: int) -> dict[str, Any]:
-        region = {"level": 0.9, "radius_meters": 0.01, "share": 0.1}
+        region = {"probability": 0.9, "radius": 0.01, "surface_fraction": 0.1}
         place = page.evaluate(f"avmsf.studio.view.placeOf({row})")
-        return {"blows": [{"place": place, "row": row, "probability": "", "region": region}], "revision": revision}
+        return {
+            "impacts": [{"position": place, "row": row, "probability": "", "credible_region": region}],
+            "revision": revision,
+        }
 
     page = visit(live=LIVE, before=lambda page: page.route("**/locate", locate))
     page.click("#tab-find")
@@ -339,7 +342,7 @@ def test_a_file_that_is_no_recording_ends_the_search_before_it(visit: Open) -> N
     page = visit(live=LIVE, before=lambda page: page.route("**/locate", lambda route: held.append(route)))
     page.click("#tab-find")
     busy = "#sheet-find progress"
-    for outcome in ({"blows": []}, {"error": "found noise alone"}):
+    for outcome in ({"impacts": []}, {"error": "found noise alone"}):
         page.set_input_files("#sheet-find input[type=file]", upload("older.wav"))
         page.wait_for_selector(busy)
         page.set_input_files("#sheet-find input[type=file]", upload("table.csv", b"file,x,y,z"))
@@ -354,7 +357,7 @@ def test_a_file_that_is_no_recording_ends_the_search_before_it(visit: Open) -> N
     page.set_input_files("#sheet-find input[type=file]", upload("newer.wav"))
     page.wait_for_selector(busy)
     page.wait_for_timeout(100)
-    answer(held.pop(), {"blows": []})
+    answer(held.pop(), {"impacts": []})
     page.wait_for_selector("text=No impact detected")
     assert "newer.wav" in page.inner_text("#sheet-find")
 

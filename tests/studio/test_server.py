@@ -31,6 +31,7 @@ from avmsf.errors import AvmsfError, StudioError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
 from avmsf.files import copy_whole
+from avmsf.localization.contact_map import enlarged
 from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.sources import SPLATS
 from avmsf.scene.ply import write_splats
@@ -43,7 +44,6 @@ from avmsf.studio.modules import find_modules, with_local_modules
 from avmsf.studio.opening import Opened, find_object, open_target
 from avmsf.studio.routes import PAGE
 from avmsf.studio.server import serve
-from avmsf.tasks.located import enlarged
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.recast import recast
 from avmsf.tasks.retune import retune
@@ -107,7 +107,7 @@ def test_a_recorded_blow_is_located_as_the_task_does(plate: Served) -> None:
         sound = torch.cat([torch.zeros(200), field.render(points[row : row + 1])[0]])
         answer = plate.ask("POST", "locate", wav(sound.numpy()))
         assert answer.status == 200
-        [found] = answer.words["blows"]
+        [found] = answer.words["impacts"]
         [(seconds, expected)] = locate_blows(field, sound, locator=Locator.of(field, points=points))
         assert (found["row"], found["seconds"]) == (expected.most_probable, seconds)
         assert np.array_equal(unpacked(found["probability"]), expected.probability.float())
@@ -115,7 +115,7 @@ def test_a_recorded_blow_is_located_as_the_task_does(plate: Served) -> None:
         # The plate's symmetric places sound alike, and all of them as the blow does.
         assert unpacked(found["distance"])[row] < 0.01
         assert {found["row"], row} <= set(np.argsort(unpacked(found["distance"]))[:8])
-        assert found["explained"] > 0.95
+        assert found["explained_energy"] > 0.95
 
 
 @pytest.mark.parametrize("content", [b"", b"RIFF", b"\x00" * 5000, b"<svg/>", wav(np.zeros(4000)), wav(ring(0.01))])
@@ -161,9 +161,9 @@ def test_a_blow_on_an_edited_object_is_located_in_the_pages_frame(plate: Served)
     plate.ask("POST", "edit", {"base": 1, "material": {"from": "ceramic"}, "size": 0.8})
     edited = plate.studio.session.current.expect_field()
     sound = edited.render(0.8 * points[[33]].double())[0]
-    [found] = plate.ask("POST", "locate", wav(np.concatenate([np.zeros(200), sound.numpy()]))).words["blows"]
+    [found] = plate.ask("POST", "locate", wav(np.concatenate([np.zeros(200), sound.numpy()]))).words["impacts"]
     assert found["row"] == 33
-    assert found["place"] == pytest.approx(points[33].tolist(), abs=1e-7)
+    assert found["position"] == pytest.approx(points[33].tolist(), abs=1e-7)
 
 
 def test_two_tabs_hear_of_each_other(plate: Served) -> None:

@@ -16,8 +16,8 @@ from avmsf.bench.clouds import draw_cloud
 from avmsf.bench.sides import ALL_SIDES, Side
 from avmsf.errors import EvaluationError
 from avmsf.files import write_whole
+from avmsf.localization.contact_map import ContactMap
 from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, styled
-from avmsf.tasks.contactmap import ContactMap
 
 _DECADES = 3.0
 """Powers of ten below the likeliest that colors tell apart."""

@@ -34,8 +34,8 @@ from avmsf.errors import EvaluationError, LocationError
 from avmsf.evaluation.diffsound import DiffSound
 from avmsf.evaluation.diffsound_locator import DiffSoundLocator
 from avmsf.field.soundfield import SoundField
+from avmsf.localization.contact_map import ContactMap
 from avmsf.scene.points import farthest_points
-from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locator import Locator
 
 CANDIDATES = 2000
@@ -284,7 +284,7 @@ def _located(
                 more = {"refusal": " ".join(str(error).split())}
         elif method != "random" and isinstance(found, ContactMap):
             place = ground.points[int(found.distance.argmin())] if method == "cosine" else found.position.double()
-            more = {"explained": found.explained}
+            more = {"explained": found.explained_energy}
             more |= _regions(found, ground, truth) if method == "posterior" else {}
         elif method != "random":
             more = {"refusal": " ".join(str(found).split())}

@@ -23,10 +23,9 @@ from avmsf.cli.writing import OutputError, expect_writable
 from avmsf.errors import AvmsfError, LocationError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
+from avmsf.localization.contact_map import ContactMap, not_located, symmetries_of
 from avmsf.scene.symmetry import Symmetries
-from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locate import locate
-from avmsf.tasks.located import describe_blow, not_located, symmetries_of
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
 from avmsf.tasks.severalblows import locate_blows
@@ -75,8 +74,8 @@ def run(options: Options) -> int:
                 values |= _draw(contact, options.output, _name(path, taken), values, truth)
             found.append(values)
     if options.json:
-        print_json({"field": str(options.field), "quality": verdict, "blows": found, "failures": failures})
-    return UNLOCATED if failures or any(each["place"] is None for each in found) else 0
+        print_json({"field": str(options.field), "quality": verdict, "impacts": found, "failures": failures})
+    return UNLOCATED if failures or any(each["position"] is None for each in found) else 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,33 +153,33 @@ def _error(contact: ContactMap, truth: Float64[Tensor, " 3"]) -> dict[str, Any]:
     places = (contact.points[int(contact.distance.argmin())], contact.position)
     cosine, likely = (float((place.double() - truth).norm()) for place in places)
     relative = {"rmed": cosine / diagonal, "rmed_posterior": likely / diagonal}
-    return {"true_contact": truth.tolist(), "error_meters": likely, **relative}
+    return {"true_contact": truth.tolist(), "error": likely, **relative}
 
 
 def _describe(name: str, seconds: float | None, contact: ContactMap, known: _Known, level: float) -> dict[str, Any]:
     """Return the results for an impact, as plain values."""
-    symmetries = known.symmetries if len(contact.peaks(level)) > 1 else None
-    return {"recording": name, "seconds": seconds, **describe_blow(contact, symmetries, level)}
+    symmetries = known.symmetries if contact.refusal is None and len(contact.peaks(level)) > 1 else None
+    return {"recording": name, "seconds": seconds, **contact.describe(symmetries, level)}
 
 
 def _words(values: dict[str, Any]) -> str:
     """Return one line about an impact, and one for each further message."""
     when = "" if values["seconds"] is None else f" at {values['seconds']:.3f} s"
-    if values["place"] is None:
+    if values["position"] is None:
         return f"{values['recording']}{when}: {values['status']}: {values['reason']}"
-    region = values["region"]
-    where = ", ".join(f"{value + 0.0:.4f}" for value in values["place"])
+    region = values["credible_region"]
+    where = ", ".join(f"{value + 0.0:.4f}" for value in values["position"])
     lines = [
-        f"{values['recording']}{when}: impact at ({where}) m; {100 * region['level']:g} % within "
-        f"{figure(1000 * region['radius_meters'], 2)} mm, {figure(100 * region['share'], 2)} % of the surface; the "
-        f"field explains {100 * values['explained']:.0f} % of the sound"
+        f"{values['recording']}{when}: impact at ({where}) m; {100 * region['probability']:g} % within "
+        f"{figure(1000 * region['radius'], 2)} mm, {figure(100 * region['surface_fraction'], 2)} % of the surface; the "
+        f"field explains {100 * values['explained_energy']:.0f} % of the sound"
     ]
     if "rmed" in values:
-        error, share = 1000 * values["error_meters"], 100 * values["rmed_posterior"]
+        error, share = 1000 * values["error"], 100 * values["rmed_posterior"]
         lines.append(f"  {error:.1f} mm from the true contact ({share:.1f} % of the diagonal)")
-    if values["ambiguous"]:
+    if values["multimodal"]:
         lines.append("  ambiguous: several positions have similar probabilities")
-    lines += [f"  {other['words']}" for other in values["counterparts"]]
+    lines += [f"  {other['message']}" for other in values["equivalent_points"]]
     return "\n".join([*lines, *(f"  note: {note}" for note in values["notes"])])
 
 
@@ -196,7 +195,7 @@ def _draw(
     contact: ContactMap, folder: Path, name: str, values: dict[str, Any], truth: Float64[Tensor, " 3"] | None
 ) -> dict[str, str]:
     picture, cloud = folder / f"{name}.png", folder / f"{name}.ply"
-    others = [other["place"] for other in values["counterparts"]]
+    others = [other["position"] for other in values["equivalent_points"]]
     marks = torch.tensor(others) if others else None
     title = f"{values['recording']}: contact"
     save_picture(draw_contact(contact, title=title, others=marks, truth=truth), picture)

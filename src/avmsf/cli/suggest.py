@@ -72,7 +72,7 @@ def run(options: Options) -> int:
         print_json(
             {
                 "capture": field.origin.capture,
-                "before": found.before,
+                "error_before": found.before,
                 "unreachable": found.unreachable,
                 "suggestions": rows,
             }

@@ -28,9 +28,9 @@ from avmsf.modal.synthesis import synthesize_phased
 if TYPE_CHECKING:
     from avmsf.field.config import GainModel
     from avmsf.field.suggest import Suggestions
+    from avmsf.localization.contact_map import ContactMap
     from avmsf.pipeline.config import PipelineConfig
     from avmsf.scene.features import FeatureField
-    from avmsf.tasks.contactmap import ContactMap
     from avmsf.tasks.hearing import Sound
 
 _BATCH = 32

@@ -16,10 +16,9 @@ from avmsf.capture.audio import Recording, SoundBytes, decode_recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import RecordingLengthError
 from avmsf.field.soundfield import SoundField
+from avmsf.localization.contact_map import LEVEL, ContactMap, enlarged, symmetries_of
 from avmsf.scene.symmetry import Symmetries
 from avmsf.studio.refusal import RefusedError
-from avmsf.tasks.contactmap import LEVEL, ContactMap
-from avmsf.tasks.located import describe_blow, enlarged, symmetries_of
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.severalblows import locate_blows
 
@@ -81,10 +80,10 @@ class Finder:
         return [self._described(seconds, contact) for seconds, contact in blows]
 
     def _described(self, seconds: float, contact: ContactMap) -> dict[str, Any]:
-        values = describe_blow(contact, self.symmetries, LEVEL)
-        for each in (values, values["cosine"], *values["counterparts"]):
-            each["place"] = [value / self.length for value in each["place"]]
-        values["region"]["radius_meters"] /= self.length
+        values = contact.describe(self.symmetries, LEVEL)
+        for each in (values, values["cosine"], *values["equivalent_points"]):
+            each["position"] = [value / self.length for value in each["position"]]
+        values["credible_region"]["radius"] /= self.length
         return {
             "seconds": seconds,
             "row": contact.most_probable,

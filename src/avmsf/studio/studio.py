@@ -87,7 +87,7 @@ class Studio:
         revision = self.session.current
         finder = self.searches.finder_of(revision)
         blows = await self._compute(finder.locate, recording)
-        return {"revision": revision.number, "blows": blows}
+        return {"revision": revision.number, "impacts": blows}
 
     async def edit(self, words: dict[str, Any]) -> dict[str, Any]:
         """Set the sliders, or start to lead the field towards a recording or words. Raises as edits do."""

@@ -1,7 +1,5 @@
 from .config import DistillationConfig as DistillationConfig
 from .config import SteerConfig as SteerConfig
-from .contactmap import ContactMap as ContactMap
-from .contactmap import Peak as Peak
 from .distillation import DecoderDistillation as DecoderDistillation
 from .listening import Listener as Listener
 from .locate import locate as locate

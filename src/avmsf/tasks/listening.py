@@ -18,8 +18,8 @@ from torch import Tensor
 from avmsf.capture.onset import find_onset
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
+from avmsf.localization.contact_map import ContactMap
 from avmsf.modal.bank import ModalBank
-from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.locate import judged
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.ringing import Ringing

@@ -7,13 +7,13 @@ from avmsf._utils.arrays import ArrayLike
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
-from avmsf.tasks.contactmap import ContactMap
+from avmsf.localization.contact_map import ContactMap
 from avmsf.tasks.hearing import Sound, hear
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.posterior import Force
 
 STRANGE = 0.5
-"""Misfit (see `ContactMap.misfit`) above which a sound is taken for another object's."""
+"""Mismatch ratio (see `ContactMap`) above which a sound is taken for another object's."""
 DOUBTFUL = 0.3
 """The same, above which a note says that it may be."""
 UNLIKE = 0.1
@@ -65,17 +65,17 @@ def judged(found: ContactMap) -> ContactMap:
     """Return where an impact was, with a refusal where that cannot be found, and with a note where it is uncertain.
 
     A sound is refused where an object's modes do not fit it, and where the field explains its gains, over all
-    positions, no better than noise would. The thresholds of the misfit come of simulated plates of wood, plastic,
-    ceramic and steel, a measured aircraft and a recorded bowl: their own sounds have misfits of .3 at most, as long as
-    noise is no louder than they are, and 98 in 100 of others more than .5. `python -m benchmarks.locating --parts
-    strangers` reports what is refused of other sounds and of an object's own.
+    positions, no better than noise would. The thresholds of the mismatch ratio come from simulated plates of wood,
+    plastic, ceramic and steel, a measured aircraft and a recorded bowl: their own sounds have ratios of .3 at most, as
+    long as noise is no louder than they are, and 98 in 100 of others more than .5. `python -m benchmarks.locating
+    --parts strangers` reports what is refused of other sounds and of an object's own.
     """
-    share = f"the object's modes explain {100 * found.modal:.0f} % of it, detuned modes {100 * found.detuned:.0f} %"
-    if found.misfit > STRANGE:
+    modal, null, ratio = 100 * found.modal_energy, 100 * found.null_energy, found.mismatch_ratio
+    share = f"the object's modes explain {modal:.0f} % of it, detuned modes {null:.0f} %"
+    if ratio > STRANGE:
         refusal = (
-            f"expected a misfit of at most {DOUBTFUL:g}, as of this object's impacts, got a misfit of "
-            f"{found.misfit:.2f}: another object, no impact, or noise ({share}); record it again, or choose another "
-            "field"
+            f"expected a mismatch ratio of at most {DOUBTFUL:g}, as of this object's impacts, got a mismatch ratio of "
+            f"{ratio:.2f}: another object, no impact, or noise ({share}); record it again, or choose another field"
         )
         return replace(found, refusal=refusal)
     if found.evidence <= 0.0:
@@ -85,12 +85,12 @@ def judged(found: ContactMap) -> ContactMap:
             "recordings"
         )
         return replace(found, refusal=refusal)
-    if found.misfit > DOUBTFUL:
-        note = f"the sound may be of another object, or hold other sounds: a misfit of {found.misfit:.2f} ({share})"
-    elif found.explained < UNLIKE:
+    if ratio > DOUBTFUL:
+        note = f"the sound may be of another object, or hold other sounds: a mismatch ratio of {ratio:.2f} ({share})"
+    elif found.explained_energy < UNLIKE:
         note = (
-            f"the position may be wrong: an impact at the most probable one explains {100 * found.explained:.0f} % of "
-            f"the sound ({share})"
+            "the position may be wrong: an impact at the most probable one explains "
+            f"{100 * found.explained_energy:.0f} % of the sound ({share})"
         )
     else:
         return found

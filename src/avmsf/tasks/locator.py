@@ -15,9 +15,9 @@ from avmsf._utils.summary import short_repr
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
+from avmsf.localization.contact_map import ContactMap
 from avmsf.modal.bank import ModalBank
 from avmsf.tasks.amplitudes import Amplitudes, Extractor
-from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.detuning import OutOfTune
 from avmsf.tasks.foretelling import foretell, patches, unknown, widened
 from avmsf.tasks.hearing import not_finite, silent, too_short

@@ -17,10 +17,10 @@ from avmsf.capture.prepare import remove_rumble, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, LocationError
 from avmsf.field.soundfield import SoundField
+from avmsf.localization.contact_map import ContactMap
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.synthesis import synthesize
 from avmsf.tasks.amplitudes import Extractor
-from avmsf.tasks.contactmap import ContactMap
 from avmsf.tasks.hearing import (
     Sound,
     as_recording,

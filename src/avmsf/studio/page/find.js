@@ -41,7 +41,7 @@ export function findSheet(studio) {
       if (asked.number !== newest) continue;
       const answer = await attempt(() => searched, "locate");
       if (!answer) continue;
-      if (answer.revision === undefined || answer.revision === studio.revision) show(answer.blows, asked.name);
+      if (answer.revision === undefined || answer.revision === studio.revision) show(answer.impacts, asked.name);
       else tellStale(answer.revision, asked);
     }
     [running, busy.hidden] = [false, true];
@@ -105,9 +105,11 @@ function paintBlow(studio, blow) {
   });
   if (!studio.view) return values;
   clearFound(studio);
-  studio.view.face(blow.place);
-  mark(studio, "found", blow.place, "estimate");
-  (blow.counterparts ?? []).forEach(({ place }, number) => mark(studio, `counterpart-${number}`, place, "equivalent"));
+  studio.view.face(blow.position);
+  mark(studio, "found", blow.position, "estimate");
+  (blow.equivalent_points ?? []).forEach(({ position }, number) =>
+    mark(studio, `equivalent-${number}`, position, "equivalent"),
+  );
   return values;
 }
 
@@ -121,27 +123,27 @@ function mark(studio, name, place, words) {
 function clearFound(studio) {
   if (!studio.view) return;
   for (const name of [...studio.view.marks.keys()])
-    if (name === "found" || name.startsWith("counterpart-")) studio.view.unmark(name);
+    if (name === "found" || name.startsWith("equivalent-")) studio.view.unmark(name);
 }
 
 const percent = (share) => `${(100 * share).toPrecision(2)} %`;
 
 function describe(studio, blow) {
-  const { level, radius_meters: radius, share } = blow.region;
+  const { probability: level, radius, surface_fraction: share } = blow.credible_region;
   const facts = [
-    ["Contact", `${millimeters(blow.place)} mm`],
+    ["Contact", `${millimeters(blow.position)} mm`],
     [`${percent(level)} region`, `${(1000 * radius).toFixed(1)} mm radius, ${percent(share)} of the surface`],
   ];
-  if (blow.explained !== undefined && blow.explained !== null)
-    facts.push(["Explained energy", `${percent(blow.explained)} of the sound`]);
+  if (blow.explained_energy !== undefined && blow.explained_energy !== null)
+    facts.push(["Explained energy", `${percent(blow.explained_energy)} of the sound`]);
   const list = element("dl", { className: "measures" });
   for (const [name, words] of facts) list.append(element("dt", {}, name), element("dd", {}, words));
   const parts = [list, button("Strike here", () => studio.strike(blow.row))];
-  if (blow.counterparts?.length) {
+  if (blow.equivalent_points?.length) {
     parts.push(element("h3", {}, "Equivalent contacts"));
     const places = element("ul", { className: "listing" });
-    for (const { place, probability, words } of blow.counterparts) {
-      const text = `${millimeters(place)} mm, ${percent(probability)}${words ? `: ${words}` : ""}`;
+    for (const { position, probability, message } of blow.equivalent_points) {
+      const text = `${millimeters(position)} mm, ${percent(probability)}${message ? `: ${message}` : ""}`;
       places.append(element("li", {}, text));
     }
     parts.push(places);

@@ -1,0 +1,325 @@
+"""The posterior of the contact of one impact: a distance and a probability for every point of the surface."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avmsf._utils.summary import short_repr
+from avmsf.errors import AvmsfError, LocationError
+from avmsf.field.soundfield import SoundField
+from avmsf.scene.symmetry import MirrorSymmetry, RotationalSymmetry, Symmetries
+from avmsf.scene.symmetrysearch import find_symmetries
+
+LEVEL = 0.9
+"""Probability of a credible region by default."""
+COMPARABLE = 0.25
+"""Fraction of the first peak's probability from which on another peak is reported."""
+LOCATED, NOT_LOCATED = "located", "not located"
+"""Status of a recording."""
+_LEAST_RESIDUAL = 0.01
+"""Lower bound of the energy fraction that detuned modes leave: less is within rounding and noise."""
+_LINK_SPACINGS = 2.5
+_LINK_FRACTION = 0.04
+_ANGLES = 360
+"""Angles tried for a rotation about an axis that allows any."""
+_SYMMETRY_POINTS = 600
+"""Points of the object in which symmetries are searched."""
+_MISSING = 0.02
+"""Fraction of the points that may have no image: a field's points cover their object."""
+
+
+@dataclass(frozen=True, eq=False)
+class Peak:
+    """A connected set of points where the contact may be."""
+
+    __repr__ = short_repr
+
+    row: int
+    """Index of its most probable point."""
+    position: Float32[Tensor, " 3"]
+    """Where that is, object frame, meters."""
+    probability: float
+    """That the contact is one of its points."""
+    points: Bool[Tensor, " points"]
+    """Which points it contains."""
+
+
+@dataclass(frozen=True, eq=False)
+class EquivalentPoint:
+    """A position about as probable as the most probable one, and the symmetry that maps one to the other."""
+
+    position: Float32[Tensor, " 3"]
+    """Object frame, meters."""
+    probability: float
+    """That the contact is there."""
+    symmetry: RotationalSymmetry | MirrorSymmetry | None
+    """The symmetry that maps the most probable position to this one; None if no known one does."""
+    angle: float | None
+    """Its angle in radians, for a rotation."""
+
+    def __str__(self) -> str:
+        where = " ".join(f"{round(value, 4) + 0.0:.4g}" for value in self.position.tolist())
+        if self.symmetry is None:
+            why = "no known symmetry of the object explains it"
+        elif isinstance(self.symmetry, MirrorSymmetry):
+            why = f"its image in the {self.symmetry}"
+        else:
+            assert self.angle is not None
+            axis = str(self.symmetry).split(" about ")[1]
+            why = f"its rotation by {math.degrees(self.angle):.0f} degrees about {axis}"
+        return f"also at ({where}) m, with {100 * self.probability:.0f} %: {why}"
+
+    @classmethod
+    def of(
+        cls,
+        first: Float[Tensor, " 3"],
+        other: Float[Tensor, " 3"],
+        symmetries: Symmetries | None,
+        *,
+        probability: float,
+        tolerance: float,
+    ) -> "EquivalentPoint":
+        """Return `other` with the symmetry that maps `first` nearest to it; positions and tolerance in meters.
+
+        Images farther than `tolerance` from `other` do not count, nor do symmetries that leave `first` about where it
+        is.
+        """
+        nearest, found, turned = tolerance, None, None
+        for symmetry, angle, image in _images(first, symmetries):
+            distance = float((image - other.double()).norm())
+            if distance < nearest and float((image - first.double()).norm()) > distance:
+                nearest, found, turned = distance, symmetry, angle
+        return cls(other, probability, found, turned)
+
+
+@dataclass(frozen=True, eq=False)
+class ContactMap:
+    """The posterior of one impact's contact over the points of a surface, and the paper's cosine distance.
+
+    See the paper's section Contact Localization. Methods with a `level` raise LocationError for one that is not between
+    0 and 1. What depends on the position raises LocationError where the recording was rejected (`refusal`).
+    """
+
+    def __repr__(self) -> str:
+        if self.refusal is not None:
+            return f"ContactMap({len(self.points)} points, no position: {self.refusal})"
+        _, *others = self.peaks()
+        where = ", ".join(f"{value + 0.0:.3f}" for value in self.position.tolist())
+        more = f", {len(others)} more positions as probable" if others else ""
+        radius = f"{LEVEL:.0%} within {1e3 * self.credible_radius():.2g} mm"
+        return f"ContactMap({len(self.points)} points, most probable ({where}) m, {radius}{more})"
+
+    points: Float32[Tensor, "points 3"]
+    """Object frame, meters."""
+    distance: Float64[Tensor, " points"]
+    """The paper's cosine distance between recorded and predicted gains, for an impact of either polarity: 0 where they
+    agree up to a factor, 1 where they are orthogonal."""
+    probability: Float64[Tensor, " points"]
+    """That the contact is on the part of the surface that a point represents; sums to one."""
+    explained_energy: float
+    """Fraction of the sound's energy, without its noise, that an impact at the point of greatest likelihood explains,
+    0 to 1."""
+    modal_energy: float
+    """Fraction of the same energy that the object's modes explain with free amplitudes, 0 to 1."""
+    null_energy: float
+    """Fraction of it that they explain on average when detuned, 0 to 1: the null model."""
+    force: float = 1.0
+    """Force of that impact, with its sign, relative to one that sounds as the field renders it."""
+    notes: tuple[str, ...] = field(default=())
+    """What a user should know about the recording, in sentences."""
+    evidence: float = math.inf
+    """Log Bayes factor of an impact somewhere on the object against noise (see `avmsf.tasks.posterior`): 0 where both
+    explain the sound's gains equally well."""
+    refusal: str | None = None
+    """Why the recording was rejected, as that of another object; None if it was located."""
+
+    @property
+    def best(self) -> int:
+        """Index of the point of least cosine distance, the paper's answer, which has no uncertainty; see `position`."""
+        return int(torch.argmin(self.distance))
+
+    @property
+    def mismatch_ratio(self) -> float:
+        """Energy that the object's modes do not explain over that which detuned modes do not explain.
+
+        0 to .3 for recordings of the object, mostly above .5 for those of others.
+        """
+        return (1.0 - self.modal_energy) / max(1.0 - self.null_energy, _LEAST_RESIDUAL)
+
+    @property
+    def most_probable(self) -> int:
+        """Index of the most probable point."""
+        return int(torch.argmax(self.probability))
+
+    @property
+    def position(self) -> Float32[Tensor, " 3"]:
+        """The most probable position, object frame, meters."""
+        self._expect_located("position")
+        return self.points[self.most_probable]
+
+    def region(self, level: float = LEVEL) -> Bool[Tensor, " points"]:
+        """Return the smallest set of points that contains the contact with a probability of `level` or more."""
+        self._expect_located("region")
+        _expect_probability(level)
+        order = torch.argsort(self.probability, descending=True, stable=True)
+        before = torch.cumsum(self.probability[order], 0) - self.probability[order]
+        inside = torch.zeros(len(self.points), dtype=torch.bool)
+        inside[order[before < level]] = True
+        return inside
+
+    def credible_radius(self, level: float = LEVEL) -> float:
+        """Return the distance from `position` within which the contact lies with a probability of `level`, meters."""
+        _expect_probability(level)
+        order = torch.argsort(self._distances, stable=True)
+        reached = torch.cumsum(self.probability[order], 0) >= level * self.probability.sum()
+        return float(self._distances[order][int(reached.double().argmax())])
+
+    @property
+    def position_std(self) -> float:
+        """Root mean square distance of the contact from `position`, meters."""
+        return float((self.probability * self._distances.square()).sum().sqrt())
+
+    @property
+    def _distances(self) -> Float64[Tensor, " points"]:
+        return (self.points.double() - self.position.double()).norm(dim=1)
+
+    @cached_property
+    def linking_length(self) -> float:
+        """Meters up to which two points of a region belong to one peak.
+
+        Two and a half times the distance between neighboring points, and no less than 4 % of the object's diagonal.
+        """
+        positions = self.points.double().numpy()
+        diagonal = float(np.linalg.norm(np.ptp(positions, axis=0)))
+        if len(positions) < 2:
+            return diagonal
+        spacing = float(np.median(cKDTree(positions).query(positions, k=2)[0][:, 1]))
+        return max(_LINK_SPACINGS * spacing, _LINK_FRACTION * diagonal)
+
+    def peaks(self, level: float = LEVEL, *, comparable: float = COMPARABLE) -> tuple[Peak, ...]:
+        """Return the peaks of comparable probability in the credible region, the most probable first.
+
+        A peak is a set of the region's points that are linked by steps of at most `linking_length`. Comparable are
+        peaks with at least that fraction of the first one's probability.
+        """
+        rows = torch.nonzero(self.region(level)).flatten()
+        positions = self.points[rows].double().numpy()
+        pairs = cKDTree(positions).query_pairs(self.linking_length, output_type="ndarray")
+        links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(rows), len(rows)))
+        count, labels = connected_components(links, directed=False)
+        found = []
+        for label in range(count):
+            own = rows[torch.from_numpy(labels == label)]
+            row = int(own[torch.argmax(self.probability[own])])
+            members = torch.zeros(len(self.points), dtype=torch.bool)
+            members[own] = True
+            found.append(Peak(row, self.points[row], float(self.probability[own].sum()), members))
+        found.sort(key=lambda peak: (-peak.probability, peak.row))
+        return tuple(peak for peak in found if peak.probability >= comparable * found[0].probability)
+
+    @property
+    def multimodal(self) -> bool:
+        """Whether the posterior has several peaks of comparable probability."""
+        return len(self.peaks()) > 1
+
+    def equivalent_points(
+        self, symmetries: Symmetries | None = None, level: float = LEVEL
+    ) -> tuple[EquivalentPoint, ...]:
+        """Return the other positions that are about as probable, each with the symmetry that explains it.
+
+        That symmetry is named which maps the first position nearest to the other, if nearer than twice
+        `linking_length`. Empty for a posterior of one peak.
+        """
+        first, *others = self.peaks(level)
+        tolerance = 2.0 * self.linking_length
+        return tuple(
+            EquivalentPoint.of(
+                first.position, each.position, symmetries, probability=each.probability, tolerance=tolerance
+            )
+            for each in others
+        )
+
+    def describe(self, symmetries: Symmetries | None = None, level: float = LEVEL) -> dict[str, Any]:
+        """Return the results as plain values, lengths in meters; of a rejected recording the status and the reason."""
+        common = {
+            "explained_energy": self.explained_energy,
+            "modal_energy": self.modal_energy,
+            "mismatch_ratio": self.mismatch_ratio,
+            "log_bayes_factor": self.evidence,
+            "notes": list(self.notes),
+        }
+        if self.refusal is not None:
+            return not_located(self.refusal) | common
+        others = self.equivalent_points(symmetries, level)
+        return {
+            "status": LOCATED,
+            "position": self.position.tolist(),
+            "credible_region": {
+                "probability": level,
+                "radius": self.credible_radius(level),
+                "surface_fraction": float(self.region(level).double().mean()),
+            },
+            **common,
+            "force": self.force,
+            "cosine": {"position": self.points[self.best].tolist(), "distance": float(self.distance[self.best])},
+            "multimodal": bool(others),
+            "equivalent_points": [
+                {"position": each.position.tolist(), "probability": each.probability, "message": str(each)}
+                for each in others
+            ],
+        }
+
+    def _expect_located(self, name: str) -> None:
+        if self.refusal is not None:
+            raise LocationError(self.refusal, name=name, value=self.mismatch_ratio)
+
+
+def not_located(reason: str) -> dict[str, Any]:
+    """Return the values for a recording that could not be located."""
+    return {"status": NOT_LOCATED, "reason": " ".join(reason.split()), "position": None}
+
+
+def symmetries_of(field: SoundField) -> Symmetries | None:
+    """Return the symmetries of a field's points; None where these are too few."""
+    try:
+        return find_symmetries(field.gain_field.points, seed=0, missing=_MISSING, limit=_SYMMETRY_POINTS)
+    except AvmsfError:
+        return None
+
+
+def enlarged(symmetries: Symmetries, factor: float) -> Symmetries:
+    """Return the symmetries of an object scaled by `factor` about the origin."""
+    return replace(
+        symmetries,
+        rotations=tuple(replace(each, point=each.point * factor) for each in symmetries.rotations),
+        mirrors=tuple(replace(each, point=each.point * factor) for each in symmetries.mirrors),
+        spacing=symmetries.spacing * factor,
+    )
+
+
+def _images(
+    position: Float[Tensor, " 3"], symmetries: Symmetries | None
+) -> Iterator[tuple[RotationalSymmetry | MirrorSymmetry, float | None, Float[Tensor, " 3"]]]:
+    if symmetries is None:
+        return
+    row = position.double()[None]
+    for mirror in symmetries.mirrors:
+        yield mirror, None, mirror.reflect(row)[0]
+    for rotation in symmetries.rotations:
+        for angle in rotation.angles(_ANGLES)[1:]:
+            yield rotation, angle, rotation.turn(row, angle)[0]
+
+
+def _expect_probability(level: float) -> None:
+    if not 0.0 < level < 1.0:
+        raise LocationError.expected("a probability between 0 and 1, such as 0.9", level, name="level")
