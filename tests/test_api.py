@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -11,9 +12,11 @@ import numpy as np
 import pytest
 import soundfile
 import torch
+import trimesh
 
 import avmsf
 from avmsf.capture import Impacts
+from avmsf.capture.warning import CaptureWarning
 from avmsf.cli import main
 from avmsf.errors import ArrayError, AvmsfError, CaptureError, EvaluationError, FitError, PositionError
 from avmsf.field import FitConfig, SoundField
@@ -292,6 +295,20 @@ def test_contacts_in_another_unit_are_refused_before_anything_is_computed():
     far = avmsf.Capture("plate", replace(given, contacts=1000.0 * given.contacts), plate)
     with raises(CaptureError, name="contacts"):
         SoundField.fit(far, progress=False)
+
+
+def test_contacts_between_the_vertices_of_a_coarse_mesh_are_on_the_object():
+    contacts = capture().impacts.contacts.numpy()
+    box = trimesh.creation.box(bounds=[contacts.min(0) - [0.01, 0.01, 0.01], contacts.max(0) + [0.01, 0.01, 0.0]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CaptureWarning)
+        fitted = SoundField.fit(
+            replace(capture(), surface=avmsf.Surface.of(box.vertices, box.faces)),
+            gain_model="thin-plate",
+            config=PipelineConfig(modes=4),
+            progress=False,
+        )
+    assert fitted.origin.trained_on == capture().impacts.names
 
 
 def test_paths_may_be_strings(tmp_path):

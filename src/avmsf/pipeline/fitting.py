@@ -11,6 +11,7 @@ from rich.progress import Progress as Bar
 
 from avmsf._utils.caching import discard
 from avmsf.capture import Capture, Impacts
+from avmsf.capture.placement import surface_points
 from avmsf.errors import FitError
 from avmsf.field.config import GainModel
 from avmsf.field.fit import Progress, fit
@@ -54,13 +55,11 @@ def fit_capture(
     """
     config = PipelineConfig() if config is None else config
     train = capture.impacts if train is None else train
-    if capture.surface is not None:
-        expect_on_object(capture.impacts, capture.surface.vertices)
-    if features is None:
-        points = _points_of(capture, config, log)
-    else:
-        points = features
-        expect_on_object(capture.impacts, points.points)
+    if features is not None:
+        expect_on_object(capture.impacts, features.points)
+    elif capture.surface is not None:
+        expect_on_object(capture.impacts, surface_points(capture.surface))
+    points = _points_of(capture, config, log) if features is None else features
     if len(train) < _FEW:
         log(f"expected {_FEW} recordings or more to predict gains between contacts well, got {len(train)}")
     # Before the modes: what is wrong with the object's shape shows in less time than they take.
