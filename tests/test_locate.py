@@ -149,8 +149,11 @@ def test_distance_is_one_minus_the_cosine_of_gains():
     heard = torch.cat([sine, cosine], 1)[0].double()
     known = field.known(found.points)
     own = torch.cat([known.mean, known.quadrature], 1).double()
-    expected = 1 - (own @ heard).abs() / own.norm(dim=1) / heard.norm()
-    torch.testing.assert_close(found.distance, expected, atol=1e-4, rtol=0)
+    undelayed = 1 - (own @ heard).abs() / own.norm(dim=1) / heard.norm()
+    # The delay that each point is free to choose hardly matters to the nearest ones.
+    assert bool((found.distance <= undelayed + 1e-4).all())
+    near = undelayed < 1.1 * undelayed.min()
+    torch.testing.assert_close(found.distance[near], undelayed[near], atol=0.02, rtol=0)
 
 
 def test_phase_and_quadrature_are_what_the_field_renders():

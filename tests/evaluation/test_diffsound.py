@@ -209,6 +209,8 @@ def test_a_rendered_sound_is_located_where_it_was_struck():
         sound = rendered().render(points[row : row + 1].float(), directions=down)[0]
         torch.testing.assert_close(locator.place(sound), points[row])
         assert float(locator.distance(-sound)[row]) == pytest.approx(0.0, abs=1e-3)
+        late = torch.nn.functional.pad(sound, (3, 0))
+        torch.testing.assert_close(locator.place(late), points[row])
     with pytest.raises(LocationError):
         locator.place(torch.zeros(SAMPLES))
 

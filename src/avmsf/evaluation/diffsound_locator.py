@@ -11,7 +11,8 @@ from torch import Tensor
 
 from avmsf.errors import LocationError
 from avmsf.evaluation.diffsound import DiffSound
-from avmsf.modal.extraction.least_squares import fit_sine_gains
+from avmsf.localization.cosine_distance import cosine_distance
+from avmsf.modal.extraction.least_squares import fit_gains
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +23,6 @@ class DiffSoundLocator:
     points: Float64[Tensor, "points 3"]
     """Object frame, meters."""
     gains: Float64[Tensor, "points modes"]
-    """Of norm 1; 0 where the body does not move."""
 
     @classmethod
     def of(
@@ -35,21 +35,23 @@ class DiffSoundLocator:
         """Return the locator over points, struck along `directions` (unit vectors) or straight into the surface."""
         places = points.detach().cpu().double()
         gains = renderer.gains(places, directions=directions)
-        return cls(renderer, places, torch.nn.functional.normalize(gains, dim=1))
+        return cls(renderer, places, gains)
 
     def distance(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " points"]:
-        """Return the cosine distance of each point's gains from a sound's, 0 to 1, whichever sign the sound has.
+        """Return the cosine distance of each point's gains from a sound's, 0 to 1 (see `cosine_distance`).
 
-        The sound starts at its onset and has the renderer's sample rate. Raises LocationError where it is silent or not
-        finite.
+        The sound starts about at its onset and has the renderer's sample rate. Raises LocationError where it is silent
+        or not finite.
         """
         heard = sound.detach().cpu()[: self.renderer.samples].double()
         if not bool(torch.isfinite(heard).all()) or not bool(heard.any()):
             raise LocationError(
                 "sound: expected finite samples that are not all 0, got others; record the impact again", name="sound"
             )
-        found = fit_sine_gains(heard[None], self.renderer.bank, sample_rate=self.renderer.sample_rate)[0]
-        return 1.0 - (self.gains @ torch.nn.functional.normalize(found.double(), dim=0)).abs()
+        sine, cosine = fit_gains(heard[None], self.renderer.bank, sample_rate=self.renderer.sample_rate)
+        return cosine_distance(
+            self.gains.to(torch.complex64), torch.complex(sine[0], cosine[0]), self.renderer.bank.frequency
+        )
 
     def place(self, sound: Float[Tensor, " samples"]) -> Float64[Tensor, " 3"]:
         """Return the point of the least distance, meters."""

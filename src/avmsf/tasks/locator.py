@@ -16,6 +16,7 @@ from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
 from avmsf.field.soundfield import SoundField
 from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.cosine_distance import cosine_distance
 from avmsf.modal.bank import ModalBank
 from avmsf.tasks.amplitudes import Amplitudes, Extractor
 from avmsf.tasks.detuning import OutOfTune
@@ -122,7 +123,7 @@ class Locator:
             probability = torch.from_numpy(self.slack @ probability.numpy())
         return ContactMap(
             self.points,
-            length.distance(values, noise, float(found.shift[row])),
+            length.distance(values, noise),
             probability,
             explained,
             amplitudes.explained,
@@ -178,8 +179,8 @@ class _Length:
     extractor: Extractor
     foretold: Foretold
     """Of the mixtures of modes that can be told apart, in units of `unit`."""
-    parts: Complex64[Tensor, "points modes"]
-    """The modes' own gains at each point, over their norm there."""
+    gains: Complex64[Tensor, "points modes"]
+    """The modes' own gains at each point, in units of `unit`."""
     unit: float
     detuned: OutOfTune
 
@@ -207,10 +208,9 @@ class _Length:
                 "gains above 0", 0.0, got="0 at all points", name="field", advice="fit it to other recordings"
             )
         gains = gains / unit
-        parts = gains / gains.norm(dim=1, keepdim=True).clamp_min(1e-30)
         foretold = _mixed(gains, locator.variance[:, heard] / unit**2, extractor)
         detuned = OutOfTune.of(bank, sample_rate=rate, samples=samples, highest=highest)
-        return cls(extractor, foretold, parts, unit, detuned)
+        return cls(extractor, foretold, gains, unit, detuned)
 
     def separate(self, amplitudes: Amplitudes) -> tuple[Complex128[Tensor, " modes"], Float64[Tensor, " modes"]]:
         """Return the amplitudes of mixtures, and the variances of their independent errors."""
@@ -225,19 +225,13 @@ class _Length:
         return None if force is None else replace(force, expected=force.expected * self.unit)
 
     def distance(
-        self, values: Complex128[Tensor, " modes"], noise: Float64[Tensor, " modes"], delay: float
+        self, values: Complex128[Tensor, " modes"], noise: Float64[Tensor, " modes"]
     ) -> Float64[Tensor, " points"]:
-        """Return the cosine distance of each point's gains from the recorded ones without their expected noise.
-
-        The recording's delay, seconds, is taken away: one sample turns high modes by more than gains differ between
-        points.
-        """
+        """Return the cosine distance of each point's gains from the recorded ones without their expected noise."""
         power = values.abs().square()
         kept = ((power - noise) / power.clamp_min(1e-300)).clamp_min(0.0)
         recorded = self.extractor.mixing @ (kept * values)
-        recorded = recorded / recorded.norm().clamp_min(1e-300)
-        turned = recorded * torch.exp(-2.0j * torch.pi * delay * self.extractor.bank.frequency)
-        return (1.0 - (self.parts.to(torch.complex128).conj() @ turned).real.abs()).clamp(0.0, 1.0)
+        return cosine_distance(self.gains, recorded, self.extractor.bank.frequency)
 
     def explained(self, amplitudes: Amplitudes, found: Judgement, row: int) -> float:
         """Return the part of the sound's energy that a blow at a point explains."""

@@ -23,6 +23,7 @@ from jaxtyping import Complex64, Complex128, Float32, Float64, Int64
 from torch import Tensor
 
 from avmsf.errors import LocationError
+from avmsf.localization.cosine_distance import LARGEST_DELAY
 
 MISFITS = (0.8, 0.15, 0.03)
 """How wrong gains may be, relative: what every point is tried with."""
@@ -33,8 +34,6 @@ INDEPENDENT = (0.25, 0.4)
 nothing of a sound even at its best point, and of one that explains all of it. Chosen on plates, with splines and with
 physics, where the 90 % region then held nine blows in ten; elsewhere it held as few as four. So where a field has
 strikes of its own they have the last word (`avmsf.tasks.heed`)."""
-SHIFT = 5e-4
-"""How far the onset may be off, seconds, either way."""
 SHIFT_DEVIATION = 2e-4
 """Standard deviation of that, seconds."""
 _COARSE, _FINE = 0.9, 0.3
@@ -234,8 +233,8 @@ class _Trial:
         frequency = self.foretold.frequency
         heard = self.weights.double() * self.values.abs().square()
         typical = float(((heard * frequency.square()).sum() / heard.sum()).sqrt())
-        count = min(_MOST_SHIFTS, 1 + 2 * math.ceil(SHIFT * 2.0 * math.pi * typical / step))
-        shifts = torch.linspace(-SHIFT, SHIFT, count, dtype=torch.float64)
+        count = min(_MOST_SHIFTS, 1 + 2 * math.ceil(LARGEST_DELAY * 2.0 * math.pi * typical / step))
+        shifts = torch.linspace(-LARGEST_DELAY, LARGEST_DELAY, count, dtype=torch.float64)
         back = torch.polar(torch.ones((), dtype=torch.float64), -2.0 * math.pi * shifts[:, None] * frequency)
         return shifts, (self.values * back).to(torch.complex64)
 
