@@ -299,7 +299,7 @@ def test_contacts_in_another_unit_are_refused_before_anything_is_computed():
 
 def test_contacts_between_the_vertices_of_a_coarse_mesh_are_on_the_object():
     contacts = capture().impacts.contacts.numpy()
-    box = trimesh.creation.box(bounds=[contacts.min(0) - [0.01, 0.01, 0.01], contacts.max(0) + [0.01, 0.01, 0.0]])
+    box = trimesh.creation.box(bounds=[contacts.min(0) - [0.01, 0.01, 0.01], [*contacts.max(0), 0.01, 0.01, 0.0]])
     with warnings.catch_warnings():
         warnings.simplefilter("error", CaptureWarning)
         fitted = SoundField.fit(

@@ -46,7 +46,8 @@ _EXCEPTIONS = 0.5
 _MEMORY = 4_000_000
 """Numbers of a basis held at once."""
 _IMPROBABLE = 1e-6
-"""Probability of a factor, over the most probable one's, below which it is left out."""
+"""Probability of a factor, over the most probable one's, below which it is left out: all of them together change
+probabilities by less than a thousandth."""
 _MARGIN = 0.1
 """Log frequency by which the range of measured modes is widened at both ends."""
 FACTORS = torch.exp(torch.arange(-300, 301, dtype=torch.float64) * 0.01)
@@ -114,20 +115,33 @@ class Elastic(KernelFamily):
         return one.expand(-1, shapes, -1).flatten()
 
     def log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "kernels modes"]:
-        """Return the log probability that each shape is the mode's, times the density of its frequency if it is.
+        """Return the log probability that a mode is each kernel's shape, times the density of its frequency if it is.
 
-        Over the density of a frequency of which nothing is known; averaged over the factors.
+        `log_frequency` is that of frequencies in Hz; see `shape_log_prior`.
         """
         profiles = len(PERTURBATIONS) + len(WIDTHS)
         shared = self.shape_log_prior(log_frequency)[None, :, None]
         return shared.expand(profiles, -1, len(REMAINDERS), -1).flatten(0, 2)
 
     def shape_log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "shapes modes"]:
-        """Return the same of each shape."""
-        weights = self.frequency_weights
-        pairs = torch.nonzero(weights > _IMPROBABLE * weights.max()).flatten()
-        each = self.match(log_frequency, pairs=pairs) + weights[pairs].log()[:, None, None]
-        return torch.logsumexp(each, dim=0)
+        """Return the log probability that a mode is each shape, times the density of its frequency if it is.
+
+        Over the density of a frequency of which nothing is known; averaged over factors and errors by
+        `frequency_weights`. `log_frequency` is that of frequencies in Hz.
+        """
+        weights = self.frequency_weights.reshape(len(FACTORS), -1)
+        # A mode has its body's error or, as an exception, any.
+        weights = (1.0 - _EXCEPTIONS) * weights + _EXCEPTIONS * weights.mean(1, keepdim=True)
+        probable = torch.nonzero(weights.amax(1) > _IMPROBABLE * weights.max()).flatten()
+        batch = max(1, _MEMORY // (len(self.modes) * len(log_frequency)))
+        found = torch.full((len(self.modes), len(log_frequency)), -torch.inf, dtype=torch.float64)
+        for rows in torch.split(probable, batch):
+            square, constant = self._apart(FACTORS[rows], log_frequency, log_frequency)
+            for error, weight in zip(FREQUENCY_ERRORS, weights[rows].T, strict=True):
+                logs = constant + (weight / (error * math.sqrt(2.0 * math.pi))).log()
+                each = torch.logsumexp(square * (-0.5 / error**2) + logs[:, None, None], dim=0)
+                found = torch.logaddexp(found, each)
+        return found
 
     def shape_evidence(self, evidence: Float64[Tensor, "kernels noises series"]) -> Float64[Tensor, "shapes series"]:
         """Return the log evidence of each shape as center, all else being equally probable."""
@@ -141,25 +155,34 @@ class Elastic(KernelFamily):
         return float(FACTORS[self.frequency_weights.reshape(len(FACTORS), -1).sum(1).argmax()])
 
     def match(
-        self,
-        log_frequency: Float64[Tensor, " modes"],
-        *,
-        pairs: Int[Tensor, " pairs"] | None = None,
-        modes: Int[Tensor, " some"] | None = None,
+        self, log_frequency: Float64[Tensor, " modes"], modes: Int[Tensor, " some"] | None = None
     ) -> Float64[Tensor, "pairs shapes some"]:
-        """Return the same for some or all pairs of a factor and an error, as in `frequency_weights`, and some modes."""
-        low, high = float(log_frequency.min()) - _MARGIN, float(log_frequency.max()) + _MARGIN
+        """Return what `shape_log_prior` averages, for each pair of a factor and an error and all or some modes."""
+        chosen = log_frequency if modes is None else log_frequency[modes]
+        square, constant = self._apart(FACTORS, chosen, log_frequency)
         errors = torch.tensor(FREQUENCY_ERRORS, dtype=torch.float64)
-        pairs = torch.arange(len(FACTORS) * len(errors)) if pairs is None else pairs
-        nominal = torch.log(FACTORS[pairs // len(errors), None] * self.modes.frequency)
-        inside = ((nominal > low) & (nominal < high)).sum(1).clamp_min(1).double()
         shares = (1.0 - _EXCEPTIONS) * torch.eye(len(errors), dtype=torch.float64) + _EXCEPTIONS / len(errors)
-        constants = torch.log(shares / (errors * math.sqrt(2.0 * math.pi)))[pairs % len(errors)]
-        square = (log_frequency[slice(None) if modes is None else modes] - nominal[..., None]).square_()
-        found = torch.full_like(square, -torch.inf)
-        for error, constant in zip(FREQUENCY_ERRORS, constants.T, strict=True):
-            found = torch.logaddexp(found, square * (-0.5 / error**2) + constant[:, None, None])
-        return found.add_((math.log(high - low) - inside.log())[:, None, None])
+        logs = torch.log(shares / (errors * math.sqrt(2.0 * math.pi)))
+        each = [square * (-0.5 / error**2) for error in FREQUENCY_ERRORS]
+        pairs = [torch.logsumexp(torch.stack([a + b for a, b in zip(each, row, strict=True)]), dim=0) for row in logs]
+        return (torch.stack(pairs, dim=1) + constant[:, None, None, None]).flatten(0, 1)
+
+    def _apart(
+        self,
+        factors: Float64[Tensor, " factors"],
+        log_frequency: Float64[Tensor, " some"],
+        measured: Float64[Tensor, " modes"],
+    ) -> tuple[Float64[Tensor, "factors shapes some"], Float64[Tensor, " factors"]]:
+        """Return squared distances of log frequencies from the nominal ones times factors, and log constants.
+
+        The constants are the log probability of each shape within the range of the measured modes, over the density of
+        a frequency of which nothing is known.
+        """
+        low, high = float(measured.min()) - _MARGIN, float(measured.max()) + _MARGIN
+        nominal = torch.log(factors[:, None] * self.modes.frequency)
+        inside = ((nominal > low) & (nominal < high)).sum(1).clamp_min(1).double()
+        square = (log_frequency - nominal[..., None]).square_()
+        return square, math.log(high - low) - inside.log()
 
     @cached_property
     def _known(self) -> Float64[Tensor, "contacts shapes"]:

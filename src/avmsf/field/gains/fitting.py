@@ -162,7 +162,7 @@ def weigh_factors(families: Sequence[WeighedFamily], measured: MeasuredGains) ->
     rows = torch.topk(energy, min(_STRONGEST, int(measured.distinct.sum()))).indices
     for each in families:
         if isinstance(each.family, Elastic):
-            density = each.family.match(torch.log(measured.frequency), modes=rows)
+            density = each.family.match(torch.log(measured.frequency), rows)
             single = torch.logsumexp(density + _shape(each, each.family)[:, rows], dim=1)
             both = torch.logaddexp(single, unknown[rows])
             each.family.frequency_weights = torch.softmax(both.sum(1) + frequency_log_prior(), dim=0)
