@@ -16,13 +16,22 @@ from statistics import mean
 
 from avmsf.bench.clap import Clap
 from avmsf.bench.editing import EditScore, judge, write_scores
-from avmsf.bench.editingobjects import REALIMPACT_26, SHAPES, STRANGERS, KnownObject, PaperFields, recorded_objects
+from avmsf.bench.editingobjects import (
+    PUBLISHED,
+    REALIMPACT_26,
+    SHAPES,
+    STRANGERS,
+    KnownObject,
+    PaperFields,
+    recorded_objects,
+)
 from avmsf.bench.editmethods import GENERATED, EditMethod, Recast, towards_reference, towards_words
 from avmsf.bench.edittasks import RECORDED_TRANSITIONS, SEVEN_TRANSITIONS, EditTask, prompted_tasks
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.capture.datasets.recognize import open_dataset
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.pipeline.config import DINO, PRESETS
+from avmsf.pipeline.features import choose_encoder
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.tasks.config import SteerConfig
 from avmsf.tasks.reference import Reference
@@ -127,7 +136,7 @@ def recorded_cast(folder: Path, *, words: bool, seed: int = 0, paper: tuple[str,
             value=len(REALIMPACT_26) - len(missing),
         )
     tell(f"editing: extracting modes of {len(REALIMPACT_26) - len(missing)} objects")
-    objects = recorded_objects(dataset, paper=None if paper is None else _paper_fields(dataset, *paper))
+    objects = recorded_objects(dataset, paper=None if paper is None else _paper_fields(dataset, *paper, seed=seed))
     present = {each.material for each in objects}
     transitions = [each for each in RECORDED_TRANSITIONS if {each.source, each.target} <= present]
     tasks = prompted_tasks(objects, transitions, seed=seed) if words else tuple(referred_tasks(objects, seed=seed))
@@ -147,9 +156,14 @@ def recorded_cast(folder: Path, *, words: bool, seed: int = 0, paper: tuple[str,
     return Cast("realimpact", objects, tasks, what, known=False, remarks=(left_out,))
 
 
-def _paper_fields(dataset: Dataset, encoder: str, cache: Path) -> PaperFields:
-    looks = ObjectLooks(dataset, cache, paper=replace(PRESETS["paper"].scene.lift, encoder=encoder))
-    return PaperFields(lambda name: looks(name, "paper"))
+def _paper_fields(dataset: Dataset, encoder: str, cache: Path, *, seed: int) -> PaperFields:
+    scene = PRESETS["paper"].scene
+    lift = replace(scene.lift, encoder=encoder, seed=seed)
+    # Before the modes of all objects: without the encoder nothing else is worth its time.
+    choose_encoder(lift, tell=tell)
+    scene = replace(scene, splat=replace(scene.splat, seed=seed), lift=lift)
+    looks = ObjectLooks(dataset, cache, scene, lift)
+    return PaperFields(lambda name: looks(name, "paper"), replace(PUBLISHED, seed=seed), cache / "training")
 
 
 def simulated_cast(*, words: bool, seed: int = 0) -> Cast:

@@ -161,6 +161,15 @@ def test_the_posterior_is_narrow_where_an_impact_was_recorded():
     assert float(near.std.mean()) < float(away.std.mean())
 
 
+def test_suggestions_are_chosen_among_candidates():
+    candidates = field().gain_field.points[::30]
+    found = field().suggest(np.int64(2), candidates=candidates.tolist()).contacts
+    assert len(found) == 2
+    assert float(torch.cdist(found.double(), candidates.double()).amin(1).max()) < 1e-6
+    with raises(ArrayError, name="candidates"):
+        field().suggest(1, candidates=[0.02, 0.03])
+
+
 def test_the_attention_network_has_no_posterior():
     quick = PipelineConfig(gain_model="network", modes=2, fit=FitConfig(steps=0, warmup_steps=1, clusters=4))
     network = SoundField.fit(capture(), config=quick, progress=False)
@@ -299,7 +308,9 @@ def test_contacts_in_another_unit_are_refused_before_anything_is_computed():
 
 def test_contacts_between_the_vertices_of_a_coarse_mesh_are_on_the_object():
     contacts = capture().impacts.contacts.numpy()
-    box = trimesh.creation.box(bounds=[contacts.min(0) - [0.01, 0.01, 0.01], [*contacts.max(0), 0.01, 0.01, 0.0]])
+    margin = np.array([0.01, 0.01, 0.0])
+    low, high = contacts.min(0) - margin - [0.0, 0.0, 0.01], contacts.max(0) + margin
+    box = trimesh.creation.box(bounds=np.stack([low, high]))
     with warnings.catch_warnings():
         warnings.simplefilter("error", CaptureWarning)
         fitted = SoundField.fit(

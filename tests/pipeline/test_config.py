@@ -6,13 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.capture import CaptureSettings
+from avmsf.capture import Capture, CaptureSettings
 from avmsf.cli.options.fit import parse as parse_fit
 from avmsf.cli.options.reconstruct import parse as parse_reconstruct
+from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
+from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.config import PRESETS, PipelineConfig
 from avmsf.pipeline.record import capture_settings_of, finder_of
+from plate_field import plate_impacts
+from raising import raises
 
 PUBLISHED = ("warmup_gains", "warmup_weights", "spectral_norm", "residual_start", "projection")
 """Settings that were made for the paper's values."""
@@ -74,3 +78,8 @@ def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_
 def test_a_preset_that_there_is_not_is_refused() -> None:
     with pytest.raises(SystemExit):
         parse_reconstruct(["mug", "--preset", "quick"])
+
+
+def test_a_capture_with_another_start_of_sounds_than_the_presets_is_refused() -> None:
+    with raises(FitError, name="time_zero", value="onset"):
+        SoundField.fit(Capture("plate", plate_impacts()), config=PRESETS["paper"], progress=False)

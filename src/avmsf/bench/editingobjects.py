@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from pathlib import Path
 from types import MappingProxyType
 
 import torch
@@ -90,11 +91,14 @@ class PaperFields:
     """Makes the visual features of an object, by its name."""
     config: FitConfig = PUBLISHED
     """Settings of the fit."""
+    checkpoints: Path | None = None
+    """Folder for the states of training, which a repeated call goes on from."""
 
     def object(self, name: str, material: str, impacts: Impacts) -> "KnownObject":
         """Return an object of a name. Raises ExtractionError where no mode is found."""
         modes = extract_sounds(impacts.sounds, sample_rate=impacts.sample_rate, method=ShortTime())
-        return KnownObject(name, material, impacts, modes, Attention(), partial(self.features, name), self.config)
+        kept = None if self.checkpoints is None else self.checkpoints / name
+        return KnownObject(name, material, impacts, modes, Attention(), partial(self.features, name), self.config, kept)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +116,8 @@ class KnownObject:
     """Makes the points of its surface with what the gain model reads; the contacts alone where nothing is known."""
     config: FitConfig = DIRECT
     """Settings of its field."""
+    checkpoint: Path | None = None
+    """File for the state of the field's training."""
 
     @property
     def bank(self) -> ModalBank:
@@ -122,7 +128,17 @@ class KnownObject:
     def sound_field(self) -> SoundField:
         """Its field."""
         features = FeatureField.from_points(self.impacts.contacts) if self.features is None else self.features()
-        return fit(self.impacts, features, self.modes, self.config, gains=self.recipe, capture=self.name)
+        if self.checkpoint is not None:
+            self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        return fit(
+            self.impacts,
+            features,
+            self.modes,
+            self.config,
+            gains=self.recipe,
+            capture=self.name,
+            checkpoint=self.checkpoint,
+        )
 
 
 def heard_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = math.inf) -> ModalBank:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, SupportsIndex
 
 import torch
 from jaxtyping import Bool, Complex, Float, Float64
@@ -224,14 +224,19 @@ class SoundField:
         std = std_of(self, contacts, ways).square().sum(2).sqrt()
         return GainPosterior(self.complex_gains(contacts, directions=ways), std)
 
-    def suggest(self, count: int = 5) -> "Suggestions":
+    def suggest(
+        self, count: SupportsIndex = 5, *, candidates: ArrayLike | None = None, unseen: bool = False
+    ) -> "Suggestions":
         """Return where the next `count` impacts lower the field's expected error most.
 
-        Raises FitError as `posterior`.
+        `candidates` are the positions to choose from (object frame, meters, on the surface), without them all that a
+        hammer reaches from outside. With `unseen` they are on all of the body's surface, also where no photograph shows
+        it. Raises FitError as `posterior` and as `avmsf.field.suggest.suggest`.
         """
         from avmsf.field.suggest import suggest
 
-        return suggest(self, count)
+        pool = None if candidates is None else as_vectors(candidates, "candidates")
+        return suggest(self, count, candidates=pool, unseen=unseen)
 
     def locate(self, recording: "Sound", *, sample_rate: float | int | None = None) -> "ContactMap":
         """Return where on the object a recorded impact was: points with probabilities.

@@ -1,7 +1,9 @@
 """Where to strike next: the places whose recordings would reduce the expected error of the whole field most."""
 
 import math
+import operator
 from dataclasses import dataclass
+from typing import SupportsIndex
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int
@@ -60,7 +62,7 @@ class Suggestions:
 
 def suggest(
     field: SoundField,
-    count: int = 5,
+    count: SupportsIndex = 5,
     *,
     candidates: Float[Tensor, "candidates 3"] | None = None,
     directions: Float[Tensor, "_given 3"] | None = None,
@@ -78,8 +80,7 @@ def suggest(
     none of which a hammer gets to, and `unseen` without a body.
     """
     gains = unedited_mixture(field)
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise FitError(f"count: expected a whole number of 1 or more, got {count!r}", name="count", value=count)
+    count = _whole(count)
     surface = _body_nodes(gains) if unseen else gains.points
     points = surface[farthest_points(surface, min(PLACES, len(surface)))].double()
     _expect_directions(directions, candidates)
@@ -227,6 +228,14 @@ def _weighed(
         return torch.arange(len(places))
     open_to = torch.nonzero(allowed).flatten()
     return open_to[farthest_points(places[open_to], min(most, len(open_to)))].sort().values
+
+
+def _whole(count: SupportsIndex) -> int:
+    """Return a number of contacts. Raises FitError for what is no whole number above 0."""
+    found = operator.index(count) if hasattr(count, "__index__") and not isinstance(count, bool) else 0
+    if found < 1:
+        raise FitError.expected("a whole number of 1 or more", count, name="count")
+    return found
 
 
 def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates: Tensor | None) -> None:

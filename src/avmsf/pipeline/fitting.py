@@ -55,11 +55,14 @@ def fit_capture(
     """
     config = PipelineConfig() if config is None else config
     train = capture.impacts if train is None else train
+    _expect_start(capture, config)
     if features is not None:
         expect_on_object(capture.impacts, features.points)
     elif capture.surface is not None:
         expect_on_object(capture.impacts, surface_points(capture.surface))
     points = _points_of(capture, config, log) if features is None else features
+    if features is None and config.gain_model == "network":
+        log("no visual features were given: the network reads positions alone")
     if len(train) < _FEW:
         log(f"expected {_FEW} recordings or more to predict gains between contacts well, got {len(train)}")
     # Before the modes: what is wrong with the object's shape shows in less time than they take.
@@ -93,6 +96,18 @@ def fit_capture(
             discard(unfinished(output, "modes"))
         raise
     return with_record(fitted, config, features_report or {}), modes
+
+
+def _expect_start(capture: Capture, config: PipelineConfig) -> None:
+    """Raise FitError where the sounds of a folder were read with another start than the configuration has."""
+    found = capture.settings.time_zero
+    if config.time_zero not in (None, found):
+        raise FitError.expected(
+            f"sounds that start at the {config.time_zero}",
+            found,
+            name="time_zero",
+            advice="read the capture with CaptureSettings of this time_zero, or set time_zero=None",
+        )
 
 
 def fit_with_progress(
