@@ -207,11 +207,11 @@ def test_the_order_of_gaussians_changes_nothing():
 def test_contact_object_duration_and_dropped_conditions_change_the_velocity():
     one, other = (normalized(each, first_nine(each)) for each in (cloud(60), cloud(60, seed=1)))
     latents, times, place = torch.randn(1, 64, 8), torch.tensor([0.4]), torch.rand(1, 3)
-    tokens = model().condition(one, place)
+    tokens = model().condition(model().gaussians(one), place)
     base = model().velocity(latents, times, tokens, seconds=1.0)
     for changed in (
-        model().velocity(latents, times, model().condition(one, place + 0.3), seconds=1.0),
-        model().velocity(latents, times, model().condition(other, place), seconds=1.0),
+        model().velocity(latents, times, model().condition(model().gaussians(one), place + 0.3), seconds=1.0),
+        model().velocity(latents, times, model().condition(model().gaussians(other), place), seconds=1.0),
         model().velocity(latents, times, tokens, seconds=2.5),
         model().velocity(latents, times, tokens, seconds=1.0, kept=torch.zeros(1, 1, 1)),
         model().velocity(latents, times + 0.2, tokens, seconds=1.0),

@@ -144,10 +144,11 @@ class PublishedSonicGauss(nn.Module):
         parts = (self.generator.transformer, self.generator.fc, self.gaussians, self.contact, self.fusion)
         return [weight for part in parts for weight in part.parameters()]
 
-    def condition(self, seen: Normalized, places: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch both width"]:
-        """Return the tokens of an object and of contacts in its cube."""
-        tokens = self.gaussians(seen).expand(len(places), -1, -1)
-        fused: Tensor = self.fusion(tokens, self.contact(places))
+    def condition(
+        self, tokens: Float[Tensor, "1 tokens width"], places: Float[Tensor, "batch 3"]
+    ) -> Float[Tensor, "batch both width"]:
+        """Return the tokens of an object, as `gaussians` encodes it, and of contacts in its cube."""
+        fused: Tensor = self.fusion(tokens.expand(len(places), -1, -1), self.contact(places))
         return fused
 
     def velocity(

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -27,11 +28,17 @@ class PublishedRenderer(TunedRenderer):
     peak: float
     """Of the loudest training recording, in the recordings' unit."""
 
+    @cached_property
+    def _tokens(self) -> Float[Tensor, "1 tokens width"]:
+        """The encoded Gaussians, the same for all contacts."""
+        with torch.no_grad():
+            return self.model.gaussians(self.seen)
+
     def _sound(self, place: Float[Tensor, "3"]) -> Float[Tensor, " samples"]:
         model, device = self.model, _device_of(self.model)
         channels = int(model.sizes.transformer["in_channels"])
         noise = torch.randn(1, FRAMES, channels, generator=torch.Generator().manual_seed(self.seed)).to(device)
-        tokens = model.condition(self.seen, place[None].to(device))
+        tokens = model.condition(self._tokens, place[None].to(device))
         seconds = self.samples / self.sample_rate
         latents = integrate(lambda z, s: model.velocity(z, s, tokens, seconds=seconds), noise, steps=self.steps)
         sound = model.autoencoder.decode(latents.mT).sample.mean(1).float().cpu()
@@ -60,7 +67,7 @@ def fit_published(
         noise = torch.randn(means[rows].shape, generator=generator)
         latents = (means[rows] + deviations[rows] * noise).to(device)
         kept = (torch.rand(len(rows), 1, 1, generator=generator) >= DROPPED).to(latents)
-        tokens = model.condition(seen, contacts[rows.to(device)])
+        tokens = model.condition(model.gaussians(seen), contacts[rows.to(device)])
         return flow_loss(
             lambda z, s: model.velocity(z, s, tokens, seconds=seconds, kept=kept), latents, generator=generator
         )
