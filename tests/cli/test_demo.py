@@ -38,14 +38,15 @@ def test_the_demo_goes_all_the_way(
     )
     monkeypatch.setattr(demo, "CONFIG", PipelineConfig("network", scene=small, fit=QUICK))
     folder = tmp_path / "demo"
-    assert main(["demo", str(folder)]) == 0
+    assert main(["demo", str(folder), "--json"]) == 0
     out, err = capsys.readouterr()
     assert all(f"{stage}: " in err for stage in ("check", "splat", "lift", "modes", "fit", "page"))
     told = json.loads((folder / "demo.json").read_text())
     error = {method: each["relative_stft"] for method, each in told["scores"].items()}
     assert error["lower bound: the held-out recordings' own gains"] < error["field"] < error["white noise"]
     best = min(METHODS, key=lambda name: error[name])
-    assert f"has {METHODS[best]}." in out
+    assert f"has {METHODS[best]}." in err
+    assert json.loads(out) == {"output": str(folder), **told}
     assert "| field |" in (folder / "scores.md").read_text()
     files = {each.relative_to(folder).as_posix() for each in folder.rglob("*") if each.is_file()}
     assert files == set(told["files"])

@@ -647,10 +647,10 @@ def test_the_page_takes_its_libraries_from_here_where_they_are(tmp_path: Path, m
 def test_the_command_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
     opened = open_plate(tmp_path / "opened")
     command = [sys.executable, "-c", "import sys; from avmsf.cli import main; sys.exit(main())", "studio"]
-    words = [*command, str(opened.field), "--no-browser", "--port", "0"]
+    words = [*command, str(opened.field), "--no-browser", "--port", "0", "--json"]
     environment = {**os.environ, "TMPDIR": str(tmp_path / "temporary")}
     (tmp_path / "temporary").mkdir()
-    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, env=environment)
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     assert process.stderr is not None
     try:
         line = next(line for line in process.stderr if "http://" in line)
@@ -660,11 +660,12 @@ def test_the_command_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
             assert json.load(answer)["modes"] == 5
         assert list((tmp_path / "temporary").glob("avmsf-studio-*"))
         process.send_signal(signal.SIGINT)
-        rest = process.communicate(timeout=20)[1]
+        out, rest = process.communicate(timeout=20)
     finally:
         process.kill()
     assert process.returncode == 0
     assert rest == "closed\n"
+    assert json.loads(out) == {"address": address}
     assert list((tmp_path / "temporary").iterdir()) == []
 
 

@@ -1,5 +1,6 @@
 """`avmsf demo`: a complete example, from photographs and recordings of a mug to its sound anywhere, with its errors."""
 
+import json
 import shlex
 import shutil
 import sys
@@ -18,7 +19,7 @@ from avmsf.cli.demofolder import RECORD, record, replaced_whole
 from avmsf.cli.modetable import amplitudes, levels
 from avmsf.cli.options.demo import Options
 from avmsf.cli.overallbar import REFINEMENT, OverallBar
-from avmsf.cli.printing import console, figure, json_text, print_text
+from avmsf.cli.printing import console, figure, json_text, print_json, print_text, say
 from avmsf.cli.scores import compare, parts_words, score_markdown, score_table, score_values
 from avmsf.cli.writing import Level, write_sound, write_text
 from avmsf.export.webpage import write_webpage
@@ -62,8 +63,14 @@ def run(options: Options) -> int:
     """Fill the folder, then print a summary."""
     with replaced_whole(options.folder) as begun, OverallBar(STAGES) as bar:
         scores, strikes, report = _go_all_the_way(begun, bar)
-    console(errors=False).print(score_table(_title(*strikes), scores))
-    print_text(closing_words(options.folder, scores, *strikes, report))
+    screen = console(errors=options.json)
+    screen.print(score_table(_title(*strikes), scores))
+    words = closing_words(options.folder, scores, *strikes, report)
+    if options.json:
+        say(words)
+        print_json({"output": str(options.folder), **json.loads((options.folder / RECORD).read_text("utf-8"))})
+    else:
+        print_text(words)
     return 0
 
 

@@ -1,9 +1,10 @@
 """`avmsf studio`: the web page that plays an object, locates impacts, edits fields and records captures."""
 
 import os
+import sys
 
 from avmsf.cli.options.studio import Options
-from avmsf.cli.printing import say
+from avmsf.cli.printing import print_json, say
 from avmsf.cli.writing import OutputError
 from avmsf.errors import StudioError
 
@@ -37,7 +38,7 @@ def run(options: Options) -> int:
         opened,
         port=options.port,
         browser=not options.no_browser,
-        tell=lambda address: say(f"open {address}   (Ctrl-C ends)"),
+        tell=lambda address: _tell(address, json=options.json),
         config=StudioConfig(options.model, options.modes),
     )
     say("closed")
@@ -45,3 +46,11 @@ def run(options: Options) -> int:
         # The interpreter would wait for the thread, or break off in the midst of it with a dump of its memory.
         os._exit(0)
     return 0
+
+
+def _tell(address: str, *, json: bool) -> None:
+    say(f"open {address}   (Ctrl-C ends)")
+    if json:
+        print_json({"address": address})
+        # A program that starts the studio reads this while the page is served.
+        sys.stdout.flush()

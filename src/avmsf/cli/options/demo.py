@@ -7,11 +7,11 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options.common import Common, parse_options
+from avmsf.cli.options.common import Printing, parse_options
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(Printing):
     """Run a complete example: from photographs and recordings of a mug to its sound field, sounds and images.
 
     A ceramic mug, made by `avmsf simulate example`: 48 photographs and 16 impacts. Gaussians are fitted to the

@@ -7,11 +7,11 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options.common import Common, Existing, Flag, parse_options
+from avmsf.cli.options.common import Existing, Flag, Printing, parse_options
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(Printing):
     """Open a web page that plays an object, locates impacts, edits fields and records captures.
 
     The page plays and edits a field and locates recordings with it; of a capture folder, a folder of images or a mesh
