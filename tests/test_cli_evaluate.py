@@ -8,7 +8,7 @@ import pytest
 from avmsf.bench.plan import Evaluation
 from avmsf.cli.evaluate import run
 from avmsf.cli.options.evaluate import parse
-from avmsf.errors import AvmsfError
+from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.pipeline.objectbodies import ObjectBodies
 from plate_set import fill_plates
 from raising import raises
@@ -75,6 +75,27 @@ def test_what_is_wrong_is_said_before_anything_is_written(
     with raises(AvmsfError, file="nowhere"):
         run(parse(["farthest", "nowhere"]))
     assert sorted(path.name for path in plates.parent.iterdir()) == before
+
+
+def test_a_device_that_is_not_there_is_refused_before_anything(plates: Path, tmp_path: Path) -> None:
+    with raises(EvaluationError, name="device"):
+        run(parse(["farthest", str(plates), *CHEAP, "--device", "nothing", "--output", str(tmp_path / "results")]))
+    assert not (tmp_path / "results").exists()
+
+
+def test_methods_train_on_the_device_that_is_asked_for(
+    plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def stop(*given: object, device: str, **settings: object) -> None:
+        asked.append(device)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("avmsf.bench.fieldmethods.fit", stop)
+    words = ["farthest", str(plates), "--methods", "field-auto", "--no-cdpam", "--device", "cpu"]
+    assert run(parse([*words, "--output", str(tmp_path / "results")])) == 130
+    assert asked == ["cpu"]
 
 
 def test_no_figure_at_all_is_an_error(plates: Path, tmp_path: Path) -> None:

@@ -121,6 +121,7 @@ class CaseRun:
             family=self._shared(self.family),
             material=self.material,
             gaussians=self._gaussians,
+            device=self.evaluation.device,
         )
 
     def _modes(self) -> Extraction:

@@ -110,4 +110,4 @@ def fit_field(
     clusters = min(config.clusters, len(torch.unique(features.points, dim=0)))
     recipe = Attention() if gains is None else gains
     config = replace(config, clusters=clusters, seed=task.seed)
-    return fit(train, features, modes, config, gains=recipe, capture=task.name)
+    return fit(train, features, modes, config, gains=recipe, capture=task.name, device=task.device)

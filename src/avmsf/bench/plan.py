@@ -69,6 +69,8 @@ class Evaluation:
     """Settings of the features, as plain values."""
     clouds: CloudMaker | None = None
     """None where no method reads Gaussians."""
+    device: str | None = None
+    """Device that methods train on, with the same result up to rounding; None for a GPU where there is one."""
 
     def begin(self, results: ResultsFolder) -> None:
         """Take a folder for this evaluation's results.

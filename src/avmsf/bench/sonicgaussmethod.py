@@ -38,7 +38,7 @@ class SonicGaussMethod:
     def fit(self, task: Task) -> PublishedRenderer:
         """Fine-tune. Raises AvmsfError for weights of another model, and for an object without Gaussians."""
         model = PublishedSonicGauss.load(self.folder, self.sizes)
-        device = usable_device(None, raising=EvaluationError)
+        device = usable_device(task.device, raising=EvaluationError)
         return fit_published(model.to(device), task.gaussians(), task.train, epochs=self.epochs, seed=task.seed)
 
 

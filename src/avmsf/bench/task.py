@@ -61,6 +61,8 @@ class Task:
     """Material of the object in the dataset, in lower case; None where it is unknown."""
     gaussians: Callable[[], GaussianCloud] = _no_gaussians
     """Fits Gaussians to the object's views. Raises AvmsfError without views."""
+    device: str | None = None
+    """Device to train on; None for a GPU where there is one."""
 
 
 @runtime_checkable

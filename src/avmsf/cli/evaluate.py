@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
+from avmsf._utils.device import usable_device
 from avmsf.bench.cases import Growing
 from avmsf.bench.judging import Judging
 from avmsf.bench.learningcurve import curves, draw_learning_curve
@@ -63,12 +64,13 @@ def run(options: Options) -> int:
         protocol,
         methods,
         (options.cache or folder / "features").resolve(),
-        scene=SceneConfig(ViewsConfig(source=options.look), options.splat, options.lift),
+        scene=SceneConfig(ViewsConfig(source=options.visual_source), options.splat, options.lift),
         geometry=options.geometry,
         body=options.body,
         judging=Judging(level=options.amplitude_scale, cdpam=cdpam, cdpam_contacts=options.cdpam_contacts),
         modes=options.modes,
         seed=options.seed,
+        device=options.device,
     )
     results, groups = ResultsFolder(folder), members(dataset)
     say(f"{protocol.name} on {title}: {len(objects)} objects, {len(methods)} methods, results in {folder}")
@@ -151,14 +153,23 @@ def evaluation_of(
     seed: int,
     body: BodyConfig,
     geometry: Geometry = "mesh",
+    device: str | None = None,
 ) -> Evaluation:
-    """Return the plan of an evaluation that stores features and surfaces in the folder `kept`."""
+    """Return the plan of an evaluation that stores features and surfaces in the folder `kept`.
+
+    Raises SceneError for an encoder, and EvaluationError for a device, that is not available.
+    """
+    if device is not None:
+        usable_device(device, raising=EvaluationError)
     lift, paper = settled_lifts(scene.lift, methods)
     scene = replace(scene, lift=lift)
     settings = {"scene": asdict(scene), "paper": asdict(paper), "geometry": geometry, "body": asdict(body)}
-    looks, bodies = ObjectLooks(dataset, kept, scene, paper), ObjectBodies(dataset, kept, geometry, body, scene)
+    looks = ObjectLooks(dataset, kept, scene, paper, device)
+    bodies = ObjectBodies(dataset, kept, geometry, body, scene, device=device)
     finder = HighResolution(modes=modes)
-    return Evaluation(dataset, title, protocol, methods, looks, bodies, seed, judging, finder, settings, looks.cloud)
+    return Evaluation(
+        dataset, title, protocol, methods, looks, bodies, seed, judging, finder, settings, looks.cloud, device
+    )
 
 
 def run_shown(

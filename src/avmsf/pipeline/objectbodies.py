@@ -33,6 +33,8 @@ class ObjectBodies:
     """How Gaussians are made, where the geometry asks for them."""
     seed: int = 0
     """Start of the chance in the noise."""
+    device: str | None = None
+    """Device of Gaussians; None for a GPU where there is one."""
 
     def __call__(self, identifier: str) -> CandidateBodies:
         """Return an object's bodies. Raises SceneError where its shape is unknown, SimulationError for an unfit one."""
@@ -56,7 +58,11 @@ class ObjectBodies:
             raise SceneError(f"{identifier}: expected a mesh or photographs in the dataset, got none", name=identifier)
         scene = replace(self.scene, views=replace(self.scene.views, source=ViewsConfig().source))
         stages = SceneStages(
-            seen.folder, StageFolder(self.cache / identifier / "all views"), scene, settings=seen.settings
+            seen.folder,
+            StageFolder(self.cache / identifier / "all views"),
+            scene,
+            settings=seen.settings,
+            device=self.device,
         )
         with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
             return stages.shape()

@@ -34,6 +34,8 @@ class ObjectLooks:
     config: SceneConfig = field(default_factory=SceneConfig)
     paper: LiftConfig = PRESETS["paper"].scene.lift
     """How features are made in the paper's form."""
+    device: str | None = None
+    """Device of Gaussians and DINOv2; None for a GPU where there is one."""
 
     def __call__(self, identifier: str, look: Look, views: int | None = None) -> FeatureField:
         """Return what `look` means for an object, from at most `views` views, or from all for None.
@@ -70,7 +72,9 @@ class ObjectLooks:
             raise SceneError(f"{identifier}: expected a mesh or photographs in the dataset, got none", name=identifier)
         config = replace(config, views=replace(config.views, count=views or 0))
         place = self.cache / identifier / ("all views" if views is None else f"{views} views")
-        return SceneStages(seen.folder, StageFolder(place), config, settings=seen.settings, name=name)
+        return SceneStages(
+            seen.folder, StageFolder(place), config, settings=seen.settings, name=name, device=self.device
+        )
 
     def _bare(self, identifier: str) -> FeatureField:
         capture = self.dataset.capture(identifier)

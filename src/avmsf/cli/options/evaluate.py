@@ -43,7 +43,7 @@ class Options(Printing):
     """learning-curve: number of first contacts, evenly spaced in the table, that the choices start from."""
     metric: Literal["relative_stft", "l1", "l1_log", "envelope"] = "relative_stft"
     """learning-curve: metric to draw."""
-    look: Literal["best", "mesh"] = "best"
+    visual_source: Literal["best", "mesh"] = "best"
     """Source of the visual features. best: photographs if there are any, by Gaussians, otherwise the mesh. mesh: the
     mesh, onto its own surface."""
     splat: SplatConfig = field(default_factory=SplatConfig)
@@ -57,6 +57,8 @@ class Options(Printing):
     """Address of a ray cluster to compute on, or auto; its computers have to see data and results at the same paths."""
     seed: int = 0
     """Seed of all methods."""
+    device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
+    """Device for Gaussians (with gsplat), DINOv2 and training; by default the GPU if there is one."""
     geometry: Geometry = "mesh"
     """Shape that finite elements use. mesh: the object's mesh. gaussians: the surface of Gaussians fitted to its views.
     noisy: its mesh with vertices displaced by 2 % of its size."""
