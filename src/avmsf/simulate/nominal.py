@@ -147,7 +147,7 @@ def nominal_bodies(
     bodies = maker.bodies(likely, freedoms, refused)
     reasons = _grouped(refused)
     for reason in reasons:
-        told(f"skipped: {reason}")
+        told(f"candidate model left out: {reason}")
     if not bodies:
         other = "give the wall thickness in meters" if guessed else "give another wall thickness, or none"
         raise SimulationError(
@@ -178,7 +178,7 @@ def with_wall(
     try:
         return _Maker(surface, count, cache, told).body(wall, freedoms, fine=False)
     except SimulationError as error:
-        told(f"skipped: {body_name(wall)}: {error}")
+        told(f"candidate model left out: {body_name(wall)}: {error}")
         return None
 
 
@@ -237,7 +237,7 @@ def supported(
             except SimulationError as error:
                 if support is None:
                     raise
-                told(f"skipped: {body.name}, {support.name}: {error}")
+                told(f"candidate model left out: {body.name}, {support.name}: {error}")
     except SimulationError as error:
         told(f"{body.name}: no supports tested: {error}")
     return tuple(bodies)
