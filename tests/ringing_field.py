@@ -31,6 +31,8 @@ class SameGains:
     def at(self, contacts, directions=None) -> Gains:
         return Gains(self.gains.expand(len(contacts), -1))
 
+    point_estimate = at
+
     def deviation(self, contacts, directions=None) -> None:
         return None
 

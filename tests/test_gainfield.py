@@ -190,7 +190,7 @@ def test_a_field_comes_back_from_its_file_to_the_last_bit(name, tmp_path):
 @every_field
 def test_a_sound_is_the_sum_of_damped_sines_and_cosines(name):
     field = ALL[name]()
-    known, times = field.at(PLACES, BLOWS), torch.arange(600, dtype=torch.float64) / 8000.0
+    known, times = field.point_estimate(PLACES, BLOWS), torch.arange(600, dtype=torch.float64) / 8000.0
     ahead = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
     factors = torch.ones_like(known.mean) if known.damping is None else known.damping
     assert (float(ahead.abs().max()) > 0) == (name not in REAL)

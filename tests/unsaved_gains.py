@@ -6,6 +6,9 @@ import torch
 class Unsaved:
     """A gain field that knows no doubt and is never kept in a file."""
 
+    def point_estimate(self, contacts: torch.Tensor, directions: torch.Tensor | None = None):
+        return self.at(contacts, directions)
+
     def deviation(self, contacts: torch.Tensor, directions: torch.Tensor | None = None) -> None:
         return None
 

@@ -104,6 +104,12 @@ class AttentionGains(TrainableGains):
         """Return the gains at the contacts, for any direction, and the factors where dampings vary."""
         return self.read(self.feature_field.nearest(contacts))
 
+    def point_estimate(
+        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
+        """Return what `at` does."""
+        return self.at(contacts, directions)
+
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
         """Return what `at` does for the points of the given rows; differentiable in the network's parameters."""
         feature = self.features[rows] * self.shape.feature_scale

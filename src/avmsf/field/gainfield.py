@@ -52,6 +52,16 @@ class GainField(Protocol):
         """
         ...
 
+    def point_estimate(
+        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
+        """Return the gains that sounds are rendered with: those of `at`, except for a posterior whose mean cancels.
+
+        Sounds are compared by magnitudes. Where hypotheses agree that a mode is loud but not on its sign, the mean is
+        near zero, and the magnitude that they expect serves better.
+        """
+        ...
+
     def deviation(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Float[Tensor, "contacts modes 2"] | None:

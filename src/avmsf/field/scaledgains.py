@@ -61,9 +61,13 @@ class ScaledGains:
 
     def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
         """Return the scaled gains; the factors on the dampings are the fitted ones."""
-        known = self.field.at(contacts.double() / self.length, directions)
-        quadrature = None if known.quadrature is None else self._scaled(known.quadrature)
-        return Gains(self._scaled(known.mean), quadrature, known.damping)
+        return self._edited(self.field.at(contacts.double() / self.length, directions))
+
+    def point_estimate(
+        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
+        """Return the fitted field's estimate, scaled likewise."""
+        return self._edited(self.field.point_estimate(contacts.double() / self.length, directions))
 
     def deviation(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
@@ -94,6 +98,10 @@ class ScaledGains:
         """Return the field."""
         inner = {name.removeprefix(_INNER): each for name, each in tensors.items() if name.startswith(_INNER)}
         return cls(FITTED[_inner(record)].restore(record, inner), tensors["mode_factors"], float(record["size_factor"]))
+
+    def _edited(self, known: Gains) -> Gains:
+        quadrature = None if known.quadrature is None else self._scaled(known.quadrature)
+        return Gains(self._scaled(known.mean), quadrature, known.damping)
 
     def _scaled(self, gains: Float[Tensor, "contacts modes"]) -> Float32[Tensor, "contacts modes"]:
         return (gains.double() * self.scale).float()

@@ -218,11 +218,11 @@ class SoundField:
         `directions` as in `render`. Raises FitError for a field without a posterior: of the attention network, of
         recordings in one place, or guessed without recordings.
         """
-        from avmsf.field.uncertainty import std_of
+        from avmsf.field.uncertainty import parts_of, std_of
 
         contacts, ways = self._impacts(positions, directions)
         std = std_of(self, contacts, ways).square().sum(2).sqrt()
-        return GainPosterior(self.complex_gains(contacts, directions=ways), std)
+        return GainPosterior(self._amplitudes(parts_of(self, contacts, ways)), std)
 
     def suggest(
         self, count: SupportsIndex = 5, *, candidates: ArrayLike | None = None, unseen: bool = False
@@ -269,15 +269,14 @@ class SoundField:
         Contacts, directions and unit as in `gains`; dampings d are those of the contacts.
         """
         places, ways = self._impacts(contacts, directions)
-        sines, cosines = self.known(places, directions=ways).parts.unbind(2)
-        return torch.complex(cosines, -sines) * torch.exp(1j * self.phase)
+        return self._amplitudes(self.known(places, directions=ways).parts)
 
     def known(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Gains:
         """Return all that a sound needs at the contacts: both parts of the gains, and the factors on the dampings."""
         with torch.no_grad():
-            return self.gain_field.at(contacts, directions)
+            return self.gain_field.point_estimate(contacts, directions)
 
     def dampings(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts modes"]:
         """Return the dampings at the contacts, 1/s: the bank's where they are shared."""
@@ -327,6 +326,10 @@ class SoundField:
         contacts = as_vectors(positions, "positions")
         expect_near(contacts, self.gain_field.points)
         return contacts, None if directions is None else as_vectors(directions, "directions", count=len(contacts))
+
+    def _amplitudes(self, parts: Float64[Tensor, "contacts modes 2"]) -> Complex[Tensor, "contacts modes"]:
+        sines, cosines = parts.unbind(2)
+        return torch.complex(cosines, -sines) * torch.exp(1j * self.phase)
 
     def _recorded(
         self,

@@ -131,7 +131,8 @@ def parts_of(
     field: SoundField, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
 ) -> Float64[Tensor, "contacts modes 2"]:
     """Return both parts of the mean gains."""
-    return field.known(contacts, directions=directions).parts
+    with torch.no_grad():
+        return field.gain_field.at(contacts, directions).parts
 
 
 def relative_gain_std(field: SoundField, points: Float[Tensor, "points 3"]) -> Float64[Tensor, " points"]:

@@ -46,7 +46,8 @@ def foretell(
     turned = torch.polar(torch.ones_like(sound_field.phase), sound_field.phase).to(torch.complex64)
     gains, dampings = [], []
     for rows in torch.split(torch.arange(len(points)), _BATCH):
-        known = sound_field.known(points[rows], directions=None if directions is None else directions[rows])
+        with torch.no_grad():
+            known = sound_field.gain_field.at(points[rows], None if directions is None else directions[rows])
         ahead = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
         gains.append(torch.complex(known.mean.float(), ahead.float()) * turned)
         if known.damping is not None:

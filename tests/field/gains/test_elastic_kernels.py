@@ -9,17 +9,20 @@ import torch
 
 from avmsf.field.gains import elastic as module
 from avmsf.field.gains.elastic import (
+    EQUAL_PRIOR,
     FACTORS,
     FREQUENCY_ERRORS,
     PERTURBATIONS,
+    PROFILE_PRIOR,
     REACH,
+    REMAINDER_PRIOR,
     REMAINDERS,
     WIDTHS,
     Elastic,
     frequency_log_prior,
 )
 from avmsf.field.gains.family import Sites
-from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, weigh_factors
+from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, hypotheses_of, weigh_factors
 from avmsf.field.gains.mixture import NOISE_SHARES, log_evidence
 from avmsf.field.gains.model import MixtureGains
 from gain_cases import SIZE, families, impacts, measured, plate
@@ -214,3 +217,42 @@ def test_the_evidence_of_a_shape_is_that_of_the_kernels_around_it():
     shapes = plate().gains(given.reference.points, given.reference.directions)
     found = given.shape_evidence(log_evidence(given.kernels(), shapes, torch.zeros(SHAPES, dtype=torch.float64)))
     assert torch.equal(found.argmax(0), torch.arange(SHAPES))
+
+
+def test_categories_are_probable_as_their_profile_and_remainder_are():
+    """The most probable category holds the kernels of the first typical profile with the first typical remainder."""
+    given = family()
+    prior, categories = given.category_prior(), given.categories()
+    assert len(prior) == int(categories.max()) + 1
+    assert abs(float(prior.sum()) - 1.0) < 1e-12
+    assert float(prior.min()) >= EQUAL_PRIOR / len(prior)
+    remainder = given.shares[:, -1]
+    for row, other in product(range(len(REMAINDERS)), repeat=2):
+        # Among kernels of one profile: what is not the equal share goes as the typical shares do.
+        typical = [
+            prior[categories[torch.isclose(remainder, torch.tensor(REMAINDERS[each]).double())]]
+            for each in (row, other)
+        ]
+        ratio = (typical[0] - EQUAL_PRIOR / len(prior)) / (typical[1] - EQUAL_PRIOR / len(prior))
+        assert torch.allclose(ratio, torch.full_like(ratio, REMAINDER_PRIOR[row] / REMAINDER_PRIOR[other]))
+    narrowest = given.shares[categories == int(prior.argmax())]
+    shapes = narrowest[:, :-1] * given._known.square().mean(0)
+    assert PROFILE_PRIOR.index(max(PROFILE_PRIOR)) == 0
+    # Of the smallest perturbation: all but a thousandth is the shape in its center.
+    assert bool((shapes.amax(1) / shapes.sum(1) > 0.95).all())
+
+
+def test_hypotheses_take_the_probabilities_of_the_categories():
+    given, gains = family(), measured(impacts(10, seed=1), noise=0.01)
+    weighed = WeighedFamily.of(given, gains, (0.01,))
+    found = hypotheses_of([weighed], gains)
+    assert torch.allclose(found.category_prior, given.prior * given.category_prior(), rtol=1e-12)
+
+
+def test_the_evidence_of_a_shape_counts_profiles_by_their_probability():
+    """One kernel alone that explains everything: the shape's evidence is the kernel's times its category's prior."""
+    given = family()
+    evidence = torch.full((len(given.shares), 1, 1), -1e6, dtype=torch.float64)
+    evidence[7] = 3.0
+    expected = 3.0 + float(given.category_prior()[given.categories()[7]].log())
+    assert float(given.shape_evidence(evidence).max()) == pytest.approx(expected, rel=1e-12)

@@ -166,6 +166,21 @@ def test_mean_and_spread_are_those_of_the_sum_over_hypotheses():
         assert spread[:, series].numpy() == pytest.approx(expected[1], rel=1e-6)
 
 
+def test_mean_magnitude_is_that_of_each_hypothesis_by_itself():
+    joint = torch.from_numpy(joint_kernels().copy())
+    cross = joint[:, CONTACTS:, :CONTACTS]
+    values, floor, _ = drawn()
+    found = mixture().mean_magnitude(cross)
+    for series in range(SERIES):
+        expected = np.zeros(PLACES)
+        for row, kernel in enumerate(among()):
+            for column, share in enumerate(NOISE_SHARES):
+                inverse = np.linalg.inv(kernel + (share + floor[series]) * np.eye(CONTACTS))
+                weight = float(mixture().weights[row, column, series])
+                expected += weight * np.abs(cross[row].numpy() @ inverse @ values[:, series])
+        assert found[:, series].numpy() == pytest.approx(expected, rel=1e-8, abs=1e-12)
+
+
 def test_standard_error_is_the_root_of_the_mean_noise_variance():
     values, floor, _ = drawn()
     for series in range(SERIES):

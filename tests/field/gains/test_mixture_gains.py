@@ -45,6 +45,21 @@ def dense(given: MixtureGains, kernel: torch.Tensor, share: int, series: int) ->
     return mean, scale * (kernel[count:, count:] - across @ inverse @ across.T), scale * noise
 
 
+def test_hypotheses_of_opposite_signs_do_not_cancel_in_the_estimate():
+    """The estimate has the sign of the mean and at least its magnitude; with one hypothesis it is the mean."""
+    given = model(elastic=True)
+    mean, estimate = given.at(ASKED.points, ASKED.directions), given.point_estimate(ASKED.points, ASKED.directions)
+    for one, other in ((mean.mean, estimate.mean), (mean.quadrature, estimate.quadrature)):
+        assert torch.equal(one.sign(), other.sign())
+        assert bool((other.abs() >= one.abs() * (1 - 1e-5)).all())
+    assert float((estimate.power / mean.power).max()) > 1.01
+    best = given.mixture.weights.flatten(0, 1)
+    single = torch.zeros_like(best).scatter_(0, best.argmax(0, keepdim=True), 1.0).reshape(given.mixture.weights.shape)
+    sure = replace(given, mixture=replace(given.mixture, weights=single))
+    both = sure.at(ASKED.points, ASKED.directions), sure.point_estimate(ASKED.points, ASKED.directions)
+    assert torch.allclose(both[0].parts, both[1].parts, rtol=1e-5, atol=1e-7)
+
+
 @pytest.mark.parametrize("elastic", [True, False])
 def test_mean_and_deviation_are_those_of_all_hypotheses(elastic):
     given = model(elastic=elastic)

@@ -38,6 +38,12 @@ class BodyGains:
         sites = sites_along(contacts.double(), directions, lambda points: -self.normals(points))
         return Gains(self.body.gains(sites.points, sites.directions).float())
 
+    def point_estimate(
+        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
+        """Return what `at` does."""
+        return self.at(contacts, directions)
+
     def deviation(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
     ) -> None:

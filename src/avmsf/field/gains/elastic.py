@@ -35,6 +35,15 @@ WIDTHS = (0.05, 0.1, 0.2, 0.4)
 """Standard deviations w of the broad profiles, in log frequency."""
 REMAINDERS = (0.03, 0.1, 0.3, 0.6)
 """Shares p of what no shape has."""
+PROFILE_PRIOR = (0.56, 0.28, 0.1, 0.027, 0.003, 0.015, 0.004, 0.008, 0.007)
+"""Typical share of the modes of a body with each of `PERTURBATIONS`, then of `WIDTHS`."""
+REMAINDER_PRIOR = (0.96, 0.04, 7e-4, 1e-4)
+"""Typical share of the modes of a body with each of `REMAINDERS`.
+
+Both are mean posterior probabilities over the modes of seven simulated objects with 8 impacts each
+(docs/decisions/gain-model.md)."""
+EQUAL_PRIOR = 0.2
+"""Probability that a body is not typical, so that all profiles and remainders are equally probable."""
 REACH = 0.15
 """Length of the remainder's kernel over the object's size."""
 _FAR = 1e-3
@@ -114,6 +123,11 @@ class Elastic(KernelFamily):
         one = torch.arange(profiles * len(REMAINDERS)).reshape(profiles, 1, len(REMAINDERS))
         return one.expand(-1, shapes, -1).flatten()
 
+    def category_prior(self) -> Float64[Tensor, " categories"]:
+        """Return the probability of each profile and remainder before any measurement; one or two impacts keep it."""
+        typical = torch.outer(torch.tensor(PROFILE_PRIOR).double(), torch.tensor(REMAINDER_PRIOR).double()).flatten()
+        return (1.0 - EQUAL_PRIOR) * typical / typical.sum() + EQUAL_PRIOR / len(typical)
+
     def log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "kernels modes"]:
         """Return the log probability that a mode is each kernel's shape, times the density of its frequency if it is.
 
@@ -144,10 +158,12 @@ class Elastic(KernelFamily):
         return found
 
     def shape_evidence(self, evidence: Float64[Tensor, "kernels noises series"]) -> Float64[Tensor, "shapes series"]:
-        """Return the log evidence of each shape as center, all else being equally probable."""
-        shape = (len(PERTURBATIONS) + len(WIDTHS), len(self.modes), len(REMAINDERS) * evidence.shape[1], -1)
-        each = evidence.reshape(shape).transpose(0, 1).flatten(1, 2)
-        return torch.logsumexp(each, dim=1) - math.log(each.shape[1])
+        """Return the log evidence of each shape as center, over profiles and remainders by their `category_prior`."""
+        noises = evidence.shape[1]
+        shape = (len(PERTURBATIONS) + len(WIDTHS), len(self.modes), len(REMAINDERS), noises, -1)
+        prior = self.category_prior().log().reshape(shape[0], 1, shape[2], 1, 1)
+        each = (evidence.reshape(shape) + prior).transpose(0, 1).flatten(1, 3)
+        return torch.logsumexp(each, dim=1) - math.log(noises)
 
     @property
     def factor(self) -> float:

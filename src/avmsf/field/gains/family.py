@@ -107,6 +107,11 @@ class KernelFamily(ABC):
         """Return the category of each kernel, from 0 on; each kernel is one, unless a family says otherwise."""
         return torch.arange(len(self.shares))
 
+    def category_prior(self) -> Float64[Tensor, " categories"]:
+        """Return the probability of each category within the family; equal ones, unless a family says otherwise."""
+        count = int(self.categories().max()) + 1
+        return torch.full((count,), 1.0 / count, dtype=torch.float64)
+
     def log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "kernels modes"]:
         """Return the log probability of each kernel within its category for modes of these log frequencies (Hz).
 

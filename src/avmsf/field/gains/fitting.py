@@ -126,12 +126,10 @@ def hypotheses_of(families: Sequence[WeighedFamily], measured: MeasuredGains) ->
     kinds = [each.family.kind for each in families]
     category, prior, first = [], [], 0
     for each in families:
-        own = each.family.categories() + first
-        count = int(own.max()) + 1 - first
-        share = each.family.prior / kinds.count(each.family.kind) / count
-        category.append(own)
-        prior.append(torch.full((count,), share, dtype=torch.float64))
-        first += count
+        within = each.family.category_prior()
+        category.append(each.family.categories() + first)
+        prior.append(each.family.prior / kinds.count(each.family.kind) * within)
+        first += len(within)
     log_frequency = torch.log(measured.frequency)
     log_prior = torch.cat([each.family.log_prior(log_frequency) for each in families]).repeat(1, 2)
     return Hypotheses(torch.cat([each.kernels for each in families]), torch.cat(category), torch.cat(prior), log_prior)

@@ -31,6 +31,7 @@ from functools import cached_property
 import torch
 from jaxtyping import Bool, Float64, Int
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 NOISE_SHARES = (0.003, 0.01, 0.03)
 """Variances of the noise over the gains' mean square. Larger shares are left out: with few contacts that lie far apart
@@ -44,6 +45,8 @@ _NEGLIGIBLE = 1e-2
 one: few contacts leave thousands of hypotheses almost equally probable."""
 _MEMORY = 4_000_000
 """Numbers held at once in a batch of kernels."""
+_TOGETHER = 64
+"""Kernels whose predictions are one product."""
 _TINY = torch.finfo(torch.float64).tiny
 
 
@@ -207,6 +210,14 @@ class KernelMixture:
             square.addmm_(along.square_(), self._averaged[1][row], alpha=-1.0)
         return (square - mean.square()).clamp_min(0.0).sqrt()
 
+    def mean_magnitude(self, cross: Float64[Tensor, "kernels places contacts"]) -> Float64[Tensor, "places series"]:
+        """Return the mean over hypotheses of the magnitude of each one's mean at places; `cross` as in `spread`."""
+        found = torch.zeros(cross.shape[1], self.values.shape[1], dtype=torch.float64)
+        for rows, series, weights, solved in self._padded:
+            each = (cross[rows] @ solved).abs_().mul_(weights[:, None])
+            found.index_add_(1, series.flatten(), each.transpose(0, 1).flatten(1))
+        return found
+
     @cached_property
     def _averaged(self) -> tuple[Tensor, Tensor]:
         """The sums over noise shares of weight times U' C^-1 y, and of weight times s^2 / (lambda + v).
@@ -228,6 +239,21 @@ class KernelMixture:
             noise, series = torch.nonzero(weights, as_tuple=True)
             variance = values[row][:, None] + self.noise_variance[noise, series]
             found.append((series, weights[noise, series], self.projected[row][:, series] / variance))
+        return found
+
+    @cached_property
+    def _padded(self) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Rows of some kernels, and their part of `_weighted` with C^-1 y for U' C^-1 y (kernels, contacts, pairs).
+
+        Kernels with about as many pairs are together; those with fewer are filled with weights of zero.
+        """
+        found = []
+        order = sorted(range(len(self.weights)), key=lambda row: len(self._weighted[row][0]))
+        for rows in torch.split(torch.tensor(order), _TOGETHER):
+            series, weights, solved = zip(*(self._weighted[row] for row in rows.tolist()), strict=True)
+            full = pad_sequence([each.T for each in solved], batch_first=True).mT
+            both = (pad_sequence(list(each), batch_first=True) for each in (series, weights))
+            found.append((rows, *both, self.eigen[1][rows] @ full))
         return found
 
     def _inverses(self) -> Iterator[Float64[Tensor, "kernels contacts series"]]:

@@ -121,20 +121,21 @@ class MixtureGains:
 
     def at(self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None) -> Gains:
         """Return the mean gains of impacts at contacts (meters) along unit vectors, see `sites`."""
+        return _gains(self._mean(self.sites(contacts, directions)))
+
+    def point_estimate(
+        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
+    ) -> Gains:
+        """Return the mean magnitudes of what each hypothesis predicts, with the signs of the mean gains."""
         sites = self.sites(contacts, directions)
-        series = torch.zeros(len(sites), self.mixture.values.shape[1], dtype=torch.float64)
-        for family, coefficients in zip(self.families, self._coefficients, strict=True):
-            series += family.mean(sites, self.training, coefficients)
-        mean = _complex(series)
-        return Gains(mean.real.float(), mean.imag.float())
+        magnitudes = [self.mixture.mean_magnitude(self._cross(some)) for some in self._batches(sites)]
+        return _gains(torch.cat(magnitudes).copysign(self._mean(sites)))
 
     def deviation(
         self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Float[Tensor, "contacts modes 2"]:
         """Return the posterior standard deviation of both parts of the gains, without the noise of a measurement."""
-        sites = self.sites(contacts, directions)
-        size = max(1, _MEMORY // (len(self.mixture.kernels) * len(self.contacts)))
-        found = [self._spread(sites.take(rows)) for rows in torch.split(torch.arange(len(sites)), size)]
+        found = [self._spread(some) for some in self._batches(self.sites(contacts, directions))]
         return _parts(torch.cat(found)).float()
 
     def noise(self) -> Float64[Tensor, "modes 2"]:
@@ -337,9 +338,24 @@ class MixtureGains:
         return mixture.leave_out(self.places)
 
     def _spread(self, sites: Sites) -> Float64[Tensor, "sites series"]:
-        pairs = list(zip(self.families, self.kept, strict=True))
-        cross = torch.cat([family.between(sites, self.training, kept) for family, kept in pairs])
-        return self.mixture.spread(cross, torch.cat([family.own(sites, kept) for family, kept in pairs]))
+        pairs = zip(self.families, self.kept, strict=True)
+        return self.mixture.spread(self._cross(sites), torch.cat([family.own(sites, kept) for family, kept in pairs]))
+
+    def _mean(self, sites: Sites) -> Float64[Tensor, "sites series"]:
+        pairs = zip(self.families, self._coefficients, strict=True)
+        means = [family.mean(sites, self.training, coefficients) for family, coefficients in pairs]
+        return torch.stack(means).sum(0)
+
+    def _cross(self, sites: Sites) -> Float64[Tensor, "kernels sites contacts"]:
+        """Return the covariances between places and contacts of each kept kernel."""
+        pairs = zip(self.families, self.kept, strict=True)
+        return torch.cat([family.between(sites, self.training, kept) for family, kept in pairs])
+
+    def _batches(self, sites: Sites) -> Iterator[Sites]:
+        """Yield the sites in batches whose covariances fit the memory; one, without any, where there are none."""
+        size = max(1, _MEMORY // (len(self.mixture.kernels) * len(self.contacts)))
+        for rows in torch.split(torch.arange(len(sites)), size):
+            yield sites.take(rows)
 
     def _family_of(self, row: int) -> tuple[KernelFamily, Int[Tensor, " one"]]:
         """Return the family of a kept kernel, and its row there."""
@@ -375,6 +391,11 @@ def series_of(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, "
 def _complex(series: Float64[Tensor, "contacts series"]) -> Complex128[Tensor, "contacts modes"]:
     real, imaginary = series.chunk(2, dim=1)
     return torch.complex(real, imaginary)
+
+
+def _gains(series: Float64[Tensor, "contacts series"]) -> Gains:
+    real, imaginary = series.float().chunk(2, dim=1)
+    return Gains(real, imaginary)
 
 
 def _parts(series: Float64[Tensor, "contacts series"]) -> Float64[Tensor, "contacts modes 2"]:
