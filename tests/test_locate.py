@@ -147,7 +147,7 @@ def test_distance_is_one_minus_the_cosine_of_gains():
     found = Locator.of(field, use_residual=False).locate(impacts.sounds[0])
     sine, cosine = fit_gains(impacts.sounds, bank(), sample_rate=RATE)
     heard = torch.cat([sine, cosine], 1)[0].double()
-    known = field.known(found.points)
+    known = field.gain_field.at(found.points)
     own = torch.cat([known.mean, known.quadrature], 1).double()
     undelayed = 1 - (own @ heard).abs() / own.norm(dim=1) / heard.norm()
     # The delay that each point is free to choose hardly matters to the nearest ones.
