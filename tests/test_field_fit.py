@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from avmsf.bench.metrics import relative_stft_error
+from avmsf.cli.fit import summary
 from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import Progress, fit
+from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.losses import spectral_loss
 from avmsf.field.recipes import Attention
 from avmsf.field.soundfield import SoundField
@@ -226,7 +228,24 @@ def test_patience_ends_a_trial_early_and_shortens_the_fit():
 
 def test_few_contacts_are_not_divided():
     report = fitted(VALIDATED, train=plate_impacts(5)).origin.report
-    assert report == {"gain_model": "attention", "damping": "shared", "validated": False}
+    assert report.keys() == {"gain_model", "damping", "validated", "damping_reason"}
+    assert (report["damping"], report["validated"]) == ("shared", False)
+
+
+def test_the_reason_for_the_form_of_damping_is_reported():
+    one_step = replace(VALIDATED, warmup_steps=1, steps=1)
+    few = {"train": plate_impacts(5)}
+    fits = (
+        fitted(one_step, **few),
+        fitted(replace(one_step, damping="shared"), **few),
+        fitted(replace(one_step, validation=0.0)),
+        fitted(one_step, gains=MixtureEstimator(("smooth",)), **few),
+        validated_fit(),
+    )
+    reasons = [field.origin.report["damping_reason"] for field in fits]
+    # Too few positions, as set, none held out, a gain model of one form, validated.
+    assert len(set(reasons)) == len(fits)
+    assert [reason in summary(field, 5) for reason, field in zip(reasons, fits, strict=True)] == [True] * len(fits)
 
 
 @pytest.mark.parametrize("damping", ["shared", "per-contact"])

@@ -193,7 +193,7 @@ def describe_outliers(fitted: SoundField) -> list[str]:
 def summary(fitted: SoundField, contacts: int) -> str:
     """Return the summary of a fit."""
     report = fitted.origin.report
-    how = "chosen on validation contacts" if report.get("validated") else "as set"
+    reason = f" ({report['damping_reason']})" if "damping_reason" in report else ""
     gains = report.get("gain_model", "attention")
     credibility = report.get("credibility") or {}
     if credibility.get("credible"):
@@ -208,6 +208,6 @@ def summary(fitted: SoundField, contacts: int) -> str:
         )
     return (
         f"field of {fitted.origin.capture}: {len(fitted.bank)} modes from {counted(contacts, 'recording')}, gains by "
-        f"{gains}, {report.get('damping', 'shared')} damping ({how}), "
+        f"{gains}, {report.get('damping', 'shared')} damping{reason}, "
         f"{report.get('steps', fitted.origin.config.steps)} steps end to end"
     )

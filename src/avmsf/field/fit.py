@@ -171,8 +171,10 @@ class _Job:
         default = _Plan(dampings[0], self.steps)
         held = held_out(self.train.contacts, self.config.validation)
         undecided = len(dampings) > 1 or (self.config.patience > 0 and self.recipe.warms_up)
-        if len(rows_by_place(self.train.contacts)) < _MIN_PLACES or not held or not undecided:
-            return default, {"damping": default.damping, "validated": False}
+        few = len(rows_by_place(self.train.contacts)) < _MIN_PLACES
+        reason = {"damping_reason": self._damping_reason(dampings, few=few, held=held)}
+        if few or not held or not undecided:
+            return default, {"damping": default.damping, "validated": False, **reason}
         learned = [row for row in range(len(self.train)) if row not in held]
         for damping in dampings:
             name = f"trial with {damping} damping"
@@ -184,12 +186,23 @@ class _Job:
         report = {
             "damping": best,
             "validated": True,
+            **reason,
             "validation_contacts": [self.train.names[row] for row in held],
             "validation_envelope": {damping: each["envelope"] for damping, each in outcomes.items()},
             "validation_spectral": {damping: each["spectral"] for damping, each in outcomes.items()},
             "steps": steps,
         }
         return _Plan(best, steps), report
+
+    def _damping_reason(self, dampings: tuple[str, ...], *, few: bool, held: list[int]) -> str:
+        """Return why the damping has the form that it has."""
+        if self.config.damping in dampings:
+            return "as set"
+        if len(dampings) == 1:
+            return "the only form of this gain model"
+        if few:
+            return f"fewer than {_MIN_PLACES} positions leave none to validate on"
+        return "chosen on validation contacts" if held else "no positions are held out to validate on"
 
     def run(self, name: str, learned: list[int], plan: _Plan, *, held: list[int] | None = None) -> TrainingRun:
         """Train on the rows `learned`; with `held`, note how well the best step does there."""
