@@ -2,8 +2,9 @@
 
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, SupportsIndex
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -174,6 +175,12 @@ def test_arguments_that_no_contact_can_be_suggested_for_are_refused(
 ) -> None:
     with raises(FitError, **fault):
         suggest(of_one_hypothesis(), count, candidates=candidates, directions=directions)
+
+
+@pytest.mark.parametrize("count", [np.array([1, 2]), torch.tensor([1, 2]), True])
+def test_a_count_that_is_no_whole_number_is_refused(count: SupportsIndex) -> None:
+    with raises(FitError, name="count"):
+        suggest(of_one_hypothesis(), count)
 
 
 def test_a_place_that_was_struck_is_not_suggested_again() -> None:

@@ -232,7 +232,11 @@ def _weighed(
 
 def _whole(count: SupportsIndex) -> int:
     """Return a number of contacts. Raises FitError for what is no whole number above 0."""
-    found = operator.index(count) if hasattr(count, "__index__") and not isinstance(count, bool) else 0
+    try:
+        found = 0 if isinstance(count, bool) else operator.index(count)
+    except TypeError:
+        # Arrays have __index__, but only those of one whole number give one.
+        found = 0
     if found < 1:
         raise FitError.expected("a whole number of 1 or more", count, name="count")
     return found
