@@ -152,8 +152,8 @@ class PipelineConfig:
     time_zero: TimeZero | None = None
     """Where sounds start; None takes the capture's settings."""
     device: str | None = None
-    """cpu or cuda; None takes the GPU where there is one. Training gives the same result up to rounding, Gaussians
-    differ; cached stages are used for either device."""
+    """cpu or cuda; None takes the GPU where there is one. Features and training give the same result up to rounding,
+    Gaussians differ; cached stages are used for either device."""
 
 
 def _scene_error(name: str, value: float | int, expected: str) -> SceneError:

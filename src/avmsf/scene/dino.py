@@ -56,17 +56,15 @@ class DinoEncoder:
         *,
         longest: int | None = 518,
         device: str | torch.device = "cpu",
-        dtype: torch.dtype | None = None,
     ) -> "DinoEncoder":
         """Load a model of the hub (one of `MODELS`), or a folder with config.json and model.safetensors.
 
-        The default precision is bfloat16 on a GPU and on processors with matrix units for it, else float32. Raises
-        SceneError where transformers is missing, where the model is neither here nor to be downloaded, and for a folder
-        that holds another model or a part of one.
+        It computes in float32, so that features differ between devices by rounding only; by PyTorch's default a GPU
+        rounds the factors of the first layer to TF32. Raises SceneError where transformers is missing, where the model
+        is neither here nor to be downloaded, and for a folder that holds another model or a part of one.
         """
-        device = torch.device(device)
         folder, name = _find(source)
-        model = _load_model(folder, torch.device(device), dtype or _fast_dtype(device))
+        model = _load_model(folder, torch.device(device))
         mean, deviation = _constants(folder / _PREPROCESSOR)
         return cls(model, name=name, longest=longest, mean=mean, deviation=deviation)
 
@@ -106,16 +104,6 @@ def _interpolation(length: int, patch: int) -> Float[Tensor, "cells patches"]:
     places = (torch.arange(count, dtype=torch.float64) + 0.5) * length / count / patch - 0.5
     places = places.clamp(0.0, count - 1.0)
     return (1 - (places[:, None] - torch.arange(count)).abs()).clamp(min=0.0)
-
-
-def _fast_dtype(device: torch.device) -> torch.dtype:
-    """Return bfloat16 where the device multiplies matrices of it faster than of float32."""
-    if device.type == "cuda":
-        return torch.bfloat16
-    # Emulated, bfloat16 is slower than float32; processors with AMX tiles name them among their flags.
-    flags = Path("/proc/cpuinfo")
-    tiles = flags.is_file() and " amx_bf16" in flags.read_text(errors="replace")
-    return torch.bfloat16 if tiles else torch.float32
 
 
 def _find(source: str | Path) -> tuple[Path, str]:
@@ -158,7 +146,7 @@ def _from_hub(name: str) -> Path:
     return Path(paths[0]).parent
 
 
-def _load_model(folder: Path, device: torch.device, dtype: torch.dtype) -> nn.Module:
+def _load_model(folder: Path, device: torch.device) -> nn.Module:
     transformers = _transformers()
     lacking = [name for name in (_CONFIG, _WEIGHTS) if not (folder / name).is_file()]
     if lacking:
@@ -176,7 +164,7 @@ def _load_model(folder: Path, device: torch.device, dtype: torch.dtype) -> nn.Mo
         )
     try:
         model, report = getattr(transformers, classes[kind]).from_pretrained(
-            folder, local_files_only=True, use_safetensors=True, dtype=dtype, output_loading_info=True
+            folder, local_files_only=True, use_safetensors=True, dtype=torch.float32, output_loading_info=True
         )
     except Exception as error:  # whatever is wrong with the file, transformers and safetensors have their own errors
         raise SceneError(
