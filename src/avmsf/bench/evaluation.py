@@ -53,8 +53,8 @@ def split(
     Contacts nearer to each other than 1 % of the bounding box's diagonal count as one (`places_of`). `count` contacts
     to train on, or else the nearest whole number to `fraction` of all contacts and at least 2. Training recordings are
     in the order of the choice, from the contact of row `start` on, one a contact, and then the repeated ones; so with
-    more contacts the first ones stay the same. Raises EvaluationError where fewer than 2 contacts would remain to train
-    or none to test.
+    more contacts the first ones stay the same. Raises EvaluationError where no contact would remain to train on, with a
+    fraction fewer than 2, or none to test.
     """
     if count is None and not 0.0 < fraction < 1.0:
         raise EvaluationError(
@@ -63,7 +63,7 @@ def split(
             value=fraction,
         )
     places = Places.of(impacts)
-    wanted = places.expect_part(fraction) if count is None else places.expect(count, least=2)
+    wanted = places.expect_part(fraction) if count is None else places.expect(count)
     case = places.case("", farthest_points(places.contacts, wanted, start=places.number_of(start)))
     return impacts.take(case.train), impacts.take(case.test)
 

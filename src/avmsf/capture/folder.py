@@ -64,7 +64,7 @@ class Capture:
     def split(self, train_size: float | int = 0.75, *, seed: int | None = None) -> "tuple[Capture, Capture]":
         """Return (train, test): the recordings at positions as far apart as possible, and all others.
 
-        `train_size` is a part of the positions (float, 0 to 1) or their number (int, 2 or more). All recordings at a
+        `train_size` is a part of the positions (float, 0 to 1) or their number (int, 1 or more). All recordings at a
         position, also repeated ones, are on one side. The choice starts from the first recording's position, or with a
         `seed` from one drawn at random. Raises EvaluationError for a size that leaves no position to train or to test.
         """
