@@ -13,7 +13,7 @@ import torch
 import trimesh
 
 import avmsf
-from avmsf.capture import read_capture
+from avmsf.capture import Capture, CaptureSettings, read_capture
 from avmsf.cli import VERBS, main
 from avmsf.errors import CaptureError
 from avmsf.field import PAPER, FitConfig
@@ -324,6 +324,21 @@ def test_fit_to_one_position_is_scored_at_the_others(capture: Path, tmp_path: Pa
     assert len(told["tested_on"]) == 7
     assert "mean waveform of 1 nearest" in told["scores"]
     assert np.isfinite([error for each in told["scores"].values() for error in each.values()]).all()
+
+
+def test_modes_of_the_paper_start_at_the_peak(capture: Path, monkeypatch: pytest.MonkeyPatch, capsys: Streams) -> None:
+    asked: list[str] = []
+
+    def read(folder: Path, settings: CaptureSettings) -> Capture:
+        asked.append(settings.time_zero)
+        return read_capture(folder, settings)
+
+    monkeypatch.setattr("avmsf.cli.modes.read_capture", read)
+    for words in ([], ["--preset", "paper"], ["--preset", "paper", "--time-zero", "onset"]):
+        assert main(["modes", str(capture), "--modes", "4", "--json", *words]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert found["method"] == ("short-time" if words else "high-resolution")
+    assert asked == ["onset", "peak", "onset"]
 
 
 SHEET = ("--body.wall", "0.004", "--body.shapes", "8", "--body.freedoms", "1000")

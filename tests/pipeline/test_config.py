@@ -7,8 +7,11 @@ from pathlib import Path
 import pytest
 
 from avmsf.capture import Capture, CaptureSettings
+from avmsf.cli.options.features import parse as parse_features
 from avmsf.cli.options.fit import parse as parse_fit
+from avmsf.cli.options.modes import parse as parse_modes
 from avmsf.cli.options.reconstruct import parse as parse_reconstruct
+from avmsf.cli.options.splat import parse as parse_splat
 from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.soundfield import SoundField
@@ -55,6 +58,21 @@ def test_commands_start_from_the_preset_and_change_what_is_said() -> None:
     assert (mixed.scene.lift.encoder, mixed.scene.lift.onto) == ("descriptors", "gaussians")
     fitted = parse_fit(["mug", "--output", "mug.safetensors", "--preset", "paper"])
     assert (fitted.config, fitted.extraction, fitted.gain_model) == (PRESETS["paper"].fit, "short-time", "network")
+
+
+def test_features_and_modes_start_from_the_preset_too() -> None:
+    paper = PRESETS["paper"]
+    assert parse_features(["mug", "--preset", "paper"]).config == paper.scene.lift
+    assert parse_features(["mug", "--preset", "paper", "--components", "3"]).config == replace(
+        paper.scene.lift, components=3
+    )
+    modes = parse_modes(["mug", "--preset", "paper", "--modes", "5"]).pipeline
+    assert (modes.method, modes.time_zero, modes.modes) == (paper.method, paper.time_zero, 5)
+    assert parse_features(["mug"]).config == PRESETS["default"].scene.lift
+    assert parse_modes(["mug"]).pipeline == PRESETS["default"]
+    # `splat` needs no preset.
+    splat = parse_splat(["mug"])
+    assert (splat.views, splat.config) == (paper.scene.views, paper.scene.splat)
 
 
 def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:

@@ -35,5 +35,6 @@ def run(options: Options) -> int:
     if options.json:
         print_json({"features": str(options.output or features.path), **report})
     made = shlex.quote(str(options.output or features.path))
-    next_command("avmsf fit", options.folder, f"--features {made} --gain-model network -o field.safetensors")
+    network = "--preset paper" if options.preset == "paper" else "--gain-model network"
+    next_command("avmsf fit", options.folder, f"--features {made} {network} -o field.safetensors")
     return 0

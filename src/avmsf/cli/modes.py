@@ -5,13 +5,14 @@ from dataclasses import asdict
 
 from avmsf.bench.pictures import draw_modes, expect_format, save_picture
 from avmsf.capture import CaptureSettings, read_capture
+from avmsf.capture.folder import settings_of
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.modetable import ModeRow, QualityRow, amplitudes, levels, mode_rows, quality_rows
 from avmsf.cli.options.modes import Options
 from avmsf.cli.printing import console, decimals, figure, next_command, print_json, say, table
 from avmsf.modal.extraction.extract import extract_modes
-from avmsf.modal.extraction.finders import finder_named
 from avmsf.modal.extraction.quality import measure_quality
+from avmsf.pipeline.record import capture_settings_of, finder_of
 from avmsf.wording import counted
 
 _EXPLANATION = """\
@@ -24,12 +25,12 @@ def run(options: Options) -> int:
     """Print the modes."""
     if options.picture is not None:
         expect_format(options.picture)
-    settings = None if options.settings is None else CaptureSettings.read(options.settings)
-    capture = read_capture(options.capture, settings)
+    known = settings_of(options.capture) if options.settings is None else CaptureSettings.read(options.settings)
+    capture = read_capture(options.capture, capture_settings_of(options.pipeline, known))
     impacts = capture.impacts
     count = counted(len(impacts), "recording")
     say(f"finding the modes of {count}, {impacts.duration:.3g} s at {impacts.sample_rate:g} Hz")
-    extraction = extract_modes(impacts, finder_named(options.extraction, options.modes))
+    extraction = extract_modes(impacts, finder_of(options.pipeline))
     level = levels(amplitudes(extraction))
     rows = mode_rows(extraction.bank, level)
     quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)

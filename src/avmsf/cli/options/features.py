@@ -8,8 +8,9 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import parse_options
+from avmsf.cli.options.fit import preset_of
 from avmsf.cli.options.scenes import SceneOptions
-from avmsf.pipeline.config import LiftConfig, ViewsConfig
+from avmsf.pipeline.config import PRESETS, LiftConfig, Preset, ViewsConfig
 from avmsf.scene.splatconfig import SplatConfig
 
 
@@ -26,10 +27,21 @@ class Options(SceneOptions):
     """How views are made."""
     splat: SplatConfig = field(default_factory=SplatConfig)
     """How Gaussians are fitted."""
+    preset: Preset = "default"
+    """Defaults of all settings; paper: features as published. `--preset paper --help` shows its values."""
     config: tyro.conf.OmitArgPrefixes[LiftConfig] = field(default_factory=LiftConfig)
     """How features are made."""
 
 
+@dataclass(frozen=True)
+class PaperOptions(Options):
+    """The same with the defaults of the preset `paper`."""
+
+    preset: Preset = "paper"
+    config: tyro.conf.OmitArgPrefixes[LiftConfig] = field(default_factory=lambda: PRESETS["paper"].scene.lift)
+
+
 def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return parse_options(Options, "features", words)
+    """Return the options that the words spell, with the preset's settings as defaults."""
+    kind = {"default": Options, "paper": PaperOptions}[preset_of(words)]
+    return parse_options(kind, "features", words, description=Options.__doc__)

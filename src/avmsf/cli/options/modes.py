@@ -8,7 +8,9 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import CaptureFolder, Printing, SettingsFile, parse_options
+from avmsf.cli.options.fit import preset_of
 from avmsf.modal.config import ExtractionMethod
+from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
 
 
 @dataclass(frozen=True)
@@ -22,12 +24,31 @@ class Options(Printing):
     short-time: the paper's method, bin by bin of a short-time spectrum."""
     modes: int = 128
     """Maximum number of modes."""
+    time_zero: TimeZero | None = None
+    """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
+    preset: Preset = "default"
+    """Defaults of all settings; paper: the published method, from the peak on."""
     settings: SettingsFile = None
     """Use this capture.toml instead of the folder's own."""
     picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE.png")] = None
     """Draw the modes to this file, which ends in .png, .pdf or .svg."""
 
+    @property
+    def pipeline(self) -> PipelineConfig:
+        """The settings that modes depend on, with the defaults of all others."""
+        return PipelineConfig(method=self.extraction, modes=self.modes, time_zero=self.time_zero)
+
+
+@dataclass(frozen=True)
+class PaperOptions(Options):
+    """The same with the defaults of the preset `paper`."""
+
+    extraction: ExtractionMethod = PRESETS["paper"].method
+    time_zero: TimeZero | None = PRESETS["paper"].time_zero
+    preset: Preset = "paper"
+
 
 def parse(words: Sequence[str]) -> Options:
-    """Return the options that the words spell."""
-    return parse_options(Options, "modes", words)
+    """Return the options that the words spell, with the preset's settings as defaults."""
+    kind = {"default": Options, "paper": PaperOptions}[preset_of(words)]
+    return parse_options(kind, "modes", words, description=Options.__doc__)
