@@ -32,7 +32,7 @@ from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
 from avmsf.files import copy_whole
 from avmsf.localization.contact_map import enlarged
-from avmsf.pipeline.config import CACHE
+from avmsf.pipeline.config import CACHE, PRESETS
 from avmsf.pipeline.sources import SPLATS
 from avmsf.scene.ply import write_splats
 from avmsf.scene.start import StartPoints, starting_cloud
@@ -44,6 +44,7 @@ from avmsf.studio.modules import find_modules, with_local_modules
 from avmsf.studio.opening import Opened, find_object, open_target
 from avmsf.studio.routes import PAGE
 from avmsf.studio.server import serve
+from avmsf.studio.studio import StudioConfig
 from avmsf.tasks.locator import Locator
 from avmsf.tasks.recast import recast
 from avmsf.tasks.retune import retune
@@ -393,14 +394,32 @@ def test_the_field_that_a_job_made_is_opened_whatever_has_replaced_it_since(
         assert torch.equal(running.studio.session.current.expect_field().bank.frequency, made.bank.frequency)
 
 
+def test_a_reconstruction_has_the_settings_that_the_studio_was_started_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[dict[str, Any]] = []
+
+    def begin(kind: str, task: dict[str, Any], take: object) -> object:
+        asked.append(task)
+        return SimpleNamespace(identifier="j1")
+
+    config = StudioConfig(modes=7, preset="paper")
+    with served(open_target(fill(tmp_path / "struck")), tmp_path / "files", config=config) as running:
+        monkeypatch.setattr(running.studio.jobs, "start", begin)
+        assert running.ask("POST", "reconstruct", {}).words["job"] == "j1"
+    assert [(task["modes"], task["preset"]) for task in asked] == [(7, "paper")]
+
+
 def test_a_worker_copies_its_field_before_another_process_may_replace_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = fill(tmp_path / "struck")
     field = folder / CACHE / "field.safetensors"
     locked: list[bool] = []
+    given: list[tuple[object, ...]] = []
 
     def stand_in(*arguments: object, **named: object) -> object:
+        given.append((*arguments[3:], named["settings"].time_zero))
         field.write_text("made")
         return SimpleNamespace(field=field, stages=[])
 
@@ -410,10 +429,11 @@ def test_a_worker_copies_its_field_before_another_process_may_replace_it(
 
     monkeypatch.setattr(worker, "reconstruct", stand_in)
     monkeypatch.setattr(worker, "copy_whole", copy)
-    task = {"folder": str(folder), "modes": 6, "output": str(tmp_path / "files" / "reconstructed")}
+    task = {"folder": str(folder), "preset": "paper", "modes": 6, "output": str(tmp_path / "files" / "reconstructed")}
     with open(tmp_path / "said", "w") as said:
         result = worker.make_field(task, worker.Voice(said))
     assert (locked, Path(result["output"]).read_text()) == ([True], "made")
+    assert given == [(replace(PRESETS["paper"], modes=6), "peak")]
 
 
 def test_a_capture_with_a_field_is_struck_and_its_strikes_are_marked(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ def run(options: Options) -> int:
         port=options.port,
         browser=not options.no_browser,
         tell=lambda address: _tell(address, json=options.json),
-        config=StudioConfig(options.model, options.modes),
+        config=StudioConfig(options.model, options.modes, preset=options.preset),
     )
     say("closed")
     if computing:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from avmsf.field.store import load, save
+from avmsf.pipeline.config import Preset
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.editing import MATERIAL_NAMES, Sliders
 from avmsf.studio.jobs import Event, Job, Jobs
@@ -42,6 +43,8 @@ class StudioConfig:
     """Most modes that a reconstruction keeps."""
     steps: int = STEER_STEPS
     """Steps of a descent towards a recording or words."""
+    preset: Preset = "default"
+    """Settings of a reconstruction."""
 
 
 class Studio:
@@ -154,7 +157,8 @@ class Studio:
             )
         # One output is enough: the next job starts when this one's field is open.
         output = str(self.folder / "reconstructed")
-        task = {"task": "make_field", "folder": str(book.folder), "modes": self.config.modes, "output": output}
+        chosen = {"preset": self.config.preset, "modes": self.config.modes}
+        task = {"task": "make_field", "folder": str(book.folder), "output": output, **chosen}
         return self.jobs.start("reconstruct", task, self._take_field)
 
     def make_object(self) -> Job:

@@ -12,6 +12,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -23,8 +24,9 @@ from avmsf.errors import AvmsfError
 from avmsf.field.fit import Progress
 from avmsf.field.store import load, save
 from avmsf.files import copy_whole
-from avmsf.pipeline.config import CACHE, PipelineConfig, SceneConfig
+from avmsf.pipeline.config import CACHE, PRESETS, SceneConfig
 from avmsf.pipeline.reconstruct import reconstruct
+from avmsf.pipeline.record import capture_settings_of
 from avmsf.pipeline.scene import Listener, SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.lift import LiftProgress
@@ -93,7 +95,8 @@ def make_field(task: Values, voice: Voice) -> Values:
     The copy is what this reconstruction made, whatever another one puts in the place of `field` meanwhile.
     """
     folder = Path(task["folder"])
-    settings = settings_of(folder)
+    config = replace(PRESETS[task["preset"]], modes=int(task["modes"]))
+    settings = capture_settings_of(config, settings_of(folder))
     voice.tell("capture: reading the recordings")
     capture = read_capture(folder, settings)
     with StageFolder(folder / CACHE).lock(COMMAND):
@@ -101,7 +104,7 @@ def make_field(task: Values, voice: Voice) -> Values:
             folder,
             capture,
             capture.impacts,
-            PipelineConfig(modes=int(task["modes"])),
+            config,
             cache=folder / CACHE,
             settings=settings,
             listener=voice.listener,

@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import Existing, Flag, Printing, parse_options
+from avmsf.pipeline.config import Preset
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,8 @@ class Options(Printing):
     """Stable Audio pipeline for edits by text: a folder, or its name on the hub; needs the extra `text`."""
     modes: int = 128
     """Maximum number of modes of a reconstruction."""
+    preset: Preset = "default"
+    """Settings of a reconstruction; paper: everything as published, which takes hours."""
     fetch_modules: Flag = False
     """First download the page's libraries with npm, so that it works without a network from then on."""
 
