@@ -41,8 +41,10 @@ EVERY = 500
 """Steps between two points of the curve."""
 CONVENTIONS = (
     "paper: the preset `paper` for all its steps on one thread, 8 training places, descriptors in place of DINOv2's "
-    f"features, onto Gaussians of rendered views; simulated objects at {RATE / 1000:g} kHz and {SECONDS:g} s. Relative "
-    "STFT error at all other contacts; `attention, quick` and `auto` are the methods field and field-auto with meshes.",
+    "features, onto Gaussians of rendered views; recordings start at their onsets and are aligned by the phases of "
+    "their modes, and dampings are shared; simulated objects at "
+    f"{RATE / 1000:g} kHz and {SECONDS:g} s. Relative STFT error at all other contacts; `attention, quick` is the "
+    "method field with positions only, `auto` the method field-auto, both with meshes.",
 )
 
 
