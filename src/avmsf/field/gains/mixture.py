@@ -252,8 +252,8 @@ class KernelMixture:
         for rows in torch.split(torch.tensor(order), _TOGETHER):
             series, weights, solved = zip(*(self._weighted[row] for row in rows.tolist()), strict=True)
             full = pad_sequence([each.T for each in solved], batch_first=True).mT
-            both = (pad_sequence(list(each), batch_first=True) for each in (series, weights))
-            found.append((rows, *both, self.eigen[1][rows] @ full))
+            which, weighed = (pad_sequence(list(each), batch_first=True) for each in (series, weights))
+            found.append((rows, which, weighed, self.eigen[1][rows] @ full))
         return found
 
     def _inverses(self) -> Iterator[Float64[Tensor, "kernels contacts series"]]:
