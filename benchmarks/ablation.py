@@ -3,7 +3,7 @@
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +19,9 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, POSITIONAL, MixtureEstimator
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.recipes import GainCase
-from avmsf.field.soundfield import SoundField
-from avmsf.field.uncertainty import parts_of, std_of
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import Residual
-from avmsf.modal.synthesis import synthesize_phased
 from avmsf.pipeline.bodies import candidate_bodies, roughened
 from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
@@ -34,6 +31,7 @@ from avmsf.simulate.elements import SecondOrder
 from avmsf.simulate.material import CERAMIC, STEEL
 from avmsf.simulate.shapes import make_shape
 from avmsf.simulate.sim20 import ABLATED
+from benchmarks.fewimpacts import with_means
 from benchmarks.report import Options, Report, Table, tell
 from benchmarks.splitcases import COUNTS, ROUGH, SplitCase, bodies_of, measured, simulated, split_case, splits_of
 
@@ -106,7 +104,7 @@ def _variants(case: SplitCase, options: Options) -> Iterator[tuple[str, float]]:
     yield "stationary noise alone", case.error(replace(field, residual=Residual(field.residual.magnitude)))
     origin = replace(field.origin, config=replace(field.origin.config, residual_noise="gaussian"))
     yield "Gaussian noise", case.error(replace(field, origin=origin))
-    yield "magnitudes lifted half way", case.error(_Lifted(field))  # type: ignore[arg-type]
+    yield "mean gains rendered", case.error(with_means(field))
     if case.bodies is not None:
         yield "no updating", case.error(case.fit(MixtureEstimator(bodies=case.bodies, update=False), quick=False))
     for kind, label in zip(FAMILIES, _ALONE, strict=True):
@@ -210,29 +208,3 @@ def _gains_of(true: ElasticModes) -> tuple[GainCase, Float64[Tensor, "others 3"]
     phase = torch.zeros(len(true), dtype=torch.float64)
     features = FeatureField.from_points(true.nodes.float())
     return GainCase(impacts, features, found, phase, gains, FitConfig()), others, ways[12:]
-
-
-@dataclass(frozen=True, eq=False)
-class _Lifted:
-    """A field whose gains have magnitudes half way, in decibels, to the posterior median of the magnitude."""
-
-    field: SoundField
-
-    @property
-    def sample_rate(self) -> float:
-        return self.field.sample_rate
-
-    def render(self, contacts: Tensor, *, directions: Tensor | None = None, samples: int | None = None) -> Tensor:
-        """Return the sounds."""
-        mean, deviation = parts_of(self.field, contacts, directions), std_of(self.field, contacts, directions)
-        drawn = torch.randn(200, *mean.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        median = (mean + deviation * drawn).norm(dim=3).median(dim=0).values
-        lifted = mean * (median / mean.norm(dim=2).clamp_min(1e-30)).sqrt()[..., None]
-        bank, length = self.field.bank, samples or self.field.samples
-        made = synthesize_phased(
-            lifted[..., 0].float(), bank.frequency, bank.damping, self.field.phase, samples=length,
-            sample_rate=self.sample_rate, quadrature=lifted[..., 1].float(),
-        )  # fmt: skip
-        silent = replace(self.field, residual=Residual(torch.zeros_like(self.field.residual.magnitude)))
-        noise = self.field.render(contacts, directions=directions, samples=length)
-        return made + noise - silent.render(contacts, directions=directions, samples=length)

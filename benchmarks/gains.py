@@ -36,6 +36,7 @@ from avmsf.simulate.sim20 import SIM20
 from avmsf.simulate.truth import Truth
 from avmsf.tasks.locator import Locator
 from benchmarks.ablation import ablation, outliers, supports
+from benchmarks.fewimpacts import few
 from benchmarks.material import MissingDataError, example_capture
 from benchmarks.report import Options, Report, Table, tell
 from benchmarks.splitcases import COUNTS, ROUGH, SplitCase, bodies_of, measured, simulated, split_case, splits_of
@@ -260,6 +261,7 @@ PARTS: dict[str, Callable[[Options], Report]] = {
     "captures": _captures,
     **{f"sim20-{name}".rstrip("-"): partial(_sim20, condition=name) for name in _CONDITIONS},
     "ablation": ablation,
+    "few": few,
     "outliers": outliers,
     "supports": supports,
     "speed": _speed,
