@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from avmsf._utils.device import usable_device
+from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.bench.cases import Growing
 from avmsf.bench.judging import Judging
 from avmsf.bench.learningcurve import curves, draw_learning_curve
@@ -160,7 +160,7 @@ def evaluation_of(
     Raises SceneError for an encoder, and EvaluationError for a device, that is not available.
     """
     if device is not None:
-        usable_device(device, raising=EvaluationError)
+        usable_device(device, raising=EvaluationError, kinds=TRAINABLE)
     lift, paper = settled_lifts(scene.lift, methods)
     scene = replace(scene, lift=lift)
     settings = {"scene": asdict(scene), "paper": asdict(paper), "geometry": geometry, "body": asdict(body)}
