@@ -29,8 +29,8 @@ from avmsf.bench.editmethods import GENERATED, EditMethod, Recast, towards_refer
 from avmsf.bench.edittasks import RECORDED_TRANSITIONS, SEVEN_TRANSITIONS, EditTask, prompted_tasks
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.capture.datasets.recognize import open_dataset
+from avmsf.config import DINO, PRESETS
 from avmsf.errors import AvmsfError, EvaluationError
-from avmsf.pipeline.config import DINO, PRESETS
 from avmsf.pipeline.features import choose_encoder
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.tasks.config import SteerConfig

@@ -78,9 +78,7 @@ def test_what_is_wrong_is_said_before_anything_is_written(
 
 
 @pytest.mark.parametrize("device", ["nothing", "meta"])
-def test_a_device_that_no_field_trains_on_is_refused_before_anything(
-    device: str, plates: Path, tmp_path: Path
-) -> None:
+def test_a_device_that_no_field_trains_on_is_refused_before_anything(device: str, plates: Path, tmp_path: Path) -> None:
     with raises(EvaluationError, name="device", value=device):
         run(parse(["farthest", str(plates), *CHEAP, "--device", device, "--output", str(tmp_path / "results")]))
     assert not (tmp_path / "results").exists()

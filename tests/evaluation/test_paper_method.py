@@ -10,9 +10,9 @@ from avmsf.bench.fieldmethods import FieldMethod
 from avmsf.bench.methods import METHODS
 from avmsf.bench.task import Task
 from avmsf.cli.evaluate import settled_lifts
+from avmsf.config import DESCRIPTORS, DINO, PRESETS, LiftConfig
 from avmsf.errors import SceneError
 from avmsf.modal.extraction.finders import ShortTime
-from avmsf.pipeline.config import DESCRIPTORS, DINO, PRESETS, LiftConfig
 from avmsf.pipeline.features import DinoEncoder
 from avmsf.pipeline.record import finder_of
 from plate_field import QUICK, plate_features, plate_impacts

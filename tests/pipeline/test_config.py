@@ -9,11 +9,11 @@ import pytest
 from avmsf.capture import Capture, CaptureSettings
 from avmsf.cli.options.fit import parse as parse_fit
 from avmsf.cli.options.reconstruct import parse as parse_reconstruct
+from avmsf.config import PRESETS, PipelineConfig
 from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.finders import ShortTime
-from avmsf.pipeline.config import PRESETS, PipelineConfig
 from avmsf.pipeline.record import capture_settings_of, finder_of
 from plate_field import plate_impacts
 from raising import raises

@@ -28,9 +28,9 @@ from avmsf.cli import INTERRUPTED
 from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.options.evaluate import Options
 from avmsf.cli.printing import console, decimals, print_json, say, table
+from avmsf.config import AUTO, PRESETS, BodyConfig, Geometry, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.errors import EvaluationError
 from avmsf.modal.extraction.finders import HighResolution
-from avmsf.pipeline.config import AUTO, PRESETS, BodyConfig, Geometry, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.features import choose_encoder, settled
 from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks

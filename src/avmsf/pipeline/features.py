@@ -9,8 +9,8 @@ import torch
 from avmsf._utils.device import usable_device
 from avmsf.capture.cameras import View
 from avmsf.capture.surface import Surface
+from avmsf.config import AUTO, DESCRIPTORS, DINO, LiftConfig
 from avmsf.errors import SceneError
-from avmsf.pipeline.config import AUTO, DESCRIPTORS, DINO, LiftConfig
 from avmsf.scene.descriptors import ImageDescriptors
 from avmsf.scene.dino import DinoEncoder
 from avmsf.scene.encode import Encoder

@@ -5,9 +5,9 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from avmsf.capture.settings import CaptureSettings
+from avmsf.config import PipelineConfig
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.finders import ModeFinder, finder_named
-from avmsf.pipeline.config import PipelineConfig
 
 RECORD = "pipeline"
 """What a field's report calls the configuration that made it."""

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from avmsf.cli.options.common import Existing, Flag, OutputFolder, Printing, parse_options
-from avmsf.pipeline.config import BodyConfig, Geometry, LiftConfig
+from avmsf.config import BodyConfig, Geometry, LiftConfig
 from avmsf.scene.splatconfig import SplatConfig
 
 

@@ -8,9 +8,9 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import Existing, Printing, SettingsFile, parse_options
+from avmsf.config import PRESETS, BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
 from avmsf.field.config import FitConfig, GainModel
 from avmsf.modal.config import ExtractionMethod
-from avmsf.pipeline.config import PRESETS, BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
 
 
 @dataclass(frozen=True)

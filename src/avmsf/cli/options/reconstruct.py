@@ -10,9 +10,7 @@ import tyro
 from avmsf.cli.options.common import parse_options
 from avmsf.cli.options.fit import preset_of
 from avmsf.cli.options.scenes import SceneOptions, with_seed
-from avmsf.field.config import FitConfig, GainModel
-from avmsf.modal.config import ExtractionMethod
-from avmsf.pipeline.config import (
+from avmsf.config import (
     PRESETS,
     BodyConfig,
     LiftConfig,
@@ -22,6 +20,8 @@ from avmsf.pipeline.config import (
     TimeZero,
     ViewsConfig,
 )
+from avmsf.field.config import FitConfig, GainModel
+from avmsf.modal.config import ExtractionMethod
 from avmsf.scene.splatconfig import SplatConfig
 
 
