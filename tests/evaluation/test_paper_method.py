@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 import torch
 
-from avmsf.bench.fieldmethods import FieldMethod
+from avmsf.bench.fieldmethods import NETWORK, FieldMethod
+from avmsf.bench.gridfield import GridField
 from avmsf.bench.methods import METHODS
 from avmsf.bench.task import Task
 from avmsf.cli.evaluate import settled_lifts
@@ -14,21 +15,21 @@ from avmsf.config import DESCRIPTORS, DINO, PRESETS, LiftConfig
 from avmsf.errors import SceneError
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.features import DinoEncoder
-from avmsf.pipeline.record import finder_of
 from plate_field import QUICK, plate_features, plate_impacts
 from raising import raises
 
 PAPER = METHODS["paper"]
 
 
-def test_the_method_is_the_preset_with_one_damping() -> None:
+@pytest.mark.parametrize(
+    ("name", "damping"), [("paper", "shared"), ("paper-grid", "shared"), ("paper-per-contact", "per-contact")]
+)
+def test_the_method_is_the_preset_with_one_damping(name: str, damping: Any) -> None:
+    method: Any = METHODS[name]
+    field = method.method if isinstance(method, GridField) else method
     preset = PRESETS["paper"]
-    assert isinstance(PAPER, FieldMethod)
-    assert (PAPER.config, PAPER.finder, PAPER.look) == (
-        replace(preset.fit, damping="shared"),
-        finder_of(preset),
-        "paper",
-    )
+    assert field.pipeline == replace(preset, fit=replace(preset.fit, damping=damping))
+    assert (field.look, field.own_modes) == ("paper", True)
 
 
 def test_a_method_may_find_modes_in_its_own_way() -> None:
@@ -48,7 +49,8 @@ def test_a_method_may_find_modes_in_its_own_way() -> None:
         bodies=shared,
         stranger=shared,
     )
-    field = FieldMethod("quick", replace(QUICK, steps=1, correction_rate=0.0), "paper", ShortTime()).fit(task)
+    pipeline = replace(NETWORK, method="short-time", fit=replace(QUICK, steps=1, correction_rate=0.0))
+    field = FieldMethod("quick", pipeline, "paper", own_modes=True).fit(task)
     expected = ShortTime().find(impacts.sounds, impacts.sample_rate)
     assert torch.allclose(field.bank.frequency, expected.frequency)
 
