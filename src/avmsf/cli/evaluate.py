@@ -1,6 +1,6 @@
 """`avmsf evaluate`: the errors of methods on a dataset, as tables and as a page."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from avmsf.bench.report import PAGE, SUMMARY, TABLES, write_figures, write_page,
 from avmsf.bench.reporttables import Section
 from avmsf.bench.results import ResultsFolder, write_json
 from avmsf.bench.subsets import choose_objects, members
-from avmsf.bench.task import Method
+from avmsf.bench.task import Look, Looking, Method
 from avmsf.capture.datasets import CaptureCollection, open_dataset
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.cli import INTERRUPTED
@@ -161,14 +161,16 @@ def evaluation_of(
     """
     if device is not None:
         usable_device(device, raising=EvaluationError, kinds=TRAINABLE)
-    lift, paper = settled_lifts(scene.lift, methods)
-    scene = replace(scene, lift=lift)
+    given = scene.lift.encoder
+    lift, paper = settled_lifts(scene.lift, looks_of(methods, protocol), device=device)
     settings = {"scene": asdict(scene), "paper": asdict(paper), "geometry": geometry, "body": asdict(body)}
+    scene = replace(scene, lift=lift)
     looks = ObjectLooks(dataset, kept, scene, paper, device)
     bodies = ObjectBodies(dataset, kept, geometry, body, scene, device=device)
     finder = HighResolution(modes=modes)
+    encoder = None if lift.encoder == given else lift.encoder
     return Evaluation(
-        dataset, title, protocol, methods, looks, bodies, seed, judging, finder, settings, looks.cloud, device
+        dataset, title, protocol, methods, looks, bodies, seed, judging, finder, settings, looks.cloud, device, encoder
     )
 
 
@@ -191,18 +193,27 @@ def run_shown(
         run_objects(evaluation, objects, results, workers=workers, progress=show)
 
 
-def settled_lifts(lift: LiftConfig, methods: Sequence[Method]) -> tuple[LiftConfig, LiftConfig]:
-    """Return the settings of features, and those of the paper's form, with the encoders that will be used.
+def settled_lifts(
+    lift: LiftConfig, looks: Collection[Look], *, device: str | None = None
+) -> tuple[LiftConfig, LiftConfig]:
+    """Return the settings of features, and those of the paper's form, with the encoders that `looks` are made with.
 
-    The replacement of DINOv2 is printed, and is part of the results' identity. Raises SceneError where a method needs
-    the paper's encoder and it is not available.
+    Without any look no encoder is loaded. The replacement of DINOv2 is printed. Raises SceneError where a look is the
+    paper's and its encoder is not available.
     """
     paper = PRESETS["paper"].scene.lift
     if lift.encoder != AUTO:
         return lift, replace(paper, encoder=lift.encoder)
-    if any(getattr(method, "look", "").startswith("paper") for method in methods):
-        choose_encoder(paper, tell=say)
-    return settled(lift, tell=say), paper
+    if any(look.startswith("paper") for look in looks):
+        choose_encoder(paper, tell=say, device=device)
+        return replace(lift, encoder=paper.encoder), paper
+    return settled(lift, tell=say, device=device) if looks else lift, paper
+
+
+def looks_of(methods: Sequence[Method], protocol: EvaluationProtocol) -> frozenset[Look]:
+    """Return the features that an evaluation reads: those of its methods, and the points that locate recordings."""
+    read = {method.look for method in methods if isinstance(method, Looking)}
+    return frozenset(read | {"positions"} if protocol.locating else read)
 
 
 def title_of(dataset: Dataset, folder: Path) -> str:
