@@ -73,6 +73,8 @@ class Evaluation:
     """Device that methods train on, with the same result up to rounding; None for a GPU where there is one."""
     encoder: str | None = None
     """Encoder that `auto` in the settings stands for; None where the settings name it, or no method reads features."""
+    time_zero: str | None = None
+    """Start of the dataset's sounds, `onset` or `peak`, for all methods; None for the dataset's own."""
 
     def begin(self, results: ResultsFolder) -> None:
         """Take a folder for this evaluation's results.
@@ -88,6 +90,7 @@ class Evaluation:
             "choosing": repr(self.protocol.choosing),
             "dataset": self.title,
             "seed": self.seed,
+            "time_zero": self.time_zero,
             "metrics": repr(self.judging),
             "modes": repr(self.finder),
             "settings": dict(self.settings),

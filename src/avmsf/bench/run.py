@@ -34,7 +34,8 @@ def run_object(
         record = results.read(identifier) or ObjectRecord(identifier)
         try:
             impacts = evaluation.dataset.capture(identifier).impacts
-            truth = truth_of(evaluation.dataset, identifier)
+            # From its peak, a recording's modes have phases of its own, which the truth of all does not have.
+            truth = None if evaluation.time_zero == "peak" else truth_of(evaluation.dataset, identifier)
             digest = digest_of(impacts, truth)
             if truth is not None:
                 truth = truth_from_first_sample(truth_at(truth, impacts.names), impacts)

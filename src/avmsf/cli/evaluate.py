@@ -10,6 +10,7 @@ from rich.console import Console
 
 from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.bench.cases import Growing
+from avmsf.bench.fieldmethods import FieldMethod
 from avmsf.bench.judging import Judging
 from avmsf.bench.learningcurve import curves, draw_learning_curve
 from avmsf.bench.methods import method_named
@@ -28,9 +29,9 @@ from avmsf.cli import INTERRUPTED
 from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.options.evaluate import Options
 from avmsf.cli.printing import console, decimals, print_json, say, table
-from avmsf.config import AUTO, PRESETS, BodyConfig, Geometry, LiftConfig, SceneConfig, ViewsConfig
+from avmsf.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
 from avmsf.errors import EvaluationError
-from avmsf.modal.extraction.finders import HighResolution
+from avmsf.modal.extraction.finders import finder_named
 from avmsf.pipeline.features import choose_encoder, settled
 from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
@@ -48,30 +49,17 @@ def run(options: Options) -> int:
     elif options.counts or options.starts != Options.starts or options.metric != Options.metric:
         say(f"note: --counts, --starts and --metric are not used by {protocol.name}, only by {LEARNING_CURVE}")
     methods = tuple(method_named(name) for name in _words(options.methods) or protocol.methods)
-    cdpam = not options.no_cdpam and "cdpam" in protocol.metrics
     workers = Workers(options.workers, options.ray)
     # All paths are made absolute: workers may run in folders of their own.
     contacts, table_of_names = (
         None if path is None else path.resolve() for path in (options.contact_data, options.table)
     )
-    dataset = open_dataset(options.data.resolve(), contacts=contacts, table=table_of_names)
+    dataset = open_dataset(options.data.resolve(), contacts=contacts, table=table_of_names, time_zero=options.time_zero)
     title = title_of(dataset, options.data)
     objects = choose_objects(dataset, protocol, _words(options.objects))
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
-    evaluation = evaluation_of(
-        dataset,
-        title,
-        protocol,
-        methods,
-        (options.cache or folder / "features").resolve(),
-        scene=SceneConfig(ViewsConfig(source=options.visual_source), options.splat, options.lift),
-        geometry=options.geometry,
-        body=options.body,
-        judging=Judging(level=options.amplitude_scale, cdpam=cdpam, cdpam_contacts=options.cdpam_contacts),
-        modes=options.modes,
-        seed=options.seed,
-        device=options.device,
-    )
+    evaluation = evaluation_of(options, dataset, title, protocol, methods, folder)
+    _note_start(methods, options.time_zero)
     results, groups = ResultsFolder(folder), members(dataset)
     say(f"{protocol.name} on {title}: {len(objects)} objects, {len(methods)} methods, results in {folder}")
     try:
@@ -141,37 +129,51 @@ def _draw_curves(
 
 
 def evaluation_of(
+    options: Options,
     dataset: Dataset,
     title: str,
     protocol: EvaluationProtocol,
     methods: tuple[Method, ...],
-    kept: Path,
-    *,
-    scene: SceneConfig,
-    judging: Judging,
-    modes: int,
-    seed: int,
-    body: BodyConfig,
-    geometry: Geometry = "mesh",
-    device: str | None = None,
+    folder: Path,
 ) -> Evaluation:
-    """Return the plan of an evaluation that stores features and surfaces in the folder `kept`.
+    """Return the plan of an evaluation with results in a folder, and features in it unless the options name another.
 
     Raises SceneError for an encoder, and EvaluationError for a device, that is not available.
     """
+    device, body = options.device, options.body
     if device is not None:
         usable_device(device, raising=EvaluationError, kinds=TRAINABLE)
-    given = scene.lift.encoder
-    lift, paper = settled_lifts(scene.lift, looks_of(methods, protocol), device=device)
-    settings = {"scene": asdict(scene), "paper": asdict(paper), "geometry": geometry, "body": asdict(body)}
-    scene = replace(scene, lift=lift)
+    kept = (options.cache or folder / "features").resolve()
+    lift, paper = settled_lifts(options.lift, looks_of(methods, protocol), device=device)
+    given = SceneConfig(ViewsConfig(source=options.visual_source), options.splat, options.lift)
+    scene = replace(given, lift=lift)
     looks = ObjectLooks(dataset, kept, scene, paper, device)
-    bodies = ObjectBodies(dataset, kept, geometry, body, scene, device=device)
-    finder = HighResolution(modes=modes)
-    encoder = None if lift.encoder == given else lift.encoder
+    cdpam = not options.no_cdpam and "cdpam" in protocol.metrics
     return Evaluation(
-        dataset, title, protocol, methods, looks, bodies, seed, judging, finder, settings, looks.cloud, device, encoder
+        dataset,
+        title,
+        protocol,
+        methods,
+        looks,
+        ObjectBodies(dataset, kept, options.geometry, body, scene, device=device),
+        options.seed,
+        Judging(level=options.amplitude_scale, cdpam=cdpam, cdpam_contacts=options.cdpam_contacts),
+        finder_named(options.extraction, options.modes),
+        {"scene": asdict(given), "paper": asdict(paper), "geometry": options.geometry, "body": asdict(body)},
+        looks.cloud,
+        device,
+        None if lift == options.lift else lift.encoder,
+        options.time_zero,
     )
+
+
+def _note_start(methods: Sequence[Method], time_zero: TimeZero | None) -> None:
+    """Print which methods are configured for another start of sounds than the evaluation has."""
+    fields = [getattr(method, "method", method) for method in methods]
+    others = {each.name: each.pipeline.time_zero for each in fields if isinstance(each, FieldMethod)}
+    for name, wanted in others.items():
+        if wanted not in (None, time_zero):
+            say(f"note: {name} is published with sounds from their {wanted}s; choose them by --time-zero {wanted}")
 
 
 def run_shown(
