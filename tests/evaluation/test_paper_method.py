@@ -36,7 +36,7 @@ def test_the_method_is_the_preset_with_one_damping(name: str, damping: Any) -> N
     field = method.method if isinstance(method, GridField) else method
     preset = PRESETS["paper"]
     assert field.pipeline == replace(preset, fit=replace(preset.fit, damping=damping))
-    assert (field.look, field.own_modes) == ("paper", True)
+    assert (field.look, field.published) == ("paper", True)
 
 
 def test_a_method_may_find_modes_in_its_own_way() -> None:
@@ -57,7 +57,7 @@ def test_a_method_may_find_modes_in_its_own_way() -> None:
         stranger=shared,
     )
     pipeline = replace(NETWORK, method="short-time", fit=replace(QUICK, steps=1, correction_rate=0.0))
-    field = FieldMethod("quick", pipeline, "paper", own_modes=True).fit(task)
+    field = FieldMethod("quick", pipeline, "paper", published=True).fit(task)
     expected = ShortTime().find(impacts.sounds, impacts.sample_rate)
     assert torch.allclose(field.bank.frequency, expected.frequency)
 

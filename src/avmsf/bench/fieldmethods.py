@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from avmsf.bench.task import Look, Task
+from avmsf.bench.task import Look, Method, Task
 from avmsf.capture.impacts import Impacts
 from avmsf.config import PipelineConfig
 from avmsf.field.config import FitConfig
@@ -34,8 +34,9 @@ class FieldMethod:
     """Settings of all stages."""
     look: Look = "visual"
     """What is read of the object's points."""
-    own_modes: bool = False
-    """Whether modes are found as `pipeline` says, in place of those that all methods share."""
+    published: bool = False
+    """Whether modes are found as `pipeline` says, in place of those that all methods share, and recordings are located
+    by the cosine distance of gains as it is published."""
 
     def fit(self, task: Task) -> SoundField:
         """Fit the field. Raises AvmsfError where modes, features or field cannot be made."""
@@ -43,7 +44,7 @@ class FieldMethod:
 
     def modes(self, task: Task) -> Extraction:
         """Return the modes of a task's training recordings."""
-        if not self.own_modes:
+        if not self.published:
             return task.modes()
         finder = finder_named(self.pipeline.method, self.pipeline.modes)
         return extract_sounds(task.train.sounds, sample_rate=task.train.sample_rate, method=finder)
@@ -96,3 +97,9 @@ class UninformedField:
         steps = config.warmup_steps + config.steps
         config = replace(config, warmup_steps=0, steps=steps, correction_rate=self.correction_rate)
         return self.method.fitted(task, task.train, task.features(self.look), start, config)
+
+
+def configured(method: Method) -> FieldMethod | None:
+    """Return the configuration that a method fits, or starts from; None for methods without one."""
+    found = getattr(method, "method", method)
+    return found if isinstance(found, FieldMethod) else None

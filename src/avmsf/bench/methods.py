@@ -127,7 +127,7 @@ _PRESET = PRESETS["paper"]
 def _paper(name: str, look: Look = "paper", **fit: Any) -> FieldMethod:
     """Return the preset `paper` with one of its two dampings, shared unless `fit` names the other."""
     settings = {"damping": "shared", **fit}
-    return FieldMethod(name, replace(_PRESET, fit=replace(_PRESET.fit, **settings)), look, own_modes=True)
+    return FieldMethod(name, replace(_PRESET, fit=replace(_PRESET.fit, **settings)), look, published=True)
 
 
 def _quick(name: str, look: Look = "visual", **fit: Any) -> FieldMethod:

@@ -33,7 +33,8 @@ def run_object(
     with one_thread():
         record = results.read(identifier) or ObjectRecord(identifier)
         try:
-            impacts = evaluation.dataset.capture(identifier).impacts
+            capture = evaluation.dataset.capture(identifier)
+            impacts, surface = capture.impacts, capture.surface
             # From its peak, a recording's modes have phases of its own, which the truth of all does not have.
             truth = None if evaluation.time_zero == "peak" else truth_of(evaluation.dataset, identifier)
             digest = digest_of(impacts, truth)
@@ -69,6 +70,7 @@ def run_object(
                     family=family,
                     material=facts.material,
                     stranger=stranger,
+                    vertices=None if surface is None or not len(surface.faces) else surface.vertices,
                     listened=firsts[case.label] == case.key,
                 ),
                 record,

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.bench.cases import Growing
-from avmsf.bench.fieldmethods import FieldMethod
+from avmsf.bench.fieldmethods import configured
 from avmsf.bench.judging import Judging
 from avmsf.bench.learningcurve import curves, draw_learning_curve
 from avmsf.bench.methods import method_named
@@ -169,11 +169,11 @@ def evaluation_of(
 
 def _note_start(methods: Sequence[Method], time_zero: TimeZero | None) -> None:
     """Print which methods are configured for another start of sounds than the evaluation has."""
-    fields = [getattr(method, "method", method) for method in methods]
-    others = {each.name: each.pipeline.time_zero for each in fields if isinstance(each, FieldMethod)}
-    for name, wanted in others.items():
+    for method in methods:
+        settings = configured(method)
+        wanted = None if settings is None else settings.pipeline.time_zero
         if wanted not in (None, time_zero):
-            say(f"note: {name} is published with sounds from their {wanted}s; choose them by --time-zero {wanted}")
+            say(f"note: {method.name} is published with sounds from their {wanted}s: --time-zero {wanted}")
 
 
 def run_shown(

@@ -86,7 +86,8 @@ class Options(Printing):
     table: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Existing("a table of objects")] = None
     """The published table of ObjectFolder Real's names and materials."""
     figures: Flag = False
-    """Also draw figures/OBJECT.png: spectrograms of the recording and of all methods, 20 Hz to 20 kHz, first second."""
+    """Also draw figures/OBJECT.png: spectrograms of the recording and of all methods, 20 Hz to 20 kHz, first second;
+    with localize also each field's heat maps of three recordings, with the true contact marked."""
 
 
 def parse(words: Sequence[str]) -> Options:
