@@ -13,6 +13,7 @@ from torch import Tensor
 
 from avmsf.bench.evaluation import split
 from avmsf.capture import Impacts
+from avmsf.config import BodyConfig
 from avmsf.fem.supports import supports_of
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.elastic import Elastic
@@ -23,7 +24,6 @@ from avmsf.modal.bank import ModalBank
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual import Residual
 from avmsf.pipeline.bodies import candidate_bodies, roughened
-from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.block import block
 from avmsf.simulate.elastic import ElasticModes, elastic_modes

@@ -19,6 +19,7 @@ from avmsf.capture.audio import read_recording
 from avmsf.capture.folder import read_strike
 from avmsf.capture.prepare import margin_length, prepare
 from avmsf.capture.table import read_rows, understand
+from avmsf.config import BodyConfig
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
@@ -27,7 +28,6 @@ from avmsf.modal.extraction.alignment import Alignment, align, coherence, strong
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.example import EXAMPLE_FOLDER
 from avmsf.simulate.truth import read_truth

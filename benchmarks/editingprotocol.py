@@ -27,10 +27,11 @@ from avmsf.bench.editingobjects import (
 )
 from avmsf.bench.editmethods import GENERATED, EditMethod, Recast, towards_reference, towards_words
 from avmsf.bench.edittasks import RECORDED_TRANSITIONS, SEVEN_TRANSITIONS, EditTask, prompted_tasks
+from avmsf.bench.published import EDITING_UMAP
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.capture.datasets.recognize import open_dataset
+from avmsf.config import DINO, PRESETS
 from avmsf.errors import AvmsfError, EvaluationError
-from avmsf.pipeline.config import DINO, PRESETS
 from avmsf.pipeline.features import choose_encoder
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.tasks.config import SteerConfig
@@ -256,6 +257,8 @@ def _report(
         "umap_rings: with dampings; clap: mean cosine of sounds and prompt; spectral: relative STFT error from the "
         "nearest clip of the reference. edits: those with a score; a generated sound may hold no mode.",
         *cast.remarks,
+        f"umap in the paper: {', '.join(f'{title} {value:g}' for title, value in EDITING_UMAP.items())}; its choice of "
+        "objects and prompts is not published, and every set of objects has another UMAP.",
     )
     columns = ("method", "edits", "umap", "umap_rings", "clap", "spectral", "seconds")
     title = f"editing, {cast.name}: means over {len(cast.tasks)} edits"

@@ -22,6 +22,7 @@ from avmsf.bench.locatingimages import Images, symmetries_of
 from avmsf.capture import Capture, Surface, read_capture
 from avmsf.capture.audio import read_recording
 from avmsf.capture.impacts import Impacts
+from avmsf.config import BodyConfig
 from avmsf.errors import LocationError
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
@@ -31,7 +32,6 @@ from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.residual import Residual
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.plate import Plate, plate_surface_points
 from avmsf.simulate.shapes import make_shape

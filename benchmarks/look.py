@@ -12,7 +12,7 @@ from avmsf.capture import Surface
 from avmsf.capture.cameras import View
 from avmsf.capture.meshviews import Lighting, orbit_cameras, render_views
 from avmsf.capture.texturedmesh import TexturedMesh
-from avmsf.pipeline.config import LiftConfig
+from avmsf.config import LiftConfig
 from avmsf.pipeline.features import MadeFeatures, finish_features, lift_to_surface
 from avmsf.scene.descriptors import ImageDescriptors
 from avmsf.scene.lift import Lifted

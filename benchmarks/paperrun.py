@@ -15,6 +15,7 @@ from avmsf.bench.renderer import Renderer
 from avmsf.capture import Capture
 from avmsf.capture.datasets import CaptureCollection
 from avmsf.capture.impacts import Impacts
+from avmsf.config import DESCRIPTORS, PRESETS
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
@@ -23,7 +24,6 @@ from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.extraction.extract import extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import DESCRIPTORS, PRESETS
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.sim20 import sim20_recipe

@@ -15,13 +15,13 @@ import torch
 
 from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture import read_capture, write_capture
+from avmsf.config import BodyConfig
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.uncertainty import coverage
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.bodies import make_body
 from avmsf.simulate.material import material_named
 from avmsf.simulate.nominal import NOMINAL, nominal_bodies

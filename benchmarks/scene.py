@@ -13,9 +13,9 @@ from avmsf.capture import Capture, read_capture, write_capture
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.texturedmesh import TexturedMesh
 from avmsf.capture.views.write import write_views
+from avmsf.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load
-from avmsf.pipeline.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.scene import Listener
 from avmsf.scene.refine import orbit_spread, refine

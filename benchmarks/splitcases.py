@@ -8,6 +8,7 @@ from pathlib import Path
 
 from avmsf.bench.evaluation import evaluate, split
 from avmsf.capture import Capture, CaptureSettings, CaptureWarning, Impacts, Surface, read_capture
+from avmsf.config import BodyConfig
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
@@ -19,7 +20,6 @@ from avmsf.geometry import ObjectShape
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
 from avmsf.scene.symmetry import Symmetries
 from avmsf.scene.symmetrycharacters import groups_of

@@ -8,6 +8,7 @@ import torch
 
 from avmsf.bench.evaluation import evaluate
 from avmsf.capture import Capture, Impacts
+from avmsf.config import BodyConfig
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
@@ -16,7 +17,6 @@ from avmsf.field.suggest import suggest
 from avmsf.modal.extraction.alignment import align
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
 from avmsf.scene.points import farthest_points
 from avmsf.simulate.sim20 import sim20_recipe

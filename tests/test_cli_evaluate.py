@@ -5,10 +5,14 @@ from pathlib import Path
 
 import pytest
 
+from avmsf.bench.fieldmethods import FieldMethod
 from avmsf.bench.plan import Evaluation
+from avmsf.bench.results import ResultsFolder
+from avmsf.bench.task import Task
 from avmsf.cli.evaluate import run
 from avmsf.cli.options.evaluate import parse
-from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.errors import AvmsfError, EvaluationError, FitError
+from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.objectbodies import ObjectBodies
 from plate_set import fill_plates
 from raising import raises
@@ -77,9 +81,10 @@ def test_what_is_wrong_is_said_before_anything_is_written(
     assert sorted(path.name for path in plates.parent.iterdir()) == before
 
 
-def test_a_device_that_is_not_there_is_refused_before_anything(plates: Path, tmp_path: Path) -> None:
-    with raises(EvaluationError, name="device"):
-        run(parse(["farthest", str(plates), *CHEAP, "--device", "nothing", "--output", str(tmp_path / "results")]))
+@pytest.mark.parametrize("device", ["nothing", "meta"])
+def test_a_device_that_no_field_trains_on_is_refused_before_anything(device: str, plates: Path, tmp_path: Path) -> None:
+    with raises(EvaluationError, name="device", value=device):
+        run(parse(["farthest", str(plates), *CHEAP, "--device", device, "--output", str(tmp_path / "results")]))
     assert not (tmp_path / "results").exists()
 
 
@@ -96,6 +101,35 @@ def test_methods_train_on_the_device_that_is_asked_for(
     words = ["farthest", str(plates), "--methods", "field-auto", "--no-cdpam", "--device", "cpu"]
     assert run(parse([*words, "--output", str(tmp_path / "results")])) == 130
     assert asked == ["cpu"]
+
+
+def test_all_methods_hear_the_start_of_sounds_and_share_the_modes_that_are_asked_for(
+    tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plates, results = fill_plates(tmp_path / "plates", ("a",), truth=True), tmp_path / "results"
+    words = ["farthest", str(plates), "--methods", "knn-gains,paper", "--no-cdpam", "--extraction", "short-time"]
+    words += ["--lift.encoder", "descriptors", "--output", str(results)]
+    heard = []
+
+    def stop(field: FieldMethod, task: Task) -> None:
+        heard.append(task.train.sounds)
+        raise FitError("left out")
+
+    monkeypatch.setattr(FieldMethod, "fit", stop)
+    assert run(parse([*words, "--time-zero", "peak"])) == 0
+    assert "--time-zero" not in capsys.readouterr().err
+    assert bool((heard[0][:, 0].abs() == heard[0].abs().amax(1)).all())
+    # What peaks do to phases, no truth tells.
+    summary = json.loads((results / "summary.json").read_text())
+    assert "relative_stft" in summary["methods"]["knn-gains"]
+    assert "gain_error" not in summary["methods"]["knn-gains"]
+    assert ResultsFolder(results).identity()["modes"] == repr(ShortTime(128))
+    with raises(EvaluationError, name="time_zero", value="peak"):
+        run(parse(words))
+    assert run(parse([*words[:-1], str(tmp_path / "others"), "--time-zero", "onset"])) == 0
+    assert "--time-zero peak" in capsys.readouterr().err
+    summary = json.loads((tmp_path / "others" / "summary.json").read_text())
+    assert "gain_error" in summary["methods"]["knn-gains"]
 
 
 def test_no_figure_at_all_is_an_error(plates: Path, tmp_path: Path) -> None:

@@ -57,6 +57,19 @@ def test_each_kind_is_recognized(place: Path, path: str, kind: type[Dataset], ob
 
 
 @pytest.mark.parametrize("path", ["raw/of", "compact/DATA", "impact/RI", "own/captures"])
+def test_sounds_of_every_dataset_start_where_they_are_asked_to(place: Path, path: str) -> None:
+    own, peak = (open_dataset(place / path, time_zero=each) for each in (None, "peak"))
+    name = own.objects()[0]
+    usual, sounds = (dataset.capture(name).impacts.sounds for dataset in (own, peak))
+    assert bool((sounds[:, 0].abs() == sounds.abs().amax(1)).all())
+    assert not bool((usual[:, 0].abs() == usual.abs().amax(1)).any())
+    assert (
+        open_dataset(place / path, time_zero="onset").capture(name).impacts.digest()
+        == own.capture(name).impacts.digest()
+    )
+
+
+@pytest.mark.parametrize("path", ["raw/of", "compact/DATA", "impact/RI", "own/captures"])
 def test_every_dataset_answers_alike(place: Path, path: str) -> None:
     dataset = open_dataset(place / path)
     for report in dataset.check().objects:

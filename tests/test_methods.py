@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import torch
 
 from avmsf.bench.diffsoundmethod import DiffSoundMethod
 from avmsf.bench.evaluation import split
-from avmsf.bench.fieldmethods import FieldMethod, MixtureField, UninformedField
+from avmsf.bench.fieldmethods import FieldMethod, UninformedField
 from avmsf.bench.gridfield import PAPER_GRID, Grid, GridField
 from avmsf.bench.methods import METHODS, RecordedMethod, method_named, report_of
 from avmsf.bench.renderer import Renderer
@@ -23,6 +24,7 @@ from avmsf.errors import EvaluationError, FitError, SceneError
 from avmsf.evaluation.material_fit import DiffSoundConfig
 from avmsf.fem.family import BodyFamily
 from avmsf.fem.isotropic import isotropic_modes
+from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.field.recipes import Attention
@@ -47,17 +49,22 @@ def struck() -> Impacts:
     return plate_impacts(COUNT, seconds=SECONDS)
 
 
-def tiny(method: Method) -> Method:
+def with_fit(method: FieldMethod, config: FitConfig) -> FieldMethod:
+    return replace(method, pipeline=replace(method.pipeline, fit=config))
+
+
+def tiny(method: Any) -> Any:
     """Return a method of the same kind that is fitted in a moment."""
     if isinstance(method, DiffSoundMethod):
         return replace(method, config=DiffSoundConfig(transport_steps=1, difference_steps=2, search=0))
     if isinstance(method, GridField):
-        return replace(method, base=TINY, grid=Grid((4, 8), (1e-2,), (2,), (1.0,), ("shared",)))
-    if isinstance(method, MixtureField):
-        return replace(method, config=TINY)
-    if isinstance(method, FieldMethod | UninformedField):
-        kept = {name: getattr(method.config, name) for name in ("residual", "feature_scale", "bands")}
-        return replace(method, config=replace(TINY, **kept, steps=min(4, method.config.steps)))
+        return replace(method, method=tiny(method.method), grid=Grid((4, 8), (1e-2,), (2,), (1.0,), ("shared",)))
+    if isinstance(method, UninformedField):
+        return replace(method, method=tiny(method.method))
+    if isinstance(method, FieldMethod):
+        config = method.pipeline.fit
+        kept = {name: getattr(config, name) for name in ("residual", "feature_scale", "bands")}
+        return with_fit(method, replace(TINY, **kept, steps=min(4, config.steps)))
     return method
 
 
@@ -308,7 +315,7 @@ def test_a_grid_is_chosen_from_by_envelopes_held_out_of_training():
     train, _ = parts()
     # A rate at which nothing is learnt beside one at which much is, in a warm-up too short to matter.
     grid = Grid((8,), (1e-7, 2e-2), (30,), (1.0,), ("shared",))
-    method = GridField("grid", grid, replace(TINY, warmup_steps=1, warmup_rate=1e-7))
+    method = GridField(with_fit(FieldMethod("grid"), replace(TINY, warmup_steps=1, warmup_rate=1e-7)), grid)
     field = method.fit(plate_task(train))
     report = report_of(field)["grid"]
     assert report["chosen"] == {
@@ -324,7 +331,7 @@ def test_a_grid_is_chosen_from_by_envelopes_held_out_of_training():
     assert len(report["validation_contacts"]) == 2
     assert set(report["validation_contacts"]) < set(train.names)
     assert field.origin.trained_on == train.names
-    few = GridField("grid", grid, TINY).fit(plate_task(train.take(range(5))))
+    few = GridField(with_fit(FieldMethod("grid"), TINY), grid).fit(plate_task(train.take(range(5))))
     assert report_of(few)["grid"] == {"validated": False}
 
 
@@ -338,7 +345,8 @@ def test_a_grids_trials_do_not_learn_from_what_they_are_judged_by(monkeypatch):
         return fit(impacts, features, modes, config, **rest)
 
     monkeypatch.setattr("avmsf.bench.fieldmethods.fit", watched)
-    field = GridField("grid", Grid((8,), (1e-2,), (2,), (0.5, 1.0), ("shared",)), TINY).fit(plate_task(train))
+    grid = Grid((8,), (1e-2,), (2,), (0.5, 1.0), ("shared",))
+    field = GridField(with_fit(FieldMethod("grid"), TINY), grid).fit(plate_task(train))
     held = set(report_of(field)["grid"]["validation_contacts"])
     assert len(seen) == 3
     for names in seen[:2]:

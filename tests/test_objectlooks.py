@@ -11,8 +11,8 @@ from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.views.write import write_views
+from avmsf.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.errors import SceneError
-from avmsf.pipeline.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.objectlooks import ObjectLooks
 from avmsf.pipeline.sources import find_source
 from avmsf.scene.features import FeatureField

@@ -13,11 +13,11 @@ from avmsf._utils import caching
 from avmsf.capture.surface import Surface
 from avmsf.cli import main
 from avmsf.compiled import compiled
+from avmsf.config import BodyConfig
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from avmsf.field.store import load
 from avmsf.files import write_whole
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import BodyConfig
 from plate_capture import TINY, fill_plate
 from raising import raises, warns
 

@@ -9,10 +9,10 @@ from avmsf.bench.modespace import MaterialSpace
 from avmsf.bench.results import IDENTITY, ResultsFolder
 from avmsf.capture.datasets.contactlists import LISTS, read_contacts
 from avmsf.cli.demofolder import RECORD, replaced_whole
+from avmsf.config import CACHE
 from avmsf.errors import AvmsfError, DatasetError, EvaluationError, ExportError
 from avmsf.export.packedarrays import read_manifest
 from avmsf.export.written import MANIFEST, write_folder
-from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.stages import StageFolder
 from avmsf.studio.strikefiles import JOURNAL, StrikeFiles
 

@@ -42,6 +42,13 @@ def test_recordings_from_their_peaks_are_final(tmp_path: Path) -> None:
     assert not torch.equal(read_capture(folder, CaptureSettings()).impacts.sounds, impacts.sounds)
 
 
+def test_settings_start_where_they_are_asked_to() -> None:
+    own = CaptureSettings(align=False)
+    assert own.starting(None) == own.starting("onset") == own
+    assert own.starting("peak").from_peaks
+    assert not own.starting("peak").starting("onset").from_peaks
+
+
 def test_another_start_is_refused() -> None:
     with raises(CaptureError, name="time_zero", value="middle"):
         CaptureSettings(time_zero="middle")

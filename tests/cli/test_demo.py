@@ -14,9 +14,9 @@ from avmsf.capture import read_surface
 from avmsf.cli import demo, main
 from avmsf.cli.demo import verdict, wall_words
 from avmsf.cli.overallbar import REFINEMENT, OverallBar
+from avmsf.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.field.fit import Progress
 from avmsf.field.store import load
-from avmsf.pipeline.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.scene.ply import read_splats
 from avmsf.scene.splatconfig import SplatConfig
 from avmsf.simulate.example import EXAMPLE

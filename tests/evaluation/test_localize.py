@@ -3,41 +3,164 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
+from avmsf.bench import locatingmethods, report
 from avmsf.bench.baselines import NearestStrike, WhiteNoise
-from avmsf.bench.locating import located
+from avmsf.bench.fieldmethods import FieldMethod
+from avmsf.bench.gridfield import GridField
 from avmsf.bench.locatingbaselines import random_distance
+from avmsf.bench.locatingmethods import MAX_VERTICES, located
+from avmsf.bench.results import ResultsFolder
+from avmsf.bench.task import Task
+from avmsf.capture import Impacts, read_capture
 from avmsf.cli import main
+from avmsf.errors import LocationError
+from avmsf.evaluation.diffsound import DiffSound
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.soundfield import SoundField
+from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.published import PublishedLocator
+from avmsf.modal.extraction.finders import ShortTime
+from avmsf.pipeline.objectlooks import ObjectLooks
+from avmsf.scene.features import FeatureField
 from plate_field import QUICK, plate_extraction, plate_features, plate_impacts
-from plate_set import fill_plates
+from plate_set import PlateLooks, fill_plates
+from raising import raises
 
 
 def test_the_nearest_recording_finds_itself_and_noise_counts_as_a_random_point() -> None:
     train, points = plate_impacts(), plate_features().points
     size = float((points.amax(0) - points.amin(0)).norm())
-    assert located(NearestStrike(train), train, train, points) == {"rmed": (0.0,) * len(train)}
+    assert located(NearestStrike(train), train, train, points).errors == {"rmed": (0.0,) * len(train)}
     expected = [random_distance(points.double(), place[None]) / size for place in train.contacts]
-    assert located(WhiteNoise(train), train, train, points)["rmed"] == pytest.approx(expected)
+    assert located(WhiteNoise(train), train, train, points).errors["rmed"] == pytest.approx(expected)
     silent = replace(train, sounds=0 * train.sounds)
-    assert located(NearestStrike(train), train, silent, points)["rmed"] == pytest.approx(expected)
+    assert located(NearestStrike(train), train, silent, points).errors["rmed"] == pytest.approx(expected)
+
+
+def smooth_field(train: Impacts, features: FeatureField) -> SoundField:
+    config = replace(QUICK, warmup_steps=0, steps=1, residual=False)
+    return fit(train, features, plate_extraction(train), config, gains=MixtureEstimator(("smooth",)))
+
+
+def struck(field: SoundField, points: torch.Tensor) -> Impacts:
+    """Return the field's own sounds at every sixtieth point."""
+    train, rows = plate_impacts(), torch.arange(0, 600, 60)
+    sounds = field.render(points[rows])
+    return replace(train.take(range(len(rows))), contacts=points[rows].to(train.contacts), sounds=sounds)
 
 
 def test_a_field_finds_where_its_own_sounds_come_from() -> None:
-    train, features = plate_impacts(), plate_features()
-    config = replace(QUICK, warmup_steps=0, steps=1, residual=False)
-    field = fit(train, features, plate_extraction(train), config, gains=MixtureEstimator(("smooth",)))
-    rows = torch.arange(0, 600, 60)
-    sounds = field.render(features.points[rows])
-    struck = replace(train.take(range(len(rows))), contacts=features.points[rows].to(train.contacts), sounds=sounds)
-    found = located(field, train, struck, features.points)
+    train, points, field = plate_impacts(), plate_features().points, smooth_field(plate_impacts(), plate_features())
+    found = located(field, train, struck(field, points), points).errors
     assert set(found) == {"rmed", "rmed_posterior"}
     assert max(found["rmed"]) < 0.02
     assert sorted(found["rmed_posterior"])[5] < 0.1
+
+
+def test_the_published_distance_is_one_minus_the_cosine_with_the_gains_of_the_regression() -> None:
+    points = plate_features().points[::10]
+    field = smooth_field(plate_impacts(), plate_features())
+    locator = PublishedLocator.of(field, points)
+    sound = struck(field, plate_features().points).sounds[3]
+    recorded = ShortTime().gains(sound[None], field.bank, field.sample_rate)[0].numpy()
+    own = field.gains(points).double().numpy()
+    expected = 1.0 - own @ recorded / np.linalg.norm(own, axis=1) / np.linalg.norm(recorded)
+    assert locator.distance(sound).numpy() == pytest.approx(expected, abs=1e-6)
+    # Neither force nor polarity changes it.
+    assert locator.distance(-250.0 * sound).numpy() == pytest.approx(expected, abs=1e-4)
+    with raises(LocationError, name="sound"):
+        locator.distance(0.0 * sound)
+
+
+def test_the_published_form_takes_the_least_cosine_distance_and_refuses_no_noise() -> None:
+    points, train = plate_features().points, plate_impacts()
+    field = smooth_field(train, plate_features())
+    test = struck(field, points)
+    size = float((points.amax(0) - points.amin(0)).norm())
+    noise = torch.randn(test.sounds[0].shape, generator=torch.Generator().manual_seed(1))
+    test = replace(test, sounds=torch.cat([test.sounds[:-1], noise[None]]))
+    found = located(field, train, test, points, published=True, kept=(0, len(test) - 1))
+    locator = PublishedLocator.of(field, points)
+    for row, rmed in enumerate(found.errors["rmed"]):
+        place = points[int(locator.distance(test.sounds[row]).argmin())]
+        assert rmed == pytest.approx(float((place - test.contacts[row]).norm()) / size, rel=1e-5)
+    # Noise has a least distance too, and no map.
+    assert set(found.maps) == {0}
+    order = torch.cdist(found.maps[0].points, points).argmin(1)
+    torch.testing.assert_close(found.maps[0].distance, locator.distance(test.sounds[0])[order])
+
+
+def test_diffsound_searches_the_vertices_of_the_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched = []
+
+    def simulated(renderer: DiffSound, points: torch.Tensor) -> SimpleNamespace:
+        searched.append(points)
+        return SimpleNamespace(place=lambda sound: points[0])
+
+    monkeypatch.setattr(locatingmethods.DiffSoundLocator, "of", simulated)
+    train, points = plate_impacts(), plate_features().points
+    vertices = torch.rand(MAX_VERTICES + 5000, 3, generator=torch.Generator().manual_seed(0))
+    renderer = object.__new__(DiffSound)
+    object.__setattr__(renderer, "sample_rate", train.sample_rate)
+    for given in (None, vertices[:100], vertices):
+        located(renderer, train, train, points, vertices=given)
+    assert [len(each) for each in searched] == [min(2000, len(points)), 100, MAX_VERTICES]
+    assert torch.equal(searched[1].float(), vertices[:100])
+    assert len(searched[2].unique(dim=0)) == MAX_VERTICES
+
+
+def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_distance(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, results = fill_plates(tmp_path / "plates", ("a",), count=20, truth=True), tmp_path / "results"
+    asked: dict[bool, torch.Tensor] = {}
+    drawn: dict[str, tuple[ContactMap, torch.Tensor]] = {}
+
+    def quick(method: FieldMethod, task: Task) -> SoundField:
+        config = replace(QUICK, warmup_steps=0, steps=1)
+        return fit(task.train, task.features("positions"), task.modes(), config, gains=MixtureEstimator(("smooth",)))
+
+    def watched(*given: Any, **named: Any) -> Any:
+        asked[named["published"]] = named["vertices"]
+        return located(*given, **named)
+
+    def draw(found: ContactMap, *, title: str, truth: torch.Tensor) -> Figure:
+        drawn[title] = (found, truth)
+        return Figure()
+
+    monkeypatch.setattr(ObjectLooks, "__call__", lambda looks, *given, **named: PlateLooks()(*given, **named))
+    monkeypatch.setattr(FieldMethod, "fit", quick)
+    monkeypatch.setattr("avmsf.bench.caserun.located", watched)
+    monkeypatch.setattr(report, "draw_contact", draw)
+    words = ["evaluate", "localize", str(data), "--objects", "a", "--methods", "field-auto,paper-grid,paper,nearest"]
+    words += ["--lift.encoder", "descriptors", "--output", str(results), "--figures"]
+    monkeypatch.setattr(GridField, "fit", lambda grid, task: grid.method.fit(task))
+    assert main(words) == 0
+    assert set(asked) == {False, True}
+    assert asked[True].shape == (4, 3)
+    record = ResultsFolder(results).read("a")
+    assert record is not None
+    impacts = read_capture(data / "a").impacts
+    contacts = dict(zip(impacts.names, impacts.contacts, strict=True))
+    kept = list(record.cases[0].sounds)
+    fields = ("field-auto", "paper-grid", "paper")
+    assert list(drawn) == [f"a: {name} located by {each}" for each in fields for name in kept]
+    for title, (_, truth) in drawn.items():
+        torch.testing.assert_close(truth, contacts[title.split()[1]])
+    ours, paper = (drawn[f"a: {kept[0]} located by {each}"][0] for each in ("field-auto", "paper"))
+    assert torch.equal(ours.probability, paper.probability)
+    assert not torch.allclose(ours.distance, paper.distance)
+    pictures = sorted(path.name for path in (results / "figures").iterdir())
+    assert len(pictures) == 1 + 3 * len(kept)
 
 
 def test_the_experiment_is_a_command(tmp_path: Path) -> None:

@@ -1,34 +1,42 @@
 """The paper's method in an evaluation: its own extraction, its features, and an encoder that is never replaced."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from avmsf.bench.fieldmethods import FieldMethod
+from avmsf.bench.fieldmethods import NETWORK, FieldMethod
+from avmsf.bench.gridfield import GridField
+from avmsf.bench.judging import Judging
 from avmsf.bench.methods import METHODS
+from avmsf.bench.plan import Evaluation
+from avmsf.bench.protocols import PROTOCOLS
+from avmsf.bench.results import ResultsFolder
 from avmsf.bench.task import Task
-from avmsf.cli.evaluate import settled_lifts
-from avmsf.errors import SceneError
+from avmsf.capture.datasets import CaptureCollection
+from avmsf.cli.evaluate import looks_of, settled_lifts
+from avmsf.config import DESCRIPTORS, DINO, PRESETS, LiftConfig
+from avmsf.errors import EvaluationError, SceneError
 from avmsf.modal.extraction.finders import ShortTime
-from avmsf.pipeline.config import DESCRIPTORS, DINO, PRESETS, LiftConfig
 from avmsf.pipeline.features import DinoEncoder
-from avmsf.pipeline.record import finder_of
+from avmsf.scene.descriptors import ImageDescriptors
+from avmsf.scene.encode import Encoder
 from plate_field import QUICK, plate_features, plate_impacts
+from plate_set import NoBodies, PlateLooks
 from raising import raises
 
-PAPER = METHODS["paper"]
 
-
-def test_the_method_is_the_preset_with_one_damping() -> None:
+@pytest.mark.parametrize(
+    ("name", "damping"), [("paper", "shared"), ("paper-grid", "shared"), ("paper-per-contact", "per-contact")]
+)
+def test_the_method_is_the_preset_with_one_damping(name: str, damping: Any) -> None:
+    method: Any = METHODS[name]
+    field = method.method if isinstance(method, GridField) else method
     preset = PRESETS["paper"]
-    assert isinstance(PAPER, FieldMethod)
-    assert (PAPER.config, PAPER.finder, PAPER.look) == (
-        replace(preset.fit, damping="shared"),
-        finder_of(preset),
-        "paper",
-    )
+    assert field.pipeline == replace(preset, fit=replace(preset.fit, damping=damping))
+    assert (field.look, field.published) == ("paper", True)
 
 
 def test_a_method_may_find_modes_in_its_own_way() -> None:
@@ -48,7 +56,8 @@ def test_a_method_may_find_modes_in_its_own_way() -> None:
         bodies=shared,
         stranger=shared,
     )
-    field = FieldMethod("quick", replace(QUICK, steps=1, correction_rate=0.0), "paper", ShortTime()).fit(task)
+    pipeline = replace(NETWORK, method="short-time", fit=replace(QUICK, steps=1, correction_rate=0.0))
+    field = FieldMethod("quick", pipeline, "paper", published=True).fit(task)
     expected = ShortTime().find(impacts.sounds, impacts.sample_rate)
     assert torch.allclose(field.bank.frequency, expected.frequency)
 
@@ -66,10 +75,44 @@ def test_an_encoder_that_is_not_there_is_refused_by_the_paper_and_said_elsewhere
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     with raises(SceneError, value="facebook/dinov2-base"):
-        settled_lifts(LiftConfig(), [METHODS["knn3"], PAPER])
-    usual, paper = settled_lifts(LiftConfig(), [METHODS["knn3"], METHODS["field"]])
+        settled_lifts(LiftConfig(), {"visual", "paper"})
+    usual, paper = settled_lifts(LiftConfig(), {"visual"})
     assert (usual.encoder, paper.encoder) == (DESCRIPTORS, DINO)
     assert "descriptors" in capsys.readouterr().err
-    named = settled_lifts(LiftConfig(encoder=DESCRIPTORS), [PAPER])
+    named = settled_lifts(LiftConfig(encoder=DESCRIPTORS), {"paper"})
     assert [each.encoder for each in named] == [DESCRIPTORS, DESCRIPTORS]
     assert named[1].onto == "gaussians"
+
+
+def test_encoders_are_loaded_once_on_the_device_and_only_for_who_reads_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded = []
+
+    def load(name: str, *, device: torch.device, **_: Any) -> Encoder:
+        loaded.append((name, device.type))
+        return ImageDescriptors()
+
+    monkeypatch.setattr(DinoEncoder, "load", load)
+    read = looks_of([METHODS["knn3"], METHODS["white-noise"], METHODS["diffsound"]], PROTOCOLS["farthest"])
+    assert settled_lifts(LiftConfig(), read, device="cpu")[0] == LiftConfig()
+    assert loaded == []
+    # Recordings are located at the points that features have.
+    assert looks_of([METHODS["nearest"]], PROTOCOLS["localize"]) == {"positions"}
+    read = looks_of([METHODS["field"], METHODS["field-auto"], METHODS["paper-grid"]], PROTOCOLS["farthest"])
+    assert read == {"visual", "positions", "paper"}
+    assert settled_lifts(LiftConfig(), read, device="cpu")[0].encoder == DINO
+    assert loaded == [(DINO, "cpu")]
+
+
+def test_methods_without_features_share_results_with_any_encoder(tmp_path: Path) -> None:
+    def begin(name: str, encoder: str | None) -> None:
+        evaluation = Evaluation(
+            CaptureCollection(tmp_path), "plates", PROTOCOLS["farthest"], (METHODS[name],), PlateLooks(), NoBodies(),
+            judging=Judging(cdpam=False), encoder=encoder,
+        )  # fmt: skip
+        evaluation.begin(ResultsFolder(tmp_path / "results"))
+
+    begin("knn3", None)
+    begin("field", DESCRIPTORS)
+    begin("knn3", DESCRIPTORS)
+    with raises(EvaluationError, name="field"):
+        begin("field", DINO)

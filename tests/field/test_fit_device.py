@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from avmsf.cli import main
+from avmsf.config import PipelineConfig
 from avmsf.errors import FitError
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.losses import SpectralTarget
 from avmsf.field.recipes import Attention, GainRecipe, gain_case
 from avmsf.field.training import Targets, TrainingRun
-from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.record import with_record
 from avmsf.scene import features
 from plate_field import QUICK, plate_extraction, plate_features, plate_impacts

@@ -1,7 +1,7 @@
 """Presets: what `paper` selects, that it is complete, and that the options of the commands start from it."""
 
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -12,12 +12,13 @@ from avmsf.cli.options.fit import parse as parse_fit
 from avmsf.cli.options.modes import parse as parse_modes
 from avmsf.cli.options.reconstruct import parse as parse_reconstruct
 from avmsf.cli.options.splat import parse as parse_splat
+from avmsf.config import PRESETS, BodyConfig, LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.errors import FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.finders import ShortTime
-from avmsf.pipeline.config import PRESETS, PipelineConfig
 from avmsf.pipeline.record import capture_settings_of, finder_of
+from avmsf.scene.splatconfig import SplatConfig
 from plate_field import plate_impacts
 from raising import raises
 
@@ -73,6 +74,16 @@ def test_features_and_modes_start_from_the_preset_too() -> None:
     # `splat` needs no preset.
     splat = parse_splat(["mug"])
     assert (splat.views, splat.config) == (paper.scene.views, paper.scene.splat)
+
+
+def test_no_setting_of_a_preset_is_left_out_by_the_commands(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = SceneConfig(ViewsConfig(count=9), SplatConfig(steps=8), LiftConfig(angles=7))
+    other = PipelineConfig("smooth", BodyConfig(wall=0.5), scene, FitConfig(steps=6), "short-time", 5, "peak", "cpu")
+    assert all(getattr(other, each.name) != getattr(PipelineConfig(), each.name) for each in fields(other))
+    monkeypatch.setattr("avmsf.cli.options.presets.PRESETS", {"default": PipelineConfig(), "paper": other})
+    assert parse_reconstruct(["mug", "--preset", "paper"]).pipeline == other
+    fitted = parse_fit(["mug", "--output", "mug.safetensors", "--preset", "paper"])
+    assert (fitted.pipeline, fitted.preset) == (replace(other, scene=SceneConfig()), "paper")
 
 
 def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:

@@ -12,12 +12,12 @@ import trimesh
 from avmsf.capture import CaptureSettings
 from avmsf.capture.surface import Surface, write_surface
 from avmsf.cli import main
+from avmsf.config import BodyConfig
 from avmsf.errors import FitError, SimulationError
 from avmsf.export import SampledField
 from avmsf.fem.radiation import radiated_pressure
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
-from avmsf.pipeline.config import BodyConfig
 from avmsf.pipeline.guess import guess_field, known_surface
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.material import STEEL

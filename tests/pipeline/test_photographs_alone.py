@@ -10,10 +10,10 @@ from avmsf.capture import read_surface
 from avmsf.capture.views.write import write_views
 from avmsf.cli import main
 from avmsf.cli.fit import summary
+from avmsf.config import CACHE
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.store import load
 from avmsf.geometry.closest import ClosestPoints
-from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.reconstruct import SURFACE
 from avmsf.simulate.example import EXAMPLE, EXAMPLE_FOLDER
 from plate_capture import TINY, fill_plate

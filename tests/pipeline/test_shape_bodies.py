@@ -8,10 +8,10 @@ import torch
 import trimesh
 
 from avmsf.capture.surface import Surface
+from avmsf.config import BodyConfig
 from avmsf.errors import SceneError
 from avmsf.geometry.boolean import difference
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.nominal import nominal_bodies, with_wall
 
 SIDES = (0.08, 0.06, 0.05)

@@ -10,8 +10,8 @@ import trimesh
 
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli import main
+from avmsf.config import CACHE, PipelineConfig
 from avmsf.errors import FolderInUseError
-from avmsf.pipeline.config import CACHE, PipelineConfig
 from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.scene import Listener
 from avmsf.pipeline.stages import StageFolder

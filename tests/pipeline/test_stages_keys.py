@@ -12,6 +12,7 @@ import torch
 
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.surface import Surface
+from avmsf.config import BodyConfig, PipelineConfig
 from avmsf.errors import CaptureError, SimulationError
 from avmsf.field import recipes
 from avmsf.field.config import FitConfig
@@ -22,7 +23,6 @@ from avmsf.field.store import load
 from avmsf.pipeline import reconstruct as module
 from avmsf.pipeline import stages
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import BodyConfig, PipelineConfig
 from avmsf.pipeline.scene import Listener
 from avmsf.pipeline.stages import StageFolder
 from avmsf.simulate import nominal, recipe

@@ -8,8 +8,8 @@ import pytest
 import torch
 import trimesh
 
+from avmsf.config import CACHE
 from avmsf.field.store import save
-from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.reconstruct import FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
 from avmsf.scene.ply import write_splats

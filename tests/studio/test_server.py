@@ -27,12 +27,12 @@ import trimesh
 from filelock import FileLock
 
 from avmsf.cli import main
+from avmsf.config import CACHE, PRESETS
 from avmsf.errors import AvmsfError, StudioError
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load, save
 from avmsf.files import copy_whole
 from avmsf.localization.contact_map import enlarged
-from avmsf.pipeline.config import CACHE, PRESETS
 from avmsf.pipeline.sources import SPLATS
 from avmsf.scene.ply import write_splats
 from avmsf.scene.start import StartPoints, starting_cloud

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from avmsf._utils.locks import write_lock
-from avmsf.pipeline.config import CACHE
+from avmsf.config import CACHE
 from avmsf.studio import strikefiles
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.place import Place

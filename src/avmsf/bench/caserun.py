@@ -12,10 +12,12 @@ from torch import Tensor
 
 from avmsf._utils.caching import Given, Result
 from avmsf.bench.cases import Case
+from avmsf.bench.contactmaps import write_map
+from avmsf.bench.fieldmethods import configured
 from avmsf.bench.judging import Judgement, spread
 from avmsf.bench.knowntruth import truth_at
 from avmsf.bench.listening import keep_sound, listening_gain
-from avmsf.bench.locating import located
+from avmsf.bench.locatingmethods import located
 from avmsf.bench.methods import report_of
 from avmsf.bench.plan import Evaluation
 from avmsf.bench.renderer import Renderer
@@ -54,6 +56,7 @@ class CaseRun:
         family: Callable[[], BodyFamily],
         material: str | None,
         stranger: Callable[[], Float[Tensor, " samples"]],
+        vertices: Float[Tensor, "vertices 3"] | None,
         listened: bool,
     ) -> None:
         """Prepare a case of an object; `place` is its own path beneath the results' folder."""
@@ -61,7 +64,7 @@ class CaseRun:
         self.train, self.test = impacts.take(case.train), impacts.take(case.test)
         self.truth = None if truth is None else truth_at(truth, self.test.names)
         self.folder, self.place, self.look, self.stranger = folder, place, look, stranger
-        self.bodies, self.family, self.material = bodies, family, material
+        self.bodies, self.family, self.material, self.vertices = bodies, family, material, vertices
         self.listened = spread(len(case.test), LISTENED) if listened else []
         self.shared = 0.0
         self.found: Extraction | None = None
@@ -77,7 +80,7 @@ class CaseRun:
             with torch.no_grad():
                 sounds = renderer.render(self.test.contacts, directions=self.test.directions)
             render_seconds = time.perf_counter() - begun
-            judgement = self._judgement(renderer, sounds)
+            judgement, maps = self._judgement(method, renderer, sounds)
         except AvmsfError as error:
             return Outcome(self.case.key, method.name, failure=one_line(error))
         except Exception as error:  # A fault in one method must not cost the others their hours.
@@ -91,6 +94,7 @@ class CaseRun:
             round(render_seconds, 4),
             self._keep_sounds(method.name, sounds),
             report_of(renderer),
+            maps,
         )
 
     def described(self, known: CaseRecord) -> CaseRecord:
@@ -99,13 +103,24 @@ class CaseRun:
         seconds, self.shared = known.shared_seconds + self.shared, 0.0
         return replace(known, sounds=sounds, shared_seconds=round(seconds, 4))
 
-    def _judgement(self, renderer: Renderer, sounds: Float[Tensor, "contacts samples"]) -> Judgement:
-        if self.evaluation.protocol.locating:
-            points = self._shared(self.look)("positions").points
-            return Judgement(dict(located(renderer, self.train, self.test, points)), {})
-        return self.evaluation.judging.judge(
-            renderer, sounds, self.test, self.truth, loudest=float(self.impacts.sounds.abs().max())
+    def _judgement(
+        self, method: Method, renderer: Renderer, sounds: Float[Tensor, "contacts samples"]
+    ) -> tuple[Judgement, dict[str, str]]:
+        """Return the metrics, and the files of contacts' maps by the names of their recordings."""
+        if not self.evaluation.protocol.locating:
+            loudest = float(self.impacts.sounds.abs().max())
+            return self.evaluation.judging.judge(renderer, sounds, self.test, self.truth, loudest=loudest), {}
+        points, settings = self._shared(self.look)("positions").points, configured(method)
+        published = settings is not None and settings.published
+        found = located(
+            renderer, self.train, self.test, points, vertices=self.vertices, published=published, kept=self.listened
         )
+        maps = {}
+        for row, each in found.maps.items():
+            file = f"maps/{self.place}/{row:03d} {_file_word(method.name)}.safetensors"
+            write_map(self.folder / file, each, truth=self.test.contacts[row])
+            maps[self.test.names[row]] = file
+        return Judgement(dict(found.errors), {}), maps
 
     def _task(self) -> Task:
         return Task(
@@ -169,11 +184,15 @@ class CaseRun:
     def _keep_sounds(self, name: str, sounds: Float[Tensor, "contacts samples"]) -> dict[str, str]:
         """Write the sounds to listen to, and return their files by the names of their recordings."""
         kept = {}
-        # Methods that read a folder have its path in their name.
-        word = "".join(mark if mark.isalnum() or mark in "-_" else "-" for mark in name)
+        word = _file_word(name)
         for row in self.listened:
             file = f"sounds/{self.place}/{row:03d} {word}.flac"
             gain = listening_gain(self.test.sounds[row])
             keep_sound(self.folder / file, sounds[row], sample_rate=self.test.sample_rate, gain=gain)
             kept[self.test.names[row]] = file
         return kept
+
+
+def _file_word(method: str) -> str:
+    """Return a method's name for files: methods that read a folder have its path in their name."""
+    return "".join(mark if mark.isalnum() or mark in "-_" else "-" for mark in method)

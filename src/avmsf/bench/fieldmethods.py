@@ -1,58 +1,63 @@
-"""The sound field as a method: the paper's form, and what is left when a part of it is taken away."""
+"""The sound field as a method: a configuration of the whole pipeline with a name, and what is left without a part."""
 
 from dataclasses import dataclass, replace
 
 import torch
 
-from avmsf.bench.task import Look, Task
+from avmsf.bench.task import Look, Method, Task
 from avmsf.capture.impacts import Impacts
-from avmsf.field.config import FitConfig, GainModel
+from avmsf.config import PipelineConfig
+from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import estimator_for
-from avmsf.field.recipes import Attention, GainRecipe
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_sounds
-from avmsf.modal.extraction.finders import ModeFinder
+from avmsf.modal.extraction.finders import finder_named
 from avmsf.modal.extraction.random_modes import random_modes
 from avmsf.scene.features import FeatureField
 
-QUICK = FitConfig()
-"""The quick recipe."""
+NETWORK = PipelineConfig(gain_model="network")
+"""The attention network with the quick settings of the fit."""
 
 
 @dataclass(frozen=True)
 class FieldMethod:
-    """A field with the attention network, fitted to extracted modes."""
+    """A field fitted as a configuration of the pipeline says.
+
+    Seed and device are the evaluation's, and so is the start of sounds, since all methods of one evaluation are scored
+    on the same recordings.
+    """
 
     name: str
     """What tables call it."""
-    config: FitConfig = QUICK
-    """Settings of the fit, but for the seed, which is the task's."""
+    pipeline: PipelineConfig = NETWORK
+    """Settings of all stages."""
     look: Look = "visual"
-    """What the network reads of the object's points."""
-    finder: ModeFinder | None = None
-    """How modes are found; None takes those that all methods share."""
+    """What is read of the object's points."""
+    published: bool = False
+    """Whether modes are found as `pipeline` says, in place of those that all methods share, and recordings are located
+    by the cosine distance of gains as it is published."""
 
     def fit(self, task: Task) -> SoundField:
         """Fit the field. Raises AvmsfError where modes, features or field cannot be made."""
-        return fit_field(task, task.train, task.features(self.look), modes_of(task, self.finder), self.config)
+        return self.fitted(task, task.train, task.features(self.look), self.modes(task), self.pipeline.fit)
 
+    def modes(self, task: Task) -> Extraction:
+        """Return the modes of a task's training recordings."""
+        if not self.published:
+            return task.modes()
+        finder = finder_named(self.pipeline.method, self.pipeline.modes)
+        return extract_sounds(task.train.sounds, sample_rate=task.train.sample_rate, method=finder)
 
-@dataclass(frozen=True)
-class MixtureField:
-    """A field whose gains are a Gaussian process over kernel families."""
-
-    name: str
-    """What tables call it."""
-    model: GainModel = "auto"
-    """All families, or one."""
-    config: FitConfig = QUICK
-    """Settings of the fit, but for the seed, which is the task's."""
-
-    def fit(self, task: Task) -> SoundField:
-        """Fit the field. Raises AvmsfError where modes or field cannot be made, or the one family cannot be had."""
-        gains = estimator_for(self.model, task.bodies)
-        return fit_field(task, task.train, task.features("positions"), task.modes(), self.config, gains=gains)
+    def fitted(
+        self, task: Task, train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig
+    ) -> SoundField:
+        """Fit the field to some of a task's recordings, in whose modes they are rows."""
+        # An object of few points has no more regions than points.
+        clusters = min(config.clusters, len(torch.unique(features.points, dim=0)))
+        gains = estimator_for(self.pipeline.gain_model, task.bodies)
+        config = replace(config, clusters=clusters, seed=task.seed)
+        return fit(train, features, modes, config, gains=gains, capture=task.name, device=task.device)
 
 
 @dataclass(frozen=True)
@@ -60,54 +65,41 @@ class UninformedField:
     """A field without modal initialization (the paper's row "w/o init"): no extracted modes and no warm-up.
 
     It starts from `random_modes`, with as many modes and bands of noise as the extraction has, and is trained end to
-    end for as many steps as the recipe takes in all. Corrections have `correction_rate`, for here they are no
+    end for as many steps as the method takes in all. Corrections have `correction_rate`, for here they are no
     corrections: frequencies, dampings and noise have to find where they belong.
     """
 
-    name: str
-    """What tables call it."""
-    config: FitConfig = QUICK
-    """Settings of the recipe whose steps are all taken end to end."""
+    method: FieldMethod
+    """The method whose steps are all taken end to end."""
     correction_rate: float = 0.03
     """Adam's step for frequencies (in widths of their modes) and for the logarithms of dampings."""
-    look: Look = "visual"
-    """What the network reads of the object's points."""
-    finder: ModeFinder | None = None
-    """How modes are counted; None takes those that all methods share."""
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        return self.method.name
+
+    @property
+    def look(self) -> Look:
+        """What is read of the object's points."""
+        return self.method.look
 
     def fit(self, task: Task) -> SoundField:
         """Fit the field. Raises AvmsfError where features or field cannot be made, or no mode can be counted."""
-        counted = modes_of(task, self.finder)
+        counted = self.method.modes(task)
         start = random_modes(
             task.train,
             modes=len(counted.bank),
             bins=len(counted.residual.magnitude),
             generator=torch.Generator().manual_seed(task.seed),
         )
-        steps = self.config.warmup_steps + self.config.steps
-        config = replace(self.config, warmup_steps=0, steps=steps, correction_rate=self.correction_rate)
-        return fit_field(task, task.train, task.features(self.look), start, config)
+        config = self.method.pipeline.fit
+        steps = config.warmup_steps + config.steps
+        config = replace(config, warmup_steps=0, steps=steps, correction_rate=self.correction_rate)
+        return self.method.fitted(task, task.train, task.features(self.look), start, config)
 
 
-def modes_of(task: Task, finder: ModeFinder | None) -> Extraction:
-    """Return the modes of a task's training blows: those that all methods share, or what another finder makes."""
-    if finder is None:
-        return task.modes()
-    return extract_sounds(task.train.sounds, sample_rate=task.train.sample_rate, method=finder)
-
-
-def fit_field(
-    task: Task,
-    train: Impacts,
-    features: FeatureField,
-    modes: Extraction,
-    config: FitConfig,
-    *,
-    gains: GainRecipe | None = None,
-) -> SoundField:
-    """Fit a field to some of a task's blows, in whose modes they are rows, by the network unless told otherwise."""
-    # An object of few points has no more regions than points.
-    clusters = min(config.clusters, len(torch.unique(features.points, dim=0)))
-    recipe = Attention() if gains is None else gains
-    config = replace(config, clusters=clusters, seed=task.seed)
-    return fit(train, features, modes, config, gains=recipe, capture=task.name, device=task.device)
+def configured(method: Method) -> FieldMethod | None:
+    """Return the configuration that a method fits, or starts from; None for methods without one."""
+    found = getattr(method, "method", method)
+    return found if isinstance(found, FieldMethod) else None

@@ -3,9 +3,10 @@
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
-from avmsf.bench.fieldmethods import QUICK, fit_field, modes_of
+from avmsf.bench.fieldmethods import FieldMethod
 from avmsf.bench.task import Look, Task
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.places import rows_by_place
@@ -13,7 +14,6 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import held_out
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.modal.spectra import envelope
 
 _FEWEST_TO_VALIDATE = 6
@@ -54,28 +54,32 @@ class GridField:
     is held out, and the base settings are taken. Modes are those of all training contacts.
     """
 
-    name: str
-    """What tables call it."""
+    method: FieldMethod
+    """The method whose settings are chosen where the grid names them, and taken where nothing can be validated."""
     grid: Grid
-    base: FitConfig = QUICK
-    """Settings that the grid does not name, and those to take where nothing can be validated."""
-    look: Look = "visual"
-    """What the network reads of the object's points."""
-    finder: ModeFinder | None = None
-    """How modes are found; None takes those that all methods share."""
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        return self.method.name
+
+    @property
+    def look(self) -> Look:
+        """What is read of the object's points."""
+        return self.method.look
 
     def fit(self, task: Task) -> SoundField:
         """Choose and fit the field, whose report has what was chosen. Raises as FieldMethod."""
-        features, modes = task.features(self.look), modes_of(task, self.finder)
-        held = held_out(task.train.contacts, self.base.validation)
+        features, modes, base = task.features(self.look), self.method.modes(task), self.method.pipeline.fit
+        fitted = partial(self.method.fitted, task)
+        held = held_out(task.train.contacts, base.validation)
         if len(rows_by_place(task.train.contacts)) < _FEWEST_TO_VALIDATE or not held:
-            field = fit_field(task, task.train, features, modes, self.base)
-            return _with_report(field, {"validated": False})
+            return _with_report(fitted(task.train, features, modes, base), {"validated": False})
         learnt = [row for row in range(len(task.train)) if row not in held]
-        candidates = list(self.grid.candidates(self.base))
+        candidates = list(self.grid.candidates(base))
         errors = [
             _held_out_error(
-                fit_field(task, task.train.take(learnt), features, _take(modes, learnt), config), task.train.take(held)
+                fitted(task.train.take(learnt), features, _take(modes, learnt), config), task.train.take(held)
             )
             for config in candidates
         ]
@@ -90,7 +94,7 @@ class GridField:
                 for name in ("clusters", "learning_rate", "steps", "early_weight", "damping")
             },
         }
-        return _with_report(fit_field(task, task.train, features, modes, chosen), report)
+        return _with_report(fitted(task.train, features, modes, chosen), report)
 
 
 def _take(modes: Extraction, rows: list[int]) -> Extraction:

@@ -15,7 +15,7 @@ A recording that the locator rejects counts as a random point, and its row has t
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -24,22 +24,15 @@ from typing import Any
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from avmsf.bench.baselines import NearestStrike
 from avmsf.bench.locatingbaselines import NearestSpectrum, random_distance
 from avmsf.bench.locatingimages import Images
-from avmsf.bench.renderer import Renderer
 from avmsf.bench.results import write_json
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError
-from avmsf.evaluation.diffsound import DiffSound
 from avmsf.evaluation.diffsound_locator import DiffSoundLocator
-from avmsf.field.soundfield import SoundField
 from avmsf.localization.contact_map import ContactMap
-from avmsf.scene.points import farthest_points
 from avmsf.tasks.locator import Locator
 
-CANDIDATES = 2000
-"""Candidate points of `located`: 2 % of the diagonal apart, which is less than the smallest errors."""
 METHODS = ("random", "nearest", "cosine", "posterior")
 DIFFSOUND = "diffsound"
 LEVEL = 0.9
@@ -158,7 +151,7 @@ def judge_locating(
             value=len(truth),
         )
     right = test.contacts if truth is None else truth
-    ground = _Ground(locator.points.double(), Images.none() if images is None else images, level)
+    ground = Ground(locator.points.double(), Images.none() if images is None else images, level)
     size = ground.diagonal if scale is None else scale
     if not (ground.diagonal > 0.0 and math.isfinite(size) and size > 0.0):
         raise EvaluationError(
@@ -176,61 +169,19 @@ def judge_locating(
     return LocatingScores(name, tuple(rows), ground.diagonal, size, level, dict(settings or {}))
 
 
-def located(
-    renderer: Renderer, train: Impacts, test: Impacts, points: Float[Tensor, "points 3"]
-) -> dict[str, tuple[float, ...]]:
-    """Return how far off a method locates each recording of `test`, over the diagonal of the object's points.
-
-    `rmed`: at the point of least cosine distance between gains (the paper), of fields and DiffSound; at the contact of
-    the training recording with the most similar spectrum, of the nearest recording. `rmed_posterior`, of fields: at the
-    most probable point. What a method cannot locate counts as a random point, as do all recordings of a method that
-    locates nothing.
-    """
-    points = points[farthest_points(points, min(CANDIDATES, len(points)))].double()
-    ground, find = _Ground(points, Images.none(), LEVEL), _finder(renderer, train, points)
-    names = ("rmed", "rmed_posterior") if isinstance(renderer, SoundField) else ("rmed",)
-    rows = []
-    for sound, truth in zip(test.sounds, test.contacts.double(), strict=True):
-        try:
-            places = find(sound)
-        except (LocationError, EvaluationError):
-            places = {}
-        chance = ground.random_errors(truth)[0]
-        rows.append([ground.errors(places[name], truth)[0] if name in places else chance for name in names])
-    return {name: tuple(row[number] for row in rows) for number, name in enumerate(names)}
-
-
-def _finder(
-    renderer: Renderer, train: Impacts, points: Float64[Tensor, "points 3"]
-) -> Callable[[Float[Tensor, " samples"]], dict[str, Float64[Tensor, " 3"]]]:
-    """Return what locates a sound by a method, once for each of `located`'s errors; nothing for other methods."""
-    if isinstance(renderer, SoundField):
-        locator = Locator.of(renderer, points=points)
-
-        def by_field(sound: Float[Tensor, " samples"]) -> dict[str, Float64[Tensor, " 3"]]:
-            found = locator.locate(sound)
-            return {"rmed": points[int(found.distance.argmin())], "rmed_posterior": found.position.double()}
-
-        return by_field
-    if isinstance(renderer, DiffSound):
-        simulated = DiffSoundLocator.of(renderer, points)
-        return lambda sound: {"rmed": simulated.place(sound)}
-    if isinstance(renderer, NearestStrike):
-        similar = NearestSpectrum(train)
-        return lambda sound: {"rmed": similar.place(sound)}
-    return lambda sound: {}
-
-
 @dataclass(frozen=True, eq=False)
-class _Ground:
+class Ground:
     """An object's points, and what is as right as a true place."""
 
     points: Float64[Tensor, "points 3"]
+    """Object frame, meters."""
     images: Images
     level: float
+    """Probability of regions."""
 
     @property
     def diagonal(self) -> float:
+        """Of the box around the points, meters."""
         return float((self.points.amax(0) - self.points.amin(0)).norm())
 
     def errors(self, place: Float64[Tensor, " 3"], truth: Float64[Tensor, " 3"]) -> tuple[float, float]:
@@ -253,7 +204,7 @@ class _Ground:
 def _located(
     locator: Locator,
     alike: NearestSpectrum,
-    ground: _Ground,
+    ground: Ground,
     sound: Float[Tensor, " samples"],
     truth: Float64[Tensor, " 3"],
     *,
@@ -294,7 +245,7 @@ def _located(
     return rows
 
 
-def _regions(found: ContactMap, ground: _Ground, truth: Float64[Tensor, " 3"]) -> dict[str, Any]:
+def _regions(found: ContactMap, ground: Ground, truth: Float64[Tensor, " 3"]) -> dict[str, Any]:
     region = found.region(ground.level)
     inside = [ground.holds(region, image) for image in ground.images.at(truth)]
     return {"covered": inside[0], "covered_modulo": any(inside), "region": float(region.double().mean())}

@@ -9,21 +9,21 @@ from typing import Any, Literal
 
 from avmsf.bench.baselines import MeanGains, MeanWaveform, NearestStrike, RandomImpact, WhiteNoise
 from avmsf.bench.diffsoundmethod import DiffSoundMethod
-from avmsf.bench.fieldmethods import QUICK, FieldMethod, MixtureField, UninformedField
+from avmsf.bench.fieldmethods import NETWORK, FieldMethod, UninformedField
 from avmsf.bench.gridfield import PAPER_GRID, QUICK_GRID, GridField
 from avmsf.bench.interpolation import SplineGains
 from avmsf.bench.recorded import Recorded
 from avmsf.bench.renderer import Renderer
 from avmsf.bench.sonicgaussmethod import PUBLISHED, SMALL, SmallSonicGaussMethod, SonicGaussMethod
 from avmsf.bench.spectralmean import MeanSpectra
-from avmsf.bench.task import Method, Task
+from avmsf.bench.task import Look, Method, Task
+from avmsf.config import PRESETS, PipelineConfig
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.diffsound import DiffSound
 from avmsf.evaluation.sonicgauss.small import COMMAND
 from avmsf.evaluation.sonicgauss.tuning import TunedRenderer
-from avmsf.field.config import PAPER
+from avmsf.field.config import GainModel
 from avmsf.field.soundfield import SoundField
-from avmsf.modal.extraction.finders import ShortTime
 
 NEIGHBORS = 3
 """Number of nearest recordings that are averaged (the paper's KNN), or all where there are fewer."""
@@ -121,32 +121,50 @@ BASELINES = (
 """The paper's baselines that need nothing but data, then the strong ones that it leaves out. Those that share modes
 have noise beside them, as the field has: without it all is silent between modes, and L1-log is lost."""
 
-_PAPER = replace(PAPER, damping="shared")
+_PRESET = PRESETS["paper"]
+
+
+def _paper(name: str, look: Look = "paper", **fit: Any) -> FieldMethod:
+    """Return the preset `paper` with one of its two dampings, shared unless `fit` names the other."""
+    settings = {"damping": "shared", **fit}
+    return FieldMethod(name, replace(_PRESET, fit=replace(_PRESET.fit, **settings)), look, published=True)
+
+
+def _quick(name: str, look: Look = "visual", **fit: Any) -> FieldMethod:
+    """Return the network with the quick settings but for those of `fit`."""
+    return FieldMethod(name, replace(NETWORK, fit=replace(NETWORK.fit, **fit)), look)
+
+
+def _process(name: str, model: GainModel) -> FieldMethod:
+    """Return a Gaussian process over all kernel families, or over one."""
+    return FieldMethod(name, PipelineConfig(gain_model=model), "positions")
+
+
 FIELDS = (
-    FieldMethod("field"),
-    MixtureField("field-auto"),
-    MixtureField("field-elastic", "elastic"),
-    MixtureField("field-smooth", "smooth"),
-    MixtureField("field-thin-plate", "thin-plate"),
-    FieldMethod("field-positions", look="positions"),
-    FieldMethod("field-unaligned", look="unaligned"),
+    _quick("field"),
+    _process("field-auto", "auto"),
+    _process("field-elastic", "elastic"),
+    _process("field-smooth", "smooth"),
+    _process("field-thin-plate", "thin-plate"),
+    _quick("field-positions", "positions"),
+    _quick("field-unaligned", "unaligned"),
     # All steps end to end take long enough without two trials of dampings beforehand. The noise is
     # trained, as measuring it needs the modes.
-    UninformedField("field-no-initialization", replace(QUICK, damping="shared", noise_rate=0.1)),
-    FieldMethod("field-no-residual", replace(QUICK, residual=False)),
+    UninformedField(_quick("field-no-initialization", damping="shared", noise_rate=0.1)),
+    _quick("field-no-residual", residual=False),
     # The warm-up moves no damping, so there is nothing to choose between.
-    FieldMethod("field-warmup", replace(QUICK, steps=0, damping="shared")),
-    FieldMethod("paper", _PAPER, "paper", ShortTime()),
-    FieldMethod("paper-positions", _PAPER, "paper-positions", ShortTime()),
-    UninformedField("paper-no-initialization", _PAPER, look="paper", finder=ShortTime()),
-    FieldMethod("paper-unaligned", _PAPER, "paper-unaligned", ShortTime()),
-    FieldMethod("paper-no-residual", replace(_PAPER, residual=False), "paper", ShortTime()),
-    FieldMethod("paper-per-contact", replace(PAPER, damping="per-contact"), "paper", ShortTime()),
-    GridField("field-grid", QUICK_GRID),
-    GridField("paper-grid", PAPER_GRID, _PAPER, "paper", ShortTime()),
+    _quick("field-warmup", steps=0, damping="shared"),
+    _paper("paper"),
+    _paper("paper-positions", "paper-positions"),
+    UninformedField(_paper("paper-no-initialization")),
+    _paper("paper-unaligned", "paper-unaligned"),
+    _paper("paper-no-residual", residual=False),
+    _paper("paper-per-contact", damping="per-contact"),
+    GridField(_quick("field-grid"), QUICK_GRID),
+    GridField(_paper("paper-grid"), PAPER_GRID),
 )
-"""Fields by the quick recipe unless told otherwise: the paper's form, other gains, ablations, the paper's method
-whole, and choices from grids."""
+"""Configurations of the pipeline by name: the network with quick settings, other gains, ablations, the preset `paper`
+and its ablations, and choices from grids."""
 
 SIMULATIONS = (DiffSoundMethod("diffsound"), DiffSoundMethod("diffsound-weighted", weighted=True))
 """Other systems, built from their publications."""

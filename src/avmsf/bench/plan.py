@@ -9,7 +9,7 @@ from avmsf._utils.caching import source_digest
 from avmsf.bench.judging import Judging
 from avmsf.bench.protocols import EvaluationProtocol
 from avmsf.bench.results import ResultsFolder
-from avmsf.bench.task import Look, Method
+from avmsf.bench.task import Look, Looking, Method
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.fem.family import BodyFamily
 from avmsf.field.gains.bodies import CandidateBodies
@@ -71,6 +71,10 @@ class Evaluation:
     """None where no method reads Gaussians."""
     device: str | None = None
     """Device that methods train on, with the same result up to rounding; None for a GPU where there is one."""
+    encoder: str | None = None
+    """Encoder that `auto` in the settings stands for; None where the settings name it, or no method reads features."""
+    time_zero: str | None = None
+    """Start of the dataset's sounds, `onset` or `peak`, for all methods; None for the dataset's own."""
 
     def begin(self, results: ResultsFolder) -> None:
         """Take a folder for this evaluation's results.
@@ -86,8 +90,14 @@ class Evaluation:
             "choosing": repr(self.protocol.choosing),
             "dataset": self.title,
             "seed": self.seed,
+            "time_zero": self.time_zero,
             "metrics": repr(self.judging),
             "modes": repr(self.finder),
             "settings": dict(self.settings),
         }
-        results.begin(identity, {method.name: repr(method) for method in self.methods})
+        results.begin(identity, {method.name: self._described(method) for method in self.methods})
+
+    def _described(self, method: Method) -> str:
+        """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
+        read = self.encoder is not None and isinstance(method, Looking)
+        return f"{method!r}, encoder {self.encoder}" if read else repr(method)

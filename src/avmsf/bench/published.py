@@ -97,6 +97,8 @@ PUBLISHED = (
         (
             PublishedRow("DiffSound", {"rmed": 0.4178}, "diffsound"),
             PublishedRow("AV-MSF", {"rmed": 0.3461}, "paper"),
+            PublishedRow("AV-MSF, ablation subset", {"rmed": 0.384}, "paper"),
+            PublishedRow("without residual, ablation subset", {"rmed": 0.438}, "paper-no-residual"),
         ),
     ),
     PublishedTable(
@@ -114,6 +116,27 @@ PUBLISHED = (
     ),
 )
 """All the paper's tables that the protocols compute (its tables 1 to 3, and the supplement's)."""
+
+EDITING_UMAP: Mapping[str, float] = {"Generation": 3.077, "Audio-SDS": 4.234, "AV-MSF": 2.753}
+"""UMAP distance to the target material after an edit, by what the paper calls the method."""
+
+
+@dataclass(frozen=True)
+class PublishedTimes:
+    """What one object takes on one A5000 GPU (supplement, computation)."""
+
+    title: str
+    """What the paper calls the method."""
+    train_seconds: float
+    render_seconds: float
+    """For one sound."""
+
+
+COMPUTATION = (
+    PublishedTimes("AV-MSF", 0.27 * 3600, 0.0438),
+    PublishedTimes("SonicGauss", 0.59 * 3600, 3.2),
+    PublishedTimes("DiffSound", 3.16 * 3600, 0.0069),
+)
 
 
 def published(protocol: str, dataset: str) -> PublishedTable | None:

@@ -6,6 +6,8 @@ from typing import Any
 
 from torch import Tensor
 
+from avmsf.bench.contactmaps import read_map
+from avmsf.bench.contactpictures import draw_contact
 from avmsf.bench.listening import Heard
 from avmsf.bench.markdown import markdown
 from avmsf.bench.page import heard_contacts, page
@@ -20,7 +22,7 @@ from avmsf.plotting.spectrograms import draw_method_spectrograms
 SUMMARY, TIMES, TABLES, PAGE = "summary.json", "times.json", "report.md", "report.html"
 """The files next to `protocol.json` and the folder `objects`."""
 FIGURES = "figures"
-"""Folder of the spectrograms, one file for each object, or for each object and case."""
+"""Folder of the spectrograms, one file for each object, or for each object and case, and of the heat maps."""
 _RECORDED = "recorded"
 """Title of the first column."""
 
@@ -44,11 +46,14 @@ def write_page(results: ResultsFolder, *, subsets: Mapping[str, frozenset[str]])
 
 
 def write_figures(results: ResultsFolder) -> list[Path]:
-    """Draw the stored sounds as spectrograms, the recording next to all methods, and return the files.
+    """Draw what is stored, and return the files.
 
-    One PNG for each object and each label of its cases. Raises EvaluationError where a stored sound is missing.
+    Sounds are drawn as spectrograms, the recording next to all methods, one PNG for each object and each label of its
+    cases; localized contacts as heat maps with the true contact marked, one PNG for each field and recording. Raises
+    EvaluationError where a stored file is missing.
     """
-    return [path for record in results.records() for path in _write_spectrograms(record, results.path)]
+    drawn = (_write_spectrograms, _write_maps)
+    return [path for record in results.records() for draw in drawn for path in draw(record, results.path)]
 
 
 def _write_spectrograms(record: ObjectRecord, folder: Path) -> list[Path]:
@@ -73,6 +78,18 @@ def _write_spectrograms(record: ObjectRecord, folder: Path) -> list[Path]:
         name = record.identifier if len(labels) == 1 else f"{record.identifier} {word}"
         paths.append(folder / FIGURES / f"{name}.png")
         save_picture(figure, paths[-1])
+    return paths
+
+
+def _write_maps(record: ObjectRecord, folder: Path) -> list[Path]:
+    paths = []
+    for outcome in record.outcomes:
+        for recording, file in outcome.maps.items():
+            found, truth = read_map(folder / file)
+            title = f"{record.identifier}: {recording} located by {outcome.method}"
+            # The file's name has the row, which tells recordings of one case apart.
+            paths.append(folder / FIGURES / f"{record.identifier} {Path(file).stem}.png")
+            save_picture(draw_contact(found, title=title, truth=truth), paths[-1])
     return paths
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from avmsf.bench.protocols import BASELINE, PROTOCOLS
-from avmsf.bench.published import published, published_ratios
+from avmsf.bench.published import COMPUTATION, published, published_ratios
 from avmsf.bench.results import ObjectRecord
 from avmsf.bench.summary import (
     RISING,
@@ -87,7 +87,7 @@ def sections(
         if len(labels) > 1:
             parts += [_case_table(metric, tables, protocol, dataset) for metric in shown]
         parts += _mode_table(main, shown) + _object_tables(main, shown)
-    parts.append(_times(records, order))
+    parts.append(_times(records, order, protocol, dataset))
     parts.append(_failures(records))
     return parts
 
@@ -248,7 +248,7 @@ def _object_tables(main: Table, shown: Sequence[str]) -> list[Section]:
     ]
 
 
-def _times(records: Sequence[ObjectRecord], order: Sequence[str]) -> Section:
+def _times(records: Sequence[ObjectRecord], order: Sequence[str], protocol: str, dataset: str) -> Section:
     times = times_of(records)
     fits = {
         method: [times[each]["methods"][method] for each in times if method in times[each]["methods"]]
@@ -266,9 +266,15 @@ def _times(records: Sequence[ObjectRecord], order: Sequence[str]) -> Section:
     shared = [each["shared"] for each in times.values()]
     if shared:
         rows.append(("shared: modes and features", figure(sum(shared) / len(shared)), _DASH))
+    words = "Seconds on one thread, mean over objects, sum over a protocol's cases, without the computation of metrics."
+    if published(protocol, dataset) is not None:
+        rows += [
+            (f"paper: {each.title}", figure(each.train_seconds), figure(each.render_seconds)) for each in COMPUTATION
+        ]
+        words += " Rows that begin with “paper:” are the paper's: one training and one sound on an A5000 GPU."
     return Section(
         "Time per object",
-        ("Seconds on one thread, mean over objects, sum over a protocol's cases, without the computation of metrics.",),
+        (words,),
         Grid(("method", "fit", "render the test contacts"), tuple(rows)),
     )
 

@@ -37,6 +37,8 @@ class Outcome:
     """Files of sounds for the page, relative to the folder, by the names of their recordings."""
     report: Mapping[str, Any] = field(default_factory=dict)
     """Choices that the method made."""
+    maps: Mapping[str, str] = field(default_factory=dict)
+    """Files of located contacts' maps, likewise."""
     failure: str | None = None
     """Reason for missing values, in one line."""
 

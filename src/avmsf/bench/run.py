@@ -33,8 +33,10 @@ def run_object(
     with one_thread():
         record = results.read(identifier) or ObjectRecord(identifier)
         try:
-            impacts = evaluation.dataset.capture(identifier).impacts
-            truth = truth_of(evaluation.dataset, identifier)
+            capture = evaluation.dataset.capture(identifier)
+            impacts, surface = capture.impacts, capture.surface
+            # From its peak, a recording's modes have phases of its own, which the truth of all does not have.
+            truth = None if evaluation.time_zero == "peak" else truth_of(evaluation.dataset, identifier)
             digest = digest_of(impacts, truth)
             if truth is not None:
                 truth = truth_from_first_sample(truth_at(truth, impacts.names), impacts)
@@ -68,6 +70,7 @@ def run_object(
                     family=family,
                     material=facts.material,
                     stranger=stranger,
+                    vertices=None if surface is None or not len(surface.faces) else surface.vertices,
                     listened=firsts[case.label] == case.key,
                 ),
                 record,

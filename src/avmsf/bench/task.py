@@ -77,3 +77,13 @@ class Method(Protocol):
     def fit(self, task: Task) -> Renderer:
         """Fit a renderer to the task's training recordings. Raises AvmsfError where it cannot."""
         ...
+
+
+@runtime_checkable
+class Looking(Protocol):
+    """A method that reads features of the object's points."""
+
+    @property
+    def look(self) -> Look:
+        """Which ones it reads."""
+        ...

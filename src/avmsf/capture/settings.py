@@ -3,7 +3,7 @@
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, get_args
@@ -99,6 +99,12 @@ class CaptureSettings:
     def from_peaks(self) -> bool:
         """Whether sounds start at their largest samples."""
         return self.align and self.time_zero == "peak"
+
+    def starting(self, time_zero: str | None) -> "CaptureSettings":
+        """Return the settings with another start of sounds, from peaks even without `align`; the same for None."""
+        if time_zero is None:
+            return self
+        return replace(self, time_zero=time_zero, align=self.align or time_zero == "peak")
 
     @property
     def meters(self) -> float:

@@ -22,11 +22,11 @@ from avmsf.cli.overallbar import REFINEMENT, OverallBar
 from avmsf.cli.printing import console, figure, json_text, print_json, print_text, say
 from avmsf.cli.scores import compare, parts_words, score_markdown, score_table, score_values
 from avmsf.cli.writing import Level, write_sound, write_text
+from avmsf.config import CACHE, DESCRIPTORS, LiftConfig, PipelineConfig, SceneConfig
 from avmsf.export.webpage import write_webpage
 from avmsf.field.config import FitConfig
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
-from avmsf.pipeline.config import CACHE, DESCRIPTORS, LiftConfig, PipelineConfig, SceneConfig
 from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.scene import CLOUD
 from avmsf.scene.points import farthest_points

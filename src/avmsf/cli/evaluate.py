@@ -1,6 +1,6 @@
 """`avmsf evaluate`: the errors of methods on a dataset, as tables and as a page."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -8,8 +8,9 @@ from typing import Any
 
 from rich.console import Console
 
-from avmsf._utils.device import usable_device
+from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.bench.cases import Growing
+from avmsf.bench.fieldmethods import configured
 from avmsf.bench.judging import Judging
 from avmsf.bench.learningcurve import curves, draw_learning_curve
 from avmsf.bench.methods import method_named
@@ -21,16 +22,16 @@ from avmsf.bench.report import PAGE, SUMMARY, TABLES, write_figures, write_page,
 from avmsf.bench.reporttables import Section
 from avmsf.bench.results import ResultsFolder, write_json
 from avmsf.bench.subsets import choose_objects, members
-from avmsf.bench.task import Method
+from avmsf.bench.task import Look, Looking, Method
 from avmsf.capture.datasets import CaptureCollection, open_dataset
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.objectbar import ObjectBar
 from avmsf.cli.options.evaluate import Options
 from avmsf.cli.printing import console, decimals, print_json, say, table
+from avmsf.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
 from avmsf.errors import EvaluationError
-from avmsf.modal.extraction.finders import HighResolution
-from avmsf.pipeline.config import AUTO, PRESETS, BodyConfig, Geometry, LiftConfig, SceneConfig, ViewsConfig
+from avmsf.modal.extraction.finders import finder_named
 from avmsf.pipeline.features import choose_encoder, settled
 from avmsf.pipeline.objectbodies import ObjectBodies
 from avmsf.pipeline.objectlooks import ObjectLooks
@@ -48,30 +49,17 @@ def run(options: Options) -> int:
     elif options.counts or options.starts != Options.starts or options.metric != Options.metric:
         say(f"note: --counts, --starts and --metric are not used by {protocol.name}, only by {LEARNING_CURVE}")
     methods = tuple(method_named(name) for name in _words(options.methods) or protocol.methods)
-    cdpam = not options.no_cdpam and "cdpam" in protocol.metrics
     workers = Workers(options.workers, options.ray)
     # All paths are made absolute: workers may run in folders of their own.
     contacts, table_of_names = (
         None if path is None else path.resolve() for path in (options.contact_data, options.table)
     )
-    dataset = open_dataset(options.data.resolve(), contacts=contacts, table=table_of_names)
+    dataset = open_dataset(options.data.resolve(), contacts=contacts, table=table_of_names, time_zero=options.time_zero)
     title = title_of(dataset, options.data)
     objects = choose_objects(dataset, protocol, _words(options.objects))
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
-    evaluation = evaluation_of(
-        dataset,
-        title,
-        protocol,
-        methods,
-        (options.cache or folder / "features").resolve(),
-        scene=SceneConfig(ViewsConfig(source=options.visual_source), options.splat, options.lift),
-        geometry=options.geometry,
-        body=options.body,
-        judging=Judging(level=options.amplitude_scale, cdpam=cdpam, cdpam_contacts=options.cdpam_contacts),
-        modes=options.modes,
-        seed=options.seed,
-        device=options.device,
-    )
+    evaluation = evaluation_of(options, dataset, title, protocol, methods, folder)
+    _note_start(methods, options.time_zero)
     results, groups = ResultsFolder(folder), members(dataset)
     say(f"{protocol.name} on {title}: {len(objects)} objects, {len(methods)} methods, results in {folder}")
     try:
@@ -141,35 +129,51 @@ def _draw_curves(
 
 
 def evaluation_of(
+    options: Options,
     dataset: Dataset,
     title: str,
     protocol: EvaluationProtocol,
     methods: tuple[Method, ...],
-    kept: Path,
-    *,
-    scene: SceneConfig,
-    judging: Judging,
-    modes: int,
-    seed: int,
-    body: BodyConfig,
-    geometry: Geometry = "mesh",
-    device: str | None = None,
+    folder: Path,
 ) -> Evaluation:
-    """Return the plan of an evaluation that stores features and surfaces in the folder `kept`.
+    """Return the plan of an evaluation with results in a folder, and features in it unless the options name another.
 
     Raises SceneError for an encoder, and EvaluationError for a device, that is not available.
     """
+    device, body = options.device, options.body
     if device is not None:
-        usable_device(device, raising=EvaluationError)
-    lift, paper = settled_lifts(scene.lift, methods)
-    scene = replace(scene, lift=lift)
-    settings = {"scene": asdict(scene), "paper": asdict(paper), "geometry": geometry, "body": asdict(body)}
+        usable_device(device, raising=EvaluationError, kinds=TRAINABLE)
+    kept = (options.cache or folder / "features").resolve()
+    lift, paper = settled_lifts(options.lift, looks_of(methods, protocol), device=device)
+    given = SceneConfig(ViewsConfig(source=options.visual_source), options.splat, options.lift)
+    scene = replace(given, lift=lift)
     looks = ObjectLooks(dataset, kept, scene, paper, device)
-    bodies = ObjectBodies(dataset, kept, geometry, body, scene, device=device)
-    finder = HighResolution(modes=modes)
+    cdpam = not options.no_cdpam and "cdpam" in protocol.metrics
     return Evaluation(
-        dataset, title, protocol, methods, looks, bodies, seed, judging, finder, settings, looks.cloud, device
+        dataset,
+        title,
+        protocol,
+        methods,
+        looks,
+        ObjectBodies(dataset, kept, options.geometry, body, scene, device=device),
+        options.seed,
+        Judging(level=options.amplitude_scale, cdpam=cdpam, cdpam_contacts=options.cdpam_contacts),
+        finder_named(options.extraction, options.modes),
+        {"scene": asdict(given), "paper": asdict(paper), "geometry": options.geometry, "body": asdict(body)},
+        looks.cloud,
+        device,
+        None if lift == options.lift else lift.encoder,
+        options.time_zero,
     )
+
+
+def _note_start(methods: Sequence[Method], time_zero: TimeZero | None) -> None:
+    """Print which methods are configured for another start of sounds than the evaluation has."""
+    for method in methods:
+        settings = configured(method)
+        wanted = None if settings is None else settings.pipeline.time_zero
+        if wanted not in (None, time_zero):
+            say(f"note: {method.name} is published with sounds from their {wanted}s: --time-zero {wanted}")
 
 
 def run_shown(
@@ -191,18 +195,27 @@ def run_shown(
         run_objects(evaluation, objects, results, workers=workers, progress=show)
 
 
-def settled_lifts(lift: LiftConfig, methods: Sequence[Method]) -> tuple[LiftConfig, LiftConfig]:
-    """Return the settings of features, and those of the paper's form, with the encoders that will be used.
+def settled_lifts(
+    lift: LiftConfig, looks: Collection[Look], *, device: str | None = None
+) -> tuple[LiftConfig, LiftConfig]:
+    """Return the settings of features, and those of the paper's form, with the encoders that `looks` are made with.
 
-    The replacement of DINOv2 is printed, and is part of the results' identity. Raises SceneError where a method needs
-    the paper's encoder and it is not available.
+    Without any look no encoder is loaded. The replacement of DINOv2 is printed. Raises SceneError where a look is the
+    paper's and its encoder is not available.
     """
     paper = PRESETS["paper"].scene.lift
     if lift.encoder != AUTO:
         return lift, replace(paper, encoder=lift.encoder)
-    if any(getattr(method, "look", "").startswith("paper") for method in methods):
-        choose_encoder(paper, tell=say)
-    return settled(lift, tell=say), paper
+    if any(look.startswith("paper") for look in looks):
+        choose_encoder(paper, tell=say, device=device)
+        return replace(lift, encoder=paper.encoder), paper
+    return settled(lift, tell=say, device=device) if looks else lift, paper
+
+
+def looks_of(methods: Sequence[Method], protocol: EvaluationProtocol) -> frozenset[Look]:
+    """Return the features that an evaluation reads: those of its methods, and the points that locate recordings."""
+    read = {method.look for method in methods if isinstance(method, Looking)}
+    return frozenset(read | {"positions"} if protocol.locating else read)
 
 
 def title_of(dataset: Dataset, folder: Path) -> str:

@@ -12,6 +12,7 @@ from avmsf.capture.surface import find_surface_file
 from avmsf.cli.options.export import Options, unused_options
 from avmsf.cli.printing import figure, print_result, say
 from avmsf.cli.render import METRES
+from avmsf.config import CACHE
 from avmsf.errors import ExportError
 from avmsf.export.faust import fitted, write_faust
 from avmsf.export.formats import FAUST_SUFFIXES, GLTF_SUFFIXES, PAGE_SUFFIXES, POINTS, UNIVERSAL_SUFFIXES, Format
@@ -26,7 +27,6 @@ from avmsf.export.webpage import write_webpage
 from avmsf.export.written import Written, expect_ending, expect_free, write_file
 from avmsf.field.soundfield import SoundField
 from avmsf.field.store import load
-from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.reconstruct import SURFACE
 from avmsf.scene.gaussians import GaussianCloud
 from avmsf.scene.ply import read_splats

@@ -7,8 +7,8 @@ from avmsf.cli.options.features import Options
 from avmsf.cli.printing import console, next_command, print_json, say
 from avmsf.cli.scenes import features_words, opened_scene, stage_line
 from avmsf.cli.writing import expect_writable
+from avmsf.config import SceneConfig
 from avmsf.files import copy_whole
-from avmsf.pipeline.config import SceneConfig
 from avmsf.scene.featurestore import read_report
 
 

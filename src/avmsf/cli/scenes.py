@@ -9,7 +9,7 @@ from avmsf.capture.folder import settings_of
 from avmsf.capture.together import expect_one_unit
 from avmsf.cli.options.scenes import SceneOptions
 from avmsf.cli.scenebar import SceneBar
-from avmsf.pipeline.config import SceneConfig
+from avmsf.config import SceneConfig
 from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.scene.symmetry import Symmetries

@@ -5,8 +5,8 @@ from avmsf.cli.options.splat import Options
 from avmsf.cli.printing import next_command, print_result, say
 from avmsf.cli.scenes import opened_scene, stage_line
 from avmsf.cli.writing import expect_writable
+from avmsf.config import SceneConfig
 from avmsf.files import copy_whole
-from avmsf.pipeline.config import SceneConfig
 from avmsf.scene.ply import read_splats
 
 

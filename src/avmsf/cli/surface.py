@@ -14,8 +14,8 @@ from avmsf.cli.options.surface import Options
 from avmsf.cli.printing import next_command, print_result, say
 from avmsf.cli.scenes import opened_scene, stage_line
 from avmsf.cli.writing import OutputError, expect_writable
+from avmsf.config import SceneConfig
 from avmsf.files import write_whole
-from avmsf.pipeline.config import SceneConfig
 from avmsf.pipeline.reconstruct import keep_surface, object_shape
 
 

@@ -26,10 +26,10 @@ from avmsf.modal.residual import Residual, low_fluctuation_noise, shape_noise
 from avmsf.modal.synthesis import synthesize_phased
 
 if TYPE_CHECKING:
+    from avmsf.config import PipelineConfig
     from avmsf.field.config import GainModel
     from avmsf.field.suggest import Suggestions
     from avmsf.localization.contact_map import ContactMap
-    from avmsf.pipeline.config import PipelineConfig
     from avmsf.scene.features import FeatureField
     from avmsf.tasks.hearing import Sound
 

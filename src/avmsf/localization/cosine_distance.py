@@ -8,10 +8,25 @@ from torch import Tensor
 
 LARGEST_DELAY = 5e-4
 """Bound of the onset's error, seconds, either way."""
-_STEP = 0.2
-"""Radians that the typical frequency turns by between two delays: 1 - cos(.1), .005, bounds what is missed."""
-_MOST_DELAYS = 201
+STEP = 0.2
+"""Radians that the typical frequency turns by between two delays, of which one is within half of that: a point with the
+recorded gains has a distance of .1^2 / 2 = .005 at most. It grows with the square of the frequency where `MOST_DELAYS`
+limits them, from 6.4 kHz on, to .05 at 20 kHz."""
+MOST_DELAYS = 201
 _BATCH = 512
+
+
+def delays_of(
+    power: Float64[Tensor, " modes"], frequency: Float64[Tensor, " modes"], *, step: float
+) -> Float64[Tensor, " delays"]:
+    """Return evenly spaced delays (seconds) up to `LARGEST_DELAY` either way, zero among them.
+
+    From one to the next the typical frequency, the root mean square of frequencies (Hz) weighted by `power`, turns by
+    `step` radians, or by more where that would take more than `MOST_DELAYS`.
+    """
+    typical = 2.0 * math.pi * float(((power @ frequency.square()) / power.sum()).sqrt())
+    count = min(MOST_DELAYS, 1 + 2 * math.ceil(LARGEST_DELAY * typical / step))
+    return torch.linspace(-LARGEST_DELAY, LARGEST_DELAY, count, dtype=torch.float64)
 
 
 def cosine_distance(
@@ -25,11 +40,11 @@ def cosine_distance(
     of the recording, up to `LARGEST_DELAY`, that makes its distance least: one sample turns high modes by more than
     gains differ between points. A point or a recording without gains has the distance 1.
     """
-    recorded = recorded / recorded.norm().clamp_min(torch.finfo(torch.float64).tiny)
+    if not bool(recorded.any()):
+        return torch.ones(len(gains), dtype=torch.float64)
+    recorded = recorded / recorded.norm()
     turns = 2.0 * math.pi * frequency
-    typical = float((recorded.abs().square() @ turns.square()).sqrt())
-    count = min(_MOST_DELAYS, 1 + 2 * math.ceil(LARGEST_DELAY * typical / _STEP))
-    delays = torch.linspace(-LARGEST_DELAY, LARGEST_DELAY, count, dtype=torch.float64)
+    delays = delays_of(recorded.abs().square(), frequency, step=STEP)
     turned = (recorded * torch.polar(torch.ones((), dtype=torch.float64), -delays[:, None] * turns)).to(torch.complex64)
     parts = torch.view_as_real(turned).flatten(1).T.contiguous()
     found = [

@@ -10,9 +10,9 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.placement import expect_placed, surface_points
 from avmsf.capture.surface import Surface
+from avmsf.config import BodyConfig
 from avmsf.fem.supports import Support
 from avmsf.field.gains.bodies import CandidateBodies
-from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.nominal import NominalBody, Shape, nominal_bodies, refined, supported, with_wall
 
 

@@ -9,8 +9,8 @@ import torch
 from avmsf._utils.device import usable_device
 from avmsf.capture.cameras import View
 from avmsf.capture.surface import Surface
+from avmsf.config import AUTO, DESCRIPTORS, DINO, LiftConfig
 from avmsf.errors import SceneError
-from avmsf.pipeline.config import AUTO, DESCRIPTORS, DINO, LiftConfig
 from avmsf.scene.descriptors import ImageDescriptors
 from avmsf.scene.dino import DinoEncoder
 from avmsf.scene.encode import Encoder
@@ -58,11 +58,11 @@ def choose_encoder(config: LiftConfig, *, tell: Callable[[str], None], device: s
         return ImageDescriptors()
 
 
-def settled(config: LiftConfig, *, tell: Callable[[str], None]) -> LiftConfig:
+def settled(config: LiftConfig, *, tell: Callable[[str], None], device: str | None = None) -> LiftConfig:
     """Return the settings with the encoder that `auto` means here; `tell` reports any other than DINOv2."""
     if config.encoder != AUTO:
         return config
-    found = choose_encoder(config, tell=tell)
+    found = choose_encoder(config, tell=tell, device=device)
     return replace(config, encoder=DESCRIPTORS if isinstance(found, ImageDescriptors) else DINO)
 
 

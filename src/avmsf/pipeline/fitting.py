@@ -12,6 +12,7 @@ from rich.progress import Progress as Bar
 from avmsf._utils.caching import discard
 from avmsf.capture import Capture, Impacts
 from avmsf.capture.placement import surface_points
+from avmsf.config import PipelineConfig
 from avmsf.errors import FitError
 from avmsf.field.config import GainModel
 from avmsf.field.fit import Progress, fit
@@ -20,7 +21,6 @@ from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_once
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.reconstruct import expect_on_object
 from avmsf.pipeline.record import finder_of, with_record
 from avmsf.scene.features import FeatureField

@@ -12,6 +12,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import SURFACE_FILES, Surface, find_surface, read_surface
 from avmsf.capture.table import TABLE, read_cells
 from avmsf.capture.together import NARROWEST, WIDEST
+from avmsf.config import BodyConfig
 from avmsf.errors import FitError, SimulationError
 from avmsf.fem.radiation import radiated_pressure
 from avmsf.field.config import FitConfig
@@ -19,7 +20,6 @@ from avmsf.field.gains.body import BodyGains
 from avmsf.field.soundfield import Origin, SoundField
 from avmsf.modal.bank import ModalBank
 from avmsf.modal.residual import Residual
-from avmsf.pipeline.config import BodyConfig
 from avmsf.scene.features import FeatureField
 from avmsf.simulate.elastic import ElasticModes
 from avmsf.simulate.hammer import contact_times, pulse_spectrum

@@ -6,13 +6,13 @@ from pathlib import Path
 from avmsf._utils.locks import NO_LIMIT
 from avmsf.capture.datasets.dataset import Dataset
 from avmsf.capture.surface import Surface
+from avmsf.config import BodyConfig, Geometry, SceneConfig, ViewsConfig
 from avmsf.errors import SceneError
 from avmsf.evaluation.material_fit import MODES as DIFFSOUND_MODES
 from avmsf.fem.family import BodyFamily, body_family
 from avmsf.field.gains.bodies import CandidateBodies
 from avmsf.geometry import ObjectShape
 from avmsf.pipeline.bodies import candidate_bodies, roughened
-from avmsf.pipeline.config import BodyConfig, Geometry, SceneConfig, ViewsConfig
 from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import StageFolder
 

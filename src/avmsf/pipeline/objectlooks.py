@@ -7,8 +7,8 @@ from pathlib import Path
 from avmsf._utils.locks import NO_LIMIT
 from avmsf.bench.task import Look
 from avmsf.capture.datasets.dataset import Dataset
+from avmsf.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.errors import SceneError
-from avmsf.pipeline.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.scene import FEATURES, SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.scene.features import FeatureField

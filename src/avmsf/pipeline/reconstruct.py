@@ -19,6 +19,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import find_surface, read_surface, write_surface
 from avmsf.capture.views import read_views
 from avmsf.capture.warning import CaptureWarning
+from avmsf.config import PipelineConfig
 from avmsf.errors import AvmsfError, CaptureError, SceneError
 from avmsf.field.config import NETWORK
 from avmsf.field.fit import Progress, fit
@@ -32,7 +33,6 @@ from avmsf.geometry import ObjectShape
 from avmsf.geometry.closest import ClosestPoints
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.guess import expect_no_recordings, guess_field
 from avmsf.pipeline.record import finder_of, with_record
 from avmsf.pipeline.scene import Listener, SceneStages

@@ -5,9 +5,9 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from avmsf.capture.settings import CaptureSettings
+from avmsf.config import PipelineConfig
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.extraction.finders import ModeFinder, finder_named
-from avmsf.pipeline.config import PipelineConfig
 
 RECORD = "pipeline"
 """What a field's report calls the configuration that made it."""
@@ -20,7 +20,7 @@ def finder_of(config: PipelineConfig) -> ModeFinder:
 
 def capture_settings_of(config: PipelineConfig, settings: CaptureSettings) -> CaptureSettings:
     """Return a capture's settings with the configuration's start of sounds."""
-    return settings if config.time_zero is None else replace(settings, time_zero=config.time_zero)
+    return settings.starting(config.time_zero)
 
 
 def with_record(made: SoundField, config: PipelineConfig, features: Mapping[str, Any]) -> SoundField:

@@ -11,10 +11,10 @@ from avmsf.capture.cameras import View
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import read_surface
 from avmsf.capture.views import read_sparse_points, read_views
+from avmsf.config import SceneConfig
 from avmsf.errors import SceneError
 from avmsf.geometry import ObjectShape
 from avmsf.pipeline.cloudshape import masks_suffice, shape_of_cloud, views_of_cloud
-from avmsf.pipeline.config import SceneConfig
 from avmsf.pipeline.features import choose_encoder, finish_features, lift_to_cloud, lift_to_surface
 from avmsf.pipeline.sources import Source, find_source, find_splats, keep_views, replace_views
 from avmsf.pipeline.stages import Kept, StageFolder, digest_of

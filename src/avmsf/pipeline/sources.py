@@ -19,8 +19,8 @@ from avmsf.capture.views import find_foreground, read_views
 from avmsf.capture.views.colmap import find_model
 from avmsf.capture.views.pictures import SUFFIXES
 from avmsf.capture.views.write import write_views
+from avmsf.config import ViewsConfig
 from avmsf.errors import SceneError
-from avmsf.pipeline.config import ViewsConfig
 from avmsf.pipeline.stages import Kept, StageFolder, digest_files
 from avmsf.scene.points import farthest_points
 

@@ -10,10 +10,10 @@ from avmsf.capture.folder import settings_of
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.surface import find_surface_file
 from avmsf.capture.table import TABLE
+from avmsf.config import CACHE
 from avmsf.errors import StudioError
 from avmsf.export.objectfile import holds_gaussians
 from avmsf.files import copy_whole
-from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.reconstruct import FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
 from avmsf.pipeline.sources import SPLATS, find_source, find_splats

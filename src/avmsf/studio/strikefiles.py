@@ -17,9 +17,9 @@ import soundfile
 from avmsf._utils.locks import write_lock
 from avmsf._utils.text_files import read_json
 from avmsf.capture.audio import Recording
+from avmsf.config import CACHE
 from avmsf.errors import CaptureError, FolderInUseError
 from avmsf.files import write_whole
-from avmsf.pipeline.config import CACHE
 from avmsf.studio.refusal import RefusedError
 
 JOURNAL, REMOVED = "studio.json", "removed"

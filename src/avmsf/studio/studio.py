@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from avmsf.config import Preset
 from avmsf.field.store import load, save
-from avmsf.pipeline.config import Preset
 from avmsf.studio.capturing import StrikeBook
 from avmsf.studio.editing import MATERIAL_NAMES, Sliders
 from avmsf.studio.jobs import Event, Job, Jobs

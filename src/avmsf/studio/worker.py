@@ -20,11 +20,11 @@ from avmsf._utils.memory import NO_MEMORY, lacks_memory
 from avmsf.capture import read_capture
 from avmsf.capture.folder import settings_of
 from avmsf.capture.warning import CaptureWarning
+from avmsf.config import CACHE, PRESETS, SceneConfig
 from avmsf.errors import AvmsfError
 from avmsf.field.fit import Progress
 from avmsf.field.store import load, save
 from avmsf.files import copy_whole
-from avmsf.pipeline.config import CACHE, PRESETS, SceneConfig
 from avmsf.pipeline.reconstruct import reconstruct
 from avmsf.pipeline.record import capture_settings_of
 from avmsf.pipeline.scene import Listener, SceneStages

@@ -23,7 +23,7 @@ from jaxtyping import Complex64, Complex128, Float32, Float64, Int64
 from torch import Tensor
 
 from avmsf.errors import LocationError
-from avmsf.localization.cosine_distance import LARGEST_DELAY
+from avmsf.localization.cosine_distance import delays_of
 
 MISFITS = (0.8, 0.15, 0.03)
 """How wrong gains may be, relative: what every point is tried with."""
@@ -41,7 +41,6 @@ _COARSE, _FINE = 0.9, 0.3
 looked at closely."""
 _CLOSELY = 2000
 """Points that are looked at closely: those whose gains look most alike."""
-_MOST_SHIFTS = 201
 _NEGLIGIBLE = 40.0
 """A point this far below the best in log likelihood has no part in the answer."""
 _LEVEL_STEP, _LEVEL_LIMIT = 0.1, 28.0
@@ -226,15 +225,10 @@ class _Trial:
         return torch.sort(torch.topk(match / size, count).indices).values
 
     def _turned(self, step: float) -> tuple[Float64[Tensor, " shifts"], Complex64[Tensor, "shifts modes"]]:
-        """Return evenly spaced shifts, zero among them, and the amplitudes turned back by each.
-
-        As close as the frequencies of what is heard ask for, which turn by `step` radians from one to the next.
-        """
+        """Return the shifts of `delays_of` for what is heard, and the amplitudes turned back by each."""
         frequency = self.foretold.frequency
         heard = self.weights.double() * self.values.abs().square()
-        typical = float(((heard * frequency.square()).sum() / heard.sum()).sqrt())
-        count = min(_MOST_SHIFTS, 1 + 2 * math.ceil(LARGEST_DELAY * 2.0 * math.pi * typical / step))
-        shifts = torch.linspace(-LARGEST_DELAY, LARGEST_DELAY, count, dtype=torch.float64)
+        shifts = delays_of(heard, frequency, step=step)
         back = torch.polar(torch.ones((), dtype=torch.float64), -2.0 * math.pi * shifts[:, None] * frequency)
         return shifts, (self.values * back).to(torch.complex64)
 

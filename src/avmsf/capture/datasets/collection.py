@@ -24,13 +24,14 @@ class CaptureCollection:
     """A folder of capture folders, or one capture folder.
 
     Hidden folders are ignored, and so are folders without a table of impacts, which `check` names. An object has the
-    name of its folder.
+    name of its folder. Sounds start where its settings say, unless `time_zero` does.
     """
 
     name = "captures"
 
-    def __init__(self, folder: str | Path) -> None:
+    def __init__(self, folder: str | Path, *, time_zero: str | None = None) -> None:
         self.folder = Path(folder)
+        self._time_zero = time_zero
 
     def objects(self) -> tuple[str, ...]:
         """Return the names of all capture folders, by numbers where they begin with one, else by the alphabet."""
@@ -49,7 +50,7 @@ class CaptureCollection:
         """Read one capture as `read_capture` does. Raises DatasetError for an unknown one and for what that refuses."""
         folder = self._expect(identifier)
         try:
-            return read_capture(folder)
+            return read_capture(folder, settings_of(folder).starting(self._time_zero))
         except CaptureError as error:
             raise DatasetError(f"{folder}: {error}", **error.attributes) from error
 

@@ -34,15 +34,17 @@ SPLITS = ("train", "val", "test")
 class ObjectFolderCompact:
     """The compact copy: `audio/<object>/<contact>.wav` with `contacts/<object>/<contact>.npy`.
 
-    There is no force, so sounds start where they exceed the noise and keep their recorded level: impacts of another
-    force and recordings of another gain differ in level. The surface is a mesh where there is one in the folder or
-    next to it (`find_mesh`), else the copy's own 1,024 points. `table` is a list of names (`read_names`).
+    There is no force, so sounds start where they exceed the noise, or with `time_zero` "peak" at their peaks, and keep
+    their recorded level: impacts of another force and recordings of another gain differ in level. The surface is a mesh
+    where there is one in the folder or next to it (`find_mesh`), else the copy's own 1,024 points. `table` is a list of
+    names (`read_names`).
     """
 
     name = "ObjectFolder Real (compact)"
 
-    def __init__(self, folder: str | Path, *, table: str | Path | None = None) -> None:
+    def __init__(self, folder: str | Path, *, table: str | Path | None = None, time_zero: str | None = None) -> None:
         self.folder = Path(folder)
+        self._settings = SETTINGS.starting(time_zero)
         self._table = None if table is None else Path(table)
 
     def objects(self) -> tuple[str, ...]:
@@ -78,7 +80,7 @@ class ObjectFolderCompact:
             self._blows(identifier, contacts),
             name=self.facts(identifier).name,
             origin=origin,
-            settings=SETTINGS,
+            settings=self._settings,
             surface=self._surface(identifier, origin),
             remarks=problems,
         )

@@ -47,16 +47,23 @@ class ObjectFolderRaw:
     by default they are sought in the folder and its parent. `table` is a list of the objects' names and materials
     (`read_names`). Meshes are found in the folder or its parent (`find_mesh`).
 
-    Sounds start at the force's onset, are divided by the peak force in newtons and by the recorder's gain, so that one
-    is the microphone's full scale at 0 dB of gain, per newton.
+    Sounds start at the force's onset, or with `time_zero` "peak" at their peaks, as in the paper. They are divided by
+    the peak force in newtons and by the recorder's gain, so that one is the microphone's full scale at 0 dB of gain,
+    per newton.
     """
 
     name = "ObjectFolder Real"
 
     def __init__(
-        self, folder: str | Path, *, contacts: str | Path | None = None, table: str | Path | None = None
+        self,
+        folder: str | Path,
+        *,
+        contacts: str | Path | None = None,
+        table: str | Path | None = None,
+        time_zero: str | None = None,
     ) -> None:
         self.folder = Path(folder)
+        self._settings = SETTINGS.starting(time_zero)
         self._given_contacts = None if contacts is None else Path(contacts)
         self._table = None if table is None else Path(table)
 
@@ -85,7 +92,7 @@ class ObjectFolderRaw:
             self._blows(identifier, strikes),
             name=self.facts(identifier).name,
             origin=origin,
-            settings=SETTINGS,
+            settings=self._settings,
             surface=surface,
             remarks=problems,
         )

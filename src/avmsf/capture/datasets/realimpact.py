@@ -56,14 +56,15 @@ class RealImpact:
     """RealImpact, unpacked: `<number>_<name>/preprocessed/deconvolved_0db.npy` and so on.
 
     The published sounds are divided by the hammer's spectrum already, and their first sample is the force's onset: they
-    are taken as they are, cut to 3 s. All blows of an object are heard by one microphone (`closest_rows`). Of the
-    sounds, 2.8 GB an object, only the rows needed are read.
+    are taken as they are, or with `time_zero` "peak" from their peaks, as in the paper, and cut to 3 s. All blows of an
+    object are heard by one microphone (`closest_rows`). Of the sounds, 2.8 GB an object, only the rows needed are read.
     """
 
     name = "RealImpact"
 
-    def __init__(self, folder: str | Path) -> None:
+    def __init__(self, folder: str | Path, *, time_zero: str | None = None) -> None:
         self.folder = Path(folder)
+        self._settings = SETTINGS.starting(time_zero)
 
     def objects(self) -> tuple[str, ...]:
         """Return the names of all objects with recordings, by their numbers."""
@@ -100,7 +101,7 @@ class RealImpact:
             self._blows(identifier, rows, vertices=vertices, places=places),
             name=in_words(identifier),
             origin=origin,
-            settings=SETTINGS,
+            settings=self._settings,
             remarks=remarks,
             recorded=False,
         )

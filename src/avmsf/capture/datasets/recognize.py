@@ -20,12 +20,19 @@ SOUGHT = (
 )
 
 
-def open_dataset(path: str | Path, *, contacts: str | Path | None = None, table: str | Path | None = None) -> Dataset:
+def open_dataset(
+    path: str | Path,
+    *,
+    contacts: str | Path | None = None,
+    table: str | Path | None = None,
+    time_zero: str | None = None,
+) -> Dataset:
     """Return the dataset that a folder holds, recognized by its files.
 
-    `contacts` is the path of ObjectFolder Real's contacts, `table` that of its objects' names (`ObjectFolderRaw`). Of
-    the raw and the compact form in one folder the raw one is taken, which has the forces. Raises DatasetError for a
-    folder that holds none and for options that the dataset does not take.
+    `contacts` is the path of ObjectFolder Real's contacts, `table` that of its objects' names (`ObjectFolderRaw`).
+    `time_zero` is where sounds start, `onset` or `peak`; None leaves that to the dataset or the captures. Of the raw
+    and the compact form in one folder the raw one is taken, which has the forces. Raises DatasetError for a folder that
+    holds none and for options that the dataset does not take.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -43,10 +50,10 @@ def open_dataset(path: str | Path, *, contacts: str | Path | None = None, table:
                 f"no `{name}` with {kind.name}", str(given), got=str(given), file=folder, name=name, advice="omit it"
             )
     if kind is ObjectFolderRaw:
-        return ObjectFolderRaw(folder, contacts=contacts, table=table)
+        return ObjectFolderRaw(folder, contacts=contacts, table=table, time_zero=time_zero)
     if kind is ObjectFolderCompact:
-        return ObjectFolderCompact(folder, table=table)
-    return kind(folder)
+        return ObjectFolderCompact(folder, table=table, time_zero=time_zero)
+    return kind(folder, time_zero=time_zero)
 
 
 Kind = type[CaptureCollection] | type[ObjectFolderRaw] | type[ObjectFolderCompact] | type[RealImpact]

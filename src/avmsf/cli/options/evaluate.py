@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import tyro
 
 from avmsf.cli.options.common import Existing, Flag, OutputFolder, Printing, parse_options
-from avmsf.pipeline.config import BodyConfig, Geometry, LiftConfig
+from avmsf.config import BodyConfig, Geometry, LiftConfig, TimeZero
+from avmsf.modal.config import ExtractionMethod
 from avmsf.scene.splatconfig import SplatConfig
 
 
@@ -71,8 +72,13 @@ class Options(Printing):
     """Do not compute the metric CDPAM, which needs the extra `eval`."""
     cdpam_contacts: int = 8
     """Number of test contacts per case at which CDPAM is computed, evenly spaced; 0 for all."""
+    extraction: ExtractionMethod = "high-resolution"
+    """How the modes that methods share are extracted; see `avmsf modes --help`. The methods `paper` have their own."""
     modes: int = 128
-    """Maximum number of modes."""
+    """Maximum number of the modes that methods share."""
+    time_zero: TimeZero | None = None
+    """Start of the sounds, for all methods: onset, or peak (paper); by default that of the dataset or of each
+    capture.toml. From peaks, methods are not compared with the ground truth of simulated objects."""
     contact_data: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), Existing("ObjectFolder Real's contacts")] = (
         None
     )
@@ -80,7 +86,8 @@ class Options(Printing):
     table: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Existing("a table of objects")] = None
     """The published table of ObjectFolder Real's names and materials."""
     figures: Flag = False
-    """Also draw figures/OBJECT.png: spectrograms of the recording and of all methods, 20 Hz to 20 kHz, first second."""
+    """Also draw figures/OBJECT.png: spectrograms of the recording and of all methods, 20 Hz to 20 kHz, first second;
+    with localize also each field's heat maps of three recordings, with the true contact marked."""
 
 
 def parse(words: Sequence[str]) -> Options:

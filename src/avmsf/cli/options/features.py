@@ -8,9 +8,9 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import parse_options
-from avmsf.cli.options.fit import preset_of
+from avmsf.cli.options.presets import preset_of, with_defaults
 from avmsf.cli.options.scenes import SceneOptions
-from avmsf.pipeline.config import PRESETS, LiftConfig, Preset, ViewsConfig
+from avmsf.config import PRESETS, LiftConfig, Preset, ViewsConfig
 from avmsf.scene.splatconfig import SplatConfig
 
 
@@ -33,15 +33,8 @@ class Options(SceneOptions):
     """How features are made."""
 
 
-@dataclass(frozen=True)
-class PaperOptions(Options):
-    """The same with the defaults of the preset `paper`."""
-
-    preset: Preset = "paper"
-    config: tyro.conf.OmitArgPrefixes[LiftConfig] = field(default_factory=lambda: PRESETS["paper"].scene.lift)
-
-
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell, with the preset's settings as defaults."""
-    kind = {"default": Options, "paper": PaperOptions}[preset_of(words)]
+    preset = preset_of(words)
+    kind = with_defaults(Options, {"config": PRESETS[preset].scene.lift, "preset": preset})
     return parse_options(kind, "features", words, description=Options.__doc__)

@@ -8,9 +8,10 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import Existing, Printing, SettingsFile, parse_options
+from avmsf.cli.options.presets import preset_of, preset_values, with_defaults
+from avmsf.config import BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
 from avmsf.field.config import FitConfig, GainModel
 from avmsf.modal.config import ExtractionMethod
-from avmsf.pipeline.config import PRESETS, BodyConfig, PipelineConfig, Preset, SceneConfig, TimeZero
 
 
 @dataclass(frozen=True)
@@ -74,29 +75,9 @@ class Options(Printing):
         )
 
 
-@dataclass(frozen=True)
-class PaperOptions(Options):
-    """The same with the defaults of the preset `paper`."""
-
-    gain_model: GainModel = PRESETS["paper"].gain_model
-    extraction: ExtractionMethod = PRESETS["paper"].method
-    time_zero: TimeZero | None = PRESETS["paper"].time_zero
-    preset: Preset = "paper"
-    config: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=lambda: PRESETS["paper"].fit)
-
-
-@dataclass(frozen=True)
-class _Preset:
-    preset: Preset = "default"
-
-
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell, with the preset's settings as defaults."""
-    kind = {"default": Options, "paper": PaperOptions}[preset_of(words)]
-    return parse_options(kind, "fit", words, description=Options.__doc__)
-
-
-def preset_of(words: Sequence[str]) -> Preset:
-    """Return the preset that the words name; it is read first, since it decides the defaults of all others."""
-    chosen, _ = tyro.cli(_Preset, args=words, add_help=False, return_unknown_args=True)
-    return chosen.preset
+    values = preset_values(preset_of(words), method="extraction", fit="config")
+    # Views and features are made beforehand.
+    del values["scene"]
+    return parse_options(with_defaults(Options, values), "fit", words, description=Options.__doc__)

@@ -8,9 +8,9 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import CaptureFolder, Printing, SettingsFile, parse_options
-from avmsf.cli.options.fit import preset_of
+from avmsf.cli.options.presets import preset_of, preset_values, with_defaults
+from avmsf.config import PipelineConfig, Preset, TimeZero
 from avmsf.modal.config import ExtractionMethod
-from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
 
 
 @dataclass(frozen=True)
@@ -39,16 +39,8 @@ class Options(Printing):
         return PipelineConfig(method=self.extraction, modes=self.modes, time_zero=self.time_zero)
 
 
-@dataclass(frozen=True)
-class PaperOptions(Options):
-    """The same with the defaults of the preset `paper`."""
-
-    extraction: ExtractionMethod = PRESETS["paper"].method
-    time_zero: TimeZero | None = PRESETS["paper"].time_zero
-    preset: Preset = "paper"
-
-
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell, with the preset's settings as defaults."""
-    kind = {"default": Options, "paper": PaperOptions}[preset_of(words)]
-    return parse_options(kind, "modes", words, description=Options.__doc__)
+    values = preset_values(preset_of(words), method="extraction")
+    own = {name: values[name] for name in ("extraction", "modes", "time_zero", "preset")}
+    return parse_options(with_defaults(Options, own), "modes", words, description=Options.__doc__)

@@ -1,19 +1,16 @@
 """Options of `avmsf reconstruct`."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from avmsf.cli.options.common import parse_options
-from avmsf.cli.options.fit import preset_of
+from avmsf.cli.options.presets import preset_of, preset_values, with_defaults
 from avmsf.cli.options.scenes import SceneOptions, with_seed
-from avmsf.field.config import FitConfig, GainModel
-from avmsf.modal.config import ExtractionMethod
-from avmsf.pipeline.config import (
-    PRESETS,
+from avmsf.config import (
     BodyConfig,
     LiftConfig,
     PipelineConfig,
@@ -22,6 +19,8 @@ from avmsf.pipeline.config import (
     TimeZero,
     ViewsConfig,
 )
+from avmsf.field.config import FitConfig, GainModel
+from avmsf.modal.config import ExtractionMethod
 from avmsf.scene.splatconfig import SplatConfig
 
 
@@ -77,19 +76,9 @@ class Options(SceneOptions):
         return PipelineConfig(self.gain_model, self.body, scene, fit, self.extraction, self.modes, start, self.device)
 
 
-@dataclass(frozen=True)
-class PaperOptions(Options):
-    """The same with the defaults of the preset `paper`."""
-
-    gain_model: GainModel = PRESETS["paper"].gain_model
-    extraction: ExtractionMethod = PRESETS["paper"].method
-    lift: LiftConfig = field(default_factory=lambda: PRESETS["paper"].scene.lift)
-    time_zero: TimeZero | None = PRESETS["paper"].time_zero
-    preset: Preset = "paper"
-    fit: FitConfig = field(default_factory=lambda: PRESETS["paper"].fit)
-
-
 def parse(words: Sequence[str]) -> Options:
     """Return the options that the words spell, with the preset's settings as defaults."""
-    kind = {"default": Options, "paper": PaperOptions}[preset_of(words)]
-    return parse_options(kind, "reconstruct", words, description=Options.__doc__)
+    values = preset_values(preset_of(words), method="extraction")
+    scene = values.pop("scene")
+    values |= {each.name: getattr(scene, each.name) for each in fields(scene)}
+    return parse_options(with_defaults(Options, values), "reconstruct", words, description=Options.__doc__)

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import Existing, Printing, SettingsFile
-from avmsf.pipeline.config import CACHE, SceneConfig
+from avmsf.config import CACHE, SceneConfig
 
 
 @dataclass(frozen=True)

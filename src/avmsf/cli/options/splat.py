@@ -9,7 +9,7 @@ import tyro
 
 from avmsf.cli.options.common import parse_options
 from avmsf.cli.options.scenes import SceneOptions
-from avmsf.pipeline.config import ViewsConfig
+from avmsf.config import ViewsConfig
 from avmsf.scene.splatconfig import SplatConfig
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options.common import Existing, Flag, Printing, parse_options
-from avmsf.pipeline.config import Preset
+from avmsf.config import Preset
 
 
 @dataclass(frozen=True)
