@@ -24,7 +24,7 @@ from avmsf.field.gains.elastic import (
 from avmsf.field.gains.family import Sites
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, hypotheses_of, weigh_factors
 from avmsf.field.gains.mixture import NOISE_SHARES, log_evidence
-from avmsf.field.gains.model import MixtureGains
+from avmsf.field.gains.model import MixtureGains, series_of
 from gain_cases import SIZE, families, impacts, measured, plate
 
 SHAPES = 6
@@ -256,3 +256,27 @@ def test_the_evidence_of_a_shape_counts_profiles_by_their_probability():
     evidence[7] = 3.0
     expected = 3.0 + float(given.category_prior()[given.categories()[7]].log())
     assert float(given.shape_evidence(evidence).max()) == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_shape_without_motion_at_the_impacts_is_not_visible():
+    """Of unit remainders: the visibility is the shapes' mean square at the impacts over their mean."""
+    given = family()
+    size = given._known.square().mean(0)
+    narrowest = given.categories() == 0
+    found = given.visibility()[narrowest]
+    assert torch.allclose(found, (1.0 - REMAINDERS[0]) * size / size.mean() + REMAINDERS[0], rtol=0.1, atol=0.02)
+    assert float(found.mean()) == pytest.approx(1.0, rel=1e-9)
+
+
+def test_one_impact_tells_a_visible_shape_from_one_that_does_not_move_there():
+    """At a single contact all kernels alike explain a gain; of modes as loud as others, hidden shapes are improbable."""
+    sites = impacts(1, seed=4)
+    given, gains = Elastic(sites, SIZE, plate()), measured(sites, noise=0.0)
+    gains.values[:] = 1.0 + 0.3j
+    # The least remainder, which moves everywhere.
+    seen = torch.where(given.shares[:, -1] == REMAINDERS[0], given.visibility(), torch.nan)
+    typical, hidden = (int((seen - each).abs().nan_to_num(torch.inf).argmin()) for each in (1.0, 0.0))
+    evidence = WeighedFamily.of(given, gains, NOISE_SHARES).evidence[:, 0]
+    plain = log_evidence(given.kernels(), series_of(gains.values), gains.floor)[:, 0]
+    assert torch.allclose(plain, plain[:1].expand_as(plain), atol=1e-9)
+    assert bool((evidence[typical] > evidence[hidden] + 1.0).all())

@@ -10,6 +10,7 @@ import torch
 from avmsf.field.gains import mixture as module
 from avmsf.field.gains.mixture import (
     NOISE_SHARES,
+    SCALE_SHAPE,
     Hypotheses,
     KernelMixture,
     active_series,
@@ -164,6 +165,30 @@ def test_mean_and_spread_are_those_of_the_sum_over_hypotheses():
         )
         assert mean[:, series].numpy() == pytest.approx(expected[0], rel=1e-8, abs=1e-10)
         assert spread[:, series].numpy() == pytest.approx(expected[1], rel=1e-6)
+
+
+def test_the_prior_of_the_scale_is_integrated_over():
+    """The evidence of one kernel over another is the ratio of integrals over s^2, here by quadrature."""
+    values, floor, _ = drawn()
+    few = values[:2]
+    expected = np.array([[0.3, 2.0, 0.01][row % 3] * np.ones(SERIES) for row in range(KERNELS)])
+    kernels = among()[:, :2, :2]
+    found = log_evidence(
+        *(torch.from_numpy(each.copy()) for each in (kernels, few, floor)), expected=torch.from_numpy(expected)
+    )
+    logs = np.linspace(-25.0, 25.0, 20001)
+    integrals = np.empty((KERNELS, SERIES))
+    for row, kernel in enumerate(kernels):
+        for series in range(SERIES):
+            covariance = kernel + (NOISE_SHARES[1] + floor[series]) * np.eye(2)
+            quadratic = few[:, series] @ np.linalg.inv(covariance) @ few[:, series]
+            scale = SCALE_SHAPE * expected[row, series]
+            # Inverse gamma of s^2 in log s^2, times the normal density without what is common to all kernels.
+            prior = SCALE_SHAPE * np.log(scale) - SCALE_SHAPE * logs - scale * np.exp(-logs)
+            normal = -logs - 0.5 * quadratic * np.exp(-logs) - 0.5 * np.linalg.slogdet(covariance)[1]
+            integrals[row, series] = np.log(np.trapezoid(np.exp(prior + normal), logs))
+    difference = found[:, 1].numpy() - integrals
+    assert difference == pytest.approx(np.tile(difference[:1], (KERNELS, 1)), abs=1e-6)
 
 
 def test_mean_magnitude_is_that_of_each_hypothesis_by_itself():

@@ -83,7 +83,9 @@ class Elastic(KernelFamily):
         apart = torch.log(modes.frequency[:, None] / modes.frequency)
         profiles = [1.0 / (1.0 + (2.0 * apart / tau).square()) for tau in PERTURBATIONS]
         profiles += [torch.exp(-0.5 * (apart / width).square()) + _FAR for width in WIDTHS]
-        elastic = scaled(torch.stack(profiles).flatten(0, 1), self._known.square().T)
+        profile, diagonal = torch.stack(profiles), self._known.square().T
+        self._sizes = profile @ diagonal.mean(1)
+        elastic = scaled(profile.flatten(0, 1), diagonal)
         share = torch.tensor(REMAINDERS, dtype=torch.float64)[None, :, None]
         both = [(1.0 - share) * elastic[:, None], share.expand(len(elastic), -1, 1)]
         self.shares = torch.cat(both, dim=2).flatten(0, 1)
@@ -127,6 +129,16 @@ class Elastic(KernelFamily):
         """Return the probability of each profile and remainder before any measurement; one or two impacts keep it."""
         typical = torch.outer(torch.tensor(PROFILE_PRIOR).double(), torch.tensor(REMAINDER_PRIOR).double()).flatten()
         return (1.0 - EQUAL_PRIOR) * typical / typical.sum() + EQUAL_PRIOR / len(typical)
+
+    def visibility(self) -> Float64[Tensor, " kernels"]:
+        """Return the mean square of each center's mixture of shapes at the reference impacts over their mean.
+
+        All shapes have the same modal mass: one of small components at all impacts would have to be excited far more
+        than others to be measured.
+        """
+        ratio = (self._sizes / self._sizes.mean(1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)).flatten()
+        share = torch.tensor(REMAINDERS, dtype=torch.float64)
+        return ((1.0 - share) * ratio[:, None] + share).flatten()
 
     def log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "kernels modes"]:
         """Return the log probability that a mode is each kernel's shape, times the density of its frequency if it is.

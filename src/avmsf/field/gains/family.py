@@ -112,6 +112,10 @@ class KernelFamily(ABC):
         count = int(self.categories().max()) + 1
         return torch.full((count,), 1.0 / count, dtype=torch.float64)
 
+    def visibility(self) -> Float64[Tensor, " kernels"]:
+        """Return the mean square of gains at the reference impacts over that of a typical kernel of the family."""
+        return torch.ones(len(self.shares), dtype=torch.float64)
+
     def log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "kernels modes"]:
         """Return the log probability of each kernel within its category for modes of these log frequencies (Hz).
 

@@ -25,6 +25,8 @@ _STRONGEST = 16
 """Modes of the most energy, which decide on the factor on nominal frequencies: many weak ones are not the body's."""
 _ALL_NOISE = 1e12
 """Variance of the noise over the mean square of a part at most: far beyond what leaves anything of the gains."""
+_NEAR = 0.3
+"""Standard deviation of the log frequency of modes by which the level of one is expected."""
 _SUBSTANTIAL = 1e-3
 """Part of a mode's energy from which on a part of its gains counts in learning the prior."""
 
@@ -46,6 +48,21 @@ class MeasuredGains:
     def energy(self) -> Float64[Tensor, " modes"]:
         """Of each mode's sound, up to a constant."""
         return self.values.abs().square().sum(0) / self.damping
+
+    @property
+    def level(self) -> Float64[Tensor, " series"]:
+        """The mean square that a part is expected to have by those of the informative modes near in frequency.
+
+        Their geometric mean, without the bias of a mean of few squares; a part's own where there are none.
+        """
+        tiny = torch.finfo(torch.float64).tiny
+        own = torch.stack([self.values.real, self.values.imag]).square().mean(1).clamp_min(tiny)
+        apart = torch.log(self.frequency[:, None] / self.frequency)
+        near = torch.exp(-0.5 * (apart / _NEAR).square()) * self.informative.reshape(2, -1, 1)
+        total = near.sum(1)
+        half = torch.tensor(0.5 * len(self.values), dtype=torch.float64)
+        logs = (own.log()[:, None] @ near)[:, 0] / total.clamp_min(tiny) - torch.digamma(half) + half.log()
+        return torch.where(total > 0, logs.exp(), own).flatten()
 
     @property
     def substantial(self) -> Bool[Tensor, " series"]:
@@ -94,7 +111,11 @@ class WeighedFamily:
     def of(cls, family: KernelFamily, measured: MeasuredGains, noise_shares: tuple[float, ...]) -> "WeighedFamily":
         """Return the family with its log evidence."""
         kernels = family.kernels()
-        return cls(family, kernels, log_evidence(kernels, series_of(measured.values), measured.floor, noise_shares))
+        evidence = log_evidence(
+            kernels, series_of(measured.values), measured.floor, noise_shares,
+            expected=family.visibility()[:, None] * measured.level,
+        )  # fmt: skip
+        return cls(family, kernels, evidence)
 
 
 def fit_mixture(

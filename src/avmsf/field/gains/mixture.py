@@ -19,6 +19,14 @@ Learning, 2006, chapter 5; the scale integrated out),
 and a value at a new place, with k its covariances with the contacts and k0 its own variance, is Student t with n
 degrees of freedom, location k' C^-1 y and squared scale Q/n (k0 - k' C^-1 k).
 
+Where the mean square E that the values should have if a kernel is true is known beforehand, up to a factor, s^2 has an
+inverse-gamma prior of shape a and scale a E in place of 1/s, which adds to the log evidence, up to a constant of n,
+
+    a log E - (n/2 + a) log(Q + 2 a E) + n/2 log Q.
+
+It decides with few contacts: with one, the evidence above is the same for all kernels. Only the weights of kernels take
+it; predictions given a kernel, and their variances, keep the scale of the values alone.
+
 How probable a kernel is beforehand is learned from all series by expectation maximization: kernels come in categories,
 whose probabilities maximize the summed evidence with a pseudo-count. Within a category the prior may differ from series
 to series. So a series whose few values say little borrows from the others (MacKay, Neural Computation 4, 1992).
@@ -36,6 +44,9 @@ from torch.nn.utils.rnn import pad_sequence
 NOISE_SHARES = (0.003, 0.01, 0.03)
 """Variances of the noise over the gains' mean square. Larger shares are left out: with few contacts that lie far apart
 evidence takes what it cannot predict for noise, and smooths through clean gains."""
+SCALE_SHAPE = 1.0
+"""Shape a of the prior of s^2: its logarithm has a standard deviation of 1.3, so levels one of 5.6 dB. Chosen on
+simulated objects with 1 to 8 impacts (docs/decisions/gain-model.md)."""
 _ROUNDS = 5
 """Of expectation maximization."""
 _PSEUDO_COUNT = 0.1
@@ -158,7 +169,8 @@ class KernelMixture:
         group's error is e = B^-1 (C^-1 y) and its covariance given the others s^2 B^-1 (Rasmussen and Williams, 2006,
         equations 5.10 to 5.12, for blocks). Without the group's k values the quadratic form is Q - (C^-1 y)' e, and the
         evidence changes by n/2 log Q - (n-k)/2 log(Q - (C^-1 y)' e) - 1/2 log|B|: the hypotheses are weighed again by
-        the other groups' values alone, with the same prior. The deviation is that of a measured value, noise included.
+        the other groups' values alone, with the same prior. What the prior of the scale says of all values stays. The
+        deviation is that of a measured value, noise included.
         """
         mean, deviation = torch.empty_like(self.values), torch.empty_like(self.values)
         for group in torch.unique(groups).tolist():
@@ -267,8 +279,13 @@ def log_evidence(
     values: Float64[Tensor, "contacts series"],
     floor: Float64[Tensor, " series"],
     noise_shares: tuple[float, ...] = NOISE_SHARES,
+    *,
+    expected: Float64[Tensor, "kernels series"] | None = None,
 ) -> Float64[Tensor, "kernels noises series"]:
-    """Return the log evidence of each kernel with each noise share, up to a constant of the number of contacts."""
+    """Return the log evidence of each kernel with each noise share, up to a constant of the number of contacts.
+
+    `expected` is the mean square that the values have if a kernel is true, as far as it is known beforehand.
+    """
     noises = torch.tensor(noise_shares, dtype=torch.float64)[:, None] + floor
     found = torch.empty(len(kernels), len(noises), values.shape[1], dtype=torch.float64)
     size = max(1, _MEMORY // (len(values) * max(len(values), values.shape[1])))
@@ -279,7 +296,18 @@ def log_evidence(
             variance = eigenvalues[..., None] + noise
             quadratic = (power / variance).sum(1).clamp_min(_TINY)
             found[rows, row] = -0.5 * (len(values) * quadratic.log() + variance.log().sum(1))
+            if expected is not None:
+                found[rows, row] += _scale_evidence(quadratic, expected[rows], len(values))
     return found
+
+
+def _scale_evidence(
+    quadratic: Float64[Tensor, "kernels series"], expected: Float64[Tensor, "kernels series"], count: int
+) -> Float64[Tensor, "kernels series"]:
+    """Return what an inverse-gamma prior of s^2 adds to the log evidence of the prior 1/s, up to a constant."""
+    known = 2.0 * SCALE_SHAPE * expected.clamp_min(_TINY)
+    total = (quadratic + known).log()
+    return SCALE_SHAPE * (known.log() - total) - 0.5 * count * (total - quadratic.log())
 
 
 def log_joint(

@@ -105,9 +105,10 @@ class ThinPlate(KernelFamily):
         self._inverse = torch.linalg.pinv(self._drift(along))
         self._among = self._kernel(along, along)
         drift = torch.tensor(DRIFT_SHARES, dtype=torch.float64)
-        # Each part is of mean one on the diagonal before the shares are taken.
-        size_of = self.diagonal(reference).mean(1).clamp_min(torch.finfo(torch.float64).tiny)
-        self.shares = torch.stack([1.0 - drift, drift], dim=1) / size_of
+        # Each part is of mean one on the diagonal before the shares are taken; with one place, nothing bends.
+        diagonal = self.diagonal(reference)
+        size_of = torch.where(diagonal.mean(1) > torch.finfo(torch.float64).tiny, diagonal.mean(1), torch.inf)
+        self.shares = scaled(torch.stack([1.0 - drift, drift], dim=1) / size_of, diagonal)
 
     def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
         """Return the kernel of what bends, and that of the affine part."""
