@@ -269,7 +269,7 @@ def test_a_shape_without_motion_at_the_impacts_is_not_visible():
 
 
 def test_one_impact_tells_a_visible_shape_from_one_that_does_not_move_there():
-    """At a single contact all kernels alike explain a gain; of modes as loud as others, hidden shapes are improbable."""
+    """At one contact all kernels explain a gain alike; a mode as loud as others is no shape that hardly moves there."""
     sites = impacts(1, seed=4)
     given, gains = Elastic(sites, SIZE, plate()), measured(sites, noise=0.0)
     gains.values[:] = 1.0 + 0.3j
@@ -279,4 +279,4 @@ def test_one_impact_tells_a_visible_shape_from_one_that_does_not_move_there():
     evidence = WeighedFamily.of(given, gains, NOISE_SHARES).evidence[:, 0]
     plain = log_evidence(given.kernels(), series_of(gains.values), gains.floor)[:, 0]
     assert torch.allclose(plain, plain[:1].expand_as(plain), atol=1e-9)
-    assert bool((evidence[typical] > evidence[hidden] + 1.0).all())
+    assert bool((evidence[typical] > evidence[hidden] + 0.5).all())
