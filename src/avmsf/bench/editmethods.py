@@ -200,7 +200,7 @@ def heard(edited: SoundField, task: EditTask) -> Edited:
 
 def _reference(task: EditTask) -> Guide:
     if task.reference is None:
-        raise EvaluationError(
-            f"{task.object.name} to {task.target}: expected a reference, found none", name="reference"
+        raise EvaluationError.expected(
+            f"one for {task.object.name} to {task.target}", name="reference", advice="give the task one"
         )
     return task.reference

@@ -57,7 +57,7 @@ class MaterialStatistics:
         number of gains.
         """
         if not banks or any(len(bank) == 0 for bank in banks):
-            raise EditError(f"{name}: expected modes of every object, found none", name="banks", value=0)
+            raise EditError.expected(f"modes of every object of {name}", 0, got="none", name="banks")
         if len(banks) != len(gains):
             raise EditError(
                 f"{name}: expected gains of all {len(banks)} objects, got those of {len(gains)}",

@@ -76,10 +76,11 @@ class StableAudio:
         try:
             pipeline = pipeline.to(place)
         except torch.OutOfMemoryError as error:
-            raise EditError(
-                f"{name}: out of memory on {place}; free memory, or choose the device cpu",
+            raise EditError.expected(
+                f"one with memory for {name}",
+                str(place),
                 name="device",
-                value=str(place),
+                advice="free memory, or choose the device cpu",
             ) from error
         return cls(pipeline, name=name, seconds=seconds)
 
@@ -215,10 +216,11 @@ class StableAudio:
             latents = self._sampled(words, seconds, seed, negative=negative, steps=steps, guidance=guidance)
             return self.decode(latents, samples=round(seconds * self.sample_rate))[0].mean(dim=0).cpu()
         except torch.OutOfMemoryError as error:
-            raise EditError(
-                f"{self.name}: out of memory on {self.device} during generation; free memory, or choose the device cpu",
+            raise EditError.expected(
+                f"one with memory for a sound of {self.name}",
+                str(self.device),
                 name="device",
-                value=str(self.device),
+                advice="free memory, or choose the device cpu",
             ) from error
 
     def _sampled(
