@@ -21,7 +21,7 @@ def as_vectors(values: ArrayLike, name: str, *, count: int | None = None) -> Flo
     Raises ArrayError for another shape, for another number of rows than `count`, and for values that are not finite.
     """
     found = as_floats(values, name)
-    rows = "contacts" if count is None else str(count)
+    rows = "rows" if count is None else str(count)
     if found.ndim != 2 or found.shape[1] != 3 or (count is not None and len(found) != count):
         single = f"; put a single one into a list, {name}=[[x, y, z]]" if found.shape == (3,) else ""
         shape = list(found.shape)
@@ -51,8 +51,11 @@ def as_floats(values: float | int | ArrayLike, name: str) -> Float[Tensor, "*sha
     """Return numbers of any shape as floats on the CPU. Raises ArrayError for what are no numbers."""
     try:
         found = torch.as_tensor(values if isinstance(values, Tensor) else np.asarray(values))
-    except (ValueError, TypeError) as error:
-        raise ArrayError(f"{name}: expected numbers in an array or nested lists ({error})", name=name) from error
+    except (ValueError, TypeError, RuntimeError) as error:
+        got = "lists of different lengths or other values" if isinstance(values, Sequence) else repr(values)[:60]
+        raise ArrayError.expected(
+            "numbers in an array or nested lists of equal lengths", type(values).__name__, got=got, name=name
+        ) from error
     if found.is_complex():
         raise ArrayError(f"{name}: expected real numbers, got {found.dtype}", name=name, value=str(found.dtype))
     kept = isinstance(values, Tensor) and found.is_floating_point()
