@@ -1,8 +1,9 @@
 """Arrays that users give, lists and numpy arrays among them, as tensors of a known shape."""
 
 import math
+import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 import torch
@@ -27,6 +28,23 @@ def as_vectors(values: ArrayLike, name: str, *, count: int | None = None) -> Flo
         shape = list(found.shape)
         raise ArrayError(f"{name}: expected an array [{rows}, 3], got {shape}{single}", name=name, value=shape)
     return _finite(found, name)
+
+
+def as_directions(values: ArrayLike, name: str, *, count: int) -> Float[Tensor, "rows 3"]:
+    """Return `count` vectors of length 1, or 0 where they are given so. Raises as `as_vectors`."""
+    vectors = as_vectors(values, name, count=count)
+    length = vectors.norm(dim=1, keepdim=True)
+    # What has unit length already stays as it is, to the last bit.
+    kept = ((length - 1.0).abs() < 1e-6) | (length == 0.0)
+    return torch.where(kept, vectors, vectors / length)
+
+
+def as_count(value: SupportsIndex, name: str) -> int:
+    """Return a whole number of 1 or more. Raises ArrayError for another."""
+    count = operator.index(value) if hasattr(value, "__index__") and not isinstance(value, bool) else 0
+    if count < 1:
+        raise ArrayError.expected("a whole number of 1 or more", value, name=name)
+    return count
 
 
 def as_numbers(values: float | int | ArrayLike, name: str, *, count: int) -> Float[Tensor, " rows"]:
