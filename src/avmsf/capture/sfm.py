@@ -70,7 +70,7 @@ def estimate_cameras(
     output: str | Path,
     *,
     timeout: float = 3600.0,
-    seed: int = 0,
+    seed: int | None = None,
     camera_model: str = "SIMPLE_RADIAL",
     shared_camera: bool = True,
     features: int = 4096,
@@ -84,8 +84,8 @@ def estimate_cameras(
     Where `output` is the folder that holds `images/`, `read_views` reads it. What moves with the object counts, so
     masks are used where there are any: alpha channels, or files in `masks/` beside the images. All photographs come
     from one camera with one zoom unless `shared_camera` is false. `features` and `longest` bound the features of an
-    image and the pixels of the longer side on which they are sought. One and the same seed gives the same cameras to
-    the last bit with `threads=1`, and to about one part in 100,000 with more; None takes all cores.
+    image and the pixels of the longer side on which they are sought. One and the same seed (None is 0) gives the same
+    cameras to the last bit with `threads=1`, and to about one part in 100,000 with more; None takes all cores.
 
     The work runs in a process of its own, which ends with this call, whether that returns, raises, or is interrupted;
     `sparse/0` is whole or absent. Frame and scale of the result are arbitrary: see `align_similarity`. Warns with
@@ -102,7 +102,7 @@ def estimate_cameras(
         _write_job(
             begun,
             names,
-            seed=seed,
+            seed=0 if seed is None else seed,
             camera_model=camera_model,
             shared_camera=shared_camera,
             features=features,

@@ -11,6 +11,7 @@ from jaxtyping import Float, Float64
 from scipy.optimize import nnls
 from torch import Tensor
 
+from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import EditError, ExtractionError
 from avmsf.field.soundfield import SoundField
 from avmsf.modal.bank import ModalBank
@@ -174,8 +175,8 @@ class MaterialStatistics:
             )
         return torch.cat(made)
 
-    def reference(self, *, samples: int, sample_rate: float, count: int = 8, seed: int = 0) -> Reference:
-        """Return synthetic impacts as the reference of an edit."""
-        generator = torch.Generator().manual_seed(seed)
+    def reference(self, *, samples: int, sample_rate: float, count: int = 8, seed: Seed = None) -> Reference:
+        """Return synthetic impacts as the reference of an edit; without a `seed` those of the seed 0."""
+        generator = generator_of(seed)
         sounds = self.sounds(count, samples=samples, sample_rate=sample_rate, generator=generator)
         return Reference.of(sounds, sample_rate=sample_rate, name=self.name)
