@@ -25,7 +25,7 @@ from avmsf.errors import ArrayError, AvmsfError, CaptureError, EvaluationError, 
 from avmsf.field import FitConfig, SoundField
 from avmsf.pipeline import PRESETS, PipelineConfig
 from avmsf.simulate.material import CERAMIC, WOOD
-from avmsf.tasks import recast
+from avmsf.tasks import change_material
 from plate_capture import fill_plate
 from plate_field import RATE, plate_impacts
 from raising import raises, warns
@@ -349,7 +349,7 @@ for call in (
     lambda: avmsf.SoundField.fit(capture, gain_model="bad"),
     lambda: field.render([{CONTACT}], samples=-1),
     lambda: field.render([{CONTACT}], samples=2.5),
-    lambda: avmsf.tasks.recast(field, "ceramic", "paper"),
+    lambda: avmsf.tasks.change_material(field, "ceramic", "paper"),
 ):
     try:
         call()
@@ -394,7 +394,7 @@ def test_a_position_near_the_object_gives_a_warning():
 
 
 def test_materials_are_given_by_name():
-    by_name, given = (recast(field(), *pair) for pair in (("ceramic", "Wood"), (CERAMIC, WOOD)))
+    by_name, given = (change_material(field(), *pair) for pair in (("ceramic", "Wood"), (CERAMIC, WOOD)))
     assert torch.equal(by_name.bank.frequency, given.bank.frequency)
 
 

@@ -129,7 +129,7 @@ class MaterialStatistics:
         return cls.of_modes(banks, gains, name=name or found[0].parent.name)
 
     @classmethod
-    def recast(cls, field: SoundField, old: Material, new: Material) -> "MaterialStatistics":
+    def transform(cls, field: SoundField, old: Material, new: Material) -> "MaterialStatistics":
         """Return what a field's object would be like in another material, by the laws of linear elasticity.
 
         Its frequencies times sqrt(E'/E r/r'), the new material's damping, its own brightness.

@@ -45,7 +45,7 @@ LAWS = {law.name: law for law in (DISPLACEMENT, VELOCITY, ACCELERATION, RATIO_ON
 """All of them, by name."""
 
 
-def recast(
+def change_material(
     field: SoundField, old: Material | str, new: Material | str, *, size: float = 1.0, law: GainLaw = DISPLACEMENT
 ) -> SoundField:
     """Return the field of an object of the same shape, `size` times as large, in a new material.
